@@ -1,0 +1,71 @@
+"""One family of errors: what is wrong, where, and what to do next.
+
+Everything that a user can put right is raised as a `BayesdistError`; the command line prints its one
+sentence and exits with its code.  Any other exception is a defect of the program.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "BayesdistError",
+    "ConfigError",
+    "DegenerateError",
+    "FormatError",
+    "InputError",
+    "NotConvergedError",
+]
+
+
+class BayesdistError(Exception):
+    """Base of all errors meant for the user.
+
+    Parameters
+    ----------
+    cause : str
+        What is wrong, as a clause without a full stop.
+    where : str, optional
+        File, row, column or keyword, as in ``"stars.ecsv, row 12, column 'su'"``.
+    do : str, optional
+        The next action, as an imperative clause.
+
+    Attributes
+    ----------
+    exit_code : int
+        Exit status of the command line for this kind of error.
+    """
+
+    exit_code = 1
+
+    def __init__(self, cause: str, *, where: str = "", do: str = "") -> None:
+        self.cause = cause.rstrip(".")
+        self.where = where
+        self.do = do.rstrip(".")
+        super().__init__(self.sentence)
+
+    @property
+    def sentence(self) -> str:
+        """The whole message as one sentence."""
+        head = f"{self.where}: {self.cause}" if self.where else self.cause
+        return f"{head}; {self.do}." if self.do else f"{head}."
+
+
+class InputError(BayesdistError):
+    """Input data, files or arguments that cannot be used."""
+
+
+class ConfigError(InputError):
+    """A configuration that cannot be used."""
+
+
+class FormatError(InputError):
+    """A file that is not what its format demands (truncated, corrupt, other columns)."""
+
+
+class DegenerateError(InputError):
+    """The data do not determine the parameters that are asked for."""
+
+
+class NotConvergedError(BayesdistError):
+    """The sampler did not reach its targets and ``--strict`` was given."""
+
+    exit_code = 3

@@ -1,0 +1,200 @@
+"""Symmetric matrices of arrow shape: a dense border and many small blocks on the diagonal.
+
+The normal matrix of exposures with their own frames has this shape: parameters of different exposures
+meet only through the global ones.  Local blocks are eliminated by Schur complement, so that cost grows
+linearly with the number of exposures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, solve_triangular
+
+__all__ = ["Arrow", "ArrowFactor"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Arrow:
+    """A symmetric matrix [[border, edge], [edge^T, diag(blocks)]].
+
+    Vectors that go with it are laid out as (global, local blocks, tail): the border belongs to the
+    first `n_global` and the last `n_tail` entries, the blocks to those between.
+
+    Parameters
+    ----------
+    border : ndarray, shape (b, b)
+        b = n_global + n_tail.
+    edge : ndarray, shape (n_blocks, b, q)
+    blocks : ndarray, shape (n_blocks, q, q)
+    n_tail : int
+        How many entries of the border stand behind the blocks.
+    """
+
+    border: Float
+    edge: Float
+    blocks: Float
+    n_tail: int = 0
+
+    @property
+    def n_global(self) -> int:
+        """Entries before the blocks."""
+        return len(self.border) - self.n_tail
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return len(self.border) + self.blocks.shape[0] * self.blocks.shape[1]
+
+    def __add__(self, other: Arrow) -> Arrow:
+        return Arrow(
+            self.border + other.border,
+            self.edge + other.edge,
+            self.blocks + other.blocks,
+            self.n_tail,
+        )
+
+    @cached_property
+    def _indices(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        n, q = self.blocks.shape[:2]
+        local = self.n_global + np.arange(n * q)
+        tail = self.n_global + n * q + np.arange(self.n_tail)
+        return np.concatenate([np.arange(self.n_global), tail]), local
+
+    def split(self, vector: Float) -> tuple[Float, Float]:
+        """Border part (..., b) and local part (..., n_blocks, q) of vectors (..., size)."""
+        border, local = self._indices
+        n, q = self.blocks.shape[:2]
+        return vector[..., border], vector[..., local].reshape(*vector.shape[:-1], n, q)
+
+    def join(self, border_part: Float, local_part: Float) -> Float:
+        """The inverse of `split`."""
+        border, local = self._indices
+        out = np.empty((*border_part.shape[:-1], self.size))
+        out[..., border] = border_part
+        out[..., local] = local_part.reshape(*border_part.shape[:-1], -1)
+        return out
+
+    def diagonal(self) -> Float:
+        """The diagonal, shape (size,)."""
+        return self.join(
+            np.diag(self.border).copy(), np.einsum("nqq->nq", self.blocks).astype(float)
+        )
+
+    def without_tail(self) -> Arrow:
+        """The matrix without the rows and columns of the tail."""
+        if not self.n_tail:
+            return self
+        g = self.n_global
+        return Arrow(self.border[:g, :g], self.edge[:, :g], self.blocks)
+
+    def dense(self) -> Float:
+        """The full matrix, for small problems and tests."""
+        border, local = self._indices
+        n, q = self.blocks.shape[:2]
+        out = np.zeros((self.size, self.size))
+        out[np.ix_(border, border)] = self.border
+        for e in range(n):
+            rows = local[e * q : (e + 1) * q]
+            out[np.ix_(rows, rows)] = self.blocks[e]
+            out[np.ix_(border, rows)] = self.edge[e]
+            out[np.ix_(rows, border)] = self.edge[e].T
+        return out
+
+    def times(self, vectors: Float) -> Float:
+        """The matrix times vectors (..., size)."""
+        b, l = self.split(vectors)
+        top = b @ self.border + np.einsum("...nq,nbq->...b", l, self.edge)
+        low = np.einsum("...b,nbq->...nq", b, self.edge) + np.einsum(
+            "...nq,nqr->...nr", l, self.blocks
+        )
+        return self.join(top, low)
+
+    def factor(self) -> ArrowFactor:
+        """Cholesky factors with the local blocks eliminated first.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            When the matrix is not positive definite.
+        """
+        if len(self.blocks):
+            chol_blocks = np.linalg.cholesky(self.blocks)
+            # C^-1 B^T, for all blocks at once
+            gain = np.linalg.solve(self.blocks, np.swapaxes(self.edge, 1, 2))
+            schur = self.border - np.einsum("nbq,nqc->bc", self.edge, gain)
+        else:
+            chol_blocks, gain, schur = self.blocks, np.swapaxes(self.edge, 1, 2), self.border
+        chol_border = np.linalg.cholesky((schur + schur.T) / 2)
+        return ArrowFactor(self, chol_border, chol_blocks, gain)
+
+
+@dataclass(frozen=True, eq=False)
+class ArrowFactor:
+    """A factored positive definite `Arrow` H: solves, determinants and Gaussian draws.
+
+    Parameters
+    ----------
+    matrix : Arrow
+    chol_border : ndarray, shape (b, b)
+        Lower Cholesky factor of the Schur complement.
+    chol_blocks : ndarray, shape (n_blocks, q, q)
+    gain : ndarray, shape (n_blocks, q, b)
+        C^-1 B^T of each block.
+    """
+
+    matrix: Arrow
+    chol_border: Float
+    chol_blocks: Float
+    gain: Float
+
+    def solve(self, right: Float) -> Float:
+        """H^-1 times vectors (..., size)."""
+        b, l = self.matrix.split(right)
+        b = b - np.einsum("nqb,...nq->...b", self.gain, l)
+        top = cho_solve((self.chol_border, True), b.reshape(-1, b.shape[-1]).T).T.reshape(b.shape)
+        low = l
+        if len(self.chol_blocks):
+            low = np.linalg.solve(self.matrix.blocks, l[..., None])[..., 0]
+        return self.matrix.join(top, low - np.einsum("nqb,...b->...nq", self.gain, top))
+
+    @cached_property
+    def logdet(self) -> float:
+        """Logarithm of the determinant of H."""
+        out = 2 * np.log(np.diag(self.chol_border)).sum()
+        return float(out + 2 * np.log(np.einsum("nqq->nq", self.chol_blocks)).sum())
+
+    def colour(self, z: Float) -> Float:
+        """Vectors x (..., size) with covariance H^-1 from white ones z.
+
+        x_b = L_S^-T z_b and x_e = L_e^-T z_e - C_e^-1 B_e^T x_b, so that |z|^2 = x^T H x.
+        """
+        b, l = self.matrix.split(z)
+        top = _solve_lower_transposed(self.chol_border, b)
+        low = l
+        if len(self.chol_blocks):
+            transposed = np.swapaxes(self.chol_blocks, 1, 2)
+            low = np.linalg.solve(transposed, l[..., None])[..., 0]
+        return self.matrix.join(top, low - np.einsum("nqb,...b->...nq", self.gain, top))
+
+    def whiten(self, x: Float) -> Float:
+        """White vectors z from x (..., size): the inverse of `colour`."""
+        b, l = self.matrix.split(x)
+        low = l + np.einsum("nqb,...b->...nq", self.gain, b)
+        low = np.einsum("nrq,...nr->...nq", self.chol_blocks, low)
+        return self.matrix.join(b @ self.chol_border, low)
+
+    def covariance(self) -> Float:
+        """H^-1 as a dense matrix (size, size)."""
+        root = self.colour(np.eye(self.matrix.size))
+        return root.T @ root
+
+
+def _solve_lower_transposed(L: Float, z: Float) -> Float:
+    flat = z.reshape(-1, z.shape[-1])
+    return solve_triangular(L, flat.T, lower=True, trans="T").T.reshape(z.shape)

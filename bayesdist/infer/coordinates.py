@@ -1,0 +1,66 @@
+"""Coordinates in which the conditional posterior of f and s_out is nearly Gaussian.
+
+Few outliers make logit f and log s_out skewed, with exponential tails that no Gaussian proposal covers.
+A gamma variable is nearly Gaussian in its cube root (Wilson and Hilferty 1931), so proposals live in
+
+    f^(1/3)     and     s_out^(-2/3)  (the cube root of the outliers' precision)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["from_cube_root", "inside", "to_cube_root"]
+
+Float = NDArray[np.float64]
+
+
+def to_cube_root(names: tuple[str, ...], h: Float) -> Float:
+    """Proposal coordinates (..., k) of sampled ones; `names` are those of h: 'f', 's_out'."""
+    out = np.empty_like(h)
+    for k, name in enumerate(names):
+        t = h[..., k]
+        out[..., k] = (1 + np.exp(-t)) ** (-1 / 3) if name == "f" else np.exp(-2 * t / 3)
+    return out
+
+
+def inside(names: tuple[str, ...], z: Float) -> NDArray[np.bool_]:
+    """Which points (..., k) lie in the support."""
+    ok = (z > 0).all(axis=-1)
+    if "f" in names:
+        ok &= z[..., names.index("f")] < 1
+    return ok
+
+
+def from_cube_root(names: tuple[str, ...], z: Float) -> tuple[Float, Float, Float, Float, Float]:
+    """Sampled coordinates and what a change of variables needs.
+
+    Parameters
+    ----------
+    names : tuple of str
+        'f' or 's_out' for each coordinate.
+    z : ndarray, shape (..., k)
+        Points inside the support.
+
+    Returns
+    -------
+    h, h1, h2 : ndarray, shape (..., k)
+        logit f or log s_out, and its first and second derivative by z.
+    log_h1_1, log_h1_2 : ndarray, shape (..., k)
+        First and second derivative of log |h1|.
+    """
+    h, h1, h2 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
+    g1, g2 = np.empty_like(z), np.empty_like(z)
+    for k, name in enumerate(names):
+        t = z[..., k]
+        if name == "f":
+            a, b = 1 - 4 * t**3, t - t**4
+            h[..., k] = 3 * np.log(t) - np.log1p(-(t**3))
+            h1[..., k], h2[..., k] = 3 / b, -3 * a / b**2
+            g1[..., k], g2[..., k] = -a / b, (12 * t**2 * b + a**2) / b**2
+        else:
+            h[..., k] = -1.5 * np.log(t)
+            h1[..., k], h2[..., k] = -1.5 / t, 1.5 / t**2
+            g1[..., k], g2[..., k] = -1 / t, 1 / t**2
+    return h, h1, h2, g1, g2

@@ -1,0 +1,192 @@
+"""Do the data determine the parameters?  If not: which ones, by name, and why.
+
+Checked before anything is solved, because a degenerate least-squares problem still returns numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.arrow import Arrow
+from bayesdist.model import DistortionModel
+from bayesdist.model.frames import frame_names
+
+__all__ = ["NullSpace", "check_coverage", "null_space"]
+
+Float = NDArray[np.float64]
+
+# Eigenvalues of the unit-diagonal normal matrix below this are zero: rounding alone leaves ~1e-15
+# and a fit that loses 11 of 16 digits is no longer a measurement.
+RANK_TOLERANCE = 1e-11
+
+# A polynomial over the detector is an extrapolation when its stars fill less than this of the area.
+LEAST_COVERAGE = 0.25
+
+
+@dataclass(frozen=True)
+class NullSpace:
+    """Directions in parameter space that the data leave free.
+
+    Parameters
+    ----------
+    rank : int
+    n_params : int
+    condition : float
+        Ratio of the extreme eigenvalues of the normal matrix scaled to unit diagonal.
+    directions : tuple of tuple of str
+        Names of the parameters that make up each free direction, the largest part first.
+    """
+
+    rank: int
+    n_params: int
+    condition: float
+    directions: tuple[tuple[str, ...], ...]
+
+
+def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
+    """Rank, condition and named null directions of a normal matrix.
+
+    Parameters
+    ----------
+    matrix : Arrow
+    names : tuple of str
+        Names of its rows.
+
+    Returns
+    -------
+    NullSpace
+    """
+    scale = np.sqrt(matrix.diagonal())
+    dead = scale == 0
+    scale[dead] = 1.0
+    values, vectors = np.linalg.eigh(matrix.dense() / np.outer(scale, scale))
+    free = values < RANK_TOLERANCE * max(values[-1], 1.0)
+    directions = []
+    for vector in vectors[:, free].T:
+        size = np.abs(vector)
+        parts = np.argsort(-size)[:6]
+        directions.append(tuple(names[k] for k in parts if size[k] > 0.1 * size.max()))
+    smallest = max(values[0], np.finfo(float).tiny)
+    return NullSpace(
+        rank=int((~free).sum()),
+        n_params=len(names),
+        condition=float(values[-1] / smallest),
+        directions=tuple(directions),
+    )
+
+
+def require_full_rank(
+    matrix: Arrow, model: DistortionModel, matches: MatchTable
+) -> NullSpace:
+    """The null space, which must be empty.
+
+    Raises
+    ------
+    DegenerateError
+        Naming the parameters of the first free direction and, where it can be told, the reason.
+    """
+    space = null_space(matrix, model.names)
+    if space.rank == space.n_params:
+        return space
+    first = space.directions[0]
+    listed = ", ".join(first[:-1]) + f" and {first[-1]}" if len(first) > 1 else first[0]
+    verb = "are degenerate" if len(first) > 1 else "is not determined by the data"
+    reason, do = _reason(first, model, matches)
+    raise DegenerateError(
+        f"{listed} {verb} (rank {space.rank} of {space.n_params}){reason}", where="model", do=do
+    )
+
+
+def _reason(
+    direction: tuple[str, ...], model: DistortionModel, matches: MatchTable
+) -> tuple[str, str]:
+    kinds = {p.name: p for p in model.parameters}
+    parts = [kinds[name] for name in direction]
+    if any(p.kind == "tdd" for p in parts):
+        epochs = np.unique(matches.epoch) if matches.epoch is not None else np.zeros(1)
+        if len(epochs) == 1:
+            return (
+                ": all exposures share one epoch",
+                "drop model.tdd or add exposures at other epochs",
+            )
+        if any(p.kind == "frame" for p in parts):
+            return (
+                f": the frame '{model.frames}' of each exposure absorbs the drift",
+                "choose model.frames = 'shift_rotation' or drop the time-dependent term",
+            )
+        return (
+            ": the epochs of a segment do not fix its terms",
+            "drop the term or the break, or add exposures in that segment",
+        )
+    if any(p.kind == "frame" for p in parts):
+        return (": too little joins the exposures", "choose a simpler model.frames")
+    return (
+        f": the stars do not fill the detector well enough for order {model.order}",
+        "lower model.order or add stars",
+    )
+
+
+def check_coverage(model: DistortionModel, matches: MatchTable) -> None:
+    """Refuse data that cannot carry the model, with the plain reason.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer numbers than parameters, too few stars in an exposure, stars on a line, or stars in one
+        corner of a chip.
+    """
+    n = len(matches)
+    if 2 * n < model.n_params:
+        raise DegenerateError(
+            f"{n} stars give {2 * n} numbers, fewer than the {model.n_params} parameters",
+            where=", ".join(matches.sources),
+            do="lower model.order or give more stars",
+        )
+    q = len(frame_names(model.frames))
+    if q:
+        counts = np.bincount(matches.exposure, minlength=len(model.exposures))
+        for name, count in zip(model.exposures, counts, strict=True):
+            if 2 * count < q:
+                raise DegenerateError(
+                    f"exposure {name!r} has {count} stars, too few for frame '{model.frames}'",
+                    where=", ".join(matches.sources),
+                    do="drop the exposure or choose a simpler model.frames",
+                )
+    numbers = np.asarray(matches.chip_numbers)[matches.chip]
+    for chip in model.chips:
+        on_chip = numbers == chip.number if len(model.chips) > 1 else np.ones(n, bool)
+        x, y = matches.x[on_chip], matches.y[on_chip]
+        where = f"chip {chip.name}" if len(model.chips) > 1 else ", ".join(matches.sources)
+        if not len(x):
+            raise DegenerateError("no star lies on this chip", where=where, do="drop the chip")
+        outside = (x < 0.5) | (x > chip.size[0] + 0.5) | (y < 0.5) | (y > chip.size[1] + 0.5)
+        if outside.any():
+            k = int(np.flatnonzero(on_chip)[np.flatnonzero(outside)[0]])
+            raise DegenerateError(
+                f"row {matches.row[k] + 1} lies at pixel ({matches.x[k]:.2f}, {matches.y[k]:.2f}), "
+                f"outside the {chip.size[0]:g} x {chip.size[1]:g} detector",
+                where=where,
+                do="correct detector.size, the columns or data.pixel_origin",
+            )
+        points = np.column_stack([x / chip.size[0], y / chip.size[1]])
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if len(x) < 3 or spread[-1] < 1e-6 * spread[0]:
+            raise DegenerateError("all stars lie on a line", where=where, do="check columns x and y")
+        try:
+            covered = ConvexHull(points).volume
+        except QhullError:  # nearly collinear: no area to speak of
+            covered = 0.0
+        if covered < LEAST_COVERAGE:
+            raise DegenerateError(
+                f"the stars lie within x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to "
+                f"{y.max():.0f} and span {100 * covered:.0f} % of the detector, so that the rest "
+                "would be extrapolated",
+                where=where,
+                do="add stars, or set detector.size and reference_pixel to the part that is measured",
+            )

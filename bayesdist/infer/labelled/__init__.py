@@ -1,0 +1,1 @@
+"""Everything that speaks xarray and ArviZ: convergence diagnostics and netCDF files."""

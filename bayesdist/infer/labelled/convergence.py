@@ -1,0 +1,191 @@
+"""Has the sampler converged?  Judged over independent ensembles, never over walkers of one ensemble.
+
+Differential evolution couples the walkers of an ensemble.  Then two estimates of the effective sample
+size are made and the smaller counts: that of the walkers laid end to end, and that of the ensemble
+averages, which sees a drift that all walkers share (Goodman and Weare 2010, section 5).
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Convergence", "Limits", "diagnose", "pareto_k"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a converged run has to reach.
+
+    Parameters
+    ----------
+    ess : float
+        Bulk and tail effective sample size of every parameter.
+    rhat : float
+        Rank-normalised split R-hat of every parameter.
+    """
+
+    ess: float = 400.0
+    rhat: float = 1.01
+
+
+@dataclass(frozen=True, eq=False)
+class Convergence:
+    """Diagnostics of every sampled parameter, and the verdict.
+
+    Parameters
+    ----------
+    names : tuple of str
+        theta, then the hyperparameters as sampled.
+    rhat, ess_bulk, ess_tail, mcse_mean, mcse_sd : ndarray, shape (D,)
+    pareto_k : float
+        Of the importance weights of the independence proposal (Vehtari et al. 2024).
+    importance_efficiency : float
+        Effective share of the proposal's draws.
+    converged : bool
+    reasons : tuple of str
+        Why not, worst parameter named; empty when converged.
+    limits : Limits
+    """
+
+    names: tuple[str, ...]
+    rhat: Float
+    ess_bulk: Float
+    ess_tail: Float
+    mcse_mean: Float
+    mcse_sd: Float
+    pareto_k: float
+    importance_efficiency: float
+    converged: bool
+    reasons: tuple[str, ...]
+    limits: Limits
+
+    @property
+    def rhat_max(self) -> float:
+        """Largest R-hat."""
+        return float(self.rhat.max())
+
+    @property
+    def ess_bulk_min(self) -> float:
+        """Smallest bulk effective sample size."""
+        return float(self.ess_bulk.min())
+
+    @property
+    def ess_tail_min(self) -> float:
+        """Smallest tail effective sample size."""
+        return float(self.ess_tail.min())
+
+
+def diagnose(
+    chains: Float,
+    names: tuple[str, ...],
+    log_weights: Float,
+    limits: Limits,
+    *,
+    coupled: bool,
+) -> Convergence:
+    """Diagnostics from the draws after warm-up.
+
+    Parameters
+    ----------
+    chains : ndarray, shape (ensembles, steps, walkers, D)
+    names : tuple of str
+    log_weights : ndarray, shape (n,)
+        Log importance weights of independent proposals.
+    limits : Limits
+    coupled : bool
+        Whether the walkers of an ensemble influence each other.
+
+    Returns
+    -------
+    Convergence
+    """
+    import arviz as az  # takes seconds to import
+
+    E, T, W, D = chains.shape
+    in_time = chains.reshape(E, T * W, D)
+    by_walker = np.swapaxes(chains, 1, 2).reshape(E, W * T, D)
+
+    def each(function, values: Float, **options: object) -> Float:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            out = function(az.convert_to_dataset({"x": values}), **options)
+        # a parameter that never moved has no variance: no effective draws, no agreement
+        return np.asarray(out["x"].values, float)
+
+    rhat = each(az.rhat, in_time)
+    rhat[~np.isfinite(rhat)] = np.inf
+    bulk = each(az.ess, by_walker)
+    tail = each(az.ess, by_walker, method="tail")
+    if coupled:
+        low, high = np.quantile(in_time.reshape(-1, D), [0.05, 0.95], axis=0)
+        bulk = np.minimum(bulk, _coupled_ess(chains, each))
+        for outside in (chains <= low, chains >= high):
+            tail = np.minimum(tail, _coupled_ess(outside.astype(float), each))
+    bulk[~np.isfinite(bulk)] = 0.0
+    tail[~np.isfinite(tail)] = 0.0
+    spread = in_time.reshape(-1, D).std(axis=0)
+    # delta method; arviz.mcse(method="sd") of 0.23 fails on numpy 2.4
+    squares = (by_walker - by_walker.reshape(-1, D).mean(axis=0)) ** 2
+    ess_squares = np.maximum(each(az.ess, squares, method="mean"), 1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mcse_sd = squares.reshape(-1, D).std(axis=0) / np.sqrt(ess_squares) / (2 * spread)
+    weights = np.exp(log_weights - log_weights.max())
+    efficiency = float(weights.sum() ** 2 / (weights**2).sum() / len(weights))
+
+    reasons = []
+    for label, values, bad, limit in (
+        ("R-hat", rhat, rhat > limits.rhat, limits.rhat),
+        ("bulk ESS", bulk, bulk < limits.ess, limits.ess),
+        ("tail ESS", tail, tail < limits.ess, limits.ess),
+    ):
+        if bad.any():
+            k = int(np.argmax(values) if label == "R-hat" else np.argmin(values))
+            reasons.append(
+                f"{label} of {names[k]} is {values[k]:.4g} and must be "
+                f"{'at most' if label == 'R-hat' else 'at least'} {limit:g}"
+                f" ({int(bad.sum())} of {D} parameters)"
+            )
+    return Convergence(
+        names=names,
+        rhat=rhat,
+        ess_bulk=bulk,
+        ess_tail=tail,
+        mcse_mean=spread / np.sqrt(np.maximum(bulk, 1.0)),
+        mcse_sd=np.nan_to_num(mcse_sd),
+        pareto_k=pareto_k(log_weights),
+        importance_efficiency=efficiency,
+        converged=not reasons,
+        reasons=tuple(reasons),
+        limits=limits,
+    )
+
+
+def _coupled_ess(chains: Float, each) -> Float:
+    """Effective sample size of the mean over ensembles that may move as one."""
+    import arviz as az
+
+    E, T, W, D = chains.shape
+    averages = chains.mean(axis=2)
+    share = averages.reshape(-1, D).var(axis=0)
+    total = chains.reshape(-1, D).var(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ess = each(az.ess, averages, method="mean") * total / share
+    return np.where(np.isfinite(ess), ess, 0.0)
+
+
+def pareto_k(log_weights: Float) -> float:
+    """Shape of the generalised Pareto tail of importance weights; above 0.7 they cannot be trusted."""
+    import arviz as az
+
+    finite = log_weights[np.isfinite(log_weights)]
+    if len(finite) < 25 or np.ptp(finite) < 1e-9:
+        return float("-inf") if len(finite) >= 25 else float("inf")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return float(az.psislw(finite.copy())[1])

@@ -1,0 +1,216 @@
+"""Mode and curvature of the posterior at a given jitter.
+
+Newton's method on the mixture, with the EM weights wherever the full Hessian is not positive: far from
+the mode every step is an EM step, near it convergence is quadratic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.arrow import Arrow, ArrowFactor
+from bayesdist.infer.coordinates import from_cube_root, inside, to_cube_root
+from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.target import Target
+
+__all__ = ["Conditional", "conditional_mode", "starting_point"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Conditional:
+    """Laplace approximation of everything else at one value of log j.
+
+    Coordinates are y = (theta, cube-root hyperparameters): see `coordinates`.
+
+    Parameters
+    ----------
+    log_j : float or None
+        None where the jitter is not sampled.
+    mode : ndarray, shape (D',)
+    factor : ArrowFactor
+        Of minus the Hessian at the mode.
+    log_marginal : float
+        Laplace estimate of the log posterior density of log j, up to a constant.
+    """
+
+    log_j: float | None
+    mode: Float
+    factor: ArrowFactor
+    log_marginal: float
+
+
+def split_hyper(target: Target) -> tuple[bool, tuple[str, ...]]:
+    """Whether log j is sampled, and the other hyperparameters."""
+    names = target.mixture.hyper
+    return names[:1] == ("j",), tuple(n for n in names if n != "j")
+
+
+def to_psi(target: Target, y: Float, log_j: Float | float | None) -> Float:
+    """Sampled coordinates psi (..., D) from y (..., D') and log j."""
+    has_j, rest = split_hyper(target)
+    n = target.n_theta
+    h = from_cube_root(rest, y[..., n:])[0]
+    parts = [y[..., :n]]
+    if has_j:
+        parts.append(np.broadcast_to(np.asarray(log_j, float), y.shape[:-1])[..., None])
+    return np.concatenate([*parts, h], axis=-1)
+
+
+def starting_point(target: Target, fit: LinearFit) -> tuple[Float, float | None]:
+    """Where to begin: the linear fit, and hyperparameters from what it rejected.
+
+    Parameters
+    ----------
+    target : Target
+    fit : LinearFit
+
+    Returns
+    -------
+    y : ndarray
+        (theta, cube-root hyperparameters).
+    log_j : float or None
+    """
+    has_j, rest = split_hyper(target)
+    scale = target.hyper.scale
+    n_used = int(fit.used.sum())
+    n_rejected = len(fit.used) - n_used
+    excess = max(fit.chi2 / max(fit.dof, 1) - 1.0, 0.0)
+    f = np.clip(n_rejected / len(fit.used), 0.5 / len(fit.used), 0.9)
+    s_out = 5 * scale
+    if n_rejected > 2:
+        s_out = max(s_out, float(np.sqrt(np.mean(fit.residual[~fit.used] ** 2))))
+    natural = {"f": f, "s_out": s_out}
+    h = np.array([np.log(v / (1 - v)) if k == "f" else np.log(v) for k, v in natural.items()])
+    h = h[[list(natural).index(k) for k in rest]] if rest else np.zeros(0)
+    log_j = float(np.log(scale * np.sqrt(max(excess, 0.1)))) if has_j else None
+    return np.concatenate([fit.mean, to_cube_root(rest, h)]), log_j
+
+
+def conditional_mode(
+    target: Target,
+    y: Float,
+    log_j: float | None,
+    *,
+    tolerance: float = 1e-9,
+    max_steps: int = 60,
+) -> Conditional:
+    """Mode of the posterior of everything but log j.
+
+    Parameters
+    ----------
+    target : Target
+    y : ndarray, shape (D',)
+        Starting point.
+    log_j : float or None
+    tolerance : float
+        The Newton decrement (expected gain in log density) at which to stop.
+    max_steps : int
+
+    Returns
+    -------
+    Conditional
+
+    Raises
+    ------
+    DegenerateError
+        When no maximum is found, or the curvature there is not positive.
+    """
+    value, gradient, full, safe = _expand(target, y, log_j)
+    for _ in range(max_steps):
+        try:
+            factor, exact = full.factor(), True
+        except np.linalg.LinAlgError:
+            factor, exact = _factor_safe(safe), False
+        step = factor.solve(gradient)
+        decrement = 0.5 * float(gradient @ step)
+        if exact and decrement < tolerance:
+            y = y + step if _valid(target, y + step) else y
+            break
+        length, moved = 1.0, False
+        for _ in range(40):
+            trial = y + length * step
+            if _valid(target, trial):
+                gain = _value(target, trial, log_j) - value
+                if gain > 1e-4 * length * decrement or (exact and gain > -1e-9 * abs(value)):
+                    y, moved = trial, True
+                    break
+            length /= 2
+        if not moved:
+            if exact and decrement < 1e-3:
+                break  # rounding limits the gain: this is the mode
+            raise DegenerateError(
+                "the search for the posterior mode stalled",
+                where="posterior",
+                do="check the match, the errors and the outlier model",
+            )
+        value, gradient, full, safe = _expand(target, y, log_j)
+    else:
+        raise DegenerateError(
+            f"no posterior mode was found in {max_steps} Newton steps",
+            where="posterior",
+            do="check the match, the errors and the outlier model",
+        )
+    return Conditional(log_j, y, factor, value - 0.5 * factor.logdet)
+
+
+def _factor_safe(safe: Arrow) -> ArrowFactor:
+    try:
+        return safe.factor()
+    except np.linalg.LinAlgError as error:
+        raise DegenerateError(
+            "the stars with weight do not determine the model",
+            where="posterior",
+            do="lower model.order, or check how many stars are false matches",
+        ) from error
+
+
+def _valid(target: Target, y: Float) -> bool:
+    _, rest = split_hyper(target)
+    return bool(np.isfinite(y).all() and inside(rest, y[target.n_theta :]))
+
+
+def _log_jacobian(target: Target, y: Float) -> float:
+    _, rest = split_hyper(target)
+    return float(np.log(np.abs(from_cube_root(rest, y[..., target.n_theta :])[1])).sum())
+
+
+def _value(target: Target, y: Float, log_j: float | None) -> float:
+    psi = to_psi(target, y, log_j)
+    return float(target.log_density(psi[None])[0]) + _log_jacobian(target, y)
+
+
+def _expand(
+    target: Target, y: Float, log_j: float | None
+) -> tuple[float, Float, Arrow, Arrow]:
+    """`Target.expand` in the coordinates y, at fixed log j."""
+    has_j, rest = split_hyper(target)
+    n, skip = target.n_theta, int(has_j)
+    _, gradient, full, safe = target.expand(to_psi(target, y, log_j))
+    _, h1, h2, g1, g2 = from_cube_root(rest, y[n:])
+    by_h = gradient[n + skip :]
+    out = np.concatenate([gradient[:n], by_h * h1 + g1])
+    bend = -by_h * h2 - g2
+    # the value comes from the kernel, so that line searches compare like with like
+    return (
+        _value(target, y, log_j),
+        out,
+        _change_tail(full, skip, h1, bend),
+        _change_tail(safe, skip, h1, np.maximum(bend, 0.0)),
+    )
+
+
+def _change_tail(matrix: Arrow, skip: int, h1: Float, bend: Float) -> Arrow:
+    g = matrix.n_global
+    keep = np.r_[np.arange(g), np.arange(g + skip, len(matrix.border))]
+    scale = np.concatenate([np.ones(g), h1])
+    border = matrix.border[np.ix_(keep, keep)] * np.outer(scale, scale)
+    tail = np.arange(g, len(keep))
+    border[tail, tail] += bend
+    edge = matrix.edge[:, keep] * scale[:, None]
+    return Arrow(border, edge, matrix.blocks, n_tail=len(h1))

@@ -1,0 +1,322 @@
+"""The outlier mixture: which stars are false matches, and how wrong the quoted errors are.
+
+    p(r) = (1 - f) N(r_u; 0, s_u^2 + j^2) N(r_v; 0, s_v^2 + j^2) + f p_out(r)
+
+One membership for each star, shared by both axes.  p_out is a round Gaussian of scale s_out, or uniform
+on the match circle.  Sampled are log j, logit f and log s_out; the priors are proper:
+
+    f      Beta(a, b)
+    j      half-Student-t, four degrees of freedom, scale = the median quoted error
+    s_out  inverse gamma on s_out^2 with shape 1, mode of log s_out at five times the median quoted error
+
+All three leave tails in the sampled coordinates that fall at least exponentially, so that the posterior
+stays proper where the data say nothing: j when the quoted errors are right, s_out when there are no
+outliers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, gammaln, log_expit, logit
+
+from bayesdist.errors import InputError
+
+__all__ = ["HYPER_NAMES", "Hyper", "OutlierMixture", "StarTerms"]
+
+Float = NDArray[np.float64]
+
+HYPER_NAMES = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
+LOG_2PI = float(np.log(2 * np.pi))
+T_DOF = 4.0
+OUTLIER_SHAPE = 1.0
+OUTLIER_MODE = 5.0
+
+
+@dataclass(frozen=True)
+class OutlierMixture:
+    """Likelihood of one star and the priors of its parameters.
+
+    Parameters
+    ----------
+    model : str
+        'gaussian', 'uniform' or 'none'.
+    match_radius : float, optional
+        Radius of the match circle in the unit of u, v; needed by 'uniform'.
+    jitter : float or None
+        Extra error j in the unit of u, v; None samples it.
+    fraction_prior : tuple of float
+        Parameters (a, b) of the Beta prior of f.
+
+    Raises
+    ------
+    InputError
+        For an unknown model, a missing or needless radius, a negative jitter, or an improper prior.
+    """
+
+    model: str = "gaussian"
+    match_radius: float | None = None
+    jitter: float | None = None
+    fraction_prior: tuple[float, float] = (1.0, 9.0)
+
+    def __post_init__(self) -> None:
+        if self.model not in ("gaussian", "uniform", "none"):
+            raise InputError(
+                f"unknown outlier model {self.model!r}",
+                where="outliers.model",
+                do="choose gaussian, uniform or none",
+            )
+        if self.model == "uniform" and not (self.match_radius and self.match_radius > 0):
+            raise InputError(
+                "uniform outliers need the radius of the match circle",
+                where="outliers.match_radius",
+                do="give it in the unit of u, v",
+            )
+        if self.jitter is not None and self.jitter < 0:
+            raise InputError(f"jitter is {self.jitter}", where="outliers.jitter", do="give 0 or more")
+        if min(self.fraction_prior) <= 0:
+            raise InputError(
+                f"Beta{self.fraction_prior} is not a proper prior",
+                where="outliers.fraction_prior",
+                do="give two positive numbers",
+            )
+
+    @property
+    def hyper(self) -> tuple[str, ...]:
+        """The sampled ones of 'j', 'f', 's_out', in this order."""
+        out: tuple[str, ...] = () if self.jitter is not None else ("j",)
+        if self.model != "none":
+            out += ("f",)
+        if self.model == "gaussian":
+            out += ("s_out",)
+        return out
+
+    def bind(self, scale: float) -> Hyper:
+        """The mixture with its priors scaled to the data.
+
+        Parameters
+        ----------
+        scale : float
+            Median quoted error.
+        """
+        return Hyper(self, scale)
+
+
+@dataclass(frozen=True)
+class StarTerms:
+    """First and second derivatives of each star's log-likelihood, by residuals and hyperparameters.
+
+    Hyperparameters stand in the order of `OutlierMixture.hyper`, in sampled coordinates.
+
+    Parameters
+    ----------
+    loglik : ndarray, shape (n,)
+    outlier : ndarray, shape (n,)
+        Probability that the star is an outlier.
+    pull : ndarray, shape (n, 2)
+        Minus the gradient by the residual: what a weighted residual is in least squares.
+    weight : ndarray, shape (n, 3)
+        Minus the Hessian by the residual (uu, uv, vv).
+    safe_weight : ndarray, shape (n, 3)
+        The same without the term of wavering membership: never negative (the EM weight).
+    gradient : ndarray, shape (n, h)
+    cross : ndarray, shape (n, h, 2)
+        Mixed derivative by hyperparameter and residual.
+    curvature : ndarray, shape (h, h)
+        Minus the Hessian by the hyperparameters, summed over stars.
+    """
+
+    loglik: Float
+    outlier: Float
+    pull: Float
+    weight: Float
+    safe_weight: Float
+    gradient: Float
+    cross: Float
+    curvature: Float
+
+
+@dataclass(frozen=True)
+class Hyper:
+    """An `OutlierMixture` with the scale of the data: likelihood terms and priors.
+
+    A point is a dict-free vector h in the order of `mixture.hyper`: log j, logit f, log s_out.
+
+    Parameters
+    ----------
+    mixture : OutlierMixture
+    scale : float
+        Median quoted error: the scale of the priors.
+    """
+
+    mixture: OutlierMixture
+    scale: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sampled coordinates."""
+        return tuple(HYPER_NAMES[k] for k in self.mixture.hyper)
+
+    def values(self, h: Float) -> dict[str, Float]:
+        """j, f and s_out of points (..., n_hyper), in natural form."""
+        out = {}
+        for k, name in enumerate(self.mixture.hyper):
+            out[name] = expit(h[..., k]) if name == "f" else np.exp(h[..., k])
+        return out
+
+    def point(self, values: dict[str, float]) -> Float:
+        """Sampled coordinates of natural values."""
+        pick = {"j": np.log, "f": logit, "s_out": np.log}
+        return np.array([pick[k](values[k]) for k in self.mixture.hyper], float)
+
+    def constants(self, h: Float) -> tuple[Float, Float, Float, Float]:
+        """j^2, log f, log(1 - f) and log p_out's constant part's variance, each of shape (...).
+
+        The last one is s_out^2 for Gaussian outliers and the area of the circle for uniform ones.
+        """
+        lead = h.shape[:-1]
+        fixed = self.mixture.jitter
+        j2 = np.full(lead, 0.0 if fixed is None else fixed**2)
+        lf, l1f, out = np.full(lead, -np.inf), np.zeros(lead), np.ones(lead)
+        if self.mixture.model == "uniform":
+            assert self.mixture.match_radius is not None
+            out = np.full(lead, np.pi * self.mixture.match_radius**2)
+        for k, name in enumerate(self.mixture.hyper):
+            if name == "j":
+                j2 = np.exp(2 * h[..., k])
+            elif name == "f":
+                lf, l1f = log_expit(h[..., k]), log_expit(-h[..., k])
+            else:
+                out = np.exp(2 * h[..., k])
+        return j2, lf, l1f, out
+
+    # -- likelihood ----------------------------------------------------------------------------------
+
+    def terms(self, h: Float, residual: Float, var_u: Float, var_v: Float) -> StarTerms:
+        """Derivatives of the log-likelihood of each star.
+
+        Parameters
+        ----------
+        h : ndarray, shape (n_hyper,)
+        residual : ndarray, shape (n, 2)
+        var_u, var_v : ndarray, shape (n,)
+            Squared quoted errors.
+
+        Returns
+        -------
+        StarTerms
+        """
+        j2, lf, l1f, out = (float(c) for c in self.constants(h))
+        ru, rv = residual[:, 0], residual[:, 1]
+        au, av = var_u + j2, var_v + j2
+        log_in = l1f - 0.5 * (ru**2 / au + rv**2 / av + np.log(au * av)) - LOG_2PI
+        gaussian = self.mixture.model == "gaussian"
+        if self.mixture.model == "none":
+            p = np.zeros(len(ru))
+            loglik = log_in
+        else:
+            r2 = ru**2 + rv**2
+            log_out = lf - np.log(out) - (0.5 * r2 / out + LOG_2PI if gaussian else 0.0)
+            log_out = np.broadcast_to(log_out, log_in.shape)
+            p = expit(log_out - log_in)
+            loglik = np.logaddexp(log_in, log_out)
+        q = 1.0 - p
+        wout = 1.0 / out if gaussian else 0.0
+
+        # gradients of the two branches by (ru, rv, hyper...), and their expected Hessians
+        names = self.mixture.hyper
+        n, h_ = len(ru), len(names)
+        A, B = np.zeros((n, 2 + h_)), np.zeros((n, 2 + h_))
+        A[:, 0], A[:, 1] = -ru / au, -rv / av
+        B[:, 0], B[:, 1] = -ru * wout, -rv * wout
+        cross = np.zeros((n, h_, 2))
+        second = np.zeros((n, h_))  # diagonal of the branches' own Hessian, averaged over membership
+        for k, name in enumerate(names):
+            if name == "j":
+                eu, ev = ru**2 / au, rv**2 / av
+                A[:, 2 + k] = j2 * ((eu - 1) / au + (ev - 1) / av)
+                second[:, k] = q * (
+                    2 * A[:, 2 + k] + 2 * j2**2 * ((1 - 2 * eu) / au**2 + (1 - 2 * ev) / av**2)
+                )
+                cross[:, k, 0] = q * 2 * j2 * ru / au**2
+                cross[:, k, 1] = q * 2 * j2 * rv / av**2
+            elif name == "f":
+                f = np.exp(lf)
+                A[:, 2 + k], B[:, 2 + k] = -f, 1.0 - f
+                second[:, k] = -f * (1.0 - f)
+            else:
+                e = (ru**2 + rv**2) / out
+                B[:, 2 + k] = e - 2.0
+                second[:, k] = p * -2.0 * e
+                cross[:, k, 0] = p * 2.0 * ru / out
+                cross[:, k, 1] = p * 2.0 * rv / out
+        gradient = q[:, None] * A + p[:, None] * B
+        D = (A - B) * np.sqrt(p * q)[:, None]
+        safe = np.stack([q / au + p * wout, np.zeros(n), q / av + p * wout], axis=1)
+        weight = safe - np.stack([D[:, 0] ** 2, D[:, 0] * D[:, 1], D[:, 1] ** 2], axis=1)
+        cross += D[:, 2:, None] * D[:, None, :2]
+        curvature = -(np.diag(second.sum(axis=0)) + D[:, 2:].T @ D[:, 2:])
+        return StarTerms(
+            loglik, p, -gradient[:, :2], weight, safe, gradient[:, 2:], cross, curvature
+        )
+
+    # -- priors --------------------------------------------------------------------------------------
+
+    def log_prior(self, h: Float) -> Float:
+        """Log prior density of points (..., n_hyper) in sampled coordinates, normalised."""
+        out = np.zeros(h.shape[:-1])
+        for k, name in enumerate(self.mixture.hyper):
+            t = h[..., k]
+            if name == "f":
+                a, b = self.mixture.fraction_prior
+                norm = gammaln(a + b) - gammaln(a) - gammaln(b)
+                out = out + a * log_expit(t) + b * log_expit(-t) + norm
+            elif name == "j":
+                z2 = np.exp(2 * (t - np.log(self.scale)))
+                norm = gammaln((T_DOF + 1) / 2) - gammaln(T_DOF / 2)
+                norm += np.log(2 / self.scale) - 0.5 * np.log(np.pi * T_DOF)
+                out = out + t + norm - (T_DOF + 1) / 2 * np.log1p(z2 / T_DOF)
+            else:
+                a, b = OUTLIER_SHAPE, self._outlier_rate
+                norm = np.log(2.0) + a * np.log(b) - gammaln(a)
+                out = out + norm - 2 * a * t - b * np.exp(-2 * t)
+        return out
+
+    @property
+    def _outlier_rate(self) -> float:
+        return OUTLIER_SHAPE * (OUTLIER_MODE * self.scale) ** 2
+
+    def prior_terms(self, h: Float) -> tuple[Float, Float]:
+        """Gradient and minus the (diagonal) Hessian of the log prior at one point."""
+        gradient, curvature = np.zeros(len(h)), np.zeros(len(h))
+        for k, name in enumerate(self.mixture.hyper):
+            if name == "f":
+                a, b = self.mixture.fraction_prior
+                f = expit(h[k])
+                gradient[k] = a * (1 - f) - b * f
+                curvature[k] = (a + b) * f * (1 - f)
+            elif name == "j":
+                z2 = np.exp(2 * (h[k] - np.log(self.scale)))
+                gradient[k] = 1 - (T_DOF + 1) * z2 / (T_DOF + z2)
+                curvature[k] = (T_DOF + 1) * 2 * T_DOF * z2 / (T_DOF + z2) ** 2
+            else:
+                e = self._outlier_rate * np.exp(-2 * h[k])
+                gradient[k] = -2 * OUTLIER_SHAPE + 2 * e
+                curvature[k] = 4 * e
+        return gradient, curvature
+
+    def draw_prior(self, n: int, rng: np.random.Generator) -> Float:
+        """Points (n, n_hyper) from the prior, for simulation-based calibration."""
+        columns = []
+        for name in self.mixture.hyper:
+            if name == "f":
+                f = rng.beta(*self.mixture.fraction_prior, size=n)
+                columns.append(logit(np.clip(f, 1e-300, 1 - 1e-16)))
+            elif name == "j":
+                columns.append(np.log(self.scale * np.abs(rng.standard_t(T_DOF, size=n))))
+            else:
+                precision = rng.gamma(OUTLIER_SHAPE, 1 / self._outlier_rate, size=n)
+                columns.append(-0.5 * np.log(precision))
+        return np.column_stack(columns) if columns else np.zeros((n, 0))

@@ -1,0 +1,124 @@
+"""The posterior as a result: draws, their moments, and how far they can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.labelled.convergence import Convergence
+from bayesdist.infer.mixture import OutlierMixture
+from bayesdist.model import DistortionModel
+
+__all__ = ["Posterior", "SamplerInfo"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SamplerInfo:
+    """How the draws were made.
+
+    Parameters
+    ----------
+    method : str
+        Moves that were used.
+    ensembles, walkers, steps : int
+        Steps of each ensemble, warm-up included.
+    warmup : int
+        Steps dropped from each ensemble.
+    passes : int
+        Evaluations of the likelihood of all stars.
+    acceptance : float
+    wall_s : float
+        Seconds of this session.
+    seed : int
+    """
+
+    method: str
+    ensembles: int
+    walkers: int
+    steps: int
+    warmup: int
+    passes: int
+    acceptance: float
+    wall_s: float
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Posterior draws of the distortion and of the outlier mixture.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    mixture : OutlierMixture
+    theta : ndarray, shape (chains, draws, D)
+        One chain for each independent ensemble; its draws are those of the first walker, then of the
+        second, and so on.
+    hyper : dict of str to ndarray, shape (chains, draws)
+        Of 'f', 'j', 's_out' those that were sampled, in natural form.
+    log_prob : ndarray, shape (chains, draws)
+        Log posterior density, up to a constant.
+    outlier_probability : ndarray, shape (N,)
+        Of each row of the table.
+    convergence : Convergence
+    sampler : SamplerInfo
+    """
+
+    model: DistortionModel
+    mixture: OutlierMixture
+    theta: Float
+    hyper: dict[str, Float]
+    log_prob: Float
+    outlier_probability: Float
+    convergence: Convergence
+    sampler: SamplerInfo
+
+    @cached_property
+    def flat(self) -> Float:
+        """All draws of theta, shape (chains * draws, D)."""
+        return self.theta.reshape(-1, self.theta.shape[-1])
+
+    @cached_property
+    def mean(self) -> Float:
+        """Posterior mean of theta, shape (D,)."""
+        return self.flat.mean(axis=0)
+
+    @cached_property
+    def cov(self) -> Float:
+        """Posterior covariance of theta, shape (D, D)."""
+        return np.atleast_2d(np.cov(self.flat, rowvar=False))
+
+    @property
+    def sigma(self) -> Float:
+        """Posterior standard deviation of theta, shape (D,)."""
+        return self.flat.std(axis=0, ddof=1)
+
+    @property
+    def unit(self) -> str:
+        """Unit of u and v."""
+        return self.model.unit
+
+    def interval(self, probability: float) -> Float:
+        """Central interval of every entry of theta, shape (D, 2)."""
+        tail = (1 - probability) / 2
+        return np.quantile(self.flat, [tail, 1 - tail], axis=0).T
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Random draws of theta, without replacement as far as they reach.
+
+        Parameters
+        ----------
+        n : int
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        ndarray, shape (n, D)
+        """
+        total = len(self.flat)
+        return self.flat[rng.choice(total, size=n, replace=n > total)]

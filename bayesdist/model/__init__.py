@@ -1,0 +1,17 @@
+"""The distortion as mathematics: bases, frames, time dependence, and the model that joins them."""
+
+from bayesdist.model.basis import PolynomialBasis, polynomial_terms
+from bayesdist.model.distortion import Chip, DistortionModel
+from bayesdist.model.frames import FRAME_KINDS
+from bayesdist.model.grouping import Groups
+from bayesdist.model.timedep import TimeDependence
+
+__all__ = [
+    "FRAME_KINDS",
+    "Chip",
+    "DistortionModel",
+    "Groups",
+    "PolynomialBasis",
+    "TimeDependence",
+    "polynomial_terms",
+]

@@ -1,0 +1,247 @@
+"""Two-dimensional polynomials in products of Legendre polynomials over the detector.
+
+Raw pixel monomials are hopelessly conditioned (3e16 at order 5); Legendre products over the detector
+are nearly orthogonal for stars spread evenly.  Coefficients are converted to monomials of pixel
+offsets, with their covariance, only where a product is written.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from math import comb
+from typing import overload
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import InputError
+
+__all__ = ["MAX_ORDER", "PolynomialBasis", "polynomial_terms"]
+
+MAX_ORDER = 9
+
+Float = NDArray[np.float64]
+
+
+@lru_cache
+def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
+    """Powers (i, j) of x and y up to a total order.
+
+    Sorted by total order, then by falling power of x: 1, x, y, x^2, xy, y^2, ... as Equations 1-2 of
+    ACS ISR 2015-06 number them.
+
+    Parameters
+    ----------
+    order : int
+        Total order, 0 or more.
+
+    Returns
+    -------
+    tuple of (int, int)
+        ``(order + 1) (order + 2) / 2`` pairs.
+    """
+    return tuple((n - j, j) for n in range(order + 1) for j in range(n + 1))
+
+
+def _legendre_to_powers(order: int) -> Float:
+    """Matrix whose row i holds the power coefficients of P_i."""
+    out = np.zeros((order + 1, order + 1))
+    for i in range(order + 1):
+        out[i, : i + 1] = legendre.leg2poly(np.eye(order + 1)[i, : i + 1])
+    return out
+
+
+def _powers_to_legendre(order: int) -> Float:
+    """Matrix whose row i holds the Legendre coefficients of X^i."""
+    out = np.zeros((order + 1, order + 1))
+    for i in range(order + 1):
+        out[i, : i + 1] = legendre.poly2leg(np.eye(order + 1)[i, : i + 1])
+    return out
+
+
+def _substitute(order: int, scale: float, shift: float) -> Float:
+    """Matrix whose row i holds the power coefficients in z of (scale z + shift)^i."""
+    out = np.zeros((order + 1, order + 1))
+    for i in range(order + 1):
+        for k in range(i + 1):
+            out[i, k] = comb(i, k) * scale**k * shift ** (i - k)
+    return out
+
+
+def _product_matrix(terms: tuple[tuple[int, int], ...], mx: Float, my: Float) -> Float:
+    """Coefficient map (new, old) of a change of basis that acts on each axis by itself."""
+    i, j = np.array(terms).T
+    return mx[np.ix_(i, i)].T * my[np.ix_(j, j)].T
+
+
+@dataclass(frozen=True)
+class PolynomialBasis:
+    """Legendre products P_i(X) P_j(Y) with i + j <= order over one chip.
+
+    X and Y run over [-1, 1] from edge to edge of the detector (pixels 0.5 to n + 0.5, FITS 1-based).
+
+    Parameters
+    ----------
+    order : int
+        Total order, 1 to 9.
+    size : tuple of float
+        Columns and rows of the detector, in pixels.
+    reference_pixel : tuple of float
+        Zero point (xref, yref) of the monomial form, FITS 1-based pixels.
+
+    Raises
+    ------
+    InputError
+        For an order outside 1..9 or a size that is not positive.
+    """
+
+    order: int
+    size: tuple[float, float]
+    reference_pixel: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.order <= MAX_ORDER:
+            raise InputError(
+                f"polynomial order is {self.order}",
+                where="model.order",
+                do=f"choose an order from 1 to {MAX_ORDER}",
+            )
+        if min(self.size) <= 0:
+            raise InputError(
+                f"detector size is {tuple(self.size)}",
+                where="detector.size",
+                do="give positive numbers of columns and rows",
+            )
+
+    @property
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """Powers (i, j) in the order of the coefficients."""
+        return polynomial_terms(self.order)
+
+    @property
+    def n_terms(self) -> int:
+        """Number of terms of one axis."""
+        return (self.order + 1) * (self.order + 2) // 2
+
+    @property
+    def half_size(self) -> tuple[float, float]:
+        """Half the detector's extent on x and y: what X = 1 is, in pixels from the centre."""
+        return self.size[0] / 2, self.size[1] / 2
+
+    def scaled(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
+        """Pixels to [-1, 1].
+
+        Parameters
+        ----------
+        x, y : array_like
+            FITS 1-based pixels.
+
+        Returns
+        -------
+        X, Y : ndarray
+            Same shapes; -1 and 1 at the outer edges of the first and last pixel.
+        """
+        nx, ny = self.size
+        return (
+            (2.0 * np.asarray(x, float) - (nx + 1.0)) / nx,
+            (2.0 * np.asarray(y, float) - (ny + 1.0)) / ny,
+        )
+
+    def evaluate(self, x: ArrayLike, y: ArrayLike) -> Float:
+        """Values of all basis functions.
+
+        Parameters
+        ----------
+        x, y : array_like, shape (N,)
+            FITS 1-based pixels.
+
+        Returns
+        -------
+        ndarray, shape (N, n_terms)
+        """
+        return self.evaluate_scaled(*self.scaled(x, y))
+
+    def evaluate_scaled(self, X: ArrayLike, Y: ArrayLike) -> Float:
+        """As `evaluate`, of positions that `scaled` has brought to [-1, 1]."""
+        i, j = np.array(self.terms).T
+        return legendre.legvander(X, self.order)[..., i] * legendre.legvander(Y, self.order)[..., j]
+
+    @cached_property
+    def _to_scaled_powers(self) -> Float:
+        to_powers = _legendre_to_powers(self.order)
+        return _product_matrix(self.terms, to_powers, to_powers)
+
+    @cached_property
+    def monomial_matrix(self) -> Float:
+        """Matrix (n_terms, n_terms) from Legendre to monomial coefficients of pixel offsets."""
+        to_powers = _legendre_to_powers(self.order)
+        axes = [
+            # X = (x' - c) / s with the centre c measured from the reference pixel
+            to_powers @ _substitute(self.order, 2.0 / n, -((n + 1.0) - 2.0 * ref) / n)
+            for n, ref in zip(self.size, self.reference_pixel, strict=True)
+        ]
+        return _product_matrix(self.terms, *axes)
+
+    @cached_property
+    def _inverse_monomial_matrix(self) -> Float:
+        to_legendre = _powers_to_legendre(self.order)
+        axes = [
+            _substitute(self.order, n / 2.0, ((n + 1.0) - 2.0 * ref) / 2.0) @ to_legendre
+            for n, ref in zip(self.size, self.reference_pixel, strict=True)
+        ]
+        return _product_matrix(self.terms, *axes)
+
+    def to_scaled_powers(self, coef: ArrayLike) -> Float:
+        """Coefficients of X^i Y^j: the form that Horner's rule wants.
+
+        Parameters
+        ----------
+        coef : array_like, shape (..., n_terms)
+            Legendre coefficients.
+
+        Returns
+        -------
+        ndarray, same shape
+        """
+        return np.asarray(coef, float) @ self._to_scaled_powers.T
+
+    @overload
+    def to_monomials(self, coef: ArrayLike) -> Float: ...
+    @overload
+    def to_monomials(self, coef: ArrayLike, cov: ArrayLike) -> tuple[Float, Float]: ...
+    def to_monomials(
+        self, coef: ArrayLike, cov: ArrayLike | None = None
+    ) -> Float | tuple[Float, Float]:
+        """Coefficients of (x - xref)^i (y - yref)^j, with their covariance.
+
+        Parameters
+        ----------
+        coef : array_like, shape (..., n_terms)
+            Legendre coefficients of one axis.
+        cov : array_like, shape (n_terms, n_terms), optional
+            Their covariance.
+
+        Returns
+        -------
+        ndarray, same shape as `coef`; with `cov`, a pair with the covariance of the result
+        """
+        m = self.monomial_matrix
+        out = np.asarray(coef, float) @ m.T
+        if cov is None:
+            return out
+        return out, m @ np.asarray(cov, float) @ m.T
+
+    def from_monomials(self, coef: ArrayLike) -> Float:
+        """Legendre coefficients from those of (x - xref)^i (y - yref)^j.
+
+        Parameters
+        ----------
+        coef : array_like, shape (..., n_terms)
+
+        Returns
+        -------
+        ndarray, same shape
+        """
+        return np.asarray(coef, float) @ self._inverse_monomial_matrix.T

@@ -1,0 +1,72 @@
+"""Stars that share one set of effective coefficients.
+
+Within one chip, exposure and epoch the whole model -- polynomial, time dependence, frame -- is a single
+polynomial of the pixel position.  All that the data say about the parameters passes through these groups.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Groups", "group_by"]
+
+Int = NDArray[np.int64]
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Membership of stars in groups.
+
+    Parameters
+    ----------
+    index : ndarray of int, shape (N,)
+        Group of each star.
+    chip, exposure : ndarray of int, shape (G,)
+        Codes into the model's chips and exposures.
+    epoch : ndarray, shape (G,)
+        Decimal years; 0 where the model has no time dependence.
+    """
+
+    index: Int
+    chip: Int
+    exposure: Int
+    epoch: Float
+
+    def __len__(self) -> int:
+        return len(self.chip)
+
+    def members(self) -> list[Int]:
+        """Indices of the stars of each group, each list in rising order."""
+        order = np.argsort(self.index, kind="stable")
+        ends = np.cumsum(np.bincount(self.index, minlength=len(self)))
+        return np.split(order, ends[:-1])
+
+
+def group_by(chip: Int, exposure: Int, epoch: Float) -> Groups:
+    """Groups of equal chip, exposure and epoch.
+
+    Parameters
+    ----------
+    chip, exposure : ndarray of int, shape (N,)
+    epoch : ndarray, shape (N,)
+
+    Returns
+    -------
+    Groups
+    """
+    keys = np.empty(len(chip), dtype=[("chip", "i8"), ("exposure", "i8"), ("epoch", "f8")])
+    keys["chip"], keys["exposure"], keys["epoch"] = chip, exposure, epoch
+    if len(keys) and (keys == keys[0]).all():  # one group: the usual case, without a sort
+        unique, index = keys[:1], np.zeros(len(keys), np.int64)
+    else:
+        unique, index = np.unique(keys, return_inverse=True)
+    return Groups(
+        index=np.asarray(index, np.int64),
+        chip=unique["chip"].copy(),
+        exposure=unique["exposure"].copy(),
+        epoch=unique["epoch"].copy(),
+    )

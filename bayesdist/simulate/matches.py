@@ -1,0 +1,139 @@
+"""Matched stars of a given distortion: what a calibration would have measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.model import DistortionModel
+
+__all__ = ["Truth", "simulate_matches"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a simulation was made from.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+    fraction : float
+        Probability of a false match.
+    jitter : float
+        Error beyond the quoted ones, in the unit of u, v.
+    outlier_scale : float
+        Standard deviation of false matches on each axis, or the radius of the match circle.
+    false : ndarray of bool, shape (N,)
+        Which rows are false matches.
+    """
+
+    model: DistortionModel
+    theta: Float
+    fraction: float
+    jitter: float
+    outlier_scale: float
+    false: NDArray[np.bool_]
+
+
+def simulate_matches(
+    model: DistortionModel,
+    theta: ArrayLike,
+    n: int,
+    *,
+    rng: np.random.Generator,
+    sigma: float | tuple[Float, Float] | Callable[[Float], tuple[Float, Float]] = 0.05,
+    mag: Float | None = None,
+    fraction: float = 0.03,
+    jitter: float = 0.0,
+    outlier_scale: float = 1.0,
+    outliers: str = "gaussian",
+    epochs: ArrayLike | None = None,
+) -> tuple[MatchTable, Truth]:
+    """Stars spread evenly over the chips and exposures, with known errors and false matches.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : array_like, shape (D,)
+        Its true parameters.
+    n : int
+        Number of matches.
+    rng : numpy.random.Generator
+    sigma : float, pair of ndarray, or callable
+        Quoted errors: one number, one for each star and axis, or a function of the magnitudes.
+    mag : ndarray, shape (n,), optional
+    fraction, jitter, outlier_scale : float
+        As in `Truth`.
+    outliers : str
+        'gaussian' or 'uniform' (on the match circle of radius `outlier_scale`).
+    epochs : array_like, optional
+        Date of each exposure.
+
+    Returns
+    -------
+    matches : MatchTable
+    truth : Truth
+
+    Raises
+    ------
+    InputError
+        For an unknown kind of outliers.
+    """
+    if outliers not in ("gaussian", "uniform"):
+        raise InputError(f"unknown kind of outliers {outliers!r}", do="choose gaussian or uniform")
+    theta = np.asarray(theta, float)
+    chip = rng.integers(len(model.chips), size=n)
+    exposure = np.arange(n) * len(model.exposures) // n
+    sizes = np.array([c.size for c in model.chips])[chip]
+    x = 0.5 + rng.uniform(size=n) * sizes[:, 0]
+    y = 0.5 + rng.uniform(size=n) * sizes[:, 1]
+    epoch = None if epochs is None else np.asarray(epochs, float)[exposure]
+    numbers = tuple(c.number for c in model.chips)
+
+    if callable(sigma):
+        if mag is None:
+            raise InputError("errors by magnitude need magnitudes", do="give mag")
+        sigma_u, sigma_v = sigma(mag)
+    elif isinstance(sigma, tuple):
+        sigma_u, sigma_v = sigma
+    else:
+        sigma_u, sigma_v = np.full(n, sigma), np.full(n, sigma)
+    quoted = np.column_stack([sigma_u, sigma_v])
+    error = rng.standard_normal((n, 2)) * np.hypot(quoted, jitter)
+    false = rng.uniform(size=n) < fraction
+    error[false] = _false_offsets(int(false.sum()), outlier_scale, outliers, rng)
+
+    true = model.predict(theta, x, y, epoch=epoch, exposure=exposure, chip=np.array(numbers)[chip])
+    matches = MatchTable(
+        x=x,
+        y=y,
+        u=true[:, 0] + error[:, 0],
+        v=true[:, 1] + error[:, 1],
+        sigma_u=quoted[:, 0].copy(),
+        sigma_v=quoted[:, 1].copy(),
+        unit=model.unit,
+        epoch=epoch,
+        mag=mag,
+        exposure=exposure,
+        exposure_names=model.exposures,
+        chip=chip,
+        chip_numbers=numbers,
+        sources=("simulation",),
+    )
+    return matches, Truth(model, theta, fraction, jitter, outlier_scale, false)
+
+
+def _false_offsets(n: int, scale: float, kind: str, rng: np.random.Generator) -> Float:
+    if kind == "gaussian":
+        return rng.standard_normal((n, 2)) * scale
+    radius = scale * np.sqrt(rng.uniform(size=n))
+    angle = rng.uniform(0, 2 * np.pi, size=n)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
