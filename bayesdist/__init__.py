@@ -1,0 +1,90 @@
+"""bayesdist: how well is the geometric distortion of a detector known?
+
+Everything public is here and is loaded when it is first used::
+
+    import bayesdist as bd
+    matches = bd.read_matches("stars.ecsv")
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "bayesdist.errors": ("BayesdistError", "InputError"),
+    "bayesdist.data": (
+        "MatchTable",
+        "ReferenceCatalog",
+        "match_table",
+        "read_catalog",
+        "read_hst1pass",
+        "read_matches",
+        "read_matchup",
+    ),
+    "bayesdist.model": ("Chip", "DistortionModel", "PolynomialBasis", "TimeDependence"),
+    "bayesdist.infer": (
+        "LinearFit",
+        "OutlierMixture",
+        "Posterior",
+        "build_model",
+        "fit_by_magnitude",
+        "fit_linear",
+        "load_posterior",
+        "sample",
+        "save_posterior",
+    ),
+    "bayesdist.simulate": ("simulate_matches", "simulate_wise", "wise_solution"),
+    "bayesdist.assess": (
+        "ErrorBudget",
+        "Margin",
+        "Requirement",
+        "UncertaintyMap",
+        "UserTerm",
+        "check_requirements",
+        "error_budget",
+        "uncertainty_map",
+    ),
+    "bayesdist.products": (
+        "IdcTab",
+        "SipHeader",
+        "idctab_from_solution",
+        "read_idctab",
+        "read_sip",
+        "sip_from_solution",
+        "write_idctab",
+        "write_sip",
+    ),
+    "bayesdist.app.run": ("run",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = ["__version__", *sorted(_HOME_OF)]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME_OF:
+        return getattr(import_module(_HOME_OF[name]), name)
+    raise AttributeError(f"module 'bayesdist' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME_OF})
+
+
+if TYPE_CHECKING:
+    from bayesdist.app.run import run as run
+    from bayesdist.assess import check_requirements as check_requirements
+    from bayesdist.assess import error_budget as error_budget
+    from bayesdist.assess import uncertainty_map as uncertainty_map
+    from bayesdist.data import read_matches as read_matches
+    from bayesdist.infer import fit_linear as fit_linear
+    from bayesdist.infer import load_posterior as load_posterior
+    from bayesdist.infer import sample as sample
+    from bayesdist.products import read_idctab as read_idctab
+    from bayesdist.products import read_sip as read_sip
+    from bayesdist.products import write_idctab as write_idctab
+    from bayesdist.products import write_sip as write_sip
+    from bayesdist.simulate import simulate_matches as simulate_matches

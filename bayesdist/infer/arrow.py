@@ -1,8 +1,8 @@
 """Symmetric matrices of arrow shape: a dense border and many small blocks on the diagonal.
 
-The normal matrix of exposures with their own frames has this shape: parameters of different exposures
-meet only through the global ones.  Local blocks are eliminated by Schur complement, so that cost grows
-linearly with the number of exposures.
+The normal matrix of exposures with their own frames has this shape: parameters of different
+exposures meet only through the global ones.  Local blocks are eliminated by Schur complement, so
+that cost grows linearly with the number of exposures.
 """
 
 from __future__ import annotations

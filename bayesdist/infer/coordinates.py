@@ -1,7 +1,8 @@
 """Coordinates in which the conditional posterior of f and s_out is nearly Gaussian.
 
-Few outliers make logit f and log s_out skewed, with exponential tails that no Gaussian proposal covers.
-A gamma variable is nearly Gaussian in its cube root (Wilson and Hilferty 1931), so proposals live in
+Few outliers make logit f and log s_out skewed, with exponential tails that no Gaussian proposal
+covers. A gamma variable is nearly Gaussian in its cube root (Wilson and Hilferty 1931), so
+proposals live in
 
     f^(1/3)     and     s_out^(-2/3)  (the cube root of the outliers' precision)
 """

@@ -81,9 +81,7 @@ def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
     )
 
 
-def require_full_rank(
-    matrix: Arrow, model: DistortionModel, matches: MatchTable
-) -> NullSpace:
+def require_full_rank(matrix: Arrow, model: DistortionModel, matches: MatchTable) -> NullSpace:
     """The null space, which must be empty.
 
     Raises
@@ -138,8 +136,8 @@ def check_coverage(model: DistortionModel, matches: MatchTable) -> None:
     Raises
     ------
     DegenerateError
-        Fewer numbers than parameters, too few stars in an exposure, stars on a line, or stars in one
-        corner of a chip.
+        Fewer numbers than parameters, too few stars in an exposure, stars on a line, or stars in
+        one corner of a chip.
     """
     n = len(matches)
     if 2 * n < model.n_params:
@@ -177,7 +175,9 @@ def check_coverage(model: DistortionModel, matches: MatchTable) -> None:
         points = np.column_stack([x / chip.size[0], y / chip.size[1]])
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if len(x) < 3 or spread[-1] < 1e-6 * spread[0]:
-            raise DegenerateError("all stars lie on a line", where=where, do="check columns x and y")
+            raise DegenerateError(
+                "all stars lie on a line", where=where, do="check columns x and y"
+            )
         try:
             covered = ConvexHull(points).volume
         except QhullError:  # nearly collinear: no area to speak of
@@ -188,5 +188,5 @@ def check_coverage(model: DistortionModel, matches: MatchTable) -> None:
                 f"{y.max():.0f} and span {100 * covered:.0f} % of the detector, so that the rest "
                 "would be extrapolated",
                 where=where,
-                do="add stars, or set detector.size and reference_pixel to the part that is measured",
+                do="add stars, or describe only the part that is measured as the detector",
             )

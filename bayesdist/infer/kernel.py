@@ -1,8 +1,8 @@
 """The fused likelihood kernel: one pass over the stars for many parameter vectors.
 
-Polynomials are evaluated on the fly by Horner's rule from the effective coefficients, so that no design
-matrix is read from memory.  The sum is taken over fixed blocks of stars and therefore does not depend on
-the number of threads.
+Polynomials are evaluated on the fly by Horner's rule from the effective coefficients, so that no
+design matrix is read from memory.  The sum is taken over fixed blocks of stars and therefore does
+not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -126,5 +126,7 @@ def log_likelihood(
     -------
     ndarray, shape (D,)
     """
-    sums = _partial_sums(blocks, *columns, np.ascontiguousarray(coef), order, *constants, kind, unit2)
+    sums = _partial_sums(
+        blocks, *columns, np.ascontiguousarray(coef), order, *constants, kind, unit2
+    )
     return sums.sum(axis=0)

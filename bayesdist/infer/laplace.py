@@ -1,7 +1,7 @@
 """Mode and curvature of the posterior at a given jitter.
 
-Newton's method on the mixture, with the EM weights wherever the full Hessian is not positive: far from
-the mode every step is an EM step, near it convergence is quadratic.
+Newton's method on the mixture, with the EM weights wherever the full Hessian is not positive: far
+from the mode every step is an EM step, near it convergence is quadratic.
 """
 
 from __future__ import annotations
@@ -185,9 +185,7 @@ def _value(target: Target, y: Float, log_j: float | None) -> float:
     return float(target.log_density(psi[None])[0]) + _log_jacobian(target, y)
 
 
-def _expand(
-    target: Target, y: Float, log_j: float | None
-) -> tuple[float, Float, Arrow, Arrow]:
+def _expand(target: Target, y: Float, log_j: float | None) -> tuple[float, Float, Arrow, Arrow]:
     """`Target.expand` in the coordinates y, at fixed log j."""
     has_j, rest = split_hyper(target)
     n, skip = target.n_theta, int(has_j)

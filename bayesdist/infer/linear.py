@@ -1,7 +1,8 @@
 """The weighted linear fit: two passes with rejection, frames relinearised, formal covariance.
 
 The procedure of the WISE programme gnDSTR (WSDC D-T033, section 3): fit, drop pairs whose residual
-chi-square or absolute residual is beyond a limit, fit again; optional extra weight towards the corners.
+chi-square or absolute residual is beyond a limit, fit again; optional extra weight towards the
+corners.
 """
 
 from __future__ import annotations
@@ -145,7 +146,9 @@ def build_model(
     """
     if not chips:
         if size is None:
-            raise InputError("the detector's size is not given", where="detector.size", do="give it")
+            raise InputError(
+                "the detector's size is not given", where="detector.size", do="give it"
+            )
         centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
         number = int(matches.chip_numbers[0])
         chips = (Chip(number, name or f"chip {number}", size, reference_pixel or centre),)
@@ -193,7 +196,7 @@ def fit_linear(
         Rows with a first-pass chi-square (both axes) above this are left out of the second pass.
         Where the errors are too small as a whole, the limit is scaled by the median chi-square.
     clip_abs : float or None
-        Rows with a first-pass residual above this, in the unit of u, v, are left out too.
+        Rows with a first-pass residual above this many pixels are left out too.
     radial_weight : float
         Factor on the inverse variance in the corners, rising as the square of the radius.
     priors : GaussianPriors, optional
@@ -224,7 +227,8 @@ def fit_linear(
     too_unlikely = chi2 > clip_chi2 * spread
     too_far = np.zeros(len(stars), bool)
     if clip_abs is not None:
-        too_far = np.hypot(residual[:, 0], residual[:, 1]) > clip_abs
+        limit = clip_abs * _pixel(model, theta)
+        too_far = np.hypot(residual[:, 0], residual[:, 1]) > limit
     used = ~(too_unlikely | too_far)
     if used.sum() * 2 < model.n_params or used.mean() < 0.05:
         raise DegenerateError(
@@ -324,6 +328,15 @@ def fit_by_magnitude(
     )
 
 
+def _pixel(model: DistortionModel, theta: Float) -> float:
+    """Size of a pixel at the first chip's reference pixel, in the unit of u, v."""
+    if model.unit == "pix":
+        return 1.0
+    basis = model.basis()
+    linear = [basis.to_monomials(theta[model.coefficient_slice(None, a)])[1:3] for a in (0, 1)]
+    return float(np.sqrt(abs(np.linalg.det(linear))))
+
+
 def _corner_weight(stars: Stars, factor: float) -> Float:
     radius2 = (stars.X**2 + stars.Y**2) / 2  # 1 in the corners
     return 1.0 + (factor - 1.0) * radius2
@@ -376,8 +389,6 @@ def _gauss_newton(
     model, groups = stars.model, stars.groups
     prior = priors.matrix(model)
     about = model.effective(theta, groups)
-    # the size of one pixel in the unit of u, v: what the linear terms do over half the detector
-    pixel = np.abs(about[:, :, 1:3]).max() / max(model.basis(model.chips[0].number).half_size)
     for _ in range(50):
         matrix, right = equations.moved(about).assemble(model, theta, groups)
         matrix = matrix + prior
@@ -389,10 +400,8 @@ def _gauss_newton(
         theta = theta + step
         before, about = about, model.effective(theta, groups)
         moved = np.abs(about - before).sum(axis=2).max()
-        if moved < RELINEARISED * max(pixel, 1e-300):
+        if moved < RELINEARISED * _pixel(model, theta):
             return theta
-        if not model.n_frame and moved < 1e-9 * np.abs(about).sum(axis=2).max():
-            return theta  # linear: one step is exact, the rest is rounding
     raise DegenerateError(
         "the exposure frames did not settle in 50 iterations",
         where="model.frames",

@@ -2,16 +2,16 @@
 
     p(r) = (1 - f) N(r_u; 0, s_u^2 + j^2) N(r_v; 0, s_v^2 + j^2) + f p_out(r)
 
-One membership for each star, shared by both axes.  p_out is a round Gaussian of scale s_out, or uniform
-on the match circle.  Sampled are log j, logit f and log s_out; the priors are proper:
+One membership for each star, shared by both axes.  p_out is a round Gaussian of scale s_out, or
+uniform on the match circle.  Sampled are log j, logit f and log s_out; the priors are proper:
 
-    f      Beta(a, b)
-    j      half-Student-t, four degrees of freedom, scale = the median quoted error
-    s_out  inverse gamma on s_out^2 with shape 1, mode of log s_out at five times the median quoted error
+    f      Beta(a, b) j      half-Student-t, four degrees of freedom, scale: the median quoted
+    error s_out  inverse gamma on s_out^2, shape 1, mode of log s_out at five times the median
+    quoted error
 
-All three leave tails in the sampled coordinates that fall at least exponentially, so that the posterior
-stays proper where the data say nothing: j when the quoted errors are right, s_out when there are no
-outliers.
+All three leave tails in the sampled coordinates that fall at least exponentially, so that the
+posterior stays proper where the data say nothing: j when the quoted errors are right, s_out when
+there are no outliers.
 """
 
 from __future__ import annotations
@@ -75,7 +75,9 @@ class OutlierMixture:
                 do="give it in the unit of u, v",
             )
         if self.jitter is not None and self.jitter < 0:
-            raise InputError(f"jitter is {self.jitter}", where="outliers.jitter", do="give 0 or more")
+            raise InputError(
+                f"jitter is {self.jitter}", where="outliers.jitter", do="give 0 or more"
+            )
         if min(self.fraction_prior) <= 0:
             raise InputError(
                 f"Beta{self.fraction_prior} is not a proper prior",
@@ -192,7 +194,7 @@ class Hyper:
                 out = np.exp(2 * h[..., k])
         return j2, lf, l1f, out
 
-    # -- likelihood ----------------------------------------------------------------------------------
+    # -- likelihood -------------------------------------------------------------------------------
 
     def terms(self, h: Float, residual: Float, var_u: Float, var_v: Float) -> StarTerms:
         """Derivatives of the log-likelihood of each star.
@@ -232,7 +234,8 @@ class Hyper:
         A[:, 0], A[:, 1] = -ru / au, -rv / av
         B[:, 0], B[:, 1] = -ru * wout, -rv * wout
         cross = np.zeros((n, h_, 2))
-        second = np.zeros((n, h_))  # diagonal of the branches' own Hessian, averaged over membership
+        # diagonal of the branches' own Hessian, averaged over membership
+        second = np.zeros((n, h_))
         for k, name in enumerate(names):
             if name == "j":
                 eu, ev = ru**2 / au, rv**2 / av
@@ -262,7 +265,7 @@ class Hyper:
             loglik, p, -gradient[:, :2], weight, safe, gradient[:, 2:], cross, curvature
         )
 
-    # -- priors --------------------------------------------------------------------------------------
+    # -- priors -----------------------------------------------------------------------------------
 
     def log_prior(self, h: Float) -> Float:
         """Log prior density of points (..., n_hyper) in sampled coordinates, normalised."""

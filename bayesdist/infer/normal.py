@@ -1,9 +1,9 @@
-"""Normal equations as sums over groups of stars: streaming, mergeable, relinearised without the data.
+"""Normal equations as sums over groups of stars: streaming, mergeable, movable without the data.
 
 Within a group the model is one polynomial, so the data speak only through the moments of the basis
-functions.  Partial sums over any pieces of the data add.  Because positions are linear in the effective
-coefficients, the equations can be moved to other coefficients exactly, which is how Gauss-Newton over
-the exposure frames runs without another pass.
+functions.  Partial sums over any pieces of the data add.  Because positions are linear in the
+effective coefficients, the equations can be moved to other coefficients exactly, which is how
+Gauss-Newton over the exposure frames runs without another pass.
 """
 
 from __future__ import annotations
@@ -67,9 +67,7 @@ class NormalEquations:
         step = about - self.about
         pull = self._apply(step)
         chi2 = self.chi2 - 2 * float((self.right * step).sum()) + float((pull * step).sum())
-        return NormalEquations(
-            self.weight, self.right - pull, about, chi2, self.n_rows, self.cross
-        )
+        return NormalEquations(self.weight, self.right - pull, about, chi2, self.n_rows, self.cross)
 
     def _apply(self, E: Float) -> Float:
         uu, uv, vv = self.weight[:, 0], self.weight[:, 1], self.weight[:, 2]
@@ -77,9 +75,7 @@ class NormalEquations:
         v = np.einsum("gkl,gl->gk", uv, E[:, 0]) + np.einsum("gkl,gl->gk", vv, E[:, 1])
         return np.stack([u, v], axis=1)
 
-    def assemble(
-        self, model: DistortionModel, theta: Float, groups: Groups
-    ) -> tuple[Arrow, Float]:
+    def assemble(self, model: DistortionModel, theta: Float, groups: Groups) -> tuple[Arrow, Float]:
         """Normal matrix and right-hand side in the model's parameters.
 
         Parameters
@@ -168,6 +164,4 @@ def accumulate(
         weight[g, 2] += phi.T @ (wv[:, None] * phi)
         if cross is not None:
             mixed[g] += (cross[rows].reshape(len(phi), 2 * h).T @ phi).reshape(h, 2, K)
-    return NormalEquations(
-        weight, right, about.copy(), chi2, int((weights[:, 0] > 0).sum()), mixed
-    )
+    return NormalEquations(weight, right, about.copy(), chi2, int((weights[:, 0] > 0).sum()), mixed)

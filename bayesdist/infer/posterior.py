@@ -57,8 +57,8 @@ class Posterior:
     model : DistortionModel
     mixture : OutlierMixture
     theta : ndarray, shape (chains, draws, D)
-        One chain for each independent ensemble; its draws are those of the first walker, then of the
-        second, and so on.
+        One chain for each independent ensemble; its draws are those of the first walker, then of
+        the second, and so on.
     hyper : dict of str to ndarray, shape (chains, draws)
         Of 'f', 'j', 's_out' those that were sampled, in natural form.
     log_prob : ndarray, shape (chains, draws)

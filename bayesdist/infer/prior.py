@@ -38,9 +38,7 @@ class GaussianPriors:
         return cls(np.zeros(model.n_params), np.zeros(model.n_params))
 
     @classmethod
-    def of(
-        cls, model: DistortionModel, named: Mapping[str, tuple[float, float]]
-    ) -> GaussianPriors:
+    def of(cls, model: DistortionModel, named: Mapping[str, tuple[float, float]]) -> GaussianPriors:
         """Priors from a mapping of parameter names to (mean, sigma).
 
         Raises

@@ -1,9 +1,9 @@
-"""The independence proposal: a grid over log j with a Laplace approximation of the rest at each value.
+"""The independence proposal: a grid over log j, with a Laplace approximation at each value.
 
-When the quoted errors are right, the jitter piles up at its bound and a single Gaussian misses the tail
-of log j while its acceptance still looks fine.  Here log j is drawn from its marginal, interpolated over
-about 25 values, with the exact exponential tail that prior and Jacobian give at small j; everything else
-is drawn from the conditional Gaussian.
+When the quoted errors are right, the jitter piles up at its bound and a single Gaussian misses the
+tail of log j while its acceptance still looks fine.  Here log j is drawn from its marginal,
+interpolated over about 25 values, with the exact exponential tail that prior and Jacobian give at
+small j; everything else is drawn from the conditional Gaussian.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class GridProposal:
             out[rows] += 0.5 * factor.logdet - 0.5 * (white**2).sum(axis=1)
         return out - 0.5 * y.shape[1] * np.log(2 * np.pi)
 
-    # -- as arrays, for checkpoints --------------------------------------------------------------------
+    # -- as arrays, for checkpoints ---------------------------------------------------------------
 
     def to_arrays(self) -> dict[str, Float]:
         """Everything needed to build it again, bit for bit."""
@@ -264,8 +264,9 @@ class _PiecewiseExponential:
         slope, height = self.slopes[k], self.heights[anchor]
         inside_mass = m - self.cumulative[k]
         # left tail: mass up to x is h exp(s (x - x0)) / s
-        left = self.mesh[0] + np.log(np.maximum(m * self.slopes[0] / self.heights[0], 1e-300)) / (
-            self.slopes[0]
+        left = (
+            self.mesh[0]
+            + np.log(np.maximum(m * self.slopes[0] / self.heights[0], 1e-300)) / (self.slopes[0])
         )
         flat = np.abs(slope) < 1e-9
         safe = np.where(flat, 1.0, slope)

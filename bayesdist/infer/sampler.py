@@ -269,9 +269,7 @@ class Ensembles:
         return Block(psi, log_prob, accepted, state)
 
 
-def _write_block(
-    path: Path, white: Float, log_prob: Float, accepted: Float, random: tuple
-) -> None:
+def _write_block(path: Path, white: Float, log_prob: Float, accepted: Float, random: tuple) -> None:
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file["chain"], file["log_prob"], file["accepted"] = white, log_prob, accepted
         _, file["random_keys"], position, has_gauss, gauss = random

@@ -73,8 +73,8 @@ def sample(
     checkpoint_every : int
         Most steps between two checkpoints.
     folder : path, optional
-        Where checkpoints are kept.  Blocks found there are read instead of run, so that a killed run
-        goes on bit for bit.
+        Where checkpoints are kept.  Blocks found there are read instead of run, so that a killed
+        run goes on bit for bit.
     progress : callable, optional
         Called with (steps made, `max_steps`).
 
@@ -113,9 +113,7 @@ def sample(
     efficiency = weights.sum() ** 2 / (weights**2).sum() / n_pilot
     plan = plan_moves(efficiency, pareto_k(log_weights), len(target.names), walkers)
     whitening = Whitening.of(target, proposal, pilot[ok])
-    runs = Ensembles(
-        target, proposal, whitening, plan, tuple(int(s) for s in seeds[:-1]), folder
-    )
+    runs = Ensembles(target, proposal, whitening, plan, tuple(int(s) for s in seeds[:-1]), folder)
 
     states = [runs.start(e) for e in range(ensembles)]
     psi: list[list[Float]] = [[] for _ in range(ensembles)]
@@ -136,9 +134,7 @@ def sample(
             continue
         kept = slice(min(plan.warmup, end // 2), None)
         chains = np.array([np.concatenate(p) for p in psi])[:, kept]
-        verdict = diagnose(
-            chains, target.names, log_weights, limits, coupled=plan.weights[2] > 0
-        )
+        verdict = diagnose(chains, target.names, log_weights, limits, coupled=plan.weights[2] > 0)
         if verdict.converged:
             break
     assert verdict is not None

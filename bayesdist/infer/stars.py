@@ -111,7 +111,8 @@ def prepare(model: DistortionModel, matches: MatchTable) -> Stars:
     """
     if matches.sigma_u is None or matches.sigma_v is None:
         raise InputError(
-            "the matches carry no errors", do="give sigma columns, a number, or sigma = 'by_magnitude'"
+            "the matches carry no errors",
+            do="give sigma columns, a number, or sigma = 'by_magnitude'",
         )
     if matches.unit != model.unit:
         raise InputError(f"the matches are in {matches.unit} and the model is in {model.unit}")

@@ -135,7 +135,7 @@ class Target:
         return value, gradient, matrix, safe
 
     def outlier_probability(self, psi: Float) -> Float:
-        """Probability (N,) that each star is an outlier, averaged over points (n, D); table order."""
+        """Probability (N,) of being an outlier, averaged over points (n, D); in table order."""
         total = np.zeros(len(self.stars))
         for point in psi:
             theta, h = point[: self.n_theta], point[self.n_theta :]

@@ -4,9 +4,10 @@ from bayesdist.model.basis import PolynomialBasis, polynomial_terms
 from bayesdist.model.distortion import Chip, DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
 from bayesdist.model.grouping import Groups
-from bayesdist.model.timedep import TimeDependence
+from bayesdist.model.timedep import AXES, TimeDependence
 
 __all__ = [
+    "AXES",
     "FRAME_KINDS",
     "Chip",
     "DistortionModel",

@@ -1,8 +1,8 @@
 """Two-dimensional polynomials in products of Legendre polynomials over the detector.
 
-Raw pixel monomials are hopelessly conditioned (3e16 at order 5); Legendre products over the detector
-are nearly orthogonal for stars spread evenly.  Coefficients are converted to monomials of pixel
-offsets, with their covariance, only where a product is written.
+Raw pixel monomials are hopelessly conditioned (3e16 at order 5); Legendre products over the
+detector are nearly orthogonal for stars spread evenly.  Coefficients are converted to monomials of
+pixel offsets, with their covariance, only where a product is written.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ Float = NDArray[np.float64]
 def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
     """Powers (i, j) of x and y up to a total order.
 
-    Sorted by total order, then by falling power of x: 1, x, y, x^2, xy, y^2, ... as Equations 1-2 of
-    ACS ISR 2015-06 number them.
+    Sorted by total order, then by falling power of x: 1, x, y, x^2, xy, y^2, ... as Equations 1-2
+    of ACS ISR 2015-06 number them.
 
     Parameters
     ----------
@@ -80,7 +80,8 @@ def _product_matrix(terms: tuple[tuple[int, int], ...], mx: Float, my: Float) ->
 class PolynomialBasis:
     """Legendre products P_i(X) P_j(Y) with i + j <= order over one chip.
 
-    X and Y run over [-1, 1] from edge to edge of the detector (pixels 0.5 to n + 0.5, FITS 1-based).
+    X and Y run over [-1, 1] from edge to edge of the detector (pixels 0.5 to n + 0.5, FITS
+    1-based).
 
     Parameters
     ----------

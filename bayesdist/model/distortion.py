@@ -4,9 +4,9 @@ For a star on chip c in exposure e at epoch t, at FITS pixel (x, y):
 
     w = sum_k C_ck(t) phi_k(x, y)          (u, v) = T_e(w) = o + d_e + M_e (w - o)
 
-T_e of a polynomial is a polynomial, so every (chip, exposure, epoch) has *effective coefficients*: the
-maps theta -> effective coefficients (`effective`) and its derivative (`effective_jacobian`) are all that
-fits, samplers and predictions need to know of the model.
+T_e of a polynomial is a polynomial, so every (chip, exposure, epoch) has *effective coefficients*:
+the maps theta -> effective coefficients (`effective`) and its derivative (`effective_jacobian`)
+are all that fits, samplers and predictions need to know of the model.
 """
 
 from __future__ import annotations
@@ -83,9 +83,9 @@ class Parameter:
 class DistortionModel:
     """Structure of a distortion solution: what is fitted, not its values.
 
-    theta holds first the *global* parameters (Legendre coefficients of each chip and axis, then the
-    time-dependent terms of each chip), then one *local* block for each exposure but the first, whose
-    frame is the identity and defines the gauge.
+    theta holds first the *global* parameters (Legendre coefficients of each chip and axis, then
+    the time-dependent terms of each chip), then one *local* block for each exposure but the first,
+    whose frame is the identity and defines the gauge.
 
     Parameters
     ----------
@@ -254,7 +254,7 @@ class DistortionModel:
             return ()
         return tuple(self.frame_slice(e) for e in range(1, len(self.exposures)))
 
-    # -- from parameters to effective coefficients ---------------------------------------------------
+    # -- from parameters to effective coefficients ------------------------------------------------
 
     def groups(
         self,
@@ -440,7 +440,7 @@ class DistortionModel:
             out.append((np.concatenate(columns), np.concatenate(blocks, axis=2)))
         return out
 
-    # -- from parameters to positions ----------------------------------------------------------------
+    # -- from parameters to positions -------------------------------------------------------------
 
     def predict(
         self,
@@ -524,7 +524,7 @@ class DistortionModel:
             )
         return theta
 
-    # -- as plain data -------------------------------------------------------------------------------
+    # -- as plain data ----------------------------------------------------------------------------
 
     def to_dict(self) -> dict[str, object]:
         """The structure as JSON-able data, for files."""

@@ -2,8 +2,8 @@
 
     T(w) = o + d + M (w - o)
 
-about a fixed origin o, so that shifts and linear terms are nearly uncorrelated.  The linear kinds are
-linear in their parameters; only 'shift_rotation' is not.
+about a fixed origin o, so that shifts and linear terms are nearly uncorrelated.  The linear kinds
+are linear in their parameters; only 'shift_rotation' is not.
 """
 
 from __future__ import annotations

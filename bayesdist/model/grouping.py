@@ -1,7 +1,8 @@
 """Stars that share one set of effective coefficients.
 
-Within one chip, exposure and epoch the whole model -- polynomial, time dependence, frame -- is a single
-polynomial of the pixel position.  All that the data say about the parameters passes through these groups.
+Within one chip, exposure and epoch the whole model -- polynomial, time dependence, frame -- is a
+single polynomial of the pixel position.  All that the data say about the parameters passes through
+these groups.
 """
 
 from __future__ import annotations

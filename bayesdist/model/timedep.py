@@ -36,8 +36,8 @@ class TimeDependence:
     Raises
     ------
     InputError
-        For an unknown axis, a repeated term, breaks that do not rise, or a number of reference dates
-        that is neither one nor one for each segment.
+        For an unknown axis, a repeated term, breaks that do not rise, or a number of reference
+        dates that is neither one nor one for each segment.
     """
 
     terms: tuple[tuple[str, int, int], ...]
@@ -54,7 +54,9 @@ class TimeDependence:
                     do="write for example ['u', 1, 0]",
                 )
         if len(set(self.terms)) != len(self.terms):
-            raise InputError("a term stands twice", where=f"{where}.terms", do="name each term once")
+            raise InputError(
+                "a term stands twice", where=f"{where}.terms", do="name each term once"
+            )
         if list(self.breaks) != sorted(set(self.breaks)):
             raise InputError(
                 f"breaks {list(self.breaks)} do not rise",

@@ -1,8 +1,8 @@
 """WISE: matched pairs of band-frame and 2MASS positions, from the published distortion.
 
-Coefficients are those of WSDC D-T033 ("WISE IOC Distortion Calibration"), Appendix B; the detector and
-the reference pixel follow from its printed A_DMAX and B_DMAX, which are reached with u, v within
-+-507.5 pixels.
+Coefficients are those of WSDC D-T033 ("WISE IOC Distortion Calibration"), Appendix B; the detector
+and the reference pixel follow from its printed A_DMAX and B_DMAX, which are reached with u, v
+within +-507.5 pixels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["WISE_COEFFICIENTS", "simulate_wise", "wise_solution"]
 
 Float = NDArray[np.float64]
 
-# band: (A, B), each in the order of polynomial_terms(4): 00, 10, 01, 20, 11, 02, 30, 21, 12, 03, 40, ...
+# band: (A, B), each in the order of polynomial_terms(4): 00, 10, 01, 20, 11, 02, 30, ...
 # fmt: off
 WISE_COEFFICIENTS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "W2": (
@@ -98,8 +98,8 @@ def simulate_wise(
     fraction : float
         Share of false matches.
     jitter : float
-        Error beyond the quoted ones, in pixels: the partition of the point-spread function (section 5
-        of the report) leaves residuals of this size.
+        Error beyond the quoted ones, in pixels: the partition of the point-spread function
+        (section 5 of the report) leaves residuals of this size.
     outlier_scale : float
         Standard deviation of false matches on each axis, in pixels.
 

@@ -1,8 +1,8 @@
-"""Has the sampler converged?  Judged over independent ensembles, never over walkers of one ensemble.
+"""Has the sampler converged?  Judged over independent ensembles, never over coupled walkers.
 
-Differential evolution couples the walkers of an ensemble.  Then two estimates of the effective sample
-size are made and the smaller counts: that of the walkers laid end to end, and that of the ensemble
-averages, which sees a drift that all walkers share (Goodman and Weare 2010, section 5).
+Differential evolution couples the walkers of an ensemble.  Then two estimates of the effective
+sample size are made and the smaller counts: that of the walkers laid end to end, and that of the
+ensemble averages, which sees a drift that all walkers share (Goodman and Weare 2010, section 5).
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def _coupled_ess(chains: Float, each) -> Float:
     """Effective sample size of the mean over ensembles that may move as one."""
     import arviz as az
 
-    E, T, W, D = chains.shape
+    D = chains.shape[-1]
     averages = chains.mean(axis=2)
     share = averages.reshape(-1, D).var(axis=0)
     total = chains.reshape(-1, D).var(axis=0)
@@ -180,7 +180,7 @@ def _coupled_ess(chains: Float, each) -> Float:
 
 
 def pareto_k(log_weights: Float) -> float:
-    """Shape of the generalised Pareto tail of importance weights; above 0.7 they cannot be trusted."""
+    """Shape of the Pareto tail of importance weights; above 0.7 they cannot be trusted."""
     import arviz as az
 
     finite = log_weights[np.isfinite(log_weights)]

@@ -1,7 +1,7 @@
 """posterior.nc: the posterior as a netCDF tree that ArviZ and xarray open.
 
-Groups: posterior, sample_stats, diagnostics, observed_data, constant_data, and log_likelihood -- or, where
-that would be too large, log_likelihood_summary with the mean and variance for each star.
+Groups: posterior, sample_stats, diagnostics, observed_data, constant_data, and log_likelihood --
+or, where that would be too large, log_likelihood_summary with the mean and variance for each star.
 """
 
 from __future__ import annotations
@@ -176,7 +176,9 @@ def load_posterior(path: str | Path) -> Posterior:
     if path.is_dir():
         path = path / "posterior.nc"
     if not path.exists():
-        raise FormatError("there is no such file", where=str(path), do="run 'bayesdist sample' first")
+        raise FormatError(
+            "there is no such file", where=str(path), do="run 'bayesdist sample' first"
+        )
     try:
         with xr.open_datatree(path, engine="h5netcdf") as tree:
             tree.load()

@@ -1,0 +1,1 @@
+"""The program: configuration, run directories, stages, command line."""

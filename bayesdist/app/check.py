@@ -1,0 +1,72 @@
+"""`bayesdist check`: what a configuration would do, without sampling."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+
+import numpy as np
+
+from bayesdist.app.config import load_config
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.screen import number
+from bayesdist.app.stages import Session, linear_fit
+from bayesdist.infer import GaussianPriors, OutlierMixture
+from bayesdist.infer.sampler import FIRST_CHECK
+from bayesdist.infer.stars import prepare
+from bayesdist.infer.target import Target
+
+__all__ = ["check"]
+
+WALKERS = 64  # of all ensembles, where the proposal is good
+PASSES = 2 * FIRST_CHECK * WALKERS
+
+
+def check(path: str | Path) -> str:
+    """Units, rank, null space and expected cost of a configuration.
+
+    Parameters
+    ----------
+    path : path
+        Configuration file.
+
+    Returns
+    -------
+    str
+        A readable text.
+
+    Raises
+    ------
+    BayesdistError
+        For whatever would stop the run: bad input, or parameters that the data do not determine.
+    """
+    config, text = load_config(path)
+    with TemporaryDirectory() as folder:
+        run = RunDirectory.begin(folder, config, text, Path(path).resolve().parent)
+        session = Session(run)
+        matches, model = session.raw_matches, session.model
+        fit, errors = linear_fit(session)
+    if errors is not None:
+        matches = matches.with_sigma(*errors.at(matches.mag))
+    target = Target(prepare(model, matches), OutlierMixture(), GaussianPriors.none(model))
+    psi = np.concatenate([fit.mean, target.hyper.point({"j": 0.1, "f": 0.05, "s_out": 1.0})])
+    target.log_density(psi[None])  # compiles, or loads what was compiled
+    started = perf_counter()
+    n = max(1, min(200, 2_000_000 // len(matches)))
+    target.log_density(np.repeat(psi[None], n, axis=0))
+    per_pass = (perf_counter() - started) / n
+    lines = [
+        f"matches      {len(matches)} of {matches.n_rows} rows, "
+        f"{len(matches.exposure_names)} exposure(s), u and v in {matches.unit}",
+        f"errors       median {number(target.hyper.scale)} {matches.unit}"
+        + (" (by magnitude)" if errors is not None else ""),
+        f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters",
+        f"rank         {model.n_params} of {model.n_params}, nothing is degenerate",
+        f"condition    {number(fit.condition)} (normal matrix, unit diagonal)",
+        f"linear fit   rms {number(fit.rms_u)}, {number(fit.rms_v)} {fit.unit}; "
+        f"chi2/dof {number(fit.chi2 / max(fit.dof, 1))}; {int((~fit.used).sum())} rows rejected",
+        f"cost         {number(1e3 * per_pass, 3)} ms a pass, about {PASSES} passes: "
+        f"{number(PASSES * per_pass, 2)} s of sampling if the posterior is well behaved",
+    ]
+    return "\n".join(lines)

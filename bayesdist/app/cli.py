@@ -1,0 +1,222 @@
+"""The command line."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from bayesdist.app.screen import start_logging
+from bayesdist.errors import BayesdistError
+
+__all__ = ["main"]
+
+MISSED = 4
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        In place of those of the process.
+
+    Returns
+    -------
+    int
+        0 good; 1 bad input; 2 usage; 3 not converged under --strict; 4 requirement missed; 130
+        interrupted.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    options = _parser().parse_args(arguments)
+    options.line = shlex.join(["bayesdist", *arguments])
+    start_logging(-1 if options.quiet else 0)
+    try:
+        return options.function(options) or 0
+    except BayesdistError as error:
+        print(f"bayesdist: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("bayesdist: interrupted; go on with --resume", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of a pipe had enough
+        sys.stderr.close()
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bayesdist",
+        description="How well is the geometric distortion of a detector known?",
+        epilog="Exit codes: 0 good, 1 bad input, 2 usage, 3 not converged under --strict, "
+        "4 requirement missed.",
+    )
+    parser.add_argument("--version", action="version", version=f"bayesdist {_version()}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    def add(name: str, function, text: str) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
+        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        sub.set_defaults(function=function)
+        sub.add_argument("-q", "--quiet", action="store_true", help="only warnings and errors")
+        return sub
+
+    sub = add("demo", _demo, "the main job on simulated data, with the truth beside the estimate")
+    sub.add_argument("-o", "--output", default="bayesdist-demo", metavar="DIR")
+    sub.add_argument("--force", action="store_true", help="replace an earlier demo")
+
+    sub = add("run", _run, "the whole job: fit, sample, assess, export, report")
+    sub.add_argument("config", metavar="CONFIG.toml")
+    sub.add_argument("-o", "--output", required=True, metavar="RUN")
+    again = sub.add_mutually_exclusive_group()
+    again.add_argument("--resume", action="store_true", help="go on with the run that is there")
+    again.add_argument("--force", action="store_true", help="replace the run that is there")
+    sub.add_argument("--strict", action="store_true", help="exit 3 unless converged")
+    sub.add_argument("--seed", type=_seed, metavar="N", help="in place of the configured one")
+
+    for stage, text in (
+        ("fit", "stage 1 of a run: the linear fit"),
+        ("sample", "stage 2 of a run: the posterior, going on from its checkpoints"),
+        ("assess", "stage 3 of a run: maps, budget, margins"),
+        ("export", "stage 4 of a run: files for pipelines"),
+        ("report", "stage 5 of a run: figures and report.html"),
+    ):
+        sub = add(stage, _stage, text)
+        sub.set_defaults(stage=stage)
+        sub.add_argument("run", metavar="RUN")
+        if stage == "sample":
+            sub.add_argument("--strict", action="store_true", help="exit 3 unless converged")
+
+    sub = add("check", _check, "units, rank, null space and expected cost; samples nothing")
+    sub.add_argument("config", metavar="CONFIG.toml")
+
+    sub = add("validate", _validate, "margins of a run against requirements; exit 4 unless all met")
+    sub.add_argument("run", metavar="RUN")
+    sub.add_argument("--requirements", required=True, metavar="REQ.toml")
+
+    sub = add("inspect", _inspect, "what a product or a posterior holds, and what is wrong in it")
+    sub.add_argument("file", metavar="FILE")
+
+    sub = add("simulate", _simulate, "matched stars of known truth, with a configuration")
+    sub.add_argument("what", choices=["wise"])
+    sub.add_argument("-o", "--output", required=True, metavar="DIR")
+    sub.add_argument("--seed", type=_seed, default=1, metavar="N")
+    sub.add_argument("--band", default="W2")
+    sub.add_argument("--stars", type=int, default=6000, metavar="N")
+    sub.add_argument("--fraction", type=float, default=0.03, help="share of false matches")
+
+    sub = add("init", _init, "a commented configuration for a file of matches")
+    sub.add_argument("config", metavar="CONFIG.toml")
+    sub.add_argument("--matches", required=True, metavar="FILE")
+    sub.add_argument("--force", action="store_true", help="replace the file that is there")
+    return parser
+
+
+def _version() -> str:
+    from bayesdist import __version__
+
+    return __version__
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError("a seed is 0 or more")
+    return value
+
+
+# Each command imports what it needs: the sampler and the figures take seconds to load.
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from bayesdist.app.demo import demo
+
+    print(demo(options.output, force=options.force, command=options.line))
+
+
+def _run(options: argparse.Namespace) -> None:
+    from bayesdist.app.demo import results_text
+    from bayesdist.app.run import run
+    from bayesdist.app.rundir import RunDirectory
+    from bayesdist.app.stages import Session
+
+    path = run(
+        options.config,
+        options.output,
+        resume=options.resume,
+        force=options.force,
+        strict=options.strict,
+        seed=options.seed,
+        command=options.line,
+    )
+    print(results_text(Session(RunDirectory.open(path))))
+
+
+def _stage(options: argparse.Namespace) -> None:
+    from bayesdist.app.run import continue_stage
+
+    continue_stage(options.run, options.stage, strict=getattr(options, "strict", False))
+
+
+def _check(options: argparse.Namespace) -> None:
+    from bayesdist.app.check import check
+
+    print(check(options.config))
+
+
+def _validate(options: argparse.Namespace) -> int:
+    from bayesdist.app.config import load_requirements
+    from bayesdist.app.demo import margins_text
+    from bayesdist.app.rundir import RunDirectory
+    from bayesdist.app.stages import Session, margin_rows, margins_of, require, write_margins
+
+    requirements = load_requirements(options.requirements)
+    session = Session(RunDirectory.open(options.run))
+    require(session, "validate", ("fit", "sample"))
+    margins = margins_of(session, requirements)
+    write_margins(session, margins)
+    print(margins_text(margin_rows(margins)))
+    for m in margins:
+        if m.verdict != "met":
+            print(f"{m.requirement.name}: {m.verdict}: {m.reason}")
+    return 0 if all(m.verdict == "met" for m in margins) else MISSED
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    from bayesdist.app.inspect import inspect
+
+    print(inspect(options.file))
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    import numpy as np
+
+    from bayesdist.app.demo import simulation_config, write_simulation
+    from bayesdist.errors import InputError
+    from bayesdist.simulate import simulate_wise
+
+    if options.stars < 1 or not 0 <= options.fraction < 1:
+        raise InputError("--stars must be positive and --fraction in [0, 1)")
+    matches, truth = simulate_wise(
+        options.stars,
+        band=options.band,
+        fraction=options.fraction,
+        rng=np.random.default_rng(options.seed),
+    )
+    folder = Path(options.output)
+    write_simulation(folder, matches, truth, simulation_config(options.band))
+    print(f"{len(matches)} pairs, {int(truth.false.sum())} of them false: {folder / 'stars.ecsv'}")
+    print(f"calibrate them:  bayesdist run {folder / 'config.toml'} -o {folder / 'run'}")
+
+
+def _init(options: argparse.Namespace) -> None:
+    from bayesdist.app.init import init
+
+    table = init(options.config, options.matches, force=options.force)
+    print(f"{options.config}: for {len(table)} matches; read it, then 'bayesdist check' it")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,359 @@
+"""The configuration file: every key, its type and its default."""
+
+from __future__ import annotations
+
+import tomllib
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    model_validator,
+)
+
+from bayesdist.assess import Requirement, UserTerm
+from bayesdist.errors import ConfigError, InputError
+from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
+
+__all__ = ["Config", "load_config", "load_requirements", "parse_config"]
+
+Pair = tuple[PositiveFloat, PositiveFloat]
+Unit = Literal["pix", "arcsec", "mas", "deg"]
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+
+class Section(BaseModel):
+    """A table of the file; keys that it does not know are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Data(Section):
+    """What is read, and how."""
+
+    matches: str | list[str]
+    format: Literal["auto", "table", "hst1pass", "matchup", "astrometry.net"] = "auto"
+    columns: dict[str, str] | None = None
+    unit: Unit | None = None
+    sigma: Literal["columns", "by_magnitude"] | PositiveFloat = "columns"
+    pixel_origin: Literal[0, 1] = 1
+    tangent_point: tuple[float, float] | None = None
+
+
+class Detector(Section):
+    """A detector of one chip."""
+
+    name: str = ""
+    size: Pair | None = None
+    scale_mas: PositiveFloat | None = None
+
+
+class ChipBlock(Section):
+    """One of several chips."""
+
+    number: int
+    name: str
+    size: Pair
+    reference_pixel: Pair
+    reference: bool = False
+
+
+class Tdd(Section):
+    """Terms that drift linearly with time."""
+
+    epoch0: float | list[float]
+    terms: list[tuple[Literal["u", "v"], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]]
+    breaks: list[float] = []
+
+
+class ModelBlock(Section):
+    """Structure of the distortion model."""
+
+    order: Annotated[int, Field(ge=1, le=9)]
+    reference_pixel: Pair | None = None
+    frames: Literal[FRAME_KINDS] = "none"  # type: ignore[valid-type]
+    tdd: Tdd | None = None
+
+
+class Fit(Section):
+    """The linear fit."""
+
+    clip_chi2: PositiveFloat = 25.0
+    clip_abs: PositiveFloat = 2.0
+    radial_weight: PositiveFloat = 1.0
+
+
+class Outliers(Section):
+    """The outlier mixture."""
+
+    model: Literal["gaussian", "uniform", "none"] = "gaussian"
+    match_radius: PositiveFloat | None = None
+    jitter: Literal["fit"] | Annotated[float, Field(ge=0)] = "fit"
+    fraction_prior: Pair = (1.0, 9.0)
+
+
+class Sampler(Section):
+    """When to stop, and from which seed."""
+
+    seed: Annotated[int, Field(ge=0)] = 1
+    ensembles: Annotated[int, Field(ge=2)] = 4
+    walkers: PositiveInt | None = None
+    target_ess: PositiveFloat = 400.0
+    target_rhat: Annotated[float, Field(gt=1)] = 1.01
+    max_steps: PositiveInt = 20_000
+    checkpoint_every: PositiveInt = 200
+
+
+class Compute(Section):
+    """Where the work is done."""
+
+    engine: Literal["threads"] = "threads"
+
+
+class Assess(Section):
+    """Where and when errors are assessed."""
+
+    epoch: float | None = None
+    grid: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] = (33, 17)
+    draws: Annotated[int, Field(ge=100)] = 4000
+
+
+class BudgetBlock(Section):
+    """An error term that the data cannot show."""
+
+    name: str
+    kind: Literal["random", "systematic"]
+    sigma_u: Annotated[float, Field(ge=0)]
+    sigma_v: Annotated[float, Field(ge=0)]
+    unit: Unit = "pix"
+
+
+class RequirementBlock(Section):
+    """A limit on a statistic of the position error."""
+
+    name: str
+    statistic: str
+    limit: PositiveFloat
+    unit: Unit = "pix"
+    probability: Probability = 0.95
+    epoch: float | None = None
+
+
+class PriorBlock(Section):
+    """A Gaussian prior on one parameter."""
+
+    parameter: str
+    mean: float
+    sigma: PositiveFloat
+
+
+class Sip(Section):
+    """A SIP header."""
+
+    inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
+    linear: Literal["cd", "sip"] = "cd"
+    crval: tuple[float, float] = (0.0, 0.0)
+
+
+class Idctab(Section):
+    """An IDCTAB reference file."""
+
+    instrument: str
+    detector: str
+    v2v3: Literal["aperture"] = "aperture"
+    v2ref: float = 0.0
+    v3ref: float = 0.0
+    vafactor: PositiveFloat = 1.0
+    filters: list[str] | list[list[str]] | None = None
+    useafter: str | None = None
+    pedigree: str | None = None
+
+
+class Products(Section):
+    """Files for pipelines."""
+
+    sip: Sip | None = None
+    idctab: Idctab | None = None
+
+
+class Config(Section):
+    """The whole file."""
+
+    data: Data
+    model: ModelBlock
+    detector: Detector = Detector()
+    chip: list[ChipBlock] = []
+    fit: Fit = Fit()
+    outliers: Outliers = Outliers()
+    sampler: Sampler = Sampler()
+    compute: Compute = Compute()
+    assess: Assess = Assess()
+    budget: list[BudgetBlock] = []
+    requirement: list[RequirementBlock] = []
+    prior: list[PriorBlock] = []
+    products: Products = Products()
+
+    @model_validator(mode="after")
+    def _chips_or_detector(self) -> Config:
+        if self.chip and (self.detector.size or self.model.reference_pixel):
+            raise ValueError(
+                "[[chip]] blocks stand in place of detector.size and model.reference_pixel"
+            )
+        if not self.chip and self.detector.size is None:
+            raise ValueError("detector.size is missing (or [[chip]] blocks)")
+        return self
+
+    def chips(self) -> tuple[Chip, ...]:
+        """Chips of the model; empty for a detector of one chip."""
+        # the reference chip stands first: it defines the frame
+        blocks = sorted(self.chip, key=lambda c: not c.reference)
+        return tuple(Chip(c.number, c.name, c.size, c.reference_pixel) for c in blocks)
+
+    def time(self) -> TimeDependence | None:
+        """Time dependence of the model."""
+        tdd = self.model.tdd
+        if tdd is None or not tdd.terms:
+            return None
+        epochs = tdd.epoch0 if isinstance(tdd.epoch0, list) else [tdd.epoch0]
+        return TimeDependence(tuple(tdd.terms), tuple(epochs), tuple(tdd.breaks))
+
+    def user_terms(self) -> tuple[UserTerm, ...]:
+        """The user's terms of the error budget."""
+        return tuple(UserTerm(**b.model_dump()) for b in self.budget)
+
+    def requirements(self) -> tuple[Requirement, ...]:
+        """The requirements."""
+        return tuple(Requirement(**r.model_dump()) for r in self.requirement)
+
+
+class _RequirementFile(Section):
+    requirement: list[RequirementBlock]
+
+
+def load_config(path: str | Path) -> tuple[Config, str]:
+    """Read a configuration file.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    config : Config
+    text : str
+        The file as it stands.
+
+    Raises
+    ------
+    ConfigError
+        With file, key and reason; an unknown key names the nearest known one.
+    """
+    text = _read(path)
+    return parse_config(text, str(path)), text
+
+
+def parse_config(text: str, where: str) -> Config:
+    """A configuration from the text of a file; `where` names it in errors."""
+    config = _validated(Config, text, where)
+    try:
+        config.time()
+        config.user_terms()
+        config.requirements()
+    except InputError as error:
+        raise ConfigError(error.cause, where=f"{where}: {error.where}", do=error.do) from error
+    return config
+
+
+def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
+    """Read a file of ``[[requirement]]`` blocks.
+
+    Raises
+    ------
+    ConfigError
+    """
+    blocks = _validated(_RequirementFile, _read(path), str(path)).requirement
+    try:
+        return tuple(Requirement(**r.model_dump()) for r in blocks)
+    except InputError as error:
+        raise ConfigError(error.cause, where=f"{path}: {error.where}", do=error.do) from error
+
+
+def _read(path: str | Path) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ConfigError(f"cannot be read ({reason})", where=str(path)) from error
+
+
+def _validated(kind: type[Section], text: str, where: str) -> Any:
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"is not valid TOML ({error})", where=where) from error
+    try:
+        return kind.model_validate(raw)
+    except ValidationError as error:
+        raise _as_sentence(kind, error, where) from error
+
+
+def _as_sentence(kind: type[Section], error: ValidationError, where: str) -> ConfigError:
+    """The first thing that is wrong, with its key."""
+    # an unknown key is usually the cause of a missing one
+    details = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    first = details[0]
+    path = [str(p) for p in first["loc"] if not _is_branch(p)]
+    key = _dotted(first["loc"])
+    if first["type"] == "extra_forbidden":
+        known = _known_keys(kind, first["loc"][:-1])
+        near = get_close_matches(path[-1], known, 1, cutoff=0.4)
+        do = f"did you mean {near[0]!r}" if near else f"known keys are {', '.join(sorted(known))}"
+        return ConfigError(f"unknown key {path[-1]!r}", where=f"{where}: {key}", do=do)
+    if first["type"] == "missing":
+        return ConfigError("this key is missing", where=f"{where}: {key}", do="add it")
+    cause = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "value_error":
+        return ConfigError(cause, where=where)
+    cause = cause[0].lower() + cause[1:]
+    return ConfigError(f"{first['input']!r} does not fit: {cause}", where=f"{where}: {key}")
+
+
+def _is_branch(part: str | int) -> bool:
+    """Whether part of a location names a branch of a union, not a key."""
+    return isinstance(part, str) and ("[" in part or part in ("float", "str", "int"))
+
+
+def _dotted(location: tuple[str | int, ...]) -> str:
+    out = ""
+    for part in location:
+        if isinstance(part, int):
+            out += f"[{part + 1}]"
+        elif not _is_branch(part):
+            out += f".{part}" if out else part
+    return out
+
+
+def _known_keys(kind: type[Section], location: tuple[str | int, ...]) -> list[str]:
+    """Keys of the section at a location."""
+    current: Any = kind
+    for part in location:
+        if isinstance(part, int) or _is_branch(part):
+            continue
+        current = _section_of(current.model_fields[part].annotation)
+    return list(current.model_fields)
+
+
+def _section_of(annotation: Any) -> Any:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        found = _section_of(inner)
+        if found is not None:
+            return found
+    return None

@@ -1,0 +1,144 @@
+"""`bayesdist init`: a commented configuration for a file of matches."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.app.config import parse_config
+from bayesdist.data import MatchTable, atomic_path, read_matches
+from bayesdist.errors import InputError
+
+__all__ = ["init"]
+
+_TEMPLATE = """\
+# A calibration of geometric distortion; see docs/configuration.md for every key.
+
+[data]
+matches = {matches}
+# format = "auto"               # auto | table | hst1pass | matchup | astrometry.net
+{columns}sigma = {sigma}
+pixel_origin = 1                # of x, y: 1 as in FITS, or 0
+
+[detector]
+name = "{name}"
+size = [{nx}, {ny}]             # columns, rows; {size_note}
+# scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
+
+[model] order = {order}                       # 1 to 9 # reference_pixel = [{cx}, {cy}] frames =
+"{frames}"               # of each exposure: none | shift | shift_rotation | shift_rotation_scale |
+affine # [model.tdd]                   # terms that drift with time: axis, power of x, power of y #
+epoch0 = 2004.5 # terms = [["u", 1, 0], ["v", 1, 0]]
+
+[fit]
+clip_chi2 = 25.0                # second pass without pairs beyond this chi-square
+clip_abs = 2.0                  # ... or farther off than this, in pixels
+
+[outliers]
+model = "gaussian"              # gaussian | uniform (on the match circle) | none
+# match_radius = 2.0            # needed for uniform, in the unit of u, v
+
+[sampler]
+seed = 1
+target_ess = 400
+target_rhat = 1.01
+
+[assess]
+grid = [33, {grid_y}]                 # points on x and y
+# epoch = 2006.5
+
+# [[budget]]                    # errors that the data cannot show: random | systematic
+# name = "reference catalogue"
+# kind = "systematic"
+# sigma_u = 0.02
+# sigma_v = 0.02
+# unit = "{unit}"
+
+# [[requirement]]
+# name = "field-wide"
+# statistic = "p95"             # max rms mean p50 p68 p90 p95 p99, or u_... v_... for one axis
+# limit = 0.1
+# unit = "{unit}"
+# probability = 0.95
+
+[products]
+sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
+# idctab = {{instrument = "ACS", detector = "WFC"}}
+"""
+
+
+def init(path: str | Path, matches: str | Path, *, force: bool = False) -> MatchTable:
+    """Write a commented configuration for a file of matches.
+
+    Parameters
+    ----------
+    path : path
+        TOML file to write.
+    matches : path
+        Input, as in ``data.matches``.
+    force : bool
+        Replace a file that is there.
+
+    Returns
+    -------
+    MatchTable
+        As the configuration reads it.
+
+    Raises
+    ------
+    InputError
+    """
+    path = Path(path)
+    if path.exists() and not force:
+        raise InputError("this file exists", where=str(path), do="replace it by --force")
+    table, sigma = _read(matches)
+    nx, ny = (_guess_size(v) for v in (table.x, table.y))
+    relative = os.path.relpath(Path(matches), path.resolve().parent)
+    n = len(table)
+    text = _TEMPLATE.format(
+        matches=_toml(relative),
+        columns='# columns = {x="x", y="y", u="u", v="v", ...}   # found by their names\n',
+        sigma=sigma,
+        name=Path(matches).stem.replace('"', ""),
+        nx=nx,
+        ny=ny,
+        size_note=f"guessed from x up to {table.x.max():.1f}, y up to {table.y.max():.1f}",
+        order=4 if n >= 300 else 3 if n >= 100 else 2,
+        cx=(nx + 1) / 2,
+        cy=(ny + 1) / 2,
+        frames="shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
+        grid_y=33 if ny == nx else max(3, round(32 * ny / nx) + 1),
+        unit=table.unit,
+    )
+    parse_config(text, str(path))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return table
+
+
+def _read(matches: str | Path) -> tuple[MatchTable, str]:
+    """The table, and how its errors are to be had."""
+    table = read_matches(matches)
+    if table.sigma_u is not None:
+        return table, '"columns"'
+    if table.mag is not None:
+        return table, '"by_magnitude"        # the table carries no errors'
+    return (
+        table,
+        "0.05                    # GUESSED: the table carries neither errors nor magnitudes",
+    )
+
+
+def _guess_size(values: np.ndarray) -> int:
+    """Detector size: the next multiple of 2 above the data, or a power of 2 that is near."""
+    largest = float(values.max()) - 0.5
+    for power in (256, 512, 1024, 2048, 4096, 8192):
+        if 0.97 * power <= largest <= power:
+            return power
+    return int(np.ceil(largest / 2) * 2)
+
+
+def _toml(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,189 @@
+"""The error budget: what the position error at each place of the detector is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.fields import MODEL, error_fields
+from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.terms import UserTerm
+from bayesdist.assess.units import pixel_scale_of
+
+__all__ = ["GIVEN", "MEASURED", "BudgetTerm", "ErrorBudget", "error_budget"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+MEASURED = "measured in this run"
+GIVEN = "given by the user"
+
+
+@dataclass(frozen=True, eq=False)
+class BudgetTerm:
+    """One contribution to the position error.
+
+    Parameters
+    ----------
+    name : str
+    kind : str
+        'random' or 'systematic'; the parts of the model are systematic, as all stars share them.
+    u, v : ndarray, shape (ny, nx)
+        Standard deviations, in the unit of the budget.
+    source : str
+        'measured in this run' or 'given by the user'.
+    """
+
+    name: str
+    kind: str
+    u: Float
+    v: Float
+    source: str
+
+    @property
+    def radial(self) -> Float:
+        """hypot(u, v), (ny, nx)."""
+        return np.hypot(self.u, self.v)
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBudget:
+    """Contributions to the position error over the detector, and their total.
+
+    Parameters
+    ----------
+    x : ndarray, shape (nx,)
+    y : ndarray, shape (ny,)
+        FITS 1-based pixels.
+    unit : str
+    chip : int
+    epoch : float or None
+    terms : tuple of BudgetTerm
+        Parts of the model first, then the user's.
+    model_u, model_v : ndarray, shape (ny, nx)
+        All parts of the model jointly.  They are correlated, so this may be smaller than any of
+        them.
+    total_u, total_v : ndarray, shape (ny, nx)
+        The model and the user's terms in quadrature.
+    dominant : ndarray of int, shape (ny, nx)
+        Index into `terms` of the one with the largest radial error.
+    n_draws : int
+        Draws behind the model's parts: their relative error is about 1 / sqrt(2 n_draws).
+    """
+
+    x: Float
+    y: Float
+    unit: str
+    chip: int
+    epoch: float | None
+    terms: tuple[BudgetTerm, ...]
+    model_u: Float
+    model_v: Float
+    total_u: Float
+    total_v: Float
+    dominant: Int
+    n_draws: int
+
+    @property
+    def radial(self) -> Float:
+        """Total radial error hypot(total_u, total_v), (ny, nx)."""
+        return np.hypot(self.total_u, self.total_v)
+
+    def rows(self) -> list[dict[str, str | float]]:
+        """The budget as a table: one row for each term, the total last.
+
+        Returns
+        -------
+        list of dict
+            name, kind, u, v, radial (root mean squares over the grid), source.
+        """
+        rows = [_row(t.name, t.kind, t.u, t.v, t.source) for t in self.terms]
+        return [*rows, _row("total", "total", self.total_u, self.total_v, "")]
+
+
+def _row(name: str, kind: str, u: Float, v: Float, source: str) -> dict[str, str | float]:
+    mean_u, mean_v = float(np.mean(u**2)), float(np.mean(v**2))
+    return {
+        "name": name,
+        "kind": kind,
+        "u": mean_u**0.5,
+        "v": mean_v**0.5,
+        "radial": (mean_u + mean_v) ** 0.5,
+        "source": source,
+    }
+
+
+def error_budget(
+    solution: Solution,
+    *,
+    terms: Sequence[UserTerm] = (),
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chip: int | None = None,
+    n_draws: int = 4000,
+    rng: np.random.Generator,
+    pixel_scale: float | None = None,
+) -> ErrorBudget:
+    """The error budget of a solution over a grid, at an epoch.
+
+    The parts of the model are combined by joint draws, for they are correlated; the user's terms
+    are independent and added in quadrature.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    terms : sequence of UserTerm
+    grid : tuple of int
+        Points on x and y.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    chip : int, optional
+        Chip number; the first chip by default.
+    n_draws : int
+    rng : numpy.random.Generator
+    pixel_scale : float, optional
+        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+
+    Returns
+    -------
+    ErrorBudget
+        In the unit of u, v.
+
+    Raises
+    ------
+    InputError
+        For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
+        needs a pixel scale that is not known.
+    """
+    unit = solution.model.unit
+    if pixel_scale is None:
+        pixel_scale = pixel_scale_of(solution, chip)
+    sigmas = [t.sigma(unit, pixel_scale) for t in terms]  # refuse bad units before the work
+    place = place_of(solution.model, epoch=epoch, chip=chip)
+    x, y = grid_pixels(place.chip.size, grid)
+    shape = (y.size, x.size)
+    fields = error_fields(solution, *mesh(x, y), epoch=epoch, chip=chip, n_draws=n_draws, rng=rng)
+    measured = {part: tuple(s.reshape(shape) for s in fields.sigma(part)) for part in fields.parts}
+    model_u, model_v = measured.pop(MODEL)
+    entries = [BudgetTerm(n, "systematic", u, v, MEASURED) for n, (u, v) in measured.items()]
+    for t, (su, sv) in zip(terms, sigmas, strict=True):
+        entries.append(BudgetTerm(t.name, t.kind, np.full(shape, su), np.full(shape, sv), GIVEN))
+    user_u2, user_v2 = (sum(s[axis] ** 2 for s in sigmas) for axis in (0, 1))
+    return ErrorBudget(
+        x=x,
+        y=y,
+        unit=unit,
+        chip=fields.chip,
+        epoch=fields.epoch,
+        terms=tuple(entries),
+        model_u=model_u,
+        model_v=model_v,
+        total_u=np.sqrt(model_u**2 + user_u2),
+        total_v=np.sqrt(model_v**2 + user_v2),
+        dominant=np.argmax([t.radial for t in entries], axis=0),
+        n_draws=fields.n_draws,
+    )

@@ -1,0 +1,97 @@
+"""The coefficient table: formal sigma beside posterior, in Legendre and in monomial form."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from astropy.table import MaskedColumn, Table
+from numpy.typing import NDArray
+
+from bayesdist.model import AXES
+
+if TYPE_CHECKING:
+    from bayesdist.infer import LinearFit, Posterior
+
+__all__ = ["coefficient_table"]
+
+Float = NDArray[np.float64]
+
+
+def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Table:
+    """Every parameter of the model, with its uncertainties.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    posterior : Posterior, optional
+
+    Returns
+    -------
+    astropy.table.Table
+        One row for each parameter and, behind them, one for each polynomial coefficient in
+        monomial form: coefficient of (x - xref)^i (y - yref)^j.  Columns: name, chip, axis, i, j,
+        form ('legendre', 'monomial', 'tdd' or 'frame'), value and sigma of least squares; with a
+        posterior also mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk (of the sampled, that is
+        the Legendre form); unit.
+    """
+    model = fit.model
+    blocks = [_Block.of(fit.mean, np.sqrt(np.diag(fit.cov)), posterior and posterior.flat)]
+    rows = [
+        (p.name, p.chip, p.axis, p.i, p.j, "legendre" if p.kind == "polynomial" else p.kind, p.unit)
+        for p in model.parameters
+    ]
+    for chip in model.chips:
+        basis = model.basis(chip.number)
+        prefix = f"{chip.name}." if len(model.chips) > 1 else ""
+        for axis, name in enumerate(AXES):
+            part = model.coefficient_slice(chip.number, axis)
+            value, cov = basis.to_monomials(fit.mean[part], fit.cov[part, part])
+            draws = None
+            if posterior is not None:
+                draws = basis.to_monomials(posterior.flat[:, part])
+            blocks.append(_Block.of(value, np.sqrt(np.diag(cov)), draws))
+            for i, j in basis.terms:
+                unit = model.unit + (f" / pix{i + j}" if i + j else "")
+                label = f"{prefix}{name}[x^{i} y^{j}]"
+                rows.append((label, chip.number, name, i, j, "monomial", unit))
+    table = Table()
+    for k, (column, blank) in enumerate(
+        (("name", ""), ("chip", -1), ("axis", ""), ("i", -1), ("j", -1), ("form", ""))
+    ):
+        values = [row[k] for row in rows]
+        mask = [v is None for v in values]
+        filled = [blank if v is None else v for v in values]
+        table[column] = MaskedColumn(filled, mask=mask) if any(mask) else filled
+    for column in _Block.columns(posterior is not None):
+        table[column] = np.concatenate([getattr(b, column) for b in blocks])
+    if posterior is not None:
+        blank = np.full(len(rows) - model.n_params, np.nan)
+        c = posterior.convergence
+        for column, values in (("rhat", c.rhat), ("ess_bulk", c.ess_bulk)):
+            filled = np.concatenate([values[: model.n_params], blank])
+            table[column] = MaskedColumn(filled, mask=~np.isfinite(filled))
+    table["unit"] = [row[-1] for row in rows]
+    return table
+
+
+class _Block:
+    """Numbers of some rows."""
+
+    def __init__(self, **columns: Float) -> None:
+        self.__dict__.update(columns)
+
+    @staticmethod
+    def columns(sampled: bool) -> tuple[str, ...]:
+        names = ("value", "sigma")
+        return (*names, "mean", "sd", "lo68", "hi68", "lo95", "hi95") if sampled else names
+
+    @classmethod
+    def of(cls, value: Float, sigma: Float, draws: Float | None) -> _Block:
+        columns = {"value": value, "sigma": sigma}
+        if draws is not None:
+            tails = (0.1587, 0.8413, 0.0228, 0.9772)  # one and two standard deviations
+            quantiles = np.quantile(draws, tails, axis=0)
+            columns |= {"mean": draws.mean(axis=0), "sd": draws.std(axis=0, ddof=1)}
+            columns |= dict(zip(("lo68", "hi68", "lo95", "hi95"), quantiles, strict=True))
+        return cls(**columns)

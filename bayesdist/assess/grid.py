@@ -1,0 +1,57 @@
+"""The detector grid on which everything spatial is given; arrays on it are indexed [iy, ix]."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+
+__all__ = ["DEFAULT_GRID", "grid_pixels", "mesh", "position_of_largest"]
+
+Float = NDArray[np.float64]
+
+DEFAULT_GRID = (33, 17)
+
+
+def grid_pixels(size: tuple[float, float], grid: tuple[int, int]) -> tuple[Float, Float]:
+    """Columns and rows of the grid.
+
+    Parameters
+    ----------
+    size : tuple of float
+        Columns and rows of the detector.
+    grid : tuple of int
+        Points on x and y, at least 2 each.
+
+    Returns
+    -------
+    x : ndarray, shape (nx,)
+    y : ndarray, shape (ny,)
+        FITS 1-based pixels, evenly from pixel 1 to the detector's size, both ends.
+
+    Raises
+    ------
+    InputError
+        For a grid that is not two whole numbers of at least 2.
+    """
+    if len(grid) != 2 or any(int(n) != n or n < 2 for n in grid):
+        raise InputError(
+            f"the grid is {list(grid)}",
+            where="assess.grid",
+            do="give two whole numbers of at least 2, points on x and on y",
+        )
+    nx, ny = (int(n) for n in grid)
+    return np.linspace(1.0, size[0], nx), np.linspace(1.0, size[1], ny)
+
+
+def mesh(x: Float, y: Float) -> tuple[Float, Float]:
+    """Pixel of every grid point, (ny * nx,) each, in the order of a flattened [iy, ix] array."""
+    X, Y = np.meshgrid(x, y)
+    return X.ravel(), Y.ravel()
+
+
+def position_of_largest(values: Float, x: Float, y: Float) -> tuple[float, float]:
+    """Pixel (x, y) at which a map (ny, nx) is largest."""
+    iy, ix = np.unravel_index(int(np.argmax(values)), values.shape)
+    return float(x[ix]), float(y[iy])

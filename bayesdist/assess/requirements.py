@@ -1,0 +1,268 @@
+"""Requirements on the position error, and by what margin a solution meets them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.fields import MODEL, ErrorFields, draw_solution, error_fields_of
+from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.assess.names import require_known
+from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.statistics import STATISTICS, field_statistic
+from bayesdist.assess.terms import UserTerm, combined_sigma
+from bayesdist.assess.units import UNITS, convert, pixel_scale_of
+from bayesdist.assess.verdict import counting_error, effective_draws, verdict_of
+from bayesdist.errors import InputError
+
+__all__ = ["Margin", "Requirement", "check_requirements"]
+
+Float = NDArray[np.float64]
+
+# Grid points times draws whose errors are held at once: two axes of them are 8 MB.
+BLOCK = 500_000
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """A limit on a statistic of the position error over the detector.
+
+    Parameters
+    ----------
+    name : str
+    statistic : str
+        One of `STATISTICS`.
+    limit : float
+        Positive, in `unit`.
+    unit : str
+        'pix', 'arcsec', 'mas' or 'deg'.
+    probability : float
+        With which the statistic must be at or under the limit, between 0 and 1.
+    epoch : float, optional
+        Decimal years.
+
+    Raises
+    ------
+    InputError
+        For an unknown statistic or unit, or a limit or probability out of range.
+    """
+
+    name: str
+    statistic: str
+    limit: float
+    unit: str = "pix"
+    probability: float = 0.95
+    epoch: float | None = None
+
+    def __post_init__(self) -> None:
+        require_known(self.statistic, STATISTICS, "statistic", where=self.where)
+        require_known(self.unit, UNITS, "unit", where=self.where)
+        if not (math.isfinite(self.limit) and self.limit > 0):
+            raise InputError(
+                f"the limit is {self.limit}", where=self.where, do="give a positive number"
+            )
+        if not 0 < self.probability < 1:
+            raise InputError(
+                f"the probability is {self.probability}",
+                where=self.where,
+                do="give a number between 0 and 1, without the ends",
+            )
+
+    @property
+    def where(self) -> str:
+        """How messages name it."""
+        return f"requirement {self.name!r}"
+
+
+@dataclass(frozen=True, eq=False)
+class Margin:
+    """How a solution stands against a requirement.  All lengths are in `unit`.
+
+    Parameters
+    ----------
+    requirement : Requirement
+    value : float
+        Median of the statistic over the draws.
+    interval : tuple of float
+        Central 95 % of the statistic over the draws.
+    margin : float
+        The limit minus the value that the statistic stays at or under with the probability asked
+        for: not negative exactly where `probability_met` is at least that probability.
+    probability_met : float
+        Fraction of draws at or under the limit.
+    mc_error : float
+        Monte-Carlo standard error of `probability_met`.
+    verdict : str
+        'met', 'missed' or 'undecided'.
+    reason : str
+        Why, in words.
+    unit : str
+        The requirement's.
+    epoch : float or None
+        At which it was judged.
+    n_effective : float
+        Independent draws that the draws are worth.
+    draws : ndarray, shape (n,)
+        The statistic of every draw.
+    """
+
+    requirement: Requirement
+    value: float
+    interval: tuple[float, float]
+    margin: float
+    probability_met: float
+    mc_error: float
+    verdict: str
+    reason: str
+    unit: str
+    epoch: float | None
+    n_effective: float
+    draws: Float
+
+
+def check_requirements(
+    solution: Solution,
+    requirements: Sequence[Requirement],
+    *,
+    terms: Sequence[UserTerm] = (),
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chip: int | None = None,
+    n_draws: int = 2000,
+    rng: np.random.Generator,
+    pixel_scale: float | None = None,
+    converged: bool | None = None,
+) -> tuple[Margin, ...]:
+    """Judge requirements on draws of the position error.
+
+    Each draw is an error field over the grid: a draw of the solution minus its mean (all parts of
+    the model jointly, so with the correlation between positions), plus for the systematic terms one
+    Gaussian offset of each axis for the whole field, plus for the random terms an independent
+    Gaussian error at every grid point.  The statistic of each field gives a distribution, and the
+    fraction of draws at or under the limit is compared with the probability asked for.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    requirements : sequence of Requirement
+    terms : sequence of UserTerm
+    grid : tuple of int
+        Points on x and y.
+    epoch : float, optional
+        For requirements that name none; decimal years.
+    chip : int, optional
+        Chip number; the first chip by default.
+    n_draws : int
+    rng : numpy.random.Generator
+    pixel_scale : float, optional
+        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+    converged : bool, optional
+        Whether the posterior may be trusted; by default what its convergence says.  If not, every
+        verdict is 'undecided'.
+
+    Returns
+    -------
+    tuple of Margin
+        In the order of the requirements.
+
+    Raises
+    ------
+    InputError
+        For a requirement without an epoch where the model depends on time, units that need a pixel
+        scale that is not known, an unknown chip, a bad grid, or fewer than two draws.
+    """
+    unit = solution.model.unit
+    if pixel_scale is None:
+        pixel_scale = pixel_scale_of(solution, chip)
+    epochs = [r.epoch if r.epoch is not None else epoch for r in requirements]
+    for r, t in zip(requirements, epochs, strict=True):
+        convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
+        if t is None and solution.model.time is not None:
+            raise InputError(
+                "the model depends on time and no epoch is given",
+                where=r.where,
+                do="give the requirement an epoch, or set assess.epoch",
+            )
+    systematic = combined_sigma(terms, "systematic", unit, pixel_scale)
+    random = combined_sigma(terms, "random", unit, pixel_scale)
+    if not requirements:
+        return ()
+
+    chip = place_of(solution.model, epoch=epochs[0], chip=chip).chip.number
+    points = mesh(*grid_pixels(solution.model.chips[solution.model.chip_code(chip)].size, grid))
+    theta, exposures = draw_solution(solution, n_draws, rng)
+    offsets = rng.normal(size=(len(theta), 2)) * systematic
+    statistics: dict[tuple[float | None, str], Float] = {}
+    for t in dict.fromkeys(epochs):
+        names = {r.statistic for r, e in zip(requirements, epochs, strict=True) if e == t}
+        fields = error_fields_of(solution, theta, exposures, *points, epoch=t, chip=chip)
+        for name, values in _statistics(fields, sorted(names), offsets, random, rng).items():
+            statistics[t, name] = values
+
+    doubt = _doubt(solution, converged)
+    n_effective = effective_draws(solution, len(theta))
+    margins = []
+    for r, t in zip(requirements, epochs, strict=True):
+        draws = statistics[t, r.statistic] * convert(1.0, unit, r.unit, pixel_scale)
+        margins.append(_margin(r, t, draws, n_effective, doubt))
+    return tuple(margins)
+
+
+def _statistics(
+    fields: ErrorFields,
+    names: Sequence[str],
+    offsets: Float,
+    random: tuple[float, float],
+    rng: np.random.Generator,
+) -> dict[str, Float]:
+    """Each statistic of each draw's field, by blocks of draws."""
+    out = {name: np.empty(fields.n_draws) for name in names}
+    step = max(1, BLOCK // fields.x.size)
+    for start in range(0, fields.n_draws, step):
+        rows = slice(start, start + step)
+        error = fields.field(MODEL, rows) + offsets[rows, None, :]
+        if any(random):
+            error += rng.normal(size=error.shape) * random
+        for name in names:
+            out[name][rows] = field_statistic(name, error)
+    return out
+
+
+def _doubt(solution: Solution, converged: bool | None) -> str:
+    """Why no verdict can be given; '' where the draws can be trusted."""
+    convergence = getattr(solution, "convergence", None)
+    if converged is None:
+        converged = convergence is None or bool(convergence.converged)
+    if converged:
+        return ""
+    reasons = "; ".join(getattr(convergence, "reasons", ()))
+    return "the posterior is not converged" + (f": {reasons}" if reasons else "")
+
+
+def _margin(
+    requirement: Requirement, epoch: float | None, draws: Float, n_effective: float, doubt: str
+) -> Margin:
+    asked = requirement.probability
+    met = float(np.mean(draws <= requirement.limit))
+    low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
+    # the empirical quantile without interpolation, so that its side of the limit agrees with `met`
+    reached = np.quantile(draws, asked, method="inverted_cdf")
+    verdict, reason = verdict_of(met, n_effective, asked)
+    return Margin(
+        requirement=requirement,
+        value=float(median),
+        interval=(float(low), float(high)),
+        margin=float(requirement.limit - reached),
+        probability_met=met,
+        mc_error=counting_error(met, n_effective),
+        verdict="undecided" if doubt else verdict,
+        reason=doubt or reason,
+        unit=requirement.unit,
+        epoch=epoch,
+        n_effective=n_effective,
+        draws=draws,
+    )

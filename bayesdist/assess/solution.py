@@ -1,0 +1,157 @@
+"""What a solution is to this package, and what it says at one place.
+
+At one chip, epoch and exposure the whole model is a single polynomial of the pixel position, so
+maps, budgets and margins carry 2 K coefficients and their covariance instead of one Jacobian row
+for each grid point and parameter: their cost on the grid does not grow with the exposures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
+
+__all__ = ["Place", "Solution", "kind_of", "place_of", "point_blocks"]
+
+Float = NDArray[np.float64]
+
+# Points whose basis values are held at once: 55 terms (order 9) of them are 14 MB.
+BLOCK = 32768
+
+
+class Solution(Protocol):
+    """A fit or a posterior: a model with values, their covariance, and draws of them."""
+
+    @property
+    def model(self) -> DistortionModel: ...
+
+    @property
+    def mean(self) -> Float: ...
+
+    @property
+    def cov(self) -> Float: ...
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Parameter vectors, shape (n, D)."""
+        ...
+
+
+def kind_of(solution: Solution) -> str:
+    """'posterior' for a solution whose convergence was judged, else 'least squares'."""
+    return "posterior" if hasattr(solution, "convergence") else "least squares"
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """One chip at one epoch in one exposure, where the model is one polynomial.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    group : Groups
+        The single group of this place.
+    epoch : float or None
+        Decimal years, as asked for.
+    """
+
+    model: DistortionModel
+    group: Groups
+    epoch: float | None
+
+    @property
+    def chip(self) -> Chip:
+        """The chip."""
+        return self.model.chips[int(self.group.chip[0])]
+
+    @property
+    def basis(self) -> PolynomialBasis:
+        """Basis of the polynomial."""
+        return self.model.basis(self.chip.number)
+
+    def polynomial(self, theta: ArrayLike) -> Float:
+        """Legendre coefficients (..., 2, K) of (u, v) for parameters theta (..., D)."""
+        return self.model.effective(theta, self.group)[..., 0, :, :]
+
+    def covariance(self, solution: Solution) -> Float:
+        """Covariance (2, K, 2, K) of `polynomial`, linearised at the solution's mean."""
+        [(columns, d)] = self.model.effective_jacobian(solution.mean, self.group)
+        K = self.model.n_terms
+        d = d.reshape(2 * K, -1)
+        cov = np.asarray(solution.cov, float)[np.ix_(columns, columns)]
+        return (d @ cov @ d.T).reshape(2, K, 2, K)
+
+    def gradient(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
+        """Derivatives of the basis functions.
+
+        Parameters
+        ----------
+        x, y : array_like, shape (N,)
+            FITS 1-based pixels.
+
+        Returns
+        -------
+        d_dx, d_dy : ndarray, shape (N, K)
+            Per pixel.
+        """
+        basis = self.basis
+        n = basis.order
+        derivative = np.zeros((n + 1, n + 1))  # column i holds P_i' in Legendre polynomials
+        for i in range(1, n + 1):
+            derivative[:i, i] = legendre.legder(np.eye(n + 1)[i, : i + 1])
+        X, Y = basis.scaled(x, y)
+        px, py = legendre.legvander(X, n), legendre.legvander(Y, n)
+        i, j = np.array(basis.terms).T
+        half_x, half_y = basis.half_size
+        return (
+            (px @ derivative)[:, i] * py[:, j] / half_x,
+            px[:, i] * (py @ derivative)[:, j] / half_y,
+        )
+
+
+def place_of(
+    model: DistortionModel,
+    *,
+    epoch: float | None = None,
+    exposure: int | str | None = None,
+    chip: int | None = None,
+) -> Place:
+    """The place of a chip, an epoch and an exposure.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    exposure : int or str, optional
+        Code or name; the gauge exposure by default.
+    chip : int, optional
+        Chip number; the first chip by default.
+
+    Returns
+    -------
+    Place
+
+    Raises
+    ------
+    InputError
+        For an unknown chip or exposure, or a missing or infinite epoch.
+    """
+    if epoch is not None and not np.isfinite(epoch):
+        raise InputError(f"the epoch is {epoch}", do="give it in decimal years")
+    if chip is not None:
+        model.chip_code(chip)  # a model of one chip would accept any number
+    group = model.groups(1, epoch=epoch, exposure=exposure, chip=chip)
+    return Place(model, group, None if epoch is None else float(epoch))
+
+
+def point_blocks(n: int) -> Iterator[slice]:
+    """Slices that cut n points into blocks of bounded size."""
+    for start in range(0, n, BLOCK):
+        yield slice(start, min(start + BLOCK, n))

@@ -1,0 +1,51 @@
+"""Statistics that turn an error field into one number."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.names import require_known
+
+__all__ = ["STATISTICS", "field_statistic"]
+
+Float = NDArray[np.float64]
+
+_PERCENTILES = {"p50": 50.0, "p68": 68.0, "p90": 90.0, "p95": 95.0, "p99": 99.0}
+_BASE = ("max", "rms", "mean", *_PERCENTILES)
+
+STATISTICS = (*_BASE, *(f"u_{s}" for s in _BASE), *(f"v_{s}" for s in _BASE))
+
+
+def field_statistic(name: str, error: Float) -> Float:
+    """A statistic over the points of error fields.
+
+    Parameters
+    ----------
+    name : str
+        One of `STATISTICS`: of the radial error, or with the prefix ``u_`` or ``v_`` of the
+        absolute error of one axis.
+    error : ndarray, shape (..., N, 2)
+
+    Returns
+    -------
+    ndarray, shape (...)
+
+    Raises
+    ------
+    InputError
+        For an unknown statistic.
+    """
+    require_known(name, STATISTICS, "statistic")
+    axis, _, base = name.rpartition("_")
+    if axis:
+        size = np.abs(error[..., "uv".index(axis)])
+    else:
+        size = np.hypot(error[..., 0], error[..., 1])
+    if base == "max":
+        return size.max(axis=-1)
+    if base == "mean":
+        return size.mean(axis=-1)
+    if base == "rms":
+        return np.sqrt(np.mean(size**2, axis=-1))
+    return np.percentile(size, _PERCENTILES[base], axis=-1)

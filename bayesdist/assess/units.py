@@ -1,0 +1,110 @@
+"""Units of positions and errors: pixels and angles, and the pixel scale that joins them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bayesdist.assess.names import require_known
+from bayesdist.assess.solution import Solution
+from bayesdist.data.units import UNITS
+from bayesdist.errors import InputError
+
+__all__ = ["UNITS", "convert", "pixel_scale_of", "require_scale"]
+
+_MAS = {"mas": 1.0, "arcsec": 1e3, "deg": 3.6e6}
+
+
+def convert(
+    value: float, from_unit: str, to_unit: str, pixel_scale: float | None = None, *, where: str = ""
+) -> float:
+    """A length in another unit.
+
+    Parameters
+    ----------
+    value : float or ndarray
+    from_unit, to_unit : str
+        'pix', 'arcsec', 'mas' or 'deg'.
+    pixel_scale : float, optional
+        Size of one pixel in **mas**, as `pixel_scale_of` gives it; needed only between pixels and
+        angles.
+    where : str, optional
+        Where the value was given, for the message.
+
+    Returns
+    -------
+    float or ndarray
+
+    Raises
+    ------
+    InputError
+        For an unknown unit, a scale that is not positive, or pixels and angles without a scale.
+    """
+    for unit in (from_unit, to_unit):
+        require_known(unit, UNITS, "unit", where=where)
+    if from_unit == to_unit:
+        return value
+    if pixel_scale is None and "pix" in (from_unit, to_unit):
+        raise InputError(
+            f"{from_unit} cannot be converted to {to_unit} without a pixel scale",
+            where=where,
+            do="give detector.scale_mas",
+        )
+    if pixel_scale is not None:
+        require_scale(pixel_scale)
+    mas = {**_MAS, "pix": pixel_scale}
+    return value * (mas[from_unit] / mas[to_unit])  # type: ignore[operator]
+
+
+def require_scale(scale_mas: float) -> None:
+    """Pass a pixel scale that is positive and finite.
+
+    Raises
+    ------
+    InputError
+    """
+    if not (math.isfinite(scale_mas) and scale_mas > 0):
+        raise InputError(
+            f"the pixel scale is {scale_mas} mas",
+            where="detector.scale_mas",
+            do="give a positive number",
+        )
+
+
+def pixel_scale_of(
+    solution: Solution, chip: int | None = None, scale_mas: float | None = None
+) -> float | None:
+    """Size of one pixel, in mas.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    chip : int, optional
+        Chip number; the first chip by default.
+    scale_mas : float, optional
+        The scale where the user gives it; it is returned as it is.
+
+    Returns
+    -------
+    float or None
+        In mas per pixel.  Without `scale_mas`: where u and v are angles, the square root of the
+        pixel area at the reference pixel, without drift and frames; where they are pixels, None.
+
+    Raises
+    ------
+    InputError
+        For an unknown chip or a scale that is not positive.
+    """
+    if scale_mas is not None:
+        require_scale(scale_mas)
+        return float(scale_mas)
+    model = solution.model
+    if model.unit == "pix":
+        return None
+    basis = model.basis(chip)
+    linear = [
+        basis.to_monomials(np.asarray(solution.mean)[model.coefficient_slice(chip, axis)])[1:3]
+        for axis in (0, 1)
+    ]
+    return convert(math.sqrt(abs(float(np.linalg.det(linear)))), model.unit, "mas")

@@ -1,0 +1,105 @@
+"""Whether a probability that was counted from draws is above the one asked for."""
+
+from __future__ import annotations
+
+import math
+
+from scipy.stats import beta
+
+from bayesdist.assess.solution import Solution
+
+__all__ = ["VERDICTS", "clopper_pearson", "counting_error", "effective_draws", "verdict_of"]
+
+VERDICTS = ("met", "missed", "undecided")
+
+CONFIDENCE = 0.99
+
+
+def effective_draws(solution: Solution, n_draws: int) -> float:
+    """Independent draws that are worth as much as n draws of the solution.
+
+    Drawing n rows from a chain worth `ess` independent samples adds the chain's own Monte-Carlo
+    variance to that of the drawing: 1 / n_eff = 1 / n + 1 / ess.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+        Draws of a fit are independent; a posterior is worth the smaller of its bulk and tail
+        effective sample sizes (a probability far from a half is a matter of the tails).
+    n_draws : int
+
+    Returns
+    -------
+    float
+        At least 1.
+    """
+    convergence = getattr(solution, "convergence", None)
+    if convergence is None:
+        return float(n_draws)
+    sizes = [float(convergence.ess_bulk_min), float(getattr(convergence, "ess_tail_min", math.inf))]
+    ess = 1.0 if any(math.isnan(s) for s in sizes) else max(min(sizes), 1.0)
+    return max(1.0 / (1.0 / n_draws + 1.0 / ess), 1.0)
+
+
+def clopper_pearson(
+    fraction: float, n: float, confidence: float = CONFIDENCE
+) -> tuple[float, float]:
+    """Exact central interval of a binomial probability.
+
+    Parameters
+    ----------
+    fraction : float
+        Successes over trials.
+    n : float
+        Trials; need not be whole.
+    confidence : float
+
+    Returns
+    -------
+    low, high : float
+
+    References
+    ----------
+    Clopper & Pearson 1934, Biometrika 26, 404, in its form with quantiles of the beta distribution.
+    """
+    tail = (1.0 - confidence) / 2.0
+    k = fraction * n
+    low = float(beta.ppf(tail, k, n - k + 1.0)) if k > 0 else 0.0
+    high = float(beta.ppf(1.0 - tail, k + 1.0, n - k)) if k < n else 1.0
+    return low, high
+
+
+def counting_error(fraction: float, n: float) -> float:
+    """Standard deviation of a probability counted in n draws, under Jeffreys' prior: never zero."""
+    k = fraction * n
+    return float(beta.std(k + 0.5, n - k + 0.5))
+
+
+def verdict_of(fraction: float, n: float, asked: float) -> tuple[str, str]:
+    """Verdict on the probability of meeting a limit, and its reason.
+
+    Parameters
+    ----------
+    fraction : float
+        Of draws that meet the limit.
+    n : float
+        Effective number of draws.
+    asked : float
+        The probability asked for.
+
+    Returns
+    -------
+    verdict : str
+        'met' or 'missed' where the 99 % Clopper-Pearson interval lies wholly above or below the
+        probability asked for, else 'undecided'.
+    reason : str
+    """
+    low, high = clopper_pearson(fraction, n)
+    interval = f"the probability is {low:.4g} to {high:.4g} (99 % Monte-Carlo interval)"
+    if low >= asked:
+        return "met", f"{interval}, at or above the {asked:g} asked for"
+    if high < asked:
+        return "missed", f"{interval}, below the {asked:g} asked for"
+    return "undecided", (
+        f"{interval}, on both sides of the {asked:g} asked for: {n:.0f} effective draws are too few"
+    )

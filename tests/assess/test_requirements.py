@@ -1,0 +1,280 @@
+import tracemalloc
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bayesdist.assess import STATISTICS, Requirement, UserTerm, check_requirements, requirements
+from bayesdist.assess.verdict import clopper_pearson
+from bayesdist.errors import InputError
+from bayesdist.model import Chip, DistortionModel
+
+RADIAL = [s for s in STATISTICS if s[:2] not in ("u_", "v_")]
+S = 0.03
+SYSTEMATIC = [UserTerm("offset", "systematic", S, S)]
+RANDOM = [UserTerm("centroids", "random", S, S)]
+
+
+def margins_of(s, reqs, seed=1, **options):
+    return check_requirements(s, reqs, rng=np.random.default_rng(seed), **options)
+
+
+def near(counted, n, probability):
+    """Within five standard errors of a count."""
+    return abs(counted - probability) < 5 * np.sqrt(probability * (1 - probability) / n) + 1e-12
+
+
+@pytest.fixture
+def exact(solution_of):
+    """A solution without error."""
+    return solution_of(DistortionModel(1, (Chip(1, "A", (100.0, 80.0), (50.0, 40.0)),)))
+
+
+@pytest.fixture
+def shifting(solution_of):
+    """A solution whose only error is a common shift of the field, S on each axis."""
+    cov = np.zeros((6, 6))
+    cov[0, 0] = cov[3, 3] = S**2
+    model = DistortionModel(1, (Chip(1, "A", (100.0, 80.0), (50.0, 40.0)),))
+    return lambda **c: solution_of(model, cov=cov, **c)
+
+
+# -- the distribution of the statistics ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", ["systematic term", "model"])
+@pytest.mark.parametrize("limit", [0.02, 0.06, 0.075])
+def test_a_common_offset_is_rayleigh_for_every_statistic(exact, shifting, source, limit):
+    s, terms = (shifting(), ()) if source == "model" else (exact, SYSTEMATIC)
+    reqs = [Requirement(name, name, limit) for name in STATISTICS]
+    n = 4000
+    for m in margins_of(s, reqs, terms=terms, grid=(5, 4), n_draws=n):
+        if m.requirement.statistic in RADIAL:
+            probability = 1 - np.exp(-(limit**2) / (2 * S**2))
+        else:
+            probability = stats.halfnorm(scale=S).cdf(limit)
+        assert near(m.probability_met, n, probability)
+
+
+def test_model_and_systematic_terms_add_in_quadrature(shifting):
+    terms = [*SYSTEMATIC, UserTerm("other", "systematic", S, S)]
+    [m] = margins_of(shifting(), [Requirement("r", "p95", 0.1)], terms=terms, n_draws=4000)
+    assert near(m.probability_met, 4000, 1 - np.exp(-(0.1**2) / (2 * 3 * S**2)))
+
+
+# On 201 points the percentiles fall on points: p50 is the 101st smallest of 201, and so on.
+N = 201
+RANKS = {"p50": 101, "p90": 181, "p95": 191, "p99": 199, "max": 201}
+
+
+@pytest.mark.parametrize("axis", ["", "u_", "v_"])
+def test_random_errors_have_the_distribution_of_order_statistics(exact, axis):
+    point = stats.halfnorm(scale=S) if axis else stats.rayleigh(scale=S)
+    n = 4000
+    limits = {s: point.ppf(stats.beta(k, N + 1 - k).ppf(0.7)) for s, k in RANKS.items()}
+    reqs = [Requirement(s, axis + s, limit) for s, limit in limits.items()]
+    for m in margins_of(exact, reqs, terms=RANDOM, grid=(3, 67), n_draws=n):
+        k = RANKS[m.requirement.name]
+        at_least_k_below = stats.binom(N, point.cdf(m.requirement.limit)).sf(k - 1)
+        assert at_least_k_below == pytest.approx(0.7)
+        assert near(m.probability_met, n, 0.7)
+
+
+def test_the_rms_of_random_errors_is_a_chi(exact):
+    n = 4000
+    for statistic, degrees in (("rms", 2 * N), ("u_rms", N)):
+        limit = S * np.sqrt(stats.chi2(degrees).ppf(0.3) / N)
+        [m] = margins_of(
+            exact, [Requirement("r", statistic, limit)], terms=RANDOM, grid=(3, 67), n_draws=n
+        )
+        assert near(m.probability_met, n, 0.3)
+
+
+def test_the_mean_of_random_errors_nears_that_of_rayleigh(exact):
+    [m] = margins_of(exact, [Requirement("r", "mean", 1.0)], terms=RANDOM, grid=(40, 50))
+    spread = S * np.sqrt((2 - np.pi / 2) / 2000)
+    assert m.value == pytest.approx(S * np.sqrt(np.pi / 2), abs=5 * 1.2533 * spread / np.sqrt(2000))
+    low, high = m.interval
+    assert high - low == pytest.approx(2 * 1.96 * spread, rel=0.15)
+
+
+def test_correlation_over_the_field_counts(shifting, exact):
+    """The same sigma at each point: shared it meets a limit on the maximum far more often."""
+    req = [Requirement("r", "max", 0.08)]
+    [shared] = margins_of(shifting(), req)
+    [independent] = margins_of(exact, req, terms=RANDOM)
+    assert shared.probability_met > 0.95 > 0.1 > independent.probability_met
+
+
+# -- the margin ------------------------------------------------------------------------------------
+
+
+def test_value_interval_and_margin_of_a_rayleigh_error(exact):
+    n = 20000
+    [m] = margins_of(
+        exact, [Requirement("r", "p68", 0.1)], terms=SYSTEMATIC, grid=(2, 2), n_draws=n
+    )
+    r = stats.rayleigh(scale=S)
+    for value, p in (
+        (m.value, 0.5), (m.interval[0], 0.025), (m.interval[1], 0.975), (0.1 - m.margin, 0.95),
+    ):  # fmt: skip
+        error = np.sqrt(p * (1 - p) / n) / r.pdf(r.ppf(p))
+        assert value == pytest.approx(r.ppf(p), abs=5 * error)
+    assert m.draws.shape == (n,) and m.unit == "pix"
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.683, 0.9, 0.95, 0.99])
+def test_the_margin_is_positive_where_the_fraction_is_enough(exact, probability):
+    options = dict(terms=SYSTEMATIC, grid=(2, 2), n_draws=1000)
+    [m] = margins_of(exact, [Requirement("r", "rms", 1.0)], **options)
+    k = round(1000 * probability)
+    limits = np.sort(m.draws)[k - 8 : k + 8]  # the hardest limits: equal to a draw
+    reqs = [Requirement("r", "rms", limit, probability=probability) for limit in limits]
+    margins = margins_of(exact, reqs, **options)
+    assert [m.margin >= 0 for m in margins] == [False] * 7 + [True] * 9
+    for m in margins:
+        assert (m.margin >= 0) == (m.probability_met >= probability)
+
+
+def test_limits_in_other_units_judge_the_same_thing(shifting):
+    reqs = [Requirement("r", "p95", 0.07), Requirement("r", "p95", 3.5, "mas")]
+    pix, mas = margins_of(shifting(), reqs, pixel_scale=50.0)
+    assert pix.probability_met == mas.probability_met and mas.unit == "mas"
+    for name in ("value", "margin"):
+        assert getattr(mas, name) == pytest.approx(50 * getattr(pix, name), rel=1e-10)
+    np.testing.assert_allclose(mas.interval, 50 * np.array(pix.interval), rtol=1e-12)
+
+
+def test_angular_limits_need_a_scale_where_u_and_v_are_pixels(exact):
+    with pytest.raises(InputError, match=r"requirement 'north'.*give detector\.scale_mas"):
+        margins_of(exact, [Requirement("north", "max", 5.0, "mas")])
+
+
+# -- the verdict -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("limit", "verdict"),
+    [(0.2, "met"), (0.05, "missed"), (S * np.sqrt(-2 * np.log(0.05)), "undecided")],
+)
+def test_verdicts_of_a_rayleigh_error(exact, limit, verdict):
+    [m] = margins_of(exact, [Requirement("r", "p95", limit)], terms=SYSTEMATIC, grid=(3, 3))
+    assert m.verdict == verdict and "0.95 asked for" in m.reason
+    assert m.n_effective == 2000
+
+
+def test_verdicts_are_rarely_wrong(exact):
+    """A limit whose true probability is the one asked for: a 99 % interval misses it in 1 %."""
+    limit = S * np.sqrt(-2 * np.log(0.1))
+    verdicts = [
+        margins_of(
+            exact, [Requirement("r", "rms", limit, probability=0.9)],
+            seed=seed, terms=SYSTEMATIC, grid=(2, 2), n_draws=300,
+        )[0].verdict
+        for seed in range(300)
+    ]  # fmt: skip
+    wrong = 300 - verdicts.count("undecided")
+    assert wrong <= stats.binom(300, 0.01).ppf(0.9999)
+
+
+@pytest.mark.parametrize(("fraction", "n"), [(0.0, 50), (0.94, 50), (0.5, 400), (1.0, 400)])
+def test_the_interval_is_the_exact_binomial_one(fraction, n):
+    theirs = stats.binomtest(round(fraction * n), n).proportion_ci(0.99, method="exact")
+    np.testing.assert_allclose(clopper_pearson(fraction, n), theirs, rtol=1e-9, atol=1e-12)
+
+
+def test_the_counting_error_is_that_of_a_count(exact):
+    req = [Requirement("r", "rms", S)]
+    [m] = margins_of(exact, req, terms=SYSTEMATIC, grid=(2, 2))
+    p = m.probability_met
+    assert m.mc_error == pytest.approx(np.sqrt(p * (1 - p) / 2000), rel=0.01)
+    [sure] = margins_of(exact, [Requirement("r", "rms", 1.0)], terms=SYSTEMATIC, grid=(2, 2))
+    assert sure.probability_met == 1 and 0 < sure.mc_error < 1 / 2000
+
+
+def test_a_posterior_that_is_not_converged_leaves_everything_undecided(shifting):
+    s = shifting(converged=False, reasons=("R-hat of u_0_0 is 1.3", "ESS is 20"))
+    reqs = [Requirement("easy", "rms", 5.0), Requirement("hard", "rms", 1e-6)]
+    for m in margins_of(s, reqs):
+        assert m.verdict == "undecided"
+        assert m.reason == "the posterior is not converged: R-hat of u_0_0 is 1.3; ESS is 20"
+    # the caller may know better, in either direction
+    assert [m.verdict for m in margins_of(s, reqs, converged=True)] == ["met", "missed"]
+    for m in margins_of(shifting(), reqs, converged=False):
+        assert (m.verdict, m.reason) == ("undecided", "the posterior is not converged")
+
+
+@pytest.mark.parametrize("which", ["ess_bulk_min", "ess_tail_min"])
+def test_few_effective_samples_decide_nothing_however_many_draws(shifting, which):
+    """All draws meet the limit; with n_eff of them the lower end is 0.005^(1 / n_eff)."""
+    req = [Requirement("r", "rms", 5.0)]
+    [good] = margins_of(shifting(ess_bulk_min=400.0), req)
+    [poor] = margins_of(shifting(**{which: 60.0}), req)
+    assert good.probability_met == poor.probability_met == 1
+    assert (good.verdict, poor.verdict) == ("met", "undecided")
+    assert poor.n_effective == pytest.approx(1 / (1 / 60 + 1 / 2000))
+    assert poor.n_effective < 60 and 0.005 ** (1 / poor.n_effective) < 0.95
+    assert f"{0.005 ** (1 / poor.n_effective):.4g} to 1" in poor.reason
+    [lost] = margins_of(shifting(**{which: float("nan")}), req)
+    assert lost.n_effective == 1 and lost.verdict == "undecided"
+
+
+# -- epochs, blocks, seeds, refusals ---------------------------------------------------------------
+
+
+def test_each_requirement_is_judged_at_its_own_epoch(rich):
+    """The drift's error grows away from the reference date of 2004.5."""
+    reqs = [
+        Requirement("near", "rms", 1.0, epoch=2004.5),
+        Requirement("default", "rms", 1.0),
+        Requirement("far", "rms", 1.0, epoch=1950.0),
+    ]
+    near_, default, far = margins_of(rich, reqs, epoch=2004.5, n_draws=300, chip=2)
+    assert (near_.epoch, default.epoch, far.epoch) == (2004.5, 2004.5, 1950.0)
+    np.testing.assert_array_equal(near_.draws, default.draws)
+    assert far.value > 3 * near_.value
+    with pytest.raises(InputError, match="requirement 'default': the model depends on time"):
+        margins_of(rich, reqs)
+
+
+def test_blocks_of_draws_do_not_change_the_margins(shifting, monkeypatch):
+    req = [Requirement("r", "p90", 0.1)]
+    options = dict(terms=[*SYSTEMATIC, *RANDOM], grid=(5, 5), n_draws=200)
+    [whole] = margins_of(shifting(), req, **options)
+    monkeypatch.setattr(requirements, "BLOCK", 75)
+    [cut] = margins_of(shifting(), req, **options)
+    np.testing.assert_allclose(cut.draws, whole.draws, rtol=1e-12)
+    [other] = margins_of(shifting(), req, seed=2, **options)
+    assert (other.draws != whole.draws).all()
+
+
+def test_nothing_asked_nothing_answered(exact):
+    assert margins_of(exact, []) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(statistic="rsm"), "unknown statistic 'rsm'; use 'rms' if that is meant"),
+        (dict(limit=0.0), "limit is 0.0"),
+        (dict(limit=float("nan")), "limit is nan"),
+        (dict(probability=95), "probability is 95"),
+        (dict(probability=1.0), "probability is 1.0"),
+        (dict(unit="px"), "unknown unit 'px'"),
+    ],
+)
+def test_bad_requirements_are_refused_by_name(change, message):
+    with pytest.raises(InputError, match=f"requirement 'north': .*{message}"):
+        Requirement(**(dict(name="north", statistic="p95", limit=0.1) | change))
+
+
+def test_memory_does_not_grow_with_draws_times_points(shifting):
+    """129 x 129 points and 1000 draws of two axes would be 266 MB at once."""
+    options = dict(terms=RANDOM, grid=(129, 129), n_draws=1000)
+    tracemalloc.start()
+    try:
+        margins_of(shifting(), [Requirement("r", "max", 1.0)], **options)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 60e6
