@@ -1,0 +1,224 @@
+"""A product in words: what a file holds, and what is wrong in it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.errors import FormatError, InputError
+from bayesdist.products.bivariate import largest_magnitude
+from bayesdist.products.blocks import read_blocks
+from bayesdist.products.idctab import FILTER_COLUMNS, IdcTab
+from bayesdist.products.idctab_lint import lint_idctab
+from bayesdist.products.indices import idctab_column, sip_keyword
+from bayesdist.products.lint import LEVELS, Finding
+from bayesdist.products.sip import SipHeader
+from bayesdist.products.sip_lint import lint_sip
+from bayesdist.products.sip_read import holds_sip, read_sip
+
+__all__ = ["UNDERSTOOD", "describe", "describe_idctab", "describe_sip"]
+
+UNDERSTOOD = "an IDCTAB, or a FITS file or text file of cards with SIP keywords"
+
+_SCHEMES = {
+    "2015": "scheme of 2015: CX11 += CXB dt, CY11 += CTB dt, CY10 += CYB dt",
+    "2014": "scheme of 2014 (TDD_CXB, TDD_CYB)",
+    "order": "skew terms TDD_A, TDD_B",
+    "default": "no keywords: stwcs applies its own terms of 2004.5",
+    "none": "none",
+}
+
+
+def describe(path: str | os.PathLike[str]) -> str:
+    """Readable text of what a file holds, with the findings of the lint at its end.
+
+    The kind of file is told by its content.
+
+    Parameters
+    ----------
+    path : path-like
+        An IDCTAB, or a FITS file or text header with SIP keywords.
+
+    Returns
+    -------
+    str
+        Several lines.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read or is of none of these kinds.
+    """
+    name = str(path)
+    blocks, damaged = (), None
+    try:
+        blocks = read_blocks(path)
+    except FormatError as error:
+        damaged = error
+    if len(blocks) > 1 and _is_idctab(blocks[1].header.values()):
+        return describe_idctab(IdcTab(blocks, name))
+    if holds_sip(path):  # also of a header without its data, which is no whole FITS file
+        return describe_sip(read_sip(path), name)
+    if damaged is not None and _looks_like_fits(path):
+        raise damaged
+    raise InputError("is of no kind that is understood here", where=name, do=f"give {UNDERSTOOD}")
+
+
+def _is_idctab(values: Iterable[object]) -> bool:
+    columns = {str(v).strip() for v in values}
+    return {"XREF", "YREF"} <= columns and bool({"CX10", "A10"} & columns)
+
+
+def _looks_like_fits(path: str | os.PathLike[str]) -> bool:
+    with Path(path).open("rb") as stream:
+        start = stream.read(9)
+    return start == b"SIMPLE  =" or start[:2] == b"\x1f\x8b"
+
+
+# -- IDCTAB --------------------------------------------------------------------------------------
+
+
+def describe_idctab(tab: IdcTab) -> str:
+    """Text of an IDCTAB.
+
+    Parameters
+    ----------
+    tab : IdcTab
+
+    Returns
+    -------
+    str
+    """
+    header = tab.header
+    lines = [
+        f"{tab.name}: IDCTAB of {tab.instrument}/{tab.detector or '(no DETECTOR)'}, "
+        f"order {tab.norder}, {len(tab.rows)} rows",
+    ]
+    lines += [f"  {k:<9} {header[k]}" for k in ("DESCRIP", "USEAFTER", "PEDIGREE") if k in header]
+    lines.append(f"  time      {_SCHEMES[tab.tdd_scheme]}")
+    lines += [f"            {k} = {v:.10g}" for k, v in tab.tdd.items()]
+    filters = sorted({" ".join(f) for f in tab.filters()} - {""})
+    if filters:
+        shown = ", ".join(filters[:4]) + (" ..." if len(filters) > 4 else "")
+        lines.append(f"  filters   {len(filters)} combinations: {shown}")
+    else:
+        lines.append("  filters   no columns: the rows serve every filter")
+    kept = "standard deviations and covariance" if tab.covariance is not None else "none"
+    lines.append(f"  errors    {kept}")
+    for row in _first_rows(tab):
+        lines += ["", *_row_text(tab, row)]
+    return "\n".join([*lines, "", *_finding_text(lint_idctab(tab))])
+
+
+def _first_rows(tab: IdcTab) -> list[int]:
+    """The first row of each chip and direction."""
+    names = [c for c in ("DETCHIP", "DIRECTION") if c in tab.columns]
+    seen: dict[tuple, int] = {}
+    for k, row in enumerate(tab.rows):
+        seen.setdefault(tuple(row[c] for c in names), k)
+    return list(seen.values())
+
+
+def _row_text(tab: IdcTab, row: int) -> list[str]:
+    record = tab.rows[row]
+    parts = [f"row {row + 1}"]
+    for label in ("DETCHIP", "DIRECTION", *FILTER_COLUMNS):
+        if label in tab.columns:
+            parts.append(f"{label} {str(record[label]).strip()}")
+    lines = ["  " + ", ".join(parts)]
+    geometry = [n for n in ("XSIZE", "YSIZE", "XREF", "YREF", "V2REF", "V3REF", "SCALE", "THETA")
+                if n in tab.columns]  # fmt: skip
+    lines.append("    " + "  ".join(f"{n} {float(record[n]):.10g}" for n in geometry))
+    lines.append(f"    non-linear part: {_non_linear(tab, row)} px at most")
+    sigma = tab.sigma
+    same = None if sigma is None or len(sigma) != len(tab.rows) else sigma[row]
+    head = "    column        value [arcsec/px^n]" + ("       sigma" if same is not None else "")
+    lines.append(head)
+    for prefix in tab.prefixes:
+        for i, j in tab.terms:
+            if i + j:
+                name = idctab_column(prefix, i, j)
+                error = f"  {float(same[name]):10.3e}" if same is not None else ""
+                power = f"x^{i} y^{j}"
+                lines.append(f"    {name:<5} {power:<8} {float(record[name]):21.13e}{error}")
+    return lines
+
+
+def _non_linear(tab: IdcTab, row: int) -> str:
+    """Largest terms above order 1, in pixels of SCALE, of Xc and Yc."""
+    record = tab.rows[row]
+    scale = float(record["SCALE"])
+    if scale == 0 or not np.isfinite(scale):
+        return "?"
+    ranges = [
+        (1 - float(record[f"{a}REF"]), float(record[f"{a}SIZE"]) - float(record[f"{a}REF"]))
+        for a in "XY"
+    ]
+    out = []
+    for values in tab.coefficients_of_row(row):
+        terms = {t: c for t, c in zip(tab.terms, values.tolist(), strict=True) if sum(t) > 1}
+        out.append(f"{largest_magnitude(terms, *ranges) / abs(scale):.4g}")
+    return " and ".join(out)
+
+
+# -- SIP -----------------------------------------------------------------------------------------
+
+
+def describe_sip(sip: SipHeader, name: str = "SIP header") -> str:
+    """Text of a SIP header.
+
+    Parameters
+    ----------
+    sip : SipHeader
+    name : str
+        What to call it.
+
+    Returns
+    -------
+    str
+    """
+    size = "unknown" if sip.size is None else f"{sip.size[0]} x {sip.size[1]} px"
+    lines = [
+        f"{name}: SIP header, A_ORDER {sip.order[0]}, B_ORDER {sip.order[1]}, image size {size}",
+        f"  CTYPE     {sip.ctype[0]}, {sip.ctype[1]}",
+        f"  CRPIX     {sip.crpix[0]:.10g}, {sip.crpix[1]:.10g}",
+        f"  CRVAL     {sip.crval[0]:.10g}, {sip.crval[1]:.10g} deg",
+        f"  scale     {3600 * np.sqrt(abs(np.linalg.det(sip.cd))):.8g} arcsec/px",
+        f"  CD        {' '.join(f'{value:.10g}' for value in sip.cd.flat)}",
+    ]
+    if sip.offset is not None:
+        lines.append(f"  offset    {sip.offset[0]:.10g}, {sip.offset[1]:.10g} {sip.unit} at CRVAL")
+    for prefix, value in zip("AB", sip.dmax, strict=True):
+        if value is not None:
+            lines.append(f"  {prefix}_DMAX    {value:.6g} px")
+    if sip.inverse_order is not None:
+        stated = "not stated" if sip.closure is None else f"{sip.closure:.3g} px"
+        lines.append(f"  inverse   AP_ORDER {sip.inverse_order[0]}, worst closure {stated}")
+    for prefix, terms, sigma in (
+        ("A", sip.a, sip.sigma_a), ("B", sip.b, sip.sigma_b), ("AP", sip.ap, {}), ("BP", sip.bp, {})
+    ):  # fmt: skip
+        if terms:
+            lines += ["", *_term_lines(prefix, terms, sigma)]
+    return "\n".join([*lines, "", *_finding_text(lint_sip(sip))])
+
+
+def _term_lines(
+    prefix: str,
+    terms: Mapping[tuple[int, int], float],
+    sigma: Mapping[tuple[int, int], float],
+) -> list[str]:
+    out = []
+    for powers in sorted(terms, key=lambda t: (sum(t), -t[0])):
+        error = f"  +- {sigma[powers]:.3e}" if powers in sigma else ""
+        out.append(f"  {sip_keyword(prefix, *powers):<7} {terms[powers]:21.13e}{error}")
+    return out
+
+
+def _finding_text(findings: tuple[Finding, ...]) -> list[str]:
+    if not findings:
+        return ["Findings: none"]
+    ordered = sorted(findings, key=lambda f: LEVELS.index(f.level))
+    return ["Findings:", *(f"  {finding}" for finding in ordered)]

@@ -1,0 +1,249 @@
+"""The sentence under each figure that says what to see, and the words in place of the picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numerals import count, number, percent
+from bayesdist.report.scales import with_mas
+from bayesdist.report.vectors import CHANCE, significant_cells
+
+__all__ = ["SECTIONS", "Caption", "caption"]
+
+SECTIONS: dict[str, tuple[str, ...]] = {
+    "data": ("residuals_by_magnitude",),
+    "fit": ("residual_histogram", "residual_vectors"),
+    "outliers": ("outliers_corner",),
+    "coefficients": ("coefficients_corner", "traces"),
+    "maps": (
+        "distortion",
+        "distortion_non_linear",
+        "formal_uncertainty",
+        "uncertainty_radius",
+        "pixel_area",
+    ),
+    "budget": ("budget_terms", "budget_dominating"),
+    "margins": ("margins",),
+}
+
+
+@dataclass(frozen=True)
+class Caption:
+    """Words of a figure.
+
+    Parameters
+    ----------
+    title : str
+    text : str
+        What to see.
+    alt : str
+        What the picture shows, for those who cannot see it.
+    """
+
+    title: str
+    text: str
+    alt: str
+
+
+def caption(name: str, inputs: ReportInput) -> Caption:
+    """Words of one of the figures in `SECTIONS`."""
+    return _WRITERS[name](inputs)
+
+
+def _length(value: float, inputs: ReportInput) -> str:
+    return with_mas(value, inputs.unit, inputs.scale_mas)
+
+
+def _by_magnitude(inputs: ReportInput) -> Caption:
+    text = "Residuals grow towards faint stars; colour counts stars."
+    if inputs.magnitude_errors is not None:
+        text += (
+            " The lines are ±1 σ as assigned to each magnitude:"
+            " about two thirds of the stars lie between them."
+        )
+    return Caption(
+        "Residuals against magnitude",
+        text,
+        "Two density plots of the residuals in u and v against magnitude, widening to faint stars.",
+    )
+
+
+def _histogram(inputs: ReportInput) -> Caption:
+    if inputs.posterior is None:
+        text = (
+            "The line is what the quoted errors alone predict;"
+            " stars above it in the wings are outliers."
+        )
+    else:
+        text = (
+            "The line is the fitted mixture summed over the stars' own errors, not a fit to the"
+            " bars: it should follow them in the core (top) and in the wings (bottom, logarithmic)."
+        )
+        if inputs.posterior.mixture.model != "none":
+            text += " The dashed part is false matches."
+    return Caption(
+        "Residual histograms",
+        text,
+        "Histograms of residuals in u and v, core and full range, under the expected curve.",
+    )
+
+
+def _binned(inputs: ReportInput) -> Caption:
+    b = inputs.binned
+    filled = int((np.asarray(b.count) > 0).sum())
+    significant = int(significant_cells(b).sum())
+    return Caption(
+        "Binned residuals",
+        "Mean residual of each cell; dark arrows differ from zero by more than 2 σ."
+        f" {significant} of {filled} cells do, and chance alone would give {CHANCE * filled:.0f}:"
+        " neighbouring dark arrows that point the same way would be structure that the polynomial"
+        " cannot follow.",
+        f"Map of binned residual vectors; {significant} of {filled} cells are significant.",
+    )
+
+
+def _outliers(inputs: ReportInput) -> Caption:
+    text = "Joint posterior of the mixture's parameters; dashed lines hold 68 %."
+    if inputs.posterior is not None and "f" in inputs.posterior.hyper:
+        text += f" The fraction of false matches is {percent(inputs.sampled_mean('f'))}."
+    return Caption(
+        "Outlier fraction, jitter and outlier scale",
+        text,
+        "Corner plot of f, j and s_out, as sampled.",
+    )
+
+
+def _corner(inputs: ReportInput) -> Caption:
+    assert inputs.posterior is not None
+    sd = np.sqrt(np.diag(inputs.posterior.cov))
+    formal = np.sqrt(np.diag(inputs.fit.cov))
+    ratio = float(np.median(sd[formal > 0] / formal[formal > 0]))
+    return Caption(
+        "Coefficients with the strongest correlations",
+        "Filled: posterior; lines: the formal Gaussian of least squares, whose estimate is the zero"
+        " of each axis. Where they agree, the quoted errors and the rejection did no harm. Over all"
+        f" parameters the posterior sd is {number(ratio)} times the formal σ (median).",
+        "Corner plot of the most correlated coefficients, posterior against least squares.",
+    )
+
+
+def _traces(inputs: ReportInput) -> Caption:
+    return Caption(
+        "Chains",
+        "The coefficients with the fewest effective draws, and the mixture's parameters. The"
+        " ensembles are independent: equal levels and equal densities are what convergence looks"
+        " like.",
+        "Traces of the slowest parameters and densities by ensemble.",
+    )
+
+
+def _flow(inputs: ReportInput) -> Caption:
+    v = inputs.displacement
+    x, y = v.position_of_max
+    return Caption(
+        "Distortion, zeroth order suppressed",
+        f"Vectors run from the array position to where the distortion puts it, {v.part_note}; the"
+        f" largest is {_length(v.length_max, inputs)} at pixel ({x:.0f}, {y:.0f}), ringed.",
+        f"Vector-flow diagram of the distortion, largest vector {_length(v.length_max, inputs)}.",
+    )
+
+
+def _non_linear(inputs: ReportInput) -> Caption:
+    v = inputs.non_linear
+    x, y = v.position_of_max
+    return Caption(
+        "Distortion, non-linear part",
+        f"Only {v.part_note}: what remains beyond shift, scale, rotation and skew, at most"
+        f" {_length(v.length_max, inputs)} at pixel ({x:.0f}, {y:.0f}), ringed.",
+        f"Vector diagram of the non-linear part, largest vector {_length(v.length_max, inputs)}.",
+    )
+
+
+def _formal(inputs: ReportInput) -> Caption:
+    found = " and ".join(f"{_length(m.radius_max, inputs)} ({m.kind})" for m in inputs.maps)
+    return Caption(
+        "Formal-uncertainty diagram",
+        "From each place four vectors to all combinations of ±1 σ in u and ±1 σ in v, enlarged as"
+        f" stated above the panels; the largest radius is {found}.",
+        f"Crosses of ±1 sigma over the detector; largest radius {found}.",
+    )
+
+
+def _radius(inputs: ReportInput) -> Caption:
+    text = "Radial uncertainty hypot(σ u, σ v), its largest place ringed."
+    if inputs.posterior_map is not None:
+        ratio = inputs.posterior_map.radius / inputs.formal_map.radius
+        low, high = number(float(ratio.min())), number(float(ratio.max()))
+        text += (
+            f" The posterior's is {low} to {high} times the formal one;"
+            " above 1, least squares with rejection is too sure of itself."
+        )
+    return Caption("Uncertainty over the detector", text, f"Contour maps. {text}")
+
+
+def _area(inputs: ReportInput) -> Caption:
+    a = inputs.area
+    return Caption(
+        "Pixel area",
+        f"Relative to the reference pixel the area runs from {a.area.min():.5f} to"
+        f" {a.area.max():.5f}, known to {number(float(a.sigma.max()), 2)} at worst: flat-fielded"
+        " point-source photometry is to be multiplied by it.",
+        "Contour map of the relative pixel area.",
+    )
+
+
+def _terms(inputs: ReportInput) -> Caption:
+    assert inputs.budget is not None
+    *terms, total = inputs.budget.rows()
+    top = max(terms, key=lambda r: r["radial"])
+    return Caption(
+        "Error budget by term",
+        f"The largest term is {top['name']}, {_length(top['radial'], inputs)}, of a total of"
+        f" {_length(total['radial'], inputs)} (radial rms over the detector).",
+        f"Bars of the budget's terms; the largest is {top['name']}.",
+    )
+
+
+def _dominating(inputs: ReportInput) -> Caption:
+    assert inputs.budget is not None
+    b = inputs.budget
+    share = np.bincount(np.ravel(b.dominant), minlength=len(b.terms)) / b.dominant.size
+    top = int(share.argmax())
+    return Caption(
+        "Dominating term",
+        f"Where which term is largest: {b.terms[top].name} on {percent(share[top], 2)} of the grid."
+        " A better calibration helps only where a term of the model leads.",
+        f"Map of the dominating term, mostly {b.terms[top].name}.",
+    )
+
+
+def _margins(inputs: ReportInput) -> Caption:
+    met = sum(m.verdict == "met" for m in inputs.margins)
+    return Caption(
+        "Margins",
+        "Each statistic as a fraction of its limit: histogram of the draws, bar of their central"
+        f" 95 %, marker at the median; left of the line is within the limit. {count(met)} of"
+        f" {count(len(inputs.margins))} are met with the probability asked for.",
+        f"Requirements against their limits; {met} of {len(inputs.margins)} are met.",
+    )
+
+
+_WRITERS = {
+    "residuals_by_magnitude": _by_magnitude,
+    "residual_histogram": _histogram,
+    "residual_vectors": _binned,
+    "outliers_corner": _outliers,
+    "coefficients_corner": _corner,
+    "traces": _traces,
+    "distortion": _flow,
+    "distortion_non_linear": _non_linear,
+    "formal_uncertainty": _formal,
+    "uncertainty_radius": _radius,
+    "pixel_area": _area,
+    "budget_terms": _terms,
+    "budget_dominating": _dominating,
+    "margins": _margins,
+}

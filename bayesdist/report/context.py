@@ -1,0 +1,162 @@
+"""What a report is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from bayesdist.assess import (
+        AreaMap,
+        BinnedResiduals,
+        ErrorBudget,
+        Margin,
+        UncertaintyMap,
+        VectorMap,
+    )
+    from bayesdist.data import MagnitudeErrors, MatchTable
+    from bayesdist.infer import LinearFit, Posterior
+    from bayesdist.model import Chip
+
+__all__ = ["Check", "Product", "ReportInput"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One criterion: what was found, against what.
+
+    Parameters
+    ----------
+    name : str
+        What was checked, with its unit.
+    value : float or str
+        What was found.
+    limit : str
+        What is asked, in words; empty where nothing is.
+    level : str
+        'pass', 'warn', 'fail', or 'note' where nothing is asked.
+    """
+
+    name: str
+    value: float | str
+    limit: str = ""
+    level: str = "note"
+
+
+@dataclass(frozen=True)
+class Product:
+    """A file that the run wrote.
+
+    Parameters
+    ----------
+    path : str
+        Relative to the run's folder.
+    what : str
+    checks : tuple of Check
+        What was verified on the file as written, its closure for one.
+    """
+
+    path: str
+    what: str
+    checks: tuple[Check, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ReportInput:
+    """Results of a run, as the report shows them.
+
+    Parameters
+    ----------
+    name : str
+        Of the run.
+    config : mapping
+        The resolved configuration.
+    matches : MatchTable
+    fit : LinearFit
+    posterior : Posterior or None
+        None where nothing was sampled: the report then says that errors are formal ones only.
+    formal_map : UncertaintyMap
+        Of the least-squares fit.
+    posterior_map : UncertaintyMap or None
+    displacement : VectorMap
+        The distortion with its zeroth order suppressed.
+    non_linear : VectorMap
+    area : AreaMap
+    binned : BinnedResiduals
+    coefficients : astropy.table.Table
+        Legendre coefficients and all other parameters; columns name, chip, axis, i, j, value,
+        sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit.  Those of the
+        posterior may be missing or masked.
+    budget : ErrorBudget or None
+    margins : tuple of Margin
+    products : tuple of Product
+    magnitude_errors : MagnitudeErrors or None
+        Errors by magnitude, where the stars carried none.
+    provenance : mapping
+        Versions, seed, hashes of the input, timings, command; mappings may be nested.
+    """
+
+    name: str
+    config: Mapping[str, Any]
+    matches: MatchTable
+    fit: LinearFit
+    posterior: Posterior | None
+    formal_map: UncertaintyMap
+    posterior_map: UncertaintyMap | None
+    displacement: VectorMap
+    non_linear: VectorMap
+    area: AreaMap
+    binned: BinnedResiduals
+    coefficients: Table
+    budget: ErrorBudget | None = None
+    margins: tuple[Margin, ...] = ()
+    products: tuple[Product, ...] = ()
+    magnitude_errors: MagnitudeErrors | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def unit(self) -> str:
+        """Unit of u and v."""
+        return self.fit.model.unit
+
+    @property
+    def provisional(self) -> bool:
+        """Whether what the sampler gave must not be relied on."""
+        return self.posterior is not None and not self.posterior.convergence.converged
+
+    @property
+    def solution(self) -> LinearFit | Posterior:
+        """The posterior where there is one, else the fit."""
+        return self.fit if self.posterior is None else self.posterior
+
+    @property
+    def maps(self) -> tuple[UncertaintyMap, ...]:
+        """The uncertainty maps that there are, least squares first."""
+        return tuple(m for m in (self.formal_map, self.posterior_map) if m is not None)
+
+    @property
+    def chip(self) -> Chip:
+        """The chip that the maps show."""
+        model = self.fit.model
+        return model.chips[model.chip_code(self.formal_map.chip)]
+
+    @property
+    def scale_mas(self) -> float | None:
+        """Size of a pixel in mas, where the configuration gives it."""
+        value = self.config.get("detector", {}).get("scale_mas")
+        return None if value is None else float(value)
+
+    def setting(self, section: str, key: str, default: Any) -> Any:
+        """A value of the resolved configuration."""
+        return self.config.get(section, {}).get(key, default)
+
+    def sampled_mean(self, key: str) -> float:
+        """Posterior mean of 'f', 'j' or 's_out'; 0 where it was not sampled."""
+        if self.posterior is None or key not in self.posterior.hyper:
+            return 0.0
+        return float(np.mean(self.posterior.hyper[key]))

@@ -1,0 +1,202 @@
+"""Corner plots: the posterior of pairs of parameters."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from bayesdist.report.scales import display_scale
+from bayesdist.report.style import HYPER_LABELS, PALETTE, WIDTH, figure_style, new_figure
+
+if TYPE_CHECKING:
+    from bayesdist.infer import LinearFit, Posterior
+
+__all__ = ["corner_coefficients", "corner_outliers", "correlated_parameters"]
+
+Float = NDArray[np.float64]
+
+_MAX_POINTS = 20_000  # draws that enter a corner plot
+_LEVELS = tuple(1.0 - np.exp(-0.5 * np.array([1.0, 2.0]) ** 2))  # what 1 and 2 sigma hold in 2-D
+
+
+def correlated_parameters(posterior: Posterior, n: int = 5) -> tuple[str, ...]:
+    """The coefficients that take part in the strongest correlations of the posterior.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    n : int
+        How many.
+
+    Returns
+    -------
+    tuple of str
+        In the model's order; polynomial and time-dependent terms only.
+    """
+    chosen = [k for k, p in enumerate(posterior.model.parameters) if p.kind != "frame"]
+    cov = np.asarray(posterior.cov)[np.ix_(chosen, chosen)]
+    sd = np.sqrt(np.diag(cov))
+    strength = np.triu(np.abs(cov / np.outer(sd, sd)), k=1)
+    picked: list[int] = []
+    for flat in np.argsort(-strength, axis=None, kind="stable"):
+        for k in divmod(int(flat), len(chosen)):
+            if k not in picked and len(picked) < n:
+                picked.append(k)
+        if len(picked) == min(n, len(chosen)):
+            break
+    return tuple(posterior.model.names[chosen[k]] for k in sorted(picked))
+
+
+def corner_coefficients(
+    posterior: Posterior, fit: LinearFit, names: Sequence[str] | None = None
+) -> Figure:
+    """Corner plot of coefficients, as differences from least squares, with its Gaussian over it.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    fit : LinearFit
+        Its values are the zero of every axis.
+    names : sequence of str, optional
+        Parameters to show; those of `correlated_parameters` by default.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    names = tuple(names or correlated_parameters(posterior))
+    index = [posterior.model.names.index(name) for name in names]
+    draws = _thinned(posterior.flat)[:, index] - fit.mean[index]
+    columns = [
+        _Column(f"{name}\n− l. s.", posterior.model.units[k], draws[:, c])
+        for c, (name, k) in enumerate(zip(names, index, strict=True))
+    ]
+    return _corner(columns, formal=np.asarray(fit.cov)[np.ix_(index, index)])
+
+
+def corner_outliers(posterior: Posterior) -> Figure:
+    """Corner plot of the outlier fraction, jitter and outlier scale, of those that were sampled.
+
+    Parameters
+    ----------
+    posterior : Posterior
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    unit = posterior.model.unit
+    columns = []
+    for key in ("f", "j", "s_out"):
+        if key in posterior.hyper:
+            draws = _thinned(np.asarray(posterior.hyper[key], float).ravel())
+            percent = key == "f"
+            columns.append(
+                _Column(
+                    HYPER_LABELS[key],
+                    "%" if percent else unit,
+                    100.0 * draws if percent else draws,
+                )
+            )
+    return _corner(columns)
+
+
+@dataclass(frozen=True)
+class _Column:
+    label: str
+    unit: str
+    draws: Float
+
+
+def _corner(columns: Sequence[_Column], *, formal: Float | None = None) -> Figure:
+    """Corner plot; with a formal covariance, that Gaussian about zero over it."""
+    with warnings.catch_warnings():
+        # corner imports arviz where it is installed, which then announces its own future
+        warnings.simplefilter("ignore", FutureWarning)
+        from corner import corner  # here, as it takes seconds
+
+    n = len(columns)
+    raw = np.stack([c.draws for c in columns], axis=-1)
+    ranges = _ranges(raw, formal)
+    scales = [display_scale(c.unit, limits) for c, limits in zip(columns, ranges, strict=True)]
+    factors = np.array([s.factor for s in scales])
+    side = WIDTH if n > 3 else 1.6 * n + 0.9
+    with figure_style():
+        fig = new_figure(side, side, layout="none")
+        corner(
+            raw * factors,
+            fig=fig,
+            bins=26,
+            range=[tuple(r) for r in ranges * factors[:, None]],
+            labels=[
+                f"{c.label} [{s.unit or 'no unit'}]" for c, s in zip(columns, scales, strict=True)
+            ],
+            color=PALETTE["blue"],
+            quantiles=[0.1587, 0.8413],
+            levels=_LEVELS,
+            plot_datapoints=False,
+            fill_contours=True,
+            smooth=1.0,
+            max_n_ticks=3,
+            label_kwargs={"fontsize": 8},
+            labelpad=0.04,
+            hist_kwargs={"lw": 1.0, "density": True},
+        )
+        handles = [Patch(fc=PALETTE["blue"], alpha=0.6, label="posterior\n(1 σ and 2 σ)")]
+        if formal is not None:
+            panels = np.array(fig.axes).reshape(n, n)
+            _draw_gaussian(panels, formal * np.outer(factors, factors))
+            handles.append(
+                Patch(fill=False, ec=PALETTE["vermilion"], label="least squares,\nformal")
+            )
+        if n > 1:
+            fig.legend(handles=handles, loc="upper right", fontsize=8.5)
+        else:
+            fig.axes[0].set_ylabel("density [relative]")
+        room = 0.75 / side
+        fig.subplots_adjust(
+            left=room, bottom=room, right=0.985, top=0.985, wspace=0.06, hspace=0.06
+        )
+    return fig
+
+
+def _ranges(draws: Float, formal: Float | None) -> Float:
+    """Limits (n, 2) of each column: four standard deviations, and the formal Gaussian if any."""
+    middle, spread = np.median(draws, axis=0), np.std(draws, axis=0)
+    spread = np.where(spread > 0, spread, 1e-6 * np.abs(middle) + 1e-12)
+    low, high = middle - 4 * spread, middle + 4 * spread
+    if formal is None:
+        low = np.maximum(low, 0.0)  # f, j and s_out are never negative
+    else:
+        reach = 3 * np.sqrt(np.diag(formal))
+        low, high = np.minimum(low, -reach), np.maximum(high, reach)
+    return np.stack([low, high], axis=-1)
+
+
+def _draw_gaussian(panels: NDArray[np.object_], cov: Float) -> None:
+    """The Gaussian of a covariance about zero, at 1 and 2 sigma, over a corner plot."""
+    style = {"color": PALETTE["vermilion"], "lw": 1.1, "zorder": 6}
+    turn = np.linspace(0.0, 2.0 * np.pi, 100)
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    for row in range(len(panels)):
+        own = panels[row, row]
+        at = np.linspace(*own.get_xlim(), 200)
+        density = np.exp(-0.5 * at**2 / cov[row, row]) / np.sqrt(2.0 * np.pi * cov[row, row])
+        own.plot(at, density, **style)
+        own.set_ylim(0, max(own.get_ylim()[1], 1.1 * density.max()))
+        for column in range(row):
+            index = [column, row]
+            root = np.linalg.cholesky(cov[np.ix_(index, index)])
+            for radius in (1.0, 2.0):
+                panels[row, column].plot(*(radius * root @ circle), **style)
+
+
+def _thinned(draws: Float) -> Float:
+    return draws[:: max(1, len(draws) // _MAX_POINTS)]

@@ -1,0 +1,105 @@
+"""Tables of what came in."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numerals import MISSING, count, number
+from bayesdist.report.scales import display_scale
+from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, listing, marked
+
+__all__ = ["data_tables"]
+
+
+def data_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
+    """What was read, what was rejected, errors by magnitude, exposures."""
+    m, fit = inputs.matches, inputs.fit
+    pairs = {
+        "Sources": ", ".join(m.sources),
+        "Rows read": count(m.n_rows),
+        "Matched stars": count(len(m)),
+        "Used by the least-squares fit": count(int(np.sum(fit.used))),
+        "Unit of u, v": m.unit,
+        "Exposures": count(len(np.unique(m.exposure))),
+        "Filters": ", ".join(f for f in m.filter_names if f) or MISSING,
+    }
+    if m.epoch is not None:
+        pairs["Epochs [yr]"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
+    if m.mag is not None and np.isfinite(m.mag).any():
+        pairs["Magnitudes"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
+    pairs["Errors of the stars"] = (
+        "by magnitude, see below"
+        if inputs.magnitude_errors is not None
+        else str(inputs.setting("data", "sigma", "as given"))
+    )
+    reasons = [(f"{k} (reading)", count(v)) for k, v in m.rejected.items()]
+    reasons += [(f"{k} (least-squares fit)", count(v)) for k, v in fit.rejected.items()]
+    rejected = TextTable(
+        "Rows left out, by reason",
+        ("Reason", "Rows"),
+        tuple(reasons) or (("none", "0"),),
+        note="The posterior uses every matched star: the mixture takes the place of rejection."
+        if inputs.posterior is not None
+        else "",
+    )
+    out = [listing("Input", pairs), rejected]
+    if inputs.magnitude_errors is not None:
+        out.append(_magnitude_table(inputs))
+    if len(m.exposure_names) > 1:
+        out.append(_exposure_table(inputs))
+    return tuple(out)
+
+
+def _magnitude_table(inputs: ReportInput) -> TextTable:
+    e = inputs.magnitude_errors
+    assert e is not None
+    scale = display_scale(inputs.unit, np.concatenate([e.sigma_u, e.sigma_v]))
+    rows = tuple(
+        (f"{mag:.2f}", count(n), number(su * scale.factor), number(sv * scale.factor))
+        for mag, n, su, sv in zip(e.mag, e.n, e.sigma_u, e.sigma_v, strict=True)
+    )
+    return TextTable(
+        "Errors by magnitude, estimated from the residuals",
+        ("Magnitude", "Stars", f"σ u [{scale.unit}]", f"σ v [{scale.unit}]"),
+        rows,
+        words=(),
+    )
+
+
+def _exposure_table(inputs: ReportInput) -> TextTable:
+    m, fit = inputs.matches, inputs.fit
+    scale = display_scale(inputs.unit, [fit.rms_u, fit.rms_v])
+    p = None if inputs.posterior is None else inputs.posterior.outlier_probability
+    n_codes = len(m.exposure_names)
+    stars = np.bincount(m.exposure, minlength=n_codes)
+    used = np.bincount(m.exposure, weights=fit.used, minlength=n_codes)
+    with np.errstate(invalid="ignore", divide="ignore"):  # an exposure may have lost all its stars
+        rms = [
+            np.sqrt(np.bincount(m.exposure, weights=fit.used * r**2, minlength=n_codes) / used)
+            for r in fit.residual.T
+        ]
+    flagged = None if p is None else np.bincount(m.exposure, weights=p > 0.5, minlength=n_codes)
+    rows = tuple(
+        (
+            m.exposure_names[k],
+            count(stars[k]),
+            count(used[k]),
+            *(number(r[k] * scale.factor) for r in rms),
+            MISSING if flagged is None else marked(inputs, count(flagged[k])),
+        )
+        for k in np.flatnonzero(stars)
+    )
+    return TextTable(
+        "Exposures",
+        (
+            "Exposure",
+            "Stars",
+            "Used",
+            f"rms u [{scale.unit}]",
+            f"rms v [{scale.unit}]",
+            "Outliers (P > 0.5)",
+        ),
+        rows[:MOST_ROWS],
+        note=further(len(rows)),
+    )

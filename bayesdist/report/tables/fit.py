@@ -1,0 +1,88 @@
+"""Tables of the linear fit and of the outlier mixture."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesdist.assess import residual_statistics
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numerals import MISSING, count, interval, number, rounded
+from bayesdist.report.scales import Scale, display_scale, with_mas
+from bayesdist.report.tables.text import TextTable, listing, marked
+
+__all__ = ["fit_tables", "outlier_table"]
+
+
+def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
+    """The linear fit in figures, and statistics of its residuals."""
+    fit, model = inputs.fit, inputs.fit.model
+    mas = inputs.scale_mas
+    pairs = {
+        "Polynomial order": str(model.order),
+        "Parameters": f"{count(model.n_params)} ({count(model.n_polynomial)} polynomial)",
+        "Chips": ", ".join(c.name or str(c.number) for c in model.chips),
+        "Frame of each exposure": model.frames,
+        "Time-dependent terms": ", ".join(f"{a}_{i}_{j}" for a, i, j in model.time.terms)
+        if model.time
+        else "none",
+        "Chi-square / degrees of freedom": f"{number(fit.chi2, 6)} / {count(fit.dof)} ="
+        f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",
+        "rms of u": with_mas(fit.rms_u, inputs.unit, mas),
+        "rms of v": with_mas(fit.rms_v, inputs.unit, mas),
+        "Stars used, left out": f"{count(np.sum(fit.used))}, {count(np.sum(~fit.used))}",
+        "Condition of the scaled normal matrix": number(fit.condition, 2),
+    }
+    scale = display_scale(inputs.unit, [fit.rms_u, fit.rms_v])
+    names = ("mean", "sigma", "min", "max", "median", "p01", "p99")
+    heads = ("Mean", "σ", "Min", "Max", "Median", "1 %", "99 %")
+    rows = []
+    for axis, values in zip("uv", fit.residual[fit.used].T, strict=True):
+        s = residual_statistics(values * scale.factor)
+        rows.append((axis, *(rounded(s[k], s["sigma"] / 10) for k in names)))
+    return (
+        listing("Linear fit", pairs),
+        TextTable(f"Residuals of the stars used [{scale.unit}]", ("Axis", *heads), tuple(rows)),
+    )
+
+
+def outlier_table(inputs: ReportInput) -> TextTable | None:
+    """The mixture's own parameters, and how many stars it flags."""
+    post = inputs.posterior
+    if post is None:
+        return None
+    words = {
+        "f": ("Fraction of false matches, f", ""),
+        "j": ("Jitter, j: error beyond the quoted one", inputs.unit),
+        "s_out": ("Scale of the false matches, s_out", inputs.unit),
+    }
+    rows = []
+    for key, (name, unit) in words.items():
+        if key not in post.hyper:
+            continue
+        draws = np.asarray(post.hyper[key], float)
+        scale = display_scale(unit, draws) if unit else Scale(1.0, "fraction")
+        v = draws * scale.factor
+        low, high = np.quantile(v, [0.025, 0.975])
+        sd = float(v.std())
+        cells = (rounded(v.mean(), sd), number(sd, 2), interval(low, high, sd))
+        rows.append((name, *(marked(inputs, c) for c in cells), scale.unit))
+    p = post.outlier_probability
+    flagged = marked(inputs, count(np.sum(p > 0.5)))
+    rows.append(("Stars flagged (probability above 0.5)", flagged, MISSING, MISSING, "stars"))
+    expected = marked(inputs, number(float(np.sum(p)), 4))
+    rows.append(("False matches expected (sum of the probabilities)", expected, "–", "–", "stars"))
+    mixture = post.mixture
+    note = f"Outlier component: {mixture.model}"
+    if mixture.match_radius is not None:
+        note += f", match radius {number(mixture.match_radius)} {inputs.unit}"
+    if mixture.jitter is not None:
+        note += f"; jitter fixed at {number(mixture.jitter)} {inputs.unit}"
+    a, b = mixture.fraction_prior
+    note += "." if mixture.model == "none" else f"; prior of f: Beta({a:g}, {b:g})."
+    return TextTable(
+        "Outlier mixture",
+        ("Quantity", "Mean", "sd", "95 % interval", "Unit"),
+        tuple(rows),
+        words=(0, 4),
+        note=note,
+    )

@@ -1,0 +1,60 @@
+"""Tables of what made the result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numerals import MISSING, count, number, percent
+from bayesdist.report.tables.text import TextTable, listing
+
+__all__ = ["config_table", "provenance_tables"]
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: MISSING}[value]
+    if isinstance(value, float | np.floating):
+        return f"{value:.6g}" if np.isfinite(value) else MISSING
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(v) for v in value) or MISSING
+    if isinstance(value, Mapping):
+        return ", ".join(f"{k} = {_plain(v)}" for k, v in value.items()) or MISSING
+    return str(value)
+
+
+def provenance_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
+    """What made the result: single values first, then one table for each group."""
+    single = {k: _plain(v) for k, v in inputs.provenance.items() if not isinstance(v, Mapping)}
+    if inputs.posterior is not None:
+        s = inputs.posterior.sampler
+        single["sampler"] = (
+            f"{s.method}; {s.ensembles} ensembles of {s.walkers} walkers, {count(s.steps)} steps,"
+            f" {count(s.passes)} passes over the data, acceptance {percent(s.acceptance, 2)},"
+            f" {number(s.wall_s)} s, seed {s.seed}"
+        )
+    named = {k[:1].upper() + k[1:]: v for k, v in single.items()}
+    out = [listing("Run", named)] if named else []
+    for key, value in inputs.provenance.items():
+        if isinstance(value, Mapping):
+            unit = " [s]" if key == "timings" else ""
+            out.append(
+                listing(f"{key.capitalize()}{unit}", {str(k): _plain(v) for k, v in value.items()})
+            )
+    return tuple(out)
+
+
+def config_table(inputs: ReportInput) -> TextTable | None:
+    """The resolved configuration, one key a row."""
+    pairs: dict[str, str] = {}
+    for section, value in inputs.config.items():
+        if isinstance(value, Mapping):
+            pairs.update({f"{section}.{key}": _plain(v) for key, v in value.items()})
+        elif isinstance(value, list | tuple):  # blocks: [[budget]], [[requirement]], [[chip]]
+            pairs.update({f"{section} {k}": _plain(v) for k, v in enumerate(value, start=1)})
+        else:
+            pairs[str(section)] = _plain(value)
+    return listing("Resolved configuration", pairs) if pairs else None

@@ -1,0 +1,232 @@
+"""Findings: what is wrong in real files, and what is made wrong here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from bayesdist.products import (
+    IdcTab,
+    SipHeader,
+    lint_idctab,
+    lint_sip,
+    read_idctab,
+    sip_from_solution,
+)
+from bayesdist.products.blocks import Block
+from bayesdist.products.cards import number_card
+
+from .support import F606W, some_solution
+
+# WSDC D-T033, Appendix B, band W1, as it came through text extraction: B_0_2 shows the value
+# of B_1_1.  Order of terms: 00, 10, 01, 20, 11, 02, 30, ...
+# fmt: off
+W1 = {
+    "a": (7.228039e-01, -7.790246e-04, -1.243220e-04, -1.629945e-06, 1.344445e-06, -7.793528e-06,
+          2.756392e-09, -1.186318e-10, 1.228555e-09, -2.928111e-10,
+          1.794526e-12, -4.586393e-13, 1.503974e-12, -5.895443e-13, -6.270019e-13),
+    "b": (-7.946909e-02, -2.481941e-04, 3.218232e-04, -6.590985e-08, -3.541684e-06, -3.541684e-06,
+          -6.360093e-11, -2.600160e-10, -4.987962e-10, -3.174803e-09,
+          8.797685e-13, 7.028808e-13, -2.594371e-13, 1.458031e-12, -8.545365e-13),
+    "ap": (-7.233219e-01, 7.777227e-04, 1.261763e-04, 1.636841e-06, -1.342059e-06, 7.795772e-06,
+           -2.759976e-09, 1.107923e-10, -1.159637e-09, 2.696271e-10,
+           -1.804259e-12, 4.712913e-13, -1.580363e-12, 6.084245e-13, 6.665114e-13),
+    "bp": (7.930997e-02, 2.484437e-04, -3.239962e-04, 6.524476e-08, 3.542573e-06, -1.163635e-06,
+           6.293886e-11, 2.734704e-10, 4.895069e-10, 3.198763e-09,
+           -8.708176e-13, -7.164364e-13, 2.664114e-13, -1.423222e-12, 8.509823e-13),
+}
+# fmt: on
+TERMS = tuple((n - j, j) for n in range(5) for j in range(n + 1))
+
+
+def w1(**changes) -> SipHeader:
+    terms = {name: dict(zip(TERMS, values, strict=True)) for name, values in W1.items()}
+    sip = SipHeader(
+        crpix=(508.5, 508.5),
+        crval=(0.0, 0.0),
+        cd=np.diag([-2.75, 2.75]) / 3600,
+        ctype=("RA---TAN-SIP", "DEC--TAN-SIP"),
+        order=(4, 4),
+        inverse_order=(4, 4),
+        dmax=(2.046, 1.066),
+        size=(1016, 1016),
+        **terms,
+    )
+    return replace(sip, **changes)
+
+
+def said(findings, level: str = "") -> str:
+    return "\n".join(str(f) for f in findings if f.level.startswith(level))
+
+
+# -- SIP -----------------------------------------------------------------------------------------
+
+
+def test_the_copied_coefficient_of_wise_w1_is_found_three_ways() -> None:
+    text = said(lint_sip(w1()))
+    assert "warning: B_1_1, B_0_2: the same value, 3.541684e-06" in text
+    assert "warning: B_DMAX: says 1.066 px" in text
+    assert "error: AP, BP: they miss the inverse" in text
+
+
+def test_the_right_coefficient_satisfies_all_three() -> None:
+    # the published inverse says what B_0_2 must be, but for terms of second order in the distortion
+    right = {**w1().b, (0, 2): -W1["bp"][5]}
+    findings = lint_sip(w1(b=right))
+    assert said(findings, "error") == ""
+    assert said(findings, "warning") == ""
+    assert "A_0_0, A_1_0, A_0_1, B_0_0, B_1_0, B_0_1: constant or linear terms" in said(findings)
+
+
+def good() -> SipHeader:
+    return sip_from_solution(some_solution(4, flip=True, angle=0.4, strength=0.5), scale_arcsec=0.1)
+
+
+def test_a_good_header_is_clean() -> None:
+    assert lint_sip(good()) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "message"),
+    [
+        (lambda s: {"order": (1, 4)}, "warning", "A_ORDER: is 1: astropy ignores"),
+        (lambda s: {"order": (10, 4)}, "error", "A_ORDER: is 10: the convention ends at 9"),
+        (lambda s: {"order": (3, 4)}, "warning", "A_4_0, A_3_1, A_2_2, A_1_3, A_0_4: above"),
+        (lambda s: {"a": {**s.a, (0, 0): 0.5}}, "note", "A_0_0: constant or linear terms (up to"),
+        (lambda s: {"dmax": (s.a_dmax + 0.1, s.b_dmax)}, "warning", "A_DMAX: says"),
+        (lambda s: {"dmax": (None, s.b_dmax)}, "note", "A_DMAX: is not stated"),
+        (lambda s: {"closure": s.closure / 2}, "error", "BDCLOS: states"),
+        (lambda s: {"inverse_order": None}, "note", "there is no inverse"),
+        (lambda s: {"ctype": ("RA---TAN", "DEC--TAN")}, "warning", "do not end in -SIP"),
+        (lambda s: {"cd": np.ones((2, 2))}, "error", "CD: the matrix is singular"),
+        (lambda s: {"cd": -s.cd[::-1]}, "note", "parity"),
+        (lambda s: {"size": None}, "note", "the image size is not known"),
+        (lambda s: {"b": {**s.b, (3, 1): s.a[2, 0]}}, "warning", "A_2_0, B_3_1: the same value"),
+        (lambda s: {"ap": {(j, i): c for (i, j), c in s.ap.items()},
+                    "bp": {(j, i): c for (i, j), c in s.bp.items()}}, "error", "index order"),
+    ],
+)  # fmt: skip
+def test_each_defect_of_a_header_is_found(change, level: str, message: str) -> None:
+    sip = good()
+    assert message in said(lint_sip(replace(sip, **change(sip))), level)
+
+
+def test_a_size_can_be_told() -> None:
+    sip = replace(good(), size=None)
+    assert lint_sip(sip, (1200, 900)) == ()
+    assert "A_DMAX: says" in said(lint_sip(sip, (600, 450)))
+
+
+# -- IDCTAB --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def real(data_dir) -> IdcTab:
+    """The rows of F606W of a real table."""
+    tab = read_idctab(data_dir / "hst_reference" / "0461802ej_idc.fits")
+    return keep(tab, [tab.row(1, F606W), tab.row(2, F606W)])
+
+
+def keep(tab: IdcTab, rows: list[int]) -> IdcTab:
+    block = tab.blocks[1]
+    width = block.header["NAXIS1"]
+    data = b"".join(block.data[k * width : (k + 1) * width] for k in rows)
+    cards = [
+        number_card("NAXIS2", len(rows)) if card.startswith("NAXIS2 ") else card
+        for card in block.cards
+    ]
+    return IdcTab((tab.blocks[0], Block(tuple(cards), data)), "real")
+
+
+def altered(tab: IdcTab, row: int, **values: float) -> IdcTab:
+    """The table with some numbers of one row replaced."""
+    block = tab.blocks[1]
+    data = fits.BinTableHDU.fromstring(block.to_bytes()).data.copy()
+    for name, value in values.items():
+        data[name][row] = value
+    data = data.view(np.ndarray).tobytes()
+    return IdcTab((tab.blocks[0], Block(block.cards, data), *tab.blocks[2:]), "altered")
+
+
+def with_keywords(tab: IdcTab, drop: tuple[str, ...] = (), add: tuple[str, ...] = ()) -> IdcTab:
+    block = tab.blocks[0]
+    cards = [c for c in block.cards if not c.startswith(drop)] if drop else list(block.cards)
+    return IdcTab((Block((*cards, *add), block.data), *tab.blocks[1:]), "altered")
+
+
+def test_a_delivered_table_is_clean(real: IdcTab) -> None:
+    assert lint_idctab(real) == ()
+
+
+def test_the_mirrored_polarizer_rows_of_the_delivered_table_are_found(data_dir) -> None:
+    """60 rows of chip 2 have CY10 < 0; its HISTORY says that polarizers are not calibrated."""
+    tab = read_idctab(data_dir / "hst_reference" / "0461802ej_idc.fits")
+    [finding] = lint_idctab(tab)
+    assert (finding.level, "parity" in finding.message) == ("warning", True)
+    assert finding.where.startswith("rows 278, 280, 282 and 57 more")
+    assert (tab.rows["CY10"] < 0).sum() == 60
+    assert all("POL" in f[0] for f, c in zip(tab.filters(), tab.rows["CY10"], strict=True) if c < 0)
+
+
+def test_the_old_table_would_drift_by_default(data_dir) -> None:
+    findings = lint_idctab(read_idctab(data_dir / "hst_reference" / "qbu1641sj_idc.fits"))
+    text = said(findings)
+    assert "TDD_CTB1: there are no time-dependent terms, so stwcs applies its own of 2004.5" in text
+    assert "single precision" in text
+    assert "the same chip and filters with other values" in text  # "probably includes duplicates"
+    assert said(findings, "error") == ""
+
+
+@pytest.mark.parametrize(
+    ("values", "level", "message"),
+    [
+        ({"SCALE": 0.0}, "error", "row 1, column SCALE: is zero"),
+        ({"SCALE": 1.0}, "warning", "does not fit the linear terms"),
+        ({"V3REF": 302.252}, "error", "row 1, column V3REF: is that of chip 2"),
+        ({"V3REF": 405.0}, "warning", "parity: chip 1 lies at higher V3"),
+        ({"CX11": 1.0}, "warning", "is exactly 1 and SCALE is not"),
+        ({"CX11": 0.002, "CX10": 0.049, "CY11": 0.048, "CY10": 0.002}, "warning", "index order"),
+        ({"CY10": -0.0486}, "warning", "parity: the linear part mirrors"),
+        ({"CX11": 0.0, "CX10": 0.0}, "error", "the linear part is singular"),
+        ({"CX31": 1.0e-12, "CY33": -1.0e-12}, "warning", "columns CX31, CY33: the same value"),
+        ({"XREF": 9000.0}, "warning", "row 1, column XREF: lies outside"),
+        ({"CX44": float("nan")}, "error", "row 1, column CX44: not a finite number"),
+    ],
+)
+def test_each_defect_of_a_row_is_found(real, values: dict, level: str, message: str) -> None:
+    assert real.rows["DETCHIP"][0] == 1
+    assert real.rows["V3REF"][1] == pytest.approx(302.252, abs=1e-3)
+    if values.get("V3REF") == 302.252:
+        values = {"V3REF": float(real.rows["V3REF"][1])}
+    assert message in said(lint_idctab(altered(real, 0, **values)), level)
+
+
+@pytest.mark.parametrize(
+    ("drop", "add", "level", "message"),
+    [
+        (("TDD",), (), "warning", "wrong by 30 to 50 mas in 2016"),
+        (("TDD_DATE",), (), "error", "TDD_DATE: is missing"),
+        (("TDD_CTB1",), (), "error", "stwcs looks for TDD_CTB1"),
+        (("TDD_CTB2",), (), "error", "TDD_CTB2: is missing"),
+        ((), (number_card("TDD_CTA1", 1e-5),), "warning", "TDD_CTA1: stwcs reads but never"),
+        (("DETECTOR",), (), "warning", "DETECTOR: is missing"),
+        (("PARITY",), (number_card("PARITY", 1),), "warning", "PARITY: is 1"),
+        (("PEDIGREE",), (), "note", "PEDIGREE: is missing"),
+        (("NORDER",), (number_card("NORDER", 4),), "note", "CX50 .. CY55: above NORDER 4"),
+    ],
+)
+def test_each_defect_of_the_keywords_is_found(real, drop, add, level: str, message: str) -> None:
+    assert message in said(lint_idctab(with_keywords(real, drop, add)), level)
+
+
+def test_stray_time_keywords_of_another_detector(real: IdcTab) -> None:
+    other = with_keywords(real, ("DETECTOR",), ("DETECTOR= 'HRC     '".ljust(80),))
+    assert "is not read by stwcs for ACS/HRC" in said(lint_idctab(other), "warning")
+
+
+def test_missing_rows(real: IdcTab) -> None:
+    assert "there is no chip 2" in said(lint_idctab(keep(real, [0])), "warning")
+    assert "repeats a row before it" in said(lint_idctab(keep(real, [0, 1, 1])), "note")

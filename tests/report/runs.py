@@ -1,0 +1,247 @@
+"""A WISE-like run whose fit and assessment are real and whose sampler is a Gaussian.
+
+Draws come from a normal distribution near the fit, so that a report takes a second to prepare and
+any state of convergence can be shown.
+
+Coefficients: band W2 of Appendix B of the WISE distortion report (u, v in pixels about the centre).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.assess import (
+    Requirement,
+    UserTerm,
+    area_map,
+    binned_residuals,
+    check_requirements,
+    distortion_vectors,
+    error_budget,
+    uncertainty_map,
+)
+from bayesdist.data.magnitude_errors import estimate
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer.labelled.convergence import Convergence, Limits
+from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.mixture import OutlierMixture
+from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.model import Chip, DistortionModel, TimeDependence
+from bayesdist.report import Check, Product, ReportInput
+
+SIZE = (1016.0, 1016.0)
+CENTRE = (508.5, 508.5)
+W2_A = {
+    (0, 0): 7.597772e-01, (0, 1): -1.192789e-04, (1, 0): 1 - 5.040463e-04, (0, 2): -8.064834e-06,
+    (0, 3): -4.935791e-10, (0, 4): -1.303108e-13, (1, 1): 1.082862e-06, (1, 2): 3.389170e-10,
+    (1, 3): -5.769507e-13, (2, 0): -1.349460e-06, (2, 1): -1.297961e-09, (2, 2): 2.075723e-12,
+    (3, 0): 2.959435e-09, (3, 1): -6.743610e-13, (4, 0): 1.787756e-12,
+}  # fmt: skip
+W2_B = {
+    (0, 0): -9.433609e-02, (0, 1): 1 + 5.505028e-04, (1, 0): -2.026974e-04, (0, 2): 1.091415e-06,
+    (0, 3): -3.840921e-09, (0, 4): -5.181754e-13, (1, 1): -3.953933e-06, (1, 2): -9.316313e-10,
+    (1, 3): 8.534495e-13, (2, 0): 8.038015e-08, (2, 1): 4.101600e-10, (2, 2): -5.705721e-13,
+    (3, 0): 1.067827e-10, (3, 1): 1.952342e-12, (4, 0): -1.788157e-13,
+}  # fmt: skip
+F, JITTER, S_OUT = 0.03, 0.02, 0.6
+
+
+def wise_model(unit: str = "pix", size=SIZE) -> DistortionModel:
+    centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
+    return DistortionModel(
+        order=4,
+        chips=(Chip(1, "W2", size, centre),),
+        unit=unit,
+        time=TimeDependence((("u", 1, 0),), (2010.0,)),
+        frames="shift",
+        exposures=tuple(f"frame{k}" for k in range(4)),
+    )
+
+
+def sigma_of(mag):
+    return 0.05 + 0.12 * 10 ** (0.4 * (mag - 15.0))
+
+
+def simulated(n: int = 6000, *, unit: str = "pix", size=SIZE, scale: float = 1.0, seed: int = 3):
+    """Stars of the W2 distortion with 3 % false matches; u, v are `scale` units to the pixel."""
+    rng = np.random.default_rng(seed)
+    model = wise_model(unit, size)
+    basis = model.basis(1)
+    truth = np.zeros(model.n_params)
+    truth[: model.n_polynomial] = np.concatenate(
+        [basis.from_monomials([c[t] for t in basis.terms]) for c in (W2_A, W2_B)]
+    )
+    x, y = (rng.uniform(0.5, s + 0.5, n) for s in size)
+    mag = 15.5 - rng.exponential(1.0, n)
+    sigma = sigma_of(mag)
+    exposure = rng.integers(0, 4, n)
+    epoch = 2010.0 + 0.1 * exposure
+    uv = model.predict(truth, x, y, exposure=exposure, epoch=epoch)
+    false = rng.random(n) < F
+    spread = np.where(false, S_OUT, np.hypot(sigma, JITTER))
+    uv = scale * (uv + rng.normal(size=(n, 2)) * spread[:, None])
+    return MatchTable(
+        x, y, uv[:, 0], uv[:, 1], sigma_u=scale * sigma, sigma_v=scale * sigma, unit=unit, mag=mag,
+        exposure=exposure, exposure_names=model.exposures, epoch=epoch,
+        sources=("wise-w2.ecsv",), n_rows=n + 23,
+        rejected={"quality flag": 20, "no magnitude": 3},
+    )  # fmt: skip
+
+
+def sampled(
+    fit: LinearFit,
+    table: MatchTable,
+    *,
+    converged: bool = True,
+    outliers: str = "gaussian",
+    scale=1.0,
+) -> Posterior:
+    rng = np.random.default_rng(8)
+    shape = (4, 3000)
+    root = np.linalg.cholesky(fit.cov)
+    mean = fit.mean + 0.3 * root @ rng.standard_normal(len(fit.mean))
+    theta = mean + 1.06 * rng.standard_normal((*shape, len(mean))) @ root.T
+    if not converged:
+        theta[0] += 1.3 * fit.sigma  # one ensemble sits elsewhere
+    hyper = {"j": np.abs(rng.normal(JITTER, 0.002, shape)) * scale}
+    if outliers != "none":
+        hyper["f"] = rng.beta(F * 6000, (1 - F) * 6000, shape)
+    if outliers == "gaussian":
+        hyper["s_out"] = rng.lognormal(np.log(S_OUT), 0.04, shape) * scale
+    r2 = (fit.residual**2).sum(axis=1)
+    s2, o2 = table.sigma_u**2 + (scale * JITTER) ** 2, (scale * S_OUT) ** 2
+    odds = F / (1 - F) * s2 / o2 * np.exp(np.minimum(0.5 * r2 * (1 / s2 - 1 / o2), 700.0))
+    sampled_as = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
+    n = len(mean) + len(hyper)
+    ess = rng.uniform(3200, 9000, n) if converged else rng.uniform(35, 300, n)
+    sd = np.concatenate([theta.std(axis=(0, 1)), [v.std() for v in hyper.values()]])
+    convergence = Convergence(
+        names=(*fit.model.names, *(sampled_as[k] for k in hyper)),
+        rhat=1 + rng.uniform(0, 0.004 if converged else 0.2, n),
+        ess_bulk=ess,
+        ess_tail=0.8 * ess,
+        mcse_mean=sd / np.sqrt(ess),
+        mcse_sd=sd / np.sqrt(2 * ess),
+        pareto_k=0.21 if converged else 0.83,
+        importance_efficiency=0.93 if converged else 0.04,
+        converged=converged,
+        reasons=() if converged else ("R-hat of u_3_1 is 1.19 and must be at most 1.01",),
+        limits=Limits(),
+    )
+    sampler = SamplerInfo("independence", 4, 2, 1600, 100, 12_800, 0.91, 21.4, 1)
+    radius = 3 * scale if outliers == "uniform" else None
+    mixture = OutlierMixture(outliers, match_radius=radius)
+    return Posterior(
+        model=fit.model,
+        mixture=mixture,
+        theta=theta,
+        hyper=hyper,
+        log_prob=np.zeros(shape),
+        outlier_probability=odds / (1 + odds),
+        convergence=convergence,
+        sampler=sampler,
+    )
+
+
+REQUIREMENTS = (
+    Requirement("field-wide", "p95", 0.1, "pix", 0.95),
+    Requirement("worst corner", "max", 0.02, "pix"),
+    Requirement("along scan", "u_rms", 0.0185, "pix"),
+)
+TERMS = (
+    UserTerm("reference catalogue", "systematic", 0.008, 0.007, "pix"),
+    UserTerm("centroid of a bright star", "random", 0.004, 0.004, "pix"),
+)
+
+
+def coefficient_table(fit: LinearFit, posterior: Posterior | None) -> Table:
+    t = Table()
+    p = fit.model.parameters
+    t["name"] = [q.name for q in p]
+    t["chip"], t["i"], t["j"] = ([getattr(q, k) for q in p] for k in ("chip", "i", "j"))
+    t["axis"] = [q.axis for q in p]
+    t["value"], t["sigma"] = fit.mean, fit.sigma
+    if posterior is not None:
+        sd = np.sqrt(np.diag(posterior.cov))
+        t["mean"], t["sd"] = posterior.mean, sd
+        for name, z in (("lo68", -1), ("hi68", 1), ("lo95", -1.96), ("hi95", 1.96)):
+            t[name] = posterior.mean + z * sd
+        t["rhat"] = posterior.convergence.rhat[: len(p)]
+        t["ess_bulk"] = posterior.convergence.ess_bulk[: len(p)]
+    t["unit"] = [q.unit for q in p]
+    return t
+
+
+@lru_cache
+def report_input(
+    *,
+    converged: bool = True,
+    sampler: bool = True,
+    outliers: str = "gaussian",
+    unit: str = "pix",
+    size: tuple[float, float] = SIZE,
+    scale: float = 1.0,
+) -> ReportInput:
+    """Everything of a run, as the report takes it."""
+    rng = np.random.default_rng(11)
+    table = simulated(unit=unit, size=size, scale=scale)
+    fit = fit_linear(table, wise_model(unit, size))
+    posterior = None
+    if sampler:
+        posterior = sampled(fit, table, converged=converged, outliers=outliers, scale=scale)
+    solution = posterior or fit
+    place = {"epoch": 2010.3}
+    return ReportInput(
+        name="wise-w2",
+        config={
+            "data": {"matches": "wise-w2.ecsv", "unit": unit, "sigma": "by_magnitude"},
+            "detector": {"name": "W2", "size": list(size), "scale_mas": 2757.0},
+            "model": {"order": 4, "frames": "shift"},
+            "fit": {"clip_chi2": 25.0, "clip_abs": 2.0},
+        },
+        matches=table,
+        fit=fit,
+        posterior=posterior,
+        formal_map=uncertainty_map(fit, **place),
+        posterior_map=None if posterior is None else uncertainty_map(posterior, **place),
+        displacement=distortion_vectors(solution, part="no_constant", **place),
+        non_linear=distortion_vectors(solution, part="non_linear", **place),
+        area=area_map(solution, **place),
+        binned=binned_residuals(
+            table.x,
+            table.y,
+            *fit.residual.T,
+            bins=(16, 16),
+            size=size,
+            weights=fit.used.astype(float),
+        ),
+        coefficients=coefficient_table(fit, posterior),
+        budget=error_budget(
+            solution, terms=TERMS, n_draws=500, rng=rng, pixel_scale=2757.0, **place
+        ),
+        margins=check_requirements(
+            solution, REQUIREMENTS, terms=TERMS, n_draws=500, rng=rng, pixel_scale=2757.0, **place
+        ),
+        products=(
+            Product(
+                "sip.hdr",
+                "SIP header, order 4, with inverse of order 5",
+                (
+                    Check("worst closure of the inverse [pix]", 3.1e-6, "at most 0.001", "pass"),
+                    Check("A_DMAX [pix]", 2.21),
+                ),
+            ),
+            Product("maps.fits", "uncertainty maps"),
+        ),
+        magnitude_errors=estimate(table.mag[fit.used], *fit.residual[fit.used].T),
+        provenance={
+            "command": "bayesdist run wise.toml -o run",
+            "seed": 1,
+            "versions": {"bayesdist": "0.1.0", "numpy": np.__version__},
+            "inputs": {"wise-w2.ecsv": "9f86d081884c7d659a2feaa0c55ad015" * 2},
+            "timings": {"fit": 0.4, "sample": 21.4, "assess": 3.2},
+        },
+    )

@@ -1,0 +1,282 @@
+"""Figures say what they show: labels with units, finite data, a key that is true to scale."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib import pyplot
+from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.quiver import Quiver
+
+from bayesdist.assess import VectorMap
+from bayesdist.errors import InputError
+from bayesdist.report import (
+    all_figures,
+    formal_uncertainty,
+    residual_histogram,
+    residuals_by_magnitude,
+    save_figures,
+    uncertainty_radius,
+    vector_flow,
+)
+from bayesdist.report.corners import correlated_parameters
+from bayesdist.report.residuals import MixtureCurve, posterior_residuals
+from bayesdist.report.style import nice_below
+from bayesdist.report.traces import slowest_parameters
+from bayesdist.report.vectors import square_cells
+
+from .runs import report_input
+
+WITHOUT_UNIT = {"stars per bin", "stars per hexagon"}  # counts
+CATEGORIES = {"budget_terms", "margins"}  # names, not numbers, along y
+
+RUNS = {
+    "square": {},
+    "wide in arcsec": {"size": (4096.0, 2048.0), "unit": "arcsec", "scale": 0.05},
+    "least squares": {"sampler": False},
+    "uniform": {"outliers": "uniform"},
+    "no outliers": {"outliers": "none"},
+}
+
+
+@pytest.fixture(scope="module", params=RUNS, ids=str)
+def every_figure(request):
+    return all_figures(report_input(**RUNS[request.param]))
+
+
+def test_every_axis_names_its_unit(every_figure):
+    for name, fig in every_figure.items():
+        for which in ("xlabel", "ylabel"):
+            labels = {getattr(ax, f"get_{which}")() for ax in fig.axes} - {""}
+            assert labels or (which == "ylabel" and name in CATEGORIES), f"{name} has no {which}"
+            for label in labels - WITHOUT_UNIT:
+                assert re.search(r"\[[^\]]+\]", label), f"{name}: no unit in {label!r}"
+
+
+def test_what_is_drawn_is_finite(every_figure):
+    for name, fig in every_figure.items():
+        for ax in fig.axes:
+            for line in ax.lines:
+                assert np.isfinite(line.get_xydata()).all(), name
+            for c in ax.collections:
+                if isinstance(c, Quiver):
+                    assert c.U.size == c.V.size == len(c.XY)
+                    assert np.isfinite([*c.U, *c.V]).all() and np.isfinite(c.XY).all(), name
+                elif isinstance(c, LineCollection):
+                    assert np.isfinite(c.get_segments()).all(), name
+                elif isinstance(c, QuadMesh):
+                    assert np.isfinite(c.get_array()).all(), name
+            assert np.isfinite([*ax.get_xlim(), *ax.get_ylim()]).all(), name
+
+
+def test_titles_and_keys_do_not_overlap(every_figure):
+    for name, fig in every_figure.items():
+        fig.canvas.draw()
+        renderer = fig.canvas.get_renderer()
+        for ax in fig.axes:
+            above = [t for t in (ax.title, ax._left_title, *ax.texts) if t.get_text()]
+            boxes = [
+                t.get_window_extent(renderer)
+                for t in above
+                if t.get_window_extent(renderer).y0 >= ax.bbox.y1
+            ]
+            for k, a in enumerate(boxes):
+                assert not any(a.overlaps(b) for b in boxes[k + 1 :]), name
+
+
+def test_the_words_of_the_legend_fit_into_the_figure(every_figure):
+    for name, fig in every_figure.items():
+        fig.canvas.draw()
+        for legend in fig.legends:
+            box = legend.get_window_extent()
+            assert box.x0 >= -1 and box.x1 <= fig.bbox.x1 + 1, name
+
+
+def _key(ax):
+    """What the key says, as (stated length, unit), and how long its arrow is on the paper."""
+    (words,) = [t.get_text() for t in ax.texts if "drawn" in t.get_text()]
+    number, unit = re.match(r"\s*([\d.]+)\s*(\S+),", words).groups()
+    (arrow,) = [t for t in ax.texts if getattr(t, "arrow_patch", None) is not None]
+    ends = arrow.xycoords.transform([arrow.xy, arrow.xyann])
+    return float(number), unit, float(np.hypot(*(ends[1] - ends[0]))), words
+
+
+def _drawn_lengths(quiver):
+    """Length on the paper of each arrow of a quiver, from the polygons that are painted."""
+    transform = quiver.get_transform()
+    origin = transform.transform([[0.0, 0.0]])[0]
+    out = []
+    for path in quiver.get_paths():
+        out.append(np.hypot(*(transform.transform(path.vertices) - origin).T).max())
+    return np.array(out)
+
+
+@pytest.mark.parametrize("unit, size", [("pix", (1016.0, 1016.0)), ("arcsec", (4096.0, 2048.0))])
+def test_key_has_the_length_that_arrows_of_that_value_are_drawn_with(unit, size):
+    run = report_input(size=size, unit=unit, scale=1.0 if unit == "pix" else 0.05)
+    figs = all_figures(run)
+    mas = {"mas": 1e-3, "arcsec": 1.0, "pix": 1.0}
+    for name in ("distortion", "distortion_non_linear", "residual_vectors"):
+        fig = figs[name]
+        fig.canvas.draw()
+        ax = fig.axes[0]
+        stated, key_unit, paper, _ = _key(ax)
+        for quiver in [c for c in ax.collections if isinstance(c, Quiver)]:
+            value = np.hypot(quiver.U, quiver.V)
+            long = value > 0.3 * value.max()  # the head of a short arrow is a dot of its own size
+            drawn = _drawn_lengths(quiver)[long]
+            expected = paper * value[long] / (stated * mas[key_unit])
+            np.testing.assert_allclose(drawn, expected, rtol=0.01)
+
+
+def test_key_of_the_crosses_is_to_their_scale(converged):
+    fig = formal_uncertainty(*converged.maps, magnification=2000.0)
+    fig.canvas.draw()
+    for ax, m in zip(fig.axes, converged.maps, strict=True):
+        stated, _, paper, words = _key(ax)
+        assert "×2\u202f000" in words
+        (lines,) = [c for c in ax.collections if isinstance(c, LineCollection)]
+        ends = np.array([ax.transData.transform(s) for s in lines.get_segments()])
+        drawn = np.hypot(*(ends[:, 1] - ends[:, 0]).T).max()
+        assert drawn == pytest.approx(paper * m.radius_max / stated, rel=1e-9)
+
+
+def test_crosses_reach_all_four_combinations_of_one_sigma(converged):
+    m = converged.formal_map
+    fig = formal_uncertainty(m, magnification=2000.0)
+    (lines,) = [c for c in fig.axes[0].collections if isinstance(c, LineCollection)]
+    steps = np.array([s[1] - s[0] for s in lines.get_segments()]) / 2000.0
+    rows, columns = square_cells(m.x, m.y)
+    su, sv = (s[rows, columns].ravel() for s in (m.sigma_u, m.sigma_v))
+    wanted = [(a * u, b * v) for a in (-1, 1) for b in (-1, 1) for u, v in zip(su, sv, strict=True)]
+    np.testing.assert_allclose(sorted(map(tuple, steps)), sorted(wanted), atol=1e-12)
+
+
+def test_the_largest_radius_is_printed(converged):
+    fig = formal_uncertainty(*converged.maps)
+    for ax, m in zip(fig.axes, converged.maps, strict=True):
+        printed = float(re.search(r"max radius ([\d.]+)", ax.get_title(loc="left")).group(1))
+        assert printed == pytest.approx(m.radius_max, rel=6e-3)
+        assert m.kind in ax.get_title(loc="left")
+
+
+def test_maps_of_one_figure_share_their_colours(converged):
+    fig = uncertainty_radius(*converged.maps)
+    limits = {
+        c.get_clim()
+        for ax in fig.axes[:2]
+        for c in ax.collections
+        if c.get_cmap().name == "cividis"
+    }
+    assert len(limits) == 1
+
+
+def test_detector_is_shown_x_right_y_up_with_square_pixels(figures):
+    for name in ("distortion", "formal_uncertainty", "uncertainty_radius", "pixel_area",
+                 "residual_vectors", "budget_dominating"):  # fmt: skip
+        ax = figures[name].axes[0]
+        assert ax.get_aspect() == 1.0, name
+        assert ax.get_xlim()[0] < ax.get_xlim()[1] and ax.get_ylim()[0] < ax.get_ylim()[1], name
+
+
+def test_vectors_of_a_rotated_frame_are_drawn_along_the_detector():
+    # u, v turned by 90 degrees and 0.1 units to the pixel: a shift of one pixel along x is (0, 0.1)
+    x = y = np.linspace(1.0, 100.0, 5)
+    turn = 0.1 * np.array([[0.0, -1.0], [1.0, 0.0]])
+    du, dv = np.zeros((5, 5)), np.full((5, 5), 0.1)
+    fig = vector_flow(VectorMap(x, y, du, dv, "arcsec", "no_constant", similarity=turn))
+    (quiver,) = [c for c in fig.axes[0].collections if isinstance(c, Quiver)]
+    np.testing.assert_allclose(quiver.U, 1.0)
+    np.testing.assert_allclose(quiver.V, 0.0, atol=1e-12)
+
+
+def test_a_map_without_variation_or_vectors_is_drawn(converged):
+    m = converged.formal_map
+    flat = replace(m, sigma_u=np.full_like(m.sigma_u, 0.01), sigma_v=np.full_like(m.sigma_v, 0.01))
+    uncertainty_radius(flat).canvas.draw()
+    v = converged.displacement
+    vector_flow(replace(v, du=0.0 * v.du, dv=0.0 * v.dv)).canvas.draw()
+
+
+def test_the_callers_matplotlib_is_left_alone(converged, tmp_path):
+    with matplotlib.rc_context({"font.size": 23.0, "axes.linewidth": 3.0}):
+        before = dict(matplotlib.rcParams)
+        save_figures(all_figures(converged), tmp_path)
+        assert dict(matplotlib.rcParams) == before
+    assert pyplot.get_fignums() == []
+
+
+def test_a_million_stars_are_drawn_as_counts():
+    rng = np.random.default_rng(1)
+    n = 1_000_000
+    sigma = rng.uniform(0.01, 0.1, n)
+    residual = rng.normal(size=(n, 2)) * sigma[:, None]
+    curve = MixtureCurve(sigma)
+    for fig in (
+        residual_histogram(residual, (curve, curve), unit="pix"),
+        residuals_by_magnitude(rng.uniform(10, 20, n), residual, unit="pix"),
+    ):
+        for ax in fig.axes:
+            sizes = [len(line.get_xydata()) for line in ax.lines]
+            sizes += [len(c.get_offsets()) for c in ax.collections]
+            assert max(sizes, default=0) < 10_000
+
+
+def test_every_star_of_a_histogram_is_counted(converged):
+    fig = all_figures(converged)["residual_histogram"]
+    bars = fig.axes[2].patches[0]  # all stars of u
+    assert bars.get_data().values.sum() == len(converged.matches)
+
+
+def test_residuals_at_the_fit_are_the_fits_own(converged):
+    residual = posterior_residuals(converged.matches, converged.fit)
+    np.testing.assert_allclose(residual, converged.fit.residual, atol=1e-9)
+
+
+def test_the_most_correlated_pair_is_chosen_for_the_corner_plot(converged):
+    post = converged.posterior
+    a, b = post.model.names.index("u_2_0"), post.model.names.index("v_1_3")
+    theta = post.theta.copy()
+    theta[..., b] = theta[..., a] * 3.0 + 1e-9 * theta[..., b]
+    assert correlated_parameters(replace(post, theta=theta), n=2) == ("u_2_0", "v_1_3")
+
+
+def test_traces_show_the_parameters_with_fewest_effective_draws(converged):
+    post = converged.posterior
+    ess = np.array([*post.convergence.ess_bulk])
+    ess[post.model.names.index("v_0_3")] = 1.0
+    changed = replace(post, convergence=replace(post.convergence, ess_bulk=ess))
+    assert slowest_parameters(changed)[0] == "v_0_3"
+
+
+def test_formal_ellipse_holds_what_one_sigma_holds_in_two_dimensions(converged, figures):
+    fig = figures["coefficients_corner"]
+    panels = np.array(fig.axes).reshape(5, 5)
+    names = correlated_parameters(converged.posterior)
+    index = [converged.fit.model.names.index(n) for n in names]
+    draws = converged.fit.draws(40_000, np.random.default_rng(2)) - converged.fit.mean
+    ellipse = min(panels[3, 1].lines, key=lambda line: np.ptp(line.get_xdata()))
+    from matplotlib.path import Path
+
+    inside = Path(ellipse.get_xydata()).contains_points(draws[:, [index[1], index[3]]])
+    share = 1 - np.exp(-0.5)
+    assert inside.mean() == pytest.approx(
+        share, abs=4 * np.sqrt(share * (1 - share) / 40_000) + 2e-3
+    )
+
+
+@pytest.mark.parametrize("value, expected", [(1.0, 1.0), (0.0499, 0.02), (5.0, 5.0), (999.0, 500.0),
+                                             (2e-7, 2e-7), (0.0, 1.0), (np.inf, 1.0)])  # fmt: skip
+def test_round_numbers_below(value, expected):
+    assert nice_below(value) == expected
+
+
+def test_a_folder_that_cannot_be_made_is_named(figures, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    with pytest.raises(InputError, match="file"):
+        save_figures(figures, blocked / "figures")

@@ -1,0 +1,251 @@
+"""The page: well formed, complete in itself, honest about what is not converged."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from lxml import html as lxml_html
+
+from bayesdist.errors import InputError
+from bayesdist.report import Check, Product, write_report
+from bayesdist.report.captions import SECTIONS
+from bayesdist.report.html import render_report
+from bayesdist.report.status import status_checks, verdict
+from bayesdist.report.tables import coefficient_tables
+
+from .runs import coefficient_table, report_input
+
+VOID = {"meta", "img", "br", "hr", "input", "link"}
+
+
+class Strict(HTMLParser):
+    """Fails where an element is not closed by its own end tag."""
+
+    def __init__(self):
+        super().__init__(convert_charrefs=True)
+        self.open, self.links, self.tags = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self.links += [v for k, v in attrs if k in ("src", "href", "action", "srcset")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
+        self.open.pop()
+
+
+def parsed(page: str) -> Strict:
+    parser = Strict()
+    parser.feed(page)
+    parser.close()
+    assert not parser.open
+    return parser
+
+
+def words(page: str) -> str:
+    """What a reader sees, without the pictures and the style sheet."""
+    tree = lxml_html.fromstring(page)
+    for style in tree.xpath("//style"):
+        style.getparent().remove(style)
+    return tree.text_content()
+
+
+def test_page_is_well_formed(page, bad_page):
+    for one in (page, bad_page):
+        assert one.lstrip().startswith("<!DOCTYPE html>")
+        parsed(one)
+
+
+def test_page_needs_nothing_else(page):
+    parser = parsed(page)
+    assert all(link.startswith(("data:image/png;base64,", "#")) for link in parser.links)
+    assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in parser.tags}
+    style = re.search(r"<style>(.*?)</style>", page, re.DOTALL).group(1)
+    assert "url(" not in style and "@import" not in style
+    assert "http" not in re.sub(r"base64,[^\"]+", "", page)
+
+
+def test_links_lead_to_sections_in_the_order_of_the_report(page):
+    tree = lxml_html.fromstring(page)
+    sections = tree.xpath("//section/@id")
+    assert sections == ["status", "data", "fit", "outliers", "coefficients", "maps", "budget",
+                        "margins", "products", "provenance"]  # fmt: skip
+    assert [h[1:] for h in tree.xpath("//nav//a/@href")] == sections[1:]
+
+
+def test_pictures_are_whole_and_described(page, figures):
+    images = lxml_html.fromstring(page).xpath("//figure/img")
+    assert len(images) == len(figures) == sum(map(len, SECTIONS.values()))
+    for image in images:
+        png = base64.b64decode(image.get("src").split(",", 1)[1], validate=True)
+        assert png.startswith(b"\x89PNG") and png.endswith(b"IEND\xaeB`\x82")
+        assert len(image.get("alt")) > 20
+        caption = image.getparent().xpath("figcaption")[0].text_content()
+        assert caption.strip().endswith(".") and len(caption) > 60
+
+
+def test_no_nan_is_ever_printed(converged, figures):
+    fit, c = converged.fit, converged.posterior.convergence
+    table = coefficient_table(fit, converged.posterior)
+    table["sd"][3] = table["rhat"][4] = np.nan
+    holes = replace(
+        converged,
+        coefficients=table,
+        fit=replace(fit, dof=0, condition=np.nan),
+        posterior=replace(
+            converged.posterior,
+            convergence=replace(
+                c, pareto_k=-np.inf, importance_efficiency=np.nan, mcse_mean=c.mcse_mean * np.nan
+            ),
+        ),
+        provenance={"timings": {"fit": float("nan")}, "seed": None, "note": np.float64("nan")},
+        products=(Product("a.fits", "a", (Check("closure", float("nan"), "at most 1", "warn"),)),),
+    )
+    assert not re.search(r"\b(nan|None|inf)\b", words(render_report(holes, figures)), re.IGNORECASE)
+
+
+def test_a_page_of_a_good_run_says_nothing_of_provisional(page):
+    text = words(page).lower()
+    assert "not converged" not in text and "provisional" not in text and "†" not in text
+
+
+def test_non_convergence_is_loud_and_everywhere(bad_page, not_converged):
+    tree = lxml_html.fromstring(bad_page)
+    (banner,) = tree.xpath("//*[@role='alert']")
+    assert "NOT CONVERGED" in banner.text_content()
+    # before anything else that the page says of the run
+    assert bad_page.index('role="alert"') < bad_page.index('class="verdict')
+    assert not_converged.posterior.convergence.reasons[0] in words(bad_page)
+    for heading in tree.xpath("//h2 | //figcaption | //table[not(@class='listing')]/caption"):
+        assert "PROVISIONAL" in heading.text_content()
+
+
+def test_numbers_that_rest_on_the_draws_carry_a_dagger(bad_page):
+    tree = lxml_html.fromstring(bad_page)
+    for section in ("outliers", "budget", "margins", "coefficients"):
+        for table in tree.xpath(f"//section[@id='{section}']//table"):
+            heads = [h.text_content().strip() for h in table.xpath(".//thead//th")]
+            drawn = {"Mean", "sd", "95 % interval", "Posterior mean", "Value", "Margin", "P(met)",
+                     "u", "v", "Radial", "68 %", "95 %"}  # fmt: skip
+            columns = [k for k, h in enumerate(heads) if h in drawn]
+            assert columns, heads
+            for row in table.xpath("./tbody/tr"):
+                cells = [c.text_content().strip() for c in row.xpath("./th | ./td")]
+                assert all(cells[k] == "–" or cells[k].endswith("†") for k in columns), cells
+
+
+def test_status_has_each_criterion_with_number_limit_and_outcome(page, converged):
+    tree = lxml_html.fromstring(page)
+    rows = [
+        [c.text_content().strip() for c in r.xpath("./th | ./td")]
+        for r in tree.xpath("//section[@id='status']//tbody/tr[not(@class)]")
+    ]
+    assert all(len(r) == 4 and all(r) for r in rows)
+    assert {r[3].split()[1] for r in rows} <= {"pass", "warn", "FAIL"}
+    found = {r[0]: r for r in rows}
+    rhat = next(r for name, r in found.items() if "R-hat" in name)
+    assert float(rhat[1]) == pytest.approx(converged.posterior.convergence.rhat_max, abs=1e-4)
+    for margin in converged.margins:
+        row = next(r for name, r in found.items() if name.startswith(margin.requirement.name))
+        assert row[3].endswith(
+            {"met": "pass", "missed": "FAIL", "undecided": "warn"}[margin.verdict]
+        )
+
+
+def _only(run, *verdicts):
+    return replace(run, margins=tuple(m for m in run.margins if m.verdict in verdicts))
+
+
+def test_verdict_in_words(converged, not_converged):
+    assert {m.verdict for m in converged.margins} == {"met", "missed", "undecided"}
+    assert verdict(_only(converged, "met")).level == "pass"
+    assert verdict(_only(converged, "met", "undecided")).level == "warn"
+    assert verdict(_only(converged, "met", "undecided", "missed")).level == "fail"
+    assert verdict(_only(converged)).level == "pass"
+    assert "No requirement" in " ".join(verdict(_only(converged)).sentences)
+    assert verdict(_only(not_converged)).level == "fail"
+    assert verdict(_only(report_input(sampler=False))).level == "warn"
+    broken = Product("x.fits", "x", (Check("closure [pix]", 1.0, "at most 0.001", "fail"),))
+    assert verdict(replace(_only(converged), products=(broken,))).level == "fail"
+
+
+def test_one_limit_missed_is_one_failure(converged):
+    c = converged.posterior.convergence
+    rhat = c.rhat.copy()
+    rhat[5] = 1.02
+    worse = replace(c, rhat=rhat, converged=False, reasons=("R-hat of u_0_2 is 1.02",))
+    run = replace(converged, posterior=replace(converged.posterior, convergence=worse))
+    failed = [check.name for check in status_checks(run)["Sampling"] if check.level == "fail"]
+    assert len(failed) == 2 and "Converged" in failed  # the criterion itself, and the sum of them
+
+
+def test_names_cannot_break_the_page(converged, figures):
+    evil = "<script>alert('x')</script> & \"quotes\""
+    run = replace(
+        converged,
+        name=evil,
+        config={"data": {"matches": evil}},
+        matches=replace(
+            converged.matches,
+            sources=(evil,),
+            exposure_names=("<b>", "&amp;", "frame2", "frame3"),
+            rejected={"<i>reason": 3},
+        ),
+        fit=converged.fit,
+        posterior=None,
+        posterior_map=None,
+        provenance={"command": evil, "inputs": {evil: "0"}},
+        products=(Product(evil, evil, (Check(evil, evil, evil),)),),
+    )
+    out = render_report(run, {})
+    assert "<script" not in out and "<b>\n" not in out
+    parsed(out)
+    tree = lxml_html.fromstring(out)
+    assert tree.xpath("//h1")[0].text_content() == evil
+    assert "&amp;" in [t.text_content() for t in tree.xpath("//section[@id='data']//tbody//th")]
+
+
+def test_least_squares_alone_makes_a_page():
+    run = report_input(sampler=False)
+    text = words(render_report(run, {}))
+    assert "Least squares only" in text
+    assert "NOT CONVERGED" not in text
+    assert not re.search(r"\b(nan|None)\b", text)
+
+
+def test_legendre_and_monomial_tables_hold_the_same_polynomial(converged):
+    """The two printed forms, read back, put a star at the same place."""
+    legendre, _, monomial = coefficient_tables(converged)
+    basis = converged.fit.model.basis(1)
+    x, y = np.array([200.0, 700.0]), np.array([300.0, 150.0])
+    powers = np.stack([(x - 508.5) ** i * (y - 508.5) ** j for i, j in basis.terms], axis=-1)
+
+    def value(text):
+        plain = text.translate(str.maketrans("−⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "--0123456789")).replace("\u202f", "")
+        return float(plain.replace("×10", "e"))
+
+    for axis in "uv":
+        a = [value(r[1]) for r in legendre.rows if r[0].startswith(f"{axis}_")]
+        b = [value(r[3]) for r in monomial.rows if r[0] == axis]
+        # 15 terms, each rounded to 5 % of a formal error of some 0.005 pixel
+        np.testing.assert_allclose(basis.evaluate(x, y) @ a, powers @ b, atol=0.005)
+
+
+def test_the_file_appears_whole_or_not_at_all(converged, figures, tmp_path):
+    path = tmp_path / "report.html"
+    write_report(path, converged, {"margins": figures["margins"]})
+    first = path.read_text(encoding="utf-8")
+    assert first.rstrip().endswith("</html>")
+    with pytest.raises(InputError, match="no place"):
+        write_report(path, converged, {"unknown": figures["margins"]})
+    assert path.read_text(encoding="utf-8") == first
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    with pytest.raises(InputError, match="missing"):
+        write_report(tmp_path / "missing" / "report.html", converged, {})
