@@ -1,0 +1,82 @@
+"""Correspondences of astrometry.net (`corr.fits`): detections beside index stars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.data.columns import matches_from_table
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.values import SourceColumn
+
+__all__ = ["COLUMNS", "is_astrometrynet", "matches_from_corr"]
+
+# the other quantities are left out: 'mag' there is one of the index, if it is there at all
+COLUMNS = {
+    "x": "field_x",
+    "y": "field_y",
+    "ra": "index_ra",
+    "dec": "index_dec",
+    "sigma_u": "",
+    "sigma_v": "",
+    "epoch": "",
+    "exposure": "",
+    "chip": "",
+    "filter": "",
+    "mag": "",
+}
+
+
+def is_astrometrynet(names: Iterable[str]) -> bool:
+    """Whether a table with these columns is a `corr.fits`."""
+    return {"field_x", "field_y", "index_ra", "index_dec"} <= set(names)
+
+
+def matches_from_corr(
+    table: Table,
+    *,
+    source: str = "corr.fits",
+    tangent_point: tuple[float, float] | None = None,
+    exposure_name: str | None = None,
+) -> MatchTable:
+    """MatchTable from the columns of a `corr.fits`.
+
+    field_x and field_y are FITS 1-based pixels; index_ra and index_dec come to the tangent plane in
+    seconds of arc.  Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive.
+    There are no errors.
+
+    Parameters
+    ----------
+    table : astropy Table
+    source : str, optional
+        File, for errors.
+    tangent_point : tuple of float, optional
+        RA and Dec in degrees; by default the mean direction of the stars.
+    exposure_name : str, optional
+
+    Returns
+    -------
+    MatchTable
+
+    Raises
+    ------
+    InputError
+        For missing columns or values.
+    """
+    columns = dict(COLUMNS)
+    if "FLUX" in table.colnames and len(table):
+        flux = SourceColumn(table["FLUX"], source, "FLUX").numbers()
+        if (flux > 0).all():
+            table = table.copy(copy_data=False)
+            table["instrumental_mag"] = -2.5 * np.log10(flux)
+            columns["mag"] = "instrumental_mag"
+    return matches_from_table(
+        table,
+        columns,
+        source=source,
+        read_sigma=False,
+        tangent_point=tangent_point,
+        exposure_name=exposure_name,
+    )

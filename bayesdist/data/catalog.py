@@ -1,0 +1,320 @@
+"""Reference positions with errors, proper motions and an epoch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from bayesdist.data.columns import position_unit
+from bayesdist.data.naming import find_columns
+from bayesdist.data.tables import read_table
+from bayesdist.data.tangent import mean_direction, tangent_jacobian, tangent_plane
+from bayesdist.data.units import check_unit, conversion
+from bayesdist.data.values import SourceColumn
+from bayesdist.errors import InputError
+
+__all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]
+
+Float = NDArray[np.float64]
+
+_PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceCatalog:
+    """Reference stars, arrays of length N.
+
+    Parameters
+    ----------
+    u, v : ndarray
+        Positions at `epoch`, in `unit`.
+    sigma_u, sigma_v : ndarray, optional
+        Their standard errors; 0 or more.
+    mag : ndarray, optional
+    pm_u, pm_v : ndarray, optional
+        Proper motions in `unit` per year.
+    sigma_pm_u, sigma_pm_v : ndarray, optional
+        Their standard errors; 0 or more.
+    epoch : float or ndarray, optional
+        Decimal year of the positions, one for all or one for each star.
+    unit : str
+        'pix', 'arcsec', 'mas' or 'deg'.
+    tangent_point : tuple of float, optional
+        RA and Dec in degrees of the plane that u, v lie on.
+    source : str
+        File.
+
+    Raises
+    ------
+    InputError
+        For no stars, unequal lengths, values that are not finite, negative errors, or half a pair.
+    """
+
+    u: Float
+    v: Float
+    sigma_u: Float | None = None
+    sigma_v: Float | None = None
+    mag: Float | None = None
+    pm_u: Float | None = None
+    pm_v: Float | None = None
+    sigma_pm_u: Float | None = None
+    sigma_pm_v: Float | None = None
+    epoch: float | Float | None = None
+    unit: str = "pix"
+    tangent_point: tuple[float, float] | None = None
+    source: str = "catalogue"
+
+    def __post_init__(self) -> None:
+        check_unit(self.unit, where=self.source)
+        n = np.size(self.u)
+        if n == 0:
+            raise InputError("holds no stars", where=self.source, do="give a catalogue with stars")
+        for pair in _PAIRS:
+            if (getattr(self, pair[0]) is None) != (getattr(self, pair[1]) is None):
+                raise InputError(
+                    f"has only one of {pair[0]!r} and {pair[1]!r}",
+                    where=self.source,
+                    do="give both or neither",
+                )
+        names = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair))
+        for name in names:
+            if getattr(self, name) is None:
+                continue
+            values = np.ascontiguousarray(getattr(self, name), np.float64)
+            object.__setattr__(self, name, values)
+            if values.shape != (n,):
+                raise InputError(
+                    f"column {name!r} has shape {values.shape}, but 'u' has {n} rows",
+                    where=self.source,
+                    do="give columns of one length",
+                )
+            good = np.isfinite(values) & ((values >= 0) | (not name.startswith("sigma")))
+            if not good.all():
+                bad = int(np.argmin(good))
+                must = "finite and not negative" if name.startswith("sigma") else "finite"
+                raise InputError(
+                    f"value is {values[bad]:g}, and must be {must}",
+                    where=f"{self.source}, row {bad + 1}, column {name!r}",
+                    do="correct the row or drop it",
+                )
+        if self.epoch is not None and np.ndim(self.epoch):
+            object.__setattr__(self, "epoch", np.ascontiguousarray(self.epoch, np.float64))
+        if self.epoch is not None and not (
+            np.shape(self.epoch) in ((), (n,)) and np.all(np.isfinite(self.epoch))
+        ):
+            raise InputError(
+                "epoch is neither one finite year nor one for each star",
+                where=self.source,
+                do="give decimal years",
+            )
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def select(self, which: NDArray[Any]) -> ReferenceCatalog:
+        """Some of the stars, by mask or indices."""
+        arrays = {
+            name: getattr(self, name)[which]
+            for name in ("u", "v", "mag", *(name for pair in _PAIRS for name in pair))
+            if getattr(self, name) is not None
+        }
+        if isinstance(self.epoch, np.ndarray):
+            arrays["epoch"] = self.epoch[which]
+        return replace(self, **arrays)
+
+    def at(self, epoch: float) -> ReferenceCatalog:
+        """The catalogue as it is at another epoch.
+
+            u(t) = u + pm (t - t0),   sigma(t)^2 = sigma^2 + sigma_pm^2 (t - t0)^2
+
+        Errors of positions and proper motions count as uncorrelated, which holds at the mean epoch
+        of the catalogue's observations.  Without proper motions the stars stand still; without
+        errors of them, or of positions, the errors stay as they are.
+
+        Parameters
+        ----------
+        epoch : float
+            Decimal years.
+
+        Returns
+        -------
+        ReferenceCatalog
+
+        Raises
+        ------
+        InputError
+            When there are proper motions but no epoch to count from.
+        """
+        if self.pm_u is None or self.pm_v is None:
+            return replace(self, epoch=float(epoch))
+        if self.epoch is None:
+            raise InputError(
+                "has proper motions but no epoch", where=self.source, do="give the epoch"
+            )
+        dt = float(epoch) - np.asarray(self.epoch, float)
+        sigma_u, sigma_v = self.sigma_u, self.sigma_v
+        if sigma_u is not None and self.sigma_pm_u is not None:
+            sigma_u = np.hypot(sigma_u, self.sigma_pm_u * dt)
+        if sigma_v is not None and self.sigma_pm_v is not None:
+            sigma_v = np.hypot(sigma_v, self.sigma_pm_v * dt)
+        return replace(
+            self,
+            u=self.u + self.pm_u * dt,
+            v=self.v + self.pm_v * dt,
+            sigma_u=sigma_u,
+            sigma_v=sigma_v,
+            epoch=float(epoch),
+        )
+
+
+_ALIASES: dict[str, tuple[str, ...]] = {
+    "u": ("u", "x0", "xi"),
+    "v": ("v", "y0", "eta"),
+    "ra": ("ra",),
+    "dec": ("dec",),
+    "sigma_u": ("sigma_u", "su", "u_error", "x0e", "ra_error"),
+    "sigma_v": ("sigma_v", "sv", "v_error", "y0e", "dec_error"),
+    "pm_u": ("pm_u", "vx", "pmra"),
+    "pm_v": ("pm_v", "vy", "pmdec"),
+    "sigma_pm_u": ("sigma_pm_u", "vxe", "pmra_error"),
+    "sigma_pm_v": ("sigma_pm_v", "vye", "pmdec_error"),
+    "epoch": ("epoch", "t0", "ref_epoch"),
+    "mag": ("mag", "magnitude", "phot_g_mean_mag", "g", "m"),
+}
+
+
+def read_catalog(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    *,
+    unit: str | None = None,
+    epoch: float | None = None,
+    tangent_point: tuple[float, float] | None = None,
+) -> ReferenceCatalog:
+    """Read a reference catalogue from a table file.
+
+    Parameters
+    ----------
+    path : path-like
+        .ecsv, .csv, .fits or .parquet.
+    columns, unit, epoch, tangent_point
+        As `catalog_from_table`.
+
+    Returns
+    -------
+    ReferenceCatalog
+
+    Raises
+    ------
+    InputError
+        As `catalog_from_table`, and for files that cannot be read.
+    """
+    path = Path(path)
+    return catalog_from_table(
+        read_table(path),
+        columns,
+        source=str(path),
+        unit=unit,
+        epoch=epoch,
+        tangent_point=tangent_point,
+    )
+
+
+def catalog_from_table(
+    table: Table,
+    columns: Mapping[str, str] | None = None,
+    *,
+    source: str = "catalogue",
+    unit: str | None = None,
+    epoch: float | None = None,
+    tangent_point: tuple[float, float] | None = None,
+) -> ReferenceCatalog:
+    """Reference catalogue from a table's columns.
+
+    Parameters
+    ----------
+    table : astropy Table
+    columns : mapping of str to str, optional
+        Column of each quantity: u v ra dec sigma_u sigma_v pm_u pm_v sigma_pm_u sigma_pm_v epoch
+        mag. With ra and dec, positions are projected to the tangent plane in arcsec; pm_u is then
+        the motion to the east with its factor cos(dec), and all errors and motions turn with the
+        plane.
+    source : str, optional
+        File, for errors.
+    unit : str, optional
+        Unit of u and v where the table does not say.  Errors and motions without a unit are in that
+        of u and v, per year; beside ra and dec they must have one.
+    epoch : float, optional
+        Decimal year, where the table has no such column.
+    tangent_point : tuple of float, optional
+        RA and Dec in degrees; by default the mean direction of the stars.
+
+    Returns
+    -------
+    ReferenceCatalog
+
+    Raises
+    ------
+    InputError
+        For missing columns, values that are missing or no numbers, and units missing or
+        contradictory.
+    """
+    found = find_columns(table.colnames, columns, _ALIASES, source=source)
+    on_sky = {"ra", "dec"} <= set(found) and not {"u", "v"} <= set(found)
+    first, second = ("ra", "dec") if on_sky else ("u", "v")
+    if first not in found or second not in found:
+        raise InputError(
+            f"no columns for u, v or ra, dec among {', '.join(table.colnames) or 'none'}",
+            where=source,
+            do="name them in the option 'columns'",
+        )
+
+    def column(key: str) -> SourceColumn:
+        return SourceColumn(table[found[key]], source, found[key])
+
+    base = "deg" if on_sky else position_unit((column("u"), column("v")), unit)
+
+    def values(key: str, per_year: str = "") -> Float:
+        own, where = column(key).unit, column(key).where
+        if own is None and on_sky and key not in ("ra", "dec"):
+            # catalogues write degrees for positions and mas for the rest: no guess is safe
+            raise InputError("has no unit", where=where, do="write mas or mas / yr into the file")
+        factor = 1.0 if own is None else conversion(own, base + per_year, where=where)
+        return column(key).numbers() * factor
+
+    out: dict[str, Any] = {"u": values(first), "v": values(second)}
+    for pair in _PAIRS:
+        if pair[0] in found and pair[1] in found:
+            out |= {key: values(key, " / yr" if "pm" in key else "") for key in pair}
+    if "mag" in found:
+        out["mag"] = column("mag").numbers()
+    out["epoch"] = column("epoch").years() if "epoch" in found else epoch
+    if on_sky:
+        out |= _on_plane(out, tangent_point, source)
+        base = "arcsec"
+    return ReferenceCatalog(**out, unit=base, source=source)
+
+
+def _on_plane(
+    sky: Mapping[str, Any], point: tuple[float, float] | None, source: str
+) -> dict[str, Any]:
+    """Positions, motions and errors on the sky in degrees, brought to the plane in arcsec."""
+    ra, dec = sky["u"], sky["v"]
+    point = mean_direction(ra, dec) if point is None else point
+    u, v = tangent_plane(ra, dec, point, where=source)
+    J = 3600.0 * tangent_jacobian(ra, dec, point, where=source)
+    out: dict[str, Any] = {"u": u, "v": v, "tangent_point": (float(point[0]), float(point[1]))}
+    if "pm_u" in sky:
+        pm = np.stack([sky["pm_u"], sky["pm_v"]], axis=-1)
+        out["pm_u"], out["pm_v"] = np.einsum("nij,nj->in", J, pm)
+    for pair in (("sigma_u", "sigma_v"), ("sigma_pm_u", "sigma_pm_v")):
+        if pair[0] in sky:
+            variance = np.stack([sky[key] for key in pair], axis=-1) ** 2
+            out[pair[0]], out[pair[1]] = np.sqrt(np.einsum("nij,nj->in", J**2, variance))
+    return out

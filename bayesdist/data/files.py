@@ -1,0 +1,91 @@
+"""Files that appear whole or not at all, and their fingerprints."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bayesdist.errors import InputError
+
+__all__ = ["atomic_path", "sha256_of"]
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Path of a temporary file that takes the place of `path` when the block succeeds.
+
+    The temporary file lies in the same folder and its name ends like that of `path`, so that
+    writers which go by the extension do the same.  When the block raises, it is removed and
+    whatever stood at `path` before is left as it was.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write.
+
+    Yields
+    ------
+    pathlib.Path
+        Where to write; no file is there yet.
+
+    Raises
+    ------
+    InputError
+        When the system refuses to write, naming the path and the reason (full disk, no permission).
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{secrets.token_hex(4)}.{target.name}")
+    try:
+        yield temporary
+        with temporary.open("rb+") as written:
+            os.fsync(written.fileno())  # a rename may reach the disk before the content does
+        os.replace(temporary, target)
+    except OSError as error:
+        if not _concerns(error, temporary, target):
+            raise
+        raise InputError(
+            f"cannot be written ({error.strerror or error})",
+            where=str(target),
+            do="make room, or choose a folder that exists and that you may write to",
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _concerns(error: OSError, temporary: Path, target: Path) -> bool:
+    """Whether an error is about the file being written, not about another that the block uses."""
+    if error.filename is None:  # a full disk carries no name
+        return True
+    return Path(os.fsdecode(error.filename)) in (temporary, target, target.parent)
+
+
+def sha256_of(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file's content.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    """
+    try:
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror or error})",
+            where=str(path),
+            do="check the path and its permissions",
+        ) from error

@@ -1,0 +1,97 @@
+"""Linear maps between two lists of positions, iterated with the pairs that they bring together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+__all__ = ["LEAST", "SAMPLE", "LinearMap", "iterated_map"]
+
+Float = NDArray[np.float64]
+
+SAMPLE = 20_000  # detections that the iterations use
+_FIRST = 150  # detections of the first round
+_ROUNDS = 25
+LEAST = 6  # pairs that a linear map needs to be more than its own fit
+
+
+@dataclass(frozen=True, eq=False)
+class LinearMap:
+    """p -> matrix (p - origin) + origin + shift.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (2, 2)
+    shift : ndarray, shape (2,)
+    origin : ndarray, shape (2,)
+    """
+
+    matrix: Float
+    shift: Float
+    origin: Float
+
+    def __call__(self, points: Float) -> Float:
+        """Transformed points, shape (N, 2)."""
+        return (points - self.origin) @ self.matrix.T + self.origin + self.shift
+
+
+def iterated_map(
+    points: Float, reference: Float, tree: cKDTree, start: LinearMap, reach: float, radius: float
+) -> LinearMap | None:
+    """Linear map fitted in rounds; the radius shrinks while the area grows from the start's origin.
+
+    Far from where the offset was found a small rotation displaces stars by more than their
+    distances, so the map is fitted near that place first.
+
+    Parameters
+    ----------
+    points : ndarray, shape (N, 2)
+    reference : ndarray, shape (M, 2)
+    tree : cKDTree
+        Of `reference`.
+    start : LinearMap
+    reach, radius : float
+        Largest distance of a pair in the first round and in the last.
+
+    Returns
+    -------
+    LinearMap or None
+        None where too few pairs are left, or they lie on a line.
+    """
+    outwards = np.argsort(((points - start.origin) ** 2).sum(axis=1))
+    current, size, reach = start, _FIRST, max(reach, radius)
+    for _ in range(_ROUNDS):
+        sample = points[outwards[:size][:: -(-min(size, len(points)) // SAMPLE)]]
+        distance, nearest = tree.query(current(sample), distance_upper_bound=reach, workers=-1)
+        near = np.isfinite(distance)
+        origin = start.origin
+        fitted = _robust_linear(sample[near] - origin, reference[nearest[near]] - origin)
+        if fitted is None:
+            return None
+        current = LinearMap(*fitted, origin)
+        if reach <= radius and size >= len(points):
+            break
+        reach, size = max(radius, 0.6 * reach), 3 * size
+    return current
+
+
+def _robust_linear(p: Float, q: Float) -> tuple[Float, Float] | None:
+    """Least-squares matrix and shift from p to q, with pairs far from them left out."""
+    use = np.ones(len(p), bool)
+    design = np.column_stack([p, np.ones(len(p))])
+    for _ in range(5):
+        if use.sum() < LEAST:
+            return None
+        solution, _, rank, _ = np.linalg.lstsq(design[use], q[use], rcond=None)
+        if rank < 3:
+            return None
+        distance = np.hypot(*(q - design @ solution).T)
+        # 3 x the median radius is 3.5 sigma of a circular normal
+        kept = distance <= 3.0 * np.median(distance[use]) + 1e-12 * np.abs(q).max()
+        if (kept == use).all():
+            break
+        use = kept
+    return np.asarray(solution[:2].T), np.asarray(solution[2])

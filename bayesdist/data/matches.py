@@ -1,0 +1,291 @@
+"""MatchTable: detector pixels beside reference positions, one row for each matched star."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.data.duplicates import first_duplicate
+from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
+from bayesdist.data.units import check_unit
+from bayesdist.errors import InputError
+
+__all__ = ["MatchTable"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+_POSITIONS = ("x", "y", "u", "v")
+_SIGMAS = ("sigma_u", "sigma_v")
+_OPTIONAL = ("epoch", "mag")
+_CODES = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
+
+
+@dataclass(frozen=True, eq=False)
+class MatchTable:
+    """Matched stars.
+
+    All arrays have length N and are float64, codes and rows int64; anything that converts to them
+    is taken.  Only x, y, u, v are needed.
+
+    Parameters
+    ----------
+    x, y : ndarray
+        Raw detector position, FITS 1-based pixels (centre of the first pixel = 1.0).
+    u, v : ndarray
+        Reference position, in `unit`.
+    sigma_u, sigma_v : ndarray, optional
+        Standard errors of the match in `unit`: both or neither.  None where they are to be
+        estimated.
+    unit : str
+        'pix', 'arcsec', 'mas' or 'deg'.
+    epoch : ndarray, optional
+        Decimal years.
+    mag : ndarray, optional
+        Magnitudes; any zero point.
+    exposure, chip, filter : ndarray of int, optional
+        Codes into `exposure_names`, `chip_numbers` and `filter_names`.
+    exposure_names, filter_names : tuple of str
+    chip_numbers : tuple of int
+    row : ndarray of int, optional
+        0-based row in the file that the star comes from.
+    source : ndarray of int, optional
+        Code of that file into `sources`.
+    sources : tuple of str
+        Names of the files.
+    n_rows : int, optional
+        Rows read, rejected ones included.
+    rejected : dict of str to int
+        Rows left out, by reason.
+    tangent_point : tuple of float, optional
+        RA and Dec in degrees of the plane that u, v lie on, where they were made from sky
+        positions.
+
+    Raises
+    ------
+    InputError
+        For no rows, unequal lengths, values that are not finite, errors that are not positive, an
+        unknown unit, or the same star twice.
+    """
+
+    x: Float
+    y: Float
+    u: Float
+    v: Float
+    sigma_u: Float | None = None
+    sigma_v: Float | None = None
+    unit: str = "pix"
+    epoch: Float | None = None
+    mag: Float | None = None
+    exposure: Int = None  # type: ignore[assignment]
+    exposure_names: tuple[str, ...] = ("1",)
+    chip: Int = None  # type: ignore[assignment]
+    chip_numbers: tuple[int, ...] = (1,)
+    filter: Int = None  # type: ignore[assignment]
+    filter_names: tuple[str, ...] = ("",)
+    row: Int = None  # type: ignore[assignment]
+    source: Int = None  # type: ignore[assignment]
+    sources: tuple[str, ...] = ("table",)
+    n_rows: int = None  # type: ignore[assignment]
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    tangent_point: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        n = np.size(self.x)
+        if n == 0:
+            raise InputError(
+                "holds no rows", where=", ".join(self.sources), do="give a table with matched stars"
+            )
+        for name in ("row", "source", *_CODES):
+            if getattr(self, name) is None:
+                default = np.arange(n) if name == "row" else np.zeros(n, np.int64)
+                object.__setattr__(self, name, default)
+        for name in self._array_names():
+            kind = np.int64 if name in ("row", "source", *_CODES) else np.float64
+            # contiguous and in the machine's byte order, which FITS columns are not
+            values = np.ascontiguousarray(getattr(self, name), dtype=kind)
+            object.__setattr__(self, name, values)
+            if values.shape != (n,):
+                raise InputError(
+                    f"column {name!r} has shape {values.shape}, but 'x' has {n} rows",
+                    where=", ".join(self.sources),
+                    do="give columns of one length",
+                )
+        object.__setattr__(self, "n_rows", n if self.n_rows is None else int(self.n_rows))
+        object.__setattr__(self, "rejected", dict(self.rejected))
+        self._check_values()
+        self._check_duplicates()
+
+    def _array_names(self) -> Iterator[str]:
+        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL, *_CODES, "row", "source"):
+            if getattr(self, name) is not None:
+                yield name
+
+    def _where(self, index: int, column: str = "") -> str:
+        """File, row (from 1) and column of a star, for an error."""
+        head = f"{self.sources[self.source[index]]}, row {self.row[index] + 1}"
+        return f"{head}, column {column!r}" if column else head
+
+    def _check_values(self) -> None:
+        check_unit(self.unit, where=", ".join(self.sources))
+        if (self.sigma_u is None) != (self.sigma_v is None):
+            missing = "sigma_u" if self.sigma_u is None else "sigma_v"
+            raise InputError(
+                f"column {missing!r} is missing beside its partner",
+                where=", ".join(self.sources),
+                do="give both errors or neither",
+            )
+        names_of = {**_CODES, "source": "sources"}
+        for name, labels in names_of.items():
+            codes = getattr(self, name)
+            if codes.min() < 0 or codes.max() >= len(getattr(self, labels)):
+                raise InputError(
+                    f"codes in {name!r} point outside {labels!r}",
+                    where=", ".join(self.sources),
+                    do="give a label for each code",
+                )
+        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            good = np.isfinite(values)
+            if name in _SIGMAS:
+                good &= values > 0
+            if not good.all():
+                bad = int(np.argmin(good))
+                must = "finite and positive" if name in _SIGMAS else "finite"
+                raise InputError(
+                    f"value is {values[bad]:g}, and must be {must}",
+                    where=self._where(bad, name),
+                    do="correct the row or drop it",
+                )
+
+    def _check_duplicates(self) -> None:
+        keys = [getattr(self, k) for k in (*_POSITIONS, *_CODES)]
+        if self.epoch is not None:
+            keys.append(self.epoch)
+        pair = first_duplicate(keys)
+        if pair is not None:
+            first, second = pair
+            raise InputError(
+                f"repeats {self._where(first)}: the same x, y, u, v, exposure and chip",
+                where=self._where(second),
+                do="drop one of them",
+            )
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @property
+    def exposures(self) -> tuple[str, ...]:
+        """Names of the exposures that have stars, in the order of `exposure_names`."""
+        return tuple(self.exposure_names[k] for k in np.unique(self.exposure))
+
+    def select(self, which: ArrayLike, *, reason: str | None = None) -> MatchTable:
+        """Some of the stars.
+
+        Parameters
+        ----------
+        which : array_like of bool or int
+            Mask of length N, or indices without repetition.
+        reason : str, optional
+            Why the others go; they are counted under it in `rejected`.
+
+        Returns
+        -------
+        MatchTable
+            Codes keep their meaning: names without stars stay.
+
+        Raises
+        ------
+        InputError
+            When no star is left, or when an index stands twice.
+        """
+        which = np.asarray(which)
+        if not which.size:  # an empty list has no integer type of its own
+            which = which.astype(np.int64)
+        index = np.arange(len(self))[which]
+        picked = {name: getattr(self, name)[index] for name in self._array_names()}
+        rejected = dict(self.rejected)
+        dropped = len(self) - len(index)
+        if reason is not None and dropped:
+            rejected[reason] = rejected.get(reason, 0) + dropped
+        return replace(self, **picked, rejected=rejected)
+
+    def with_sigma(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MatchTable:
+        """The same stars with other errors.
+
+        Parameters
+        ----------
+        sigma_u, sigma_v : array_like, shape () or (N,)
+            In `unit`.
+
+        Returns
+        -------
+        MatchTable
+        """
+        shape = (len(self),)
+        return replace(
+            self,
+            sigma_u=np.broadcast_to(np.asarray(sigma_u, float), shape),
+            sigma_v=np.broadcast_to(np.asarray(sigma_v, float), shape),
+        )
+
+    @staticmethod
+    def concatenate(tables: Sequence[MatchTable]) -> MatchTable:
+        """All stars of several tables, in their order.
+
+        Exposures, chips, filters and files of equal name become one.
+
+        Parameters
+        ----------
+        tables : sequence of MatchTable
+
+        Returns
+        -------
+        MatchTable
+
+        Raises
+        ------
+        InputError
+            For no tables, different units or tangent points, or an optional column that only some
+            have.
+        """
+        if not tables:
+            raise InputError("there are no tables to join", do="give at least one")
+        first = tables[0]
+        if len(tables) == 1:
+            return first
+        for other in tables[1:]:
+            for name, label in (("unit", "unit"), ("tangent_point", "tangent point")):
+                if getattr(other, name) != getattr(first, name):
+                    raise InputError(
+                        f"{label} is {getattr(other, name)}, but {getattr(first, name)} in "
+                        f"{', '.join(first.sources)}",
+                        where=", ".join(other.sources),
+                        do="bring all files to one",
+                    )
+        joined: dict[str, object] = {
+            name: np.concatenate([getattr(t, name) for t in tables])
+            for name in (*_POSITIONS, "row")
+        }
+        for name in (*_SIGMAS, *_OPTIONAL):
+            joined[name] = merged_optional(
+                name, [getattr(t, name) for t in tables], [", ".join(t.sources) for t in tables]
+            )
+        for name, labels in {**_CODES, "source": "sources"}.items():
+            joined[name], joined[labels] = merged_codes(
+                [getattr(t, name) for t in tables],
+                [getattr(t, labels) for t in tables],
+                ordered=name == "chip",
+            )
+        return MatchTable(
+            **joined,  # type: ignore[arg-type]
+            unit=first.unit,
+            tangent_point=first.tangent_point,
+            n_rows=sum(t.n_rows for t in tables),
+            rejected=merged_counts([t.rejected for t in tables]),
+        )

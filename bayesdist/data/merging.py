@@ -1,0 +1,103 @@
+"""Several tables become one: codes renumbered, counts added, optional columns in agreement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+
+__all__ = ["encoded", "merged_codes", "merged_counts", "merged_optional"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[Any, ...]]:
+    """Codes of values, and the values that they stand for.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+    ordered : bool
+        Labels sorted; otherwise in the order of their first appearance.
+
+    Returns
+    -------
+    codes : ndarray of int, shape (N,)
+    labels : tuple
+    """
+    unique, first, codes = np.unique(values, return_index=True, return_inverse=True)
+    codes = codes.astype(np.int64)
+    if not ordered:
+        by_appearance = np.argsort(first)
+        position = np.empty_like(by_appearance)
+        position[by_appearance] = np.arange(len(by_appearance))
+        unique, codes = unique[by_appearance], position[codes]
+    return codes.astype(np.int64), tuple(unique.tolist())
+
+
+def merged_codes(
+    codes: Sequence[Int], labels: Sequence[tuple[Any, ...]], *, ordered: bool = False
+) -> tuple[Int, tuple[Any, ...]]:
+    """One numbering for codes with labels of their own.
+
+    Parameters
+    ----------
+    codes : sequence of ndarray of int
+    labels : sequence of tuple
+        What the codes of each array stand for.
+    ordered : bool
+        Labels sorted; otherwise in the order of their first appearance.
+
+    Returns
+    -------
+    codes : ndarray of int
+        All arrays, joined.
+    labels : tuple
+    """
+    every: list[Any] = list(dict.fromkeys(label for own in labels for label in own))
+    if ordered:
+        every.sort()
+    number = {label: k for k, label in enumerate(every)}
+    renumbered = [
+        np.array([number[label] for label in own], np.int64)[code]
+        for code, own in zip(codes, labels, strict=True)
+    ]
+    return np.concatenate(renumbered), tuple(every)
+
+
+def merged_counts(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
+    """Sums by key."""
+    total: dict[str, int] = {}
+    for one in counts:
+        for key, number in one.items():
+            total[key] = total.get(key, 0) + number
+    return total
+
+
+def merged_optional(
+    name: str, arrays: Sequence[Float | None], sources: Sequence[str]
+) -> Float | None:
+    """A column that all tables have, joined; None where none has it.
+
+    Raises
+    ------
+    InputError
+        When only some have it.
+    """
+    present = [a for a in arrays if a is not None]
+    if not present:
+        return None
+    if len(present) < len(arrays):
+        lacking = next(s for a, s in zip(arrays, sources, strict=True) if a is None)
+        having = next(s for a, s in zip(arrays, sources, strict=True) if a is not None)
+        raise InputError(
+            f"has no {name!r}, but {having} has",
+            where=lacking,
+            do="give the column in all files or in none",
+        )
+    return np.concatenate(present)

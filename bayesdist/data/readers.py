@@ -1,0 +1,312 @@
+"""`read_matches`: files of any known kind to one MatchTable."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.data.astrometrynet import COLUMNS as CORR_COLUMNS
+from bayesdist.data.astrometrynet import is_astrometrynet, matches_from_corr
+from bayesdist.data.columns import matches_from_table, sky_positions
+from bayesdist.data.hst1pass import is_hst1pass, is_matchup, read_hst1pass, read_matchup
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.matching import match_table
+from bayesdist.data.tables import TABLE_SUFFIXES, read_lines, read_table
+from bayesdist.data.tangent import mean_direction
+from bayesdist.errors import FormatError, InputError
+
+__all__ = ["FORMATS", "input_files", "read_matches"]
+
+FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")
+
+PathLike = str | os.PathLike[str]
+
+
+def input_files(path: PathLike | Sequence[PathLike]) -> list[Path]:
+    """Files that a path, pattern, folder or list of them names.
+
+    Parameters
+    ----------
+    path : path-like or sequence of path-like
+        A pattern (``*``, ``?``, ``[``) stands for the files that fit it, a folder for the Parquet
+        files in it and below, both in the order of their names.
+
+    Returns
+    -------
+    list of pathlib.Path
+
+    Raises
+    ------
+    InputError
+        When there are none, or a file stands twice.
+    """
+    given = [path] if isinstance(path, str | os.PathLike) else list(path)
+    if not given:
+        raise InputError("no file is named", where="data.matches", do="name at least one")
+    files = [file for one in given for file in _expanded(Path(one))]
+    for file in files:
+        if files.count(file) > 1:
+            raise InputError("is named twice", where=str(file), do="name each file once")
+    return files
+
+
+def _expanded(path: Path) -> list[Path]:
+    if path.is_dir():
+        found = sorted(
+            file for file in path.rglob("*.parquet") if not file.name.startswith((".", "_"))
+        )
+        if not found:
+            raise InputError(
+                "is a folder without Parquet files", where=str(path), do="name the files"
+            )
+        return found
+    if path.exists() or not glob.has_magic(str(path)):
+        return [path]
+    found = sorted(Path(file) for file in glob.glob(str(path), recursive=True))
+    if not found:
+        raise InputError("no file fits the pattern", where=str(path), do="check the pattern")
+    return found
+
+
+@dataclass(frozen=True)
+class _Options:
+    """What the user says about all files."""
+
+    columns: Mapping[str, str] | None
+    unit: str | None
+    read_sigma: bool
+    pixel_origin: int
+    tangent_point: tuple[float, float] | None
+
+    def refuse(self, source: str, kind: str, *names: str) -> None:
+        """Refuse options that a format leaves no room for."""
+        blank = _Options(None, None, True, 1, None)
+        for name in names:
+            if getattr(self, name) != getattr(blank, name):
+                raise InputError(
+                    f"option {name!r} is given, but the format {kind} fixes it",
+                    where=source,
+                    do=f"leave {name!r} out or set the format to 'table'",
+                )
+
+
+def read_matches(
+    path: PathLike | Sequence[PathLike],
+    *,
+    format: str = "auto",
+    columns: Mapping[str, str] | None = None,
+    unit: str | None = None,
+    sigma: str | float = "columns",
+    pixel_origin: int = 1,
+    tangent_point: tuple[float, float] | None = None,
+) -> MatchTable:
+    """Read matched star positions.
+
+    Parameters
+    ----------
+    path : path-like or sequence of path-like
+        A file, a list of files, a pattern, or a folder of Parquet files (parts of one table).  Of
+        several files each is one exposure, named for the file, where it has no column of exposures.
+    format : str, optional
+        'table' (.ecsv, .csv, .fits, .parquet), 'hst1pass' (lists with raw and corrected positions),
+        'matchup' (such lists beside the MATCHUP master that they are then matched with),
+        'astrometry.net' (corr.fits), or 'auto': by name and content.
+    columns : mapping of str to str, optional
+        Column of each quantity, as in `matches_from_table`.
+    unit : {'pix', 'arcsec', 'mas', 'deg'}, optional
+        Unit of u and v, where the file does not say.
+    sigma : {'columns', 'by_magnitude'} or float, optional
+        Where errors come from: from columns; left to be estimated from residuals by magnitude (they
+        are then None); or one number, in the unit of u and v.
+    pixel_origin : {0, 1}, optional
+        Coordinate of the centre of the first pixel in the file.
+    tangent_point : tuple of float, optional
+        RA and Dec in degrees of the plane for sky positions; by default the mean direction of all
+        stars.
+
+    Returns
+    -------
+    MatchTable
+
+    Raises
+    ------
+    InputError
+        For all that is wrong with a file or an option, in one sentence.
+    """
+    if format not in FORMATS:
+        raise InputError(
+            f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(FORMATS)}"
+        )
+    _check_sigma(sigma)
+    files = input_files(path)
+    options = _Options(columns, unit, sigma == "columns", pixel_origin, tangent_point)
+    kinds = [_kind(file, columns) if format == "auto" else format for file in files]
+    masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
+    if masters:
+        table = _read_with_master(files, kinds, options)
+    else:
+        in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
+        table = _read_plain(files, kinds, options, in_parts=in_parts)
+    return _with_errors(table, sigma)
+
+
+def _check_sigma(sigma: str | float) -> None:
+    if isinstance(sigma, str):
+        good = sigma in ("columns", "by_magnitude")
+    else:
+        good = not isinstance(sigma, bool) and bool(np.isfinite(sigma)) and sigma > 0
+    if not good:
+        raise InputError(
+            f"sigma is {sigma!r}",
+            where="data.sigma",
+            do="set it to 'columns', 'by_magnitude' or a positive number",
+        )
+
+
+def _with_errors(table: MatchTable, sigma: str | float) -> MatchTable:
+    where = ", ".join(table.sources)
+    if sigma == "columns":
+        if table.sigma_u is None:
+            raise InputError(
+                "holds no errors of the positions",
+                where=where,
+                do="name sigma_u and sigma_v, or set sigma to 'by_magnitude' or a number",
+            )
+        return table
+    if sigma == "by_magnitude":
+        if table.mag is None:
+            raise InputError(
+                "holds no magnitudes, and errors by magnitude need them",
+                where=where,
+                do="name the column mag, or set sigma to a number",
+            )
+        return table
+    return table.with_sigma(float(sigma), float(sigma))
+
+
+def _kind(file: Path, columns: Mapping[str, str] | None) -> str:
+    """Format of a file, by its name and then by its content."""
+    name = file.name.lower().removesuffix(".gz")
+    if name.endswith(tuple(TABLE_SUFFIXES)):
+        if columns is None and name.endswith((".fits", ".fit")):
+            return "astrometry.net" if is_astrometrynet(read_table(file).colnames) else "table"
+        return "table"
+    lines = read_lines(file)
+    if is_hst1pass(lines):
+        return "hst1pass"
+    if is_matchup(lines):
+        return "matchup"
+    if name.endswith("uvwxympq"):
+        return "hst1pass"  # its reader says what is wrong with it
+    raise FormatError(
+        "is of no known kind",
+        where=str(file),
+        do=f"give a file that ends in {', '.join(TABLE_SUFFIXES)}, or set the format",
+    )
+
+
+def _exposure_names(files: Sequence[Path]) -> list[str]:
+    """Names of files as exposures: the stem, with as many folders before it as tell all apart."""
+    stems = [file.name.split(".")[0] or file.name for file in files]
+    parents = [file.parent for file in files]
+    while len(set(stems)) < len(stems):
+        again = {stem for stem in stems if stems.count(stem) > 1}
+        named = [
+            f"{parent.name}/{stem}" if stem in again and parent.name else stem
+            for stem, parent in zip(stems, parents, strict=True)
+        ]
+        if named == stems:  # only the extensions differ
+            return [str(file) for file in files]
+        stems, parents = named, [parent.parent for parent in parents]
+    return stems
+
+
+def _read_plain(
+    files: Sequence[Path], kinds: Sequence[str], options: _Options, *, in_parts: bool
+) -> MatchTable:
+    """Files that hold matches themselves."""
+    names: Sequence[str | None] = _exposure_names(files)
+    if in_parts or (len(files) == 1 and kinds[0] == "table"):
+        names = [None] * len(files)
+    tables = {
+        file: read_table(file)
+        for file, kind in zip(files, kinds, strict=True)
+        if kind in ("table", "astrometry.net")
+    }
+    options = _with_common_point(tables, kinds, options)
+    readers: dict[str, Callable[[Path, str | None], MatchTable]] = {
+        "hst1pass": lambda file, name: _read_list(file, name, options),
+        "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
+        "table": lambda file, name: matches_from_table(
+            tables[file],
+            options.columns,
+            source=str(file),
+            unit=options.unit,
+            read_sigma=options.read_sigma,
+            pixel_origin=options.pixel_origin,
+            tangent_point=options.tangent_point,
+            exposure_name=name,
+        ),
+    }
+    return MatchTable.concatenate(
+        [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
+    )
+
+
+def _with_common_point(
+    tables: Mapping[Path, Table], kinds: Iterable[str], options: _Options
+) -> _Options:
+    """One tangent point for all files: each by itself would choose its own."""
+    if options.tangent_point is not None or len(tables) < 2:
+        return options
+    corr = "astrometry.net" in set(kinds)
+    columns = CORR_COLUMNS if corr else options.columns
+    sky = [sky_positions(table, columns, source=str(file)) for file, table in tables.items()]
+    on_sky = [one for one in sky if one is not None and len(one[0])]
+    if not on_sky:
+        return options
+    ra, dec = (np.concatenate(axis) for axis in zip(*on_sky, strict=True))
+    return replace(options, tangent_point=mean_direction(ra, dec))
+
+
+def _read_list(file: Path, name: str | None, options: _Options) -> MatchTable:
+    options.refuse(str(file), "hst1pass", "columns", "pixel_origin", "tangent_point")
+    if options.unit not in (None, "pix"):
+        options.refuse(str(file), "hst1pass", "unit")
+    return read_hst1pass(file).matches(name=name)
+
+
+def _read_corr(file: Path, table: Table, name: str | None, options: _Options) -> MatchTable:
+    options.refuse(str(file), "astrometry.net", "columns", "pixel_origin")
+    if options.unit not in (None, "arcsec"):
+        options.refuse(str(file), "astrometry.net", "unit")
+    return matches_from_corr(
+        table, source=str(file), tangent_point=options.tangent_point, exposure_name=name
+    )
+
+
+def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: _Options) -> MatchTable:
+    """hst1pass lists, matched with the MATCHUP master among the files."""
+    masters: list[Path] = []
+    lists: list[Path] = []
+    for file, kind in zip(files, kinds, strict=True):
+        is_master = kind == "matchup" and is_matchup(read_lines(file))
+        (masters if is_master else lists).append(file)
+    if len(masters) != 1 or not lists:
+        raise InputError(
+            f"{len(masters)} MATCHUP masters and {len(lists)} lists are named: a master alone has "
+            "no detector positions",
+            where=", ".join(str(file) for file in files),
+            do="name one master together with the hst1pass lists to match with it",
+        )
+    names = _exposure_names(lists)
+    detections = MatchTable.concatenate(
+        [_read_list(file, name, options) for file, name in zip(lists, names, strict=True)]
+    )
+    return match_table(detections, read_matchup(masters[0]))

@@ -1,0 +1,112 @@
+"""The tangent plane: gnomonic projection of the sky, in seconds of arc.
+
+    D   = sin d sin d0 + cos d cos d0 cos(a - a0)
+    xi  = cos d sin(a - a0) / D                                  east
+    eta = (cos d0 sin d - sin d0 cos d cos(a - a0)) / D          north
+
+Calabretta & Greisen 2002, A&A 395, 1077, Section 5.1.3, written as standard coordinates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import InputError
+
+__all__ = ["ARCSEC", "mean_direction", "tangent_jacobian", "tangent_plane"]
+
+Float = NDArray[np.float64]
+
+ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
+
+
+def mean_direction(ra: ArrayLike, dec: ArrayLike) -> tuple[float, float]:
+    """Direction of the sum of unit vectors.
+
+    Parameters
+    ----------
+    ra, dec : array_like, shape (N,)
+        Degrees.
+
+    Returns
+    -------
+    ra0, dec0 : float
+        Degrees, ra0 in [0, 360).
+    """
+    a, d = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
+    x, y, z = np.mean(np.cos(d) * np.cos(a)), np.mean(np.cos(d) * np.sin(a)), np.mean(np.sin(d))
+    ra0 = float(np.degrees(np.arctan2(y, x)) % 360.0)
+    return ra0, float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+
+def _angles(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], where: str
+) -> tuple[Float, Float, float, Float]:
+    """Hour angle from the point, declination, the point's declination, and D; radians."""
+    delta = np.radians(np.asarray(ra, float) - point[0])
+    d = np.radians(np.asarray(dec, float))
+    d0 = float(np.radians(point[1]))
+    D = np.sin(d) * np.sin(d0) + np.cos(d) * np.cos(d0) * np.cos(delta)
+    if np.any(D <= 0):
+        row = int(np.argmax(D <= 0)) + 1
+        raise InputError(
+            f"the position lies 90 degrees or more from the tangent point {point}",
+            where=f"{where}, row {row}" if where else f"row {row}",
+            do="give a tangent point inside the field",
+        )
+    return delta, d, d0, D
+
+
+def tangent_plane(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], *, where: str = ""
+) -> tuple[Float, Float]:
+    """Sky positions on the plane that touches the sky at a point.
+
+    Parameters
+    ----------
+    ra, dec : array_like, shape (N,)
+        Degrees.
+    point : tuple of float
+        Tangent point (ra0, dec0), degrees.
+    where : str, optional
+        File, for the error.
+
+    Returns
+    -------
+    xi, eta : ndarray, shape (N,)
+        Seconds of arc; xi grows to the east, eta to the north.
+
+    Raises
+    ------
+    InputError
+        When a position is 90 degrees or more from the point.
+    """
+    delta, d, d0, D = _angles(ra, dec, point, where)
+    xi = np.cos(d) * np.sin(delta) / D
+    eta = (np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * np.cos(delta)) / D
+    return ARCSEC * xi, ARCSEC * eta
+
+
+def tangent_jacobian(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], *, where: str = ""
+) -> Float:
+    """Derivatives of (xi, eta) by small steps to the east and to the north at each position.
+
+    Parameters
+    ----------
+    ra, dec, point, where
+        As `tangent_plane`.
+
+    Returns
+    -------
+    ndarray, shape (N, 2, 2)
+        ``J[:, 0, 1]`` is d xi / d dec; a step to the east counts as d ra cos(dec).
+    """
+    delta, d, d0, D = _angles(ra, dec, point, where)
+    out = np.empty((*np.shape(D), 2, 2))
+    out[..., 0, 0] = (np.sin(d) * np.sin(d0) * np.cos(delta) + np.cos(d) * np.cos(d0)) / D**2
+    out[..., 0, 1] = -np.sin(d0) * np.sin(delta) / D**2
+    out[..., 1, 0] = np.sin(d) * np.sin(delta) / D**2
+    out[..., 1, 1] = np.cos(delta) / D**2
+    return out

@@ -1,0 +1,85 @@
+"""Units stop at the door: every unit in a file becomes one of four words, or an error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import astropy.units as apu
+
+from bayesdist.errors import InputError
+
+__all__ = ["UNITS", "check_unit", "conversion", "unit_of"]
+
+UNITS = ("pix", "arcsec", "mas", "deg")
+
+# what other programs write where astropy expects 'pix' or 'deg'
+_SPELLINGS = {
+    "pixels": "pix",
+    "pixel": "pix",
+    "px": "pix",
+    "degrees": "deg",
+    "degree": "deg",
+    "arcseconds": "arcsec",
+    "arcsecs": "arcsec",
+    "milliarcsec": "mas",
+    "none": "",
+}
+
+
+def check_unit(unit: str, *, where: str = "unit") -> str:
+    """The unit itself, when it is one of `UNITS`.
+
+    Raises
+    ------
+    InputError
+        For any other.
+    """
+    if unit not in UNITS:
+        raise InputError(f"unit is {unit!r}", where=where, do=f"choose one of {', '.join(UNITS)}")
+    return unit
+
+
+def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
+    """Unit of a table's column, None where it has none.
+
+    Parameters
+    ----------
+    column : astropy Column, Quantity or array
+    where : str
+        File and column, for the error.
+
+    Raises
+    ------
+    InputError
+        For a unit that nobody knows.
+    """
+    unit = getattr(column, "unit", None)
+    if unit is None:
+        return None
+    text = _SPELLINGS.get(str(unit).strip().lower(), str(unit).strip())
+    if not text:
+        return None
+    parsed = apu.Unit(text, parse_strict="silent")
+    if isinstance(parsed, apu.UnrecognizedUnit):
+        raise InputError(
+            f"unit {text!r} is unknown", where=where, do=f"write one of {', '.join(UNITS)}"
+        )
+    return None if parsed == apu.dimensionless_unscaled else parsed
+
+
+def conversion(unit: apu.UnitBase, to: str, *, where: str) -> float:
+    """Factor that brings values of `unit` to `to`.
+
+    Raises
+    ------
+    InputError
+        When the two measure different things, as pixels and angles do.
+    """
+    try:
+        return float(unit.to(apu.Unit(to)))
+    except apu.UnitConversionError:
+        raise InputError(
+            f"unit {unit} cannot be brought to {to}",
+            where=where,
+            do="correct the unit in the file or in the configuration",
+        ) from None

@@ -1,0 +1,236 @@
+"""One column of a table to one array, or an error that names file, row and column."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import astropy.units as apu
+import numpy as np
+from astropy.time import Time
+from numpy.typing import NDArray
+
+from bayesdist.data.merging import encoded
+from bayesdist.data.units import unit_of
+from bayesdist.errors import InputError
+
+__all__ = ["SourceColumn"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+_YEARS = (1800.0, 2200.0)  # epochs outside are a wrong unit, not a date
+
+
+@dataclass(frozen=True, eq=False)
+class SourceColumn:
+    """A column with the names that an error needs.
+
+    Parameters
+    ----------
+    values : astropy Column, Quantity, Time or array, shape (N,)
+    source : str
+        File.
+    name : str
+        Column.
+    """
+
+    values: Any
+    source: str
+    name: str
+
+    @property
+    def where(self) -> str:
+        """File and column."""
+        return f"{self.source}, column {self.name!r}"
+
+    @property
+    def unit(self) -> apu.UnitBase | None:
+        """Unit that the file gives, or None."""
+        return unit_of(self.values, where=self.where)
+
+    def fail(self, index: int, cause: str, do: str = "correct the row or drop it") -> InputError:
+        """The error about one value."""
+        where = f"{self.source}, row {index + 1}, column {self.name!r}"
+        return InputError(cause, where=where, do=do)
+
+    def _plain(self) -> NDArray[Any]:
+        """The values as a one-dimensional array without masked ones."""
+        mask = np.broadcast_to(getattr(self.values, "mask", False), np.shape(self.values))
+        if np.ndim(self.values) != 1:
+            raise InputError(
+                f"holds arrays of shape {np.shape(self.values)[1:]}",
+                where=self.where,
+                do="name a column with one value in each row",
+            )
+        if mask.any():
+            raise self.fail(
+                int(np.argmax(mask)),
+                "value is missing",
+                "fill it in, or drop the row or the column",
+            )
+        plain = getattr(self.values, "unmasked", self.values)
+        return np.asarray(getattr(plain, "value", plain))
+
+    def numbers(self) -> Float:
+        """Finite numbers, in the unit of the file.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+
+        Raises
+        ------
+        InputError
+            For text, a missing value, NaN or infinity.
+        """
+        values = self._plain()
+        if values.dtype.kind in "iuf":
+            out = values.astype(np.float64)
+        elif values.dtype.kind in "SUO":
+            out = self._parsed(values, float, "a number").astype(np.float64)
+        else:
+            raise InputError(
+                f"holds values of type {values.dtype}, not numbers",
+                where=self.where,
+                do="name a column of numbers",
+            )
+        good = np.isfinite(out)
+        if not good.all():
+            bad = int(np.argmin(good))
+            raise self.fail(bad, f"value is {out[bad]:g}, and must be finite")
+        return out
+
+    def _parsed(
+        self, texts: NDArray[Any], parse: Callable[[str], Any], wanted: str
+    ) -> NDArray[Any]:
+        """Each text parsed; the first that is not what is wanted ends it."""
+        out = []
+        for index, text in enumerate(texts):
+            try:
+                out.append(parse(_text(text)))
+            except (ValueError, TypeError):
+                raise self.fail(
+                    index, f"{_text(text)[:40]!r} stands where {wanted} must be"
+                ) from None
+        return np.array(out)
+
+    def integers(self) -> Int:
+        """Whole numbers.
+
+        Raises
+        ------
+        InputError
+            For anything else.
+        """
+        values = self.numbers()
+        whole = values == np.rint(values)
+        if not whole.all():
+            bad = int(np.argmin(whole))
+            raise self.fail(bad, f"value is {values[bad]:g}, and must be a whole number")
+        return values.astype(np.int64)
+
+    def labels(self) -> tuple[Int, tuple[str, ...]]:
+        """Codes, and the names that they stand for in the order of their first appearance.
+
+        Returns
+        -------
+        codes : ndarray of int, shape (N,)
+        names : tuple of str
+        """
+        values = self._plain()
+        if values.dtype.kind == "O":
+            values = np.array([_text(v) for v in values])
+        codes, found = encoded(values)
+        names = [_text(v) for v in found]
+        again, unique = encoded(np.array(names))  # 'a' and 'a ' are one name
+        return again[codes], unique
+
+    def years(self) -> Float:
+        """Epochs as decimal years.
+
+        Numbers are years, or Modified Julian Dates where the column's unit is the day; texts are
+        ISO dates.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+
+        Raises
+        ------
+        InputError
+            For what is no date, or lies outside 1800 to 2200.
+        """
+        if isinstance(self.values, Time):
+            self._refuse_masked_times()
+            out = np.asarray(self.values.decimalyear, float)
+        else:
+            values = self._plain()
+            if values.dtype.kind == "M":
+                # a time scale without leap seconds: dates stay as written
+                out = Time(values.astype("datetime64[ns]"), scale="tt").decimalyear
+            elif values.dtype.kind in "SUO" and not _all_numbers(values):
+                out = self._dates(values)
+            else:
+                out = self._numeric_years()
+        good = (out >= _YEARS[0]) & (out <= _YEARS[1])
+        if not good.all():
+            bad = int(np.argmin(good))
+            raise self.fail(
+                bad,
+                f"epoch is {out[bad]:g}, which is no year",
+                "give decimal years, ISO dates, or MJD with the unit 'd'",
+            )
+        return np.asarray(out, np.float64)
+
+    def _refuse_masked_times(self) -> None:
+        mask = np.broadcast_to(self.values.mask, self.values.shape)
+        if mask.any():
+            raise self.fail(int(np.argmax(mask)), "value is missing", "fill it in, or drop the row")
+
+    def _numeric_years(self) -> Float:
+        unit = self.unit
+        values = self.numbers()
+        if unit is None or unit == apu.yr:
+            return values
+        if unit == apu.d:
+            inside = np.abs(values) < 1e7
+            if not inside.all():
+                bad = int(np.argmin(inside))
+                raise self.fail(bad, f"{values[bad]:g} is no Modified Julian Date")
+            return np.asarray(Time(values, format="mjd", scale="tt").decimalyear, float)
+        raise InputError(
+            f"unit {unit} is not one of dates", where=self.where, do="give 'yr', or 'd' for MJD"
+        )
+
+    def _dates(self, texts: NDArray[Any]) -> Float:
+        codes, found = encoded(np.array([_text(t) for t in texts]))  # few dates, many stars
+        years = []
+        for k, text in enumerate(found):
+            try:
+                years.append(float(Time(text, scale="tt").decimalyear))
+            except (ValueError, TypeError):
+                index = int(np.argmax(codes == k))
+                raise self.fail(
+                    index, f"{text[:40]!r} is no date", "write ISO dates or decimal years"
+                ) from None
+        return np.array(years)[codes]
+
+
+def _text(value: Any) -> str:
+    """A label as people write it."""
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace").strip()
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    return str(value).strip()
+
+
+def _all_numbers(texts: NDArray[Any]) -> bool:
+    try:
+        for text in texts:
+            float(text)
+    except (ValueError, TypeError):
+        return False
+    return True
