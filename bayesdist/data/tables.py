@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -68,16 +70,25 @@ def read_lines(path: Path) -> list[str]:
         return stream.readlines()
 
 
+def _bare_lines(path: Path) -> list[str]:
+    """Lines without their ends: as a list, for astropy takes a lone line for the name of a file."""
+    return [line.rstrip("\r\n") for line in read_lines(path)]
+
+
 def _read_ecsv(path: Path) -> Table:
-    return Table.read(path, format="ascii.ecsv")
+    return Table.read(_bare_lines(path), format="ascii.ecsv")
 
 
 def _read_csv(path: Path) -> Table:
-    return Table.read(path, format="ascii.csv", comment="#", guess=False)
+    return Table.read(_bare_lines(path), format="ascii.csv", comment="#", guess=False)
 
 
 def _read_fits(path: Path) -> Table:
-    with fits.open(path, memmap=False, lazy_load_hdus=False) as hdus:
+    content = path.read_bytes()
+    if path.suffix.lower() == ".gz":
+        content = gzip.decompress(content)
+    # from memory: after a failure astropy leaves a file of its own open
+    with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False) as hdus:
         for hdu in hdus:
             if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
                 # NaN stays NaN: to call it a missing value would name the wrong fault

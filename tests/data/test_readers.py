@@ -1,0 +1,221 @@
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import Table
+from astropy.wcs.utils import fit_wcs_from_points
+
+from bayesdist.data import input_files, read_matches
+from bayesdist.errors import FormatError, InputError
+
+
+@pytest.fixture
+def stars(rng):
+    n = 30
+    x, y = rng.uniform(1, 2048, (2, n))
+    t = Table(
+        {"x": x, "y": y, "u": 0.05 * x, "v": 0.05 * y, "su": np.full(n, 2.0), "sv": np.full(n, 2.0)}
+    )
+    t["exp"] = np.repeat(["second", "first"], n // 2)
+    for name, unit in {
+        "x": "pix",
+        "y": "pix",
+        "u": "arcsec",
+        "v": "arcsec",
+        "su": "mas",
+        "sv": "mas",
+    }.items():
+        t[name].unit = unit
+    return t
+
+
+@pytest.mark.parametrize("suffix", ["ecsv", "fits", "parquet", "fits.gz"])
+def test_every_format_brings_the_same_table(stars, tmp_path, suffix):
+    path = tmp_path / f"stars.{suffix}"
+    stars.write(path)
+    t = read_matches(path)
+    for name in "xyuv":
+        assert (getattr(t, name) == stars[name]).all()
+    assert t.unit == "arcsec" and t.sigma_u == pytest.approx(0.002)
+    assert t.exposure_names == ("second", "first") and t.sources == (str(path),)
+
+
+def test_csv_needs_its_unit(stars, tmp_path):
+    path = tmp_path / "stars.csv"
+    stars.write(path, format="ascii.csv")
+    path.write_text("# a comment\n" + path.read_text())
+    with pytest.raises(InputError, match="has no unit"):
+        read_matches(path)
+    t = read_matches(path, unit="arcsec", sigma=0.002)
+    assert (t.x == stars["x"]).all() and t.sigma_v == pytest.approx(0.002)
+
+
+def test_a_field_of_metadata_carries_a_parquet_unit(stars, tmp_path):
+    fields = [
+        pa.field(n, pa.float64(), metadata={"unit": "mas"} if n in "uv" else None) for n in "xyuv"
+    ]
+    columns = [np.asarray(stars[n]) for n in "xyuv"]
+    pq.write_table(pa.table(columns, schema=pa.schema(fields)), tmp_path / "a.parquet")
+    assert read_matches(tmp_path / "a.parquet", sigma=1).unit == "mas"
+
+
+def test_nulls_are_missing_values(tmp_path):
+    columns = {n: [1.0, None, 3.0] if n == "v" else [1.0, 2.0, 3.0] for n in "xyuv"}
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match="row 2, column 'v': value is missing"):
+        read_matches(tmp_path / "a.parquet", unit="pix", sigma=1)
+
+
+def test_nan_in_fits_is_nan(stars, tmp_path):
+    stars["u"][6] = np.nan
+    stars.write(tmp_path / "a.fits")
+    with pytest.raises(InputError, match=r"a\.fits, row 7, column 'u': value is nan"):
+        read_matches(tmp_path / "a.fits")
+
+
+def test_several_files_are_several_exposures(stars, tmp_path):
+    stars.remove_column("exp")
+    for k, name in enumerate(("b.ecsv", "a.ecsv", "c.ecsv")):
+        stars[10 * k : 10 * k + 10].write(tmp_path / name)
+    t = read_matches(str(tmp_path / "*.ecsv"))
+    assert t.exposure_names == ("a", "b", "c") and (np.bincount(t.exposure) == 10).all()
+    assert (t.x[:10] == stars["x"][10:20]).all() and t.row[10] == 0
+    # in the order of a list, and the exposure of one file alone needs no name
+    assert read_matches([tmp_path / n for n in ("b.ecsv", "a.ecsv")]).exposure_names == ("b", "a")
+    assert read_matches(tmp_path / "b.ecsv").exposure_names == ("1",)
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(stars, tmp_path):
+    stars.remove_column("exp")
+    for k, night in enumerate(("n1", "n2")):
+        (tmp_path / night).mkdir()
+        stars[15 * k : 15 * k + 15].write(tmp_path / night / "stars.ecsv")
+    assert read_matches(str(tmp_path / "*/stars.ecsv")).exposure_names == ("n1/stars", "n2/stars")
+
+
+def test_a_folder_of_parquet_is_one_table(stars, tmp_path):
+    stars.remove_column("exp")
+    (tmp_path / "all").mkdir()
+    for k in range(3):
+        stars[10 * k : 10 * k + 10].write(tmp_path / "all" / f"part-{k}.parquet")
+    t = read_matches(tmp_path / "all")
+    assert (t.x == stars["x"]).all() and t.exposure_names == ("1",)
+    with pytest.raises(InputError, match="folder without Parquet"):
+        (tmp_path / "none").mkdir()
+        read_matches(tmp_path / "none")
+
+
+def test_where_errors_come_from(stars, tmp_path):
+    path = tmp_path / "stars.ecsv"
+    stars.write(path)
+    with pytest.raises(InputError, match="no magnitudes"):
+        read_matches(path, sigma="by_magnitude")
+    stars["mag"] = np.arange(30.0)
+    stars["su"][3] = -1.0  # of no matter when errors do not come from columns
+    stars.write(path, overwrite=True)
+    assert read_matches(path, sigma="by_magnitude").sigma_u is None
+    assert (read_matches(path, sigma=0.5).sigma_u == 0.5).all()
+    with pytest.raises(InputError, match=r"row 4, column 'su': sigma is -0\.001"):
+        read_matches(path)
+    stars.remove_columns(["su", "sv"])
+    stars.write(path, overwrite=True)
+    with pytest.raises(InputError, match="no errors of the positions"):
+        read_matches(path)
+    for bad in ("column", 0.0, -1, np.nan, True):
+        with pytest.raises(InputError, match="sigma is"):
+            read_matches(path, sigma=bad)
+
+
+def test_what_is_wrong_with_paths_and_formats(stars, tmp_path):
+    with pytest.raises(InputError, match=r"none\.fits: does not exist"):
+        read_matches(tmp_path / "none.fits")
+    with pytest.raises(InputError, match="no file fits the pattern"):
+        read_matches(str(tmp_path / "*.fits"))
+    with pytest.raises(InputError, match="no file is named"):
+        read_matches([])
+    stars.write(tmp_path / "a.ecsv")
+    with pytest.raises(InputError, match="is named twice"):
+        read_matches([tmp_path / "a.ecsv", str(tmp_path / "*.ecsv")])
+    with pytest.raises(InputError, match="format is 'rvb'"):
+        read_matches(tmp_path / "a.ecsv", format="rvb")
+    (tmp_path / "a.txt").write_text("1 2 3\n")
+    with pytest.raises(FormatError, match="of no known kind"):
+        read_matches(tmp_path / "a.txt")
+    with pytest.raises(InputError, match=r"extension '\.txt'"):
+        read_matches(tmp_path / "a.txt", format="table")
+    fits.PrimaryHDU(np.ones((4, 4))).writeto(tmp_path / "image.fits")
+    with pytest.raises(FormatError, match="no table extension"):
+        read_matches(tmp_path / "image.fits")
+    stars[:0].write(tmp_path / "empty.fits")
+    with pytest.raises(InputError, match=r"empty\.fits: holds no rows"):
+        read_matches(tmp_path / "empty.fits")
+    (tmp_path / "wrong.fits").write_text("this is no FITS file\n")
+    with pytest.raises(FormatError, match=r"wrong\.fits"):
+        read_matches(tmp_path / "wrong.fits")
+
+
+def test_a_repeated_row_is_found_across_the_columns(stars, tmp_path):
+    stars["exp"] = "one"
+    stars.add_row(stars[4])
+    stars.write(tmp_path / "a.ecsv")
+    with pytest.raises(InputError, match=r"row 31: repeats .*a\.ecsv, row 5"):
+        read_matches(tmp_path / "a.ecsv")
+
+
+@pytest.mark.parametrize("name", ["Harry695_corr.fits", "AstroTomii_corr.fits"])
+def test_astrometry_net_positions_make_a_sensible_plate(data_dir, name):
+    path = data_dir / "anet_pairs" / name
+    t = read_matches(path, sigma=1.0)
+    raw = Table(fits.getdata(path))
+    assert len(t) == len(raw) and t.unit == "arcsec"
+    # field_x are FITS pixels: astropy's own fit of a linear TAN header in that convention
+    wcs = fit_wcs_from_points(
+        (t.x - 1, t.y - 1), SkyCoord(raw["index_ra"], raw["index_dec"], unit="deg"),
+        proj_point=SkyCoord(*t.tangent_point, unit="deg"),
+    )  # fmt: skip
+    A = np.column_stack([np.ones(len(t)), t.x, t.y])
+    ours = (
+        np.column_stack([t.u, t.v])
+        - A @ np.linalg.lstsq(A, np.column_stack([t.u, t.v]), rcond=None)[0]
+    )
+    scale = np.sqrt(abs(np.linalg.det(wcs.pixel_scale_matrix))) * 3600
+    # a star's residual is a pixel or two, at the scale that astropy finds
+    assert np.median(np.hypot(*ours.T)) < 2.0 * scale
+    rows = np.linalg.lstsq(A, np.column_stack([t.u, t.v]), rcond=None)[0][1:]
+    assert np.sqrt(abs(np.linalg.det(rows))) == pytest.approx(scale, rel=1e-3)
+
+
+def test_astrometry_net_has_no_errors_of_its_own(data_dir):
+    path = data_dir / "anet_pairs" / "Harry695_corr.fits"
+    with pytest.raises(InputError, match="no errors"):
+        read_matches(path)
+    with pytest.raises(InputError, match="option 'pixel_origin' is given"):
+        read_matches(path, sigma=1, pixel_origin=0)
+    with pytest.raises(InputError, match="option 'unit' is given"):
+        read_matches(path, sigma=1, unit="pix")
+    # as any other table, by its columns
+    columns = {"x": "field_x", "y": "field_y", "ra": "index_ra", "dec": "index_dec"}
+    t = read_matches(path, columns=columns, sigma=1)
+    assert (t.u == read_matches(path, sigma=1).u).all()
+
+
+def test_files_on_the_sky_share_one_plane(rng, tmp_path):
+    for k in range(2):
+        ra, dec = 10 + 0.1 * k + rng.uniform(-0.05, 0.05, 20), rng.uniform(-0.05, 0.05, 20)
+        Table({"x": ra, "y": dec, "ra": ra, "dec": dec}).write(
+            tmp_path / f"{k}.csv", format="ascii.csv"
+        )
+    t = read_matches(str(tmp_path / "*.csv"), sigma=1)
+    assert t.tangent_point[0] == pytest.approx(10.05, abs=0.02)
+    first, second = (t.u[t.exposure == k].mean() for k in (0, 1))
+    assert second - first == pytest.approx(360.0, abs=60.0)  # 0.1 degrees apart
+
+
+def test_input_files_are_sorted_and_named(tmp_path):
+    for name in ("b.csv", "a.csv"):
+        (tmp_path / name).write_text("x")
+    assert [p.name for p in input_files(str(tmp_path / "?.csv"))] == ["a.csv", "b.csv"]

@@ -1,0 +1,127 @@
+"""The same posterior by another sampler: NumPyro's NUTS on a density that is written down anew here."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from numpy.polynomial.legendre import legvander2d
+
+from bayesdist.data import match_table, read_matches, read_matchup
+from bayesdist.infer import OutlierMixture, build_model, fit_by_magnitude, fit_linear, sample
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.simulate import simulate_matches
+
+pytestmark = pytest.mark.slow
+numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+
+
+def _nuts(matches, fit, draws: int, seed: int):
+    """Means and standard deviations of theta, log j, logit f, log s_out from NUTS."""
+    import jax
+    import jax.numpy as jnp
+    import numpyro.distributions as dist
+
+    jax.config.update("jax_enable_x64", True)
+    model = fit.model
+    nx, ny = model.chips[0].size
+    X, Y = 2 * (matches.x - 0.5) / nx - 1, 2 * (matches.y - 0.5) / ny - 1
+    V = legvander2d(X, Y, [model.order] * 2).reshape(len(X), model.order + 1, model.order + 1)
+    phi = jnp.array(np.stack([V[:, i, j] for i, j in model.basis().terms], axis=1))
+    u, v = jnp.array(matches.u), jnp.array(matches.v)
+    s2u, s2v = jnp.array(matches.sigma_u**2), jnp.array(matches.sigma_v**2)
+    scale = float(np.median(np.concatenate([matches.sigma_u, matches.sigma_v])))
+    root = jnp.array(np.linalg.cholesky(fit.cov))
+    K = model.n_terms
+
+    def normal(r, s2):
+        return -0.5 * (r**2 / s2 + jnp.log(2 * jnp.pi * s2))
+
+    def density():
+        flat = dist.ImproperUniform(dist.constraints.real, (), (2 * K,))
+        theta = fit.mean + root @ numpyro.sample("z", flat)
+        log_j = numpyro.sample("log_j", dist.ImproperUniform(dist.constraints.real, (), ()))
+        logit_f = numpyro.sample("logit_f", dist.ImproperUniform(dist.constraints.real, (), ()))
+        log_s = numpyro.sample("log_s", dist.ImproperUniform(dist.constraints.real, (), ()))
+        j, f, s_out = jnp.exp(log_j), jax.nn.sigmoid(logit_f), jnp.exp(log_s)
+        # the documented priors, with the Jacobians of the three transformations
+        prior = dist.StudentT(4.0, 0.0, scale).log_prob(j) + log_j
+        prior += dist.Beta(1.0, 9.0).log_prob(f) + jnp.log(f) + jnp.log1p(-f)
+        s2 = s_out**2
+        prior += dist.InverseGamma(1.0, (5 * scale) ** 2).log_prob(s2) + jnp.log(2 * s2)
+        ru, rv = u - phi @ theta[:K], v - phi @ theta[K:]
+        good = jnp.log1p(-f) + normal(ru, s2u + j**2) + normal(rv, s2v + j**2)
+        bad = jnp.log(f) + normal(ru, s2) + normal(rv, s2)
+        numpyro.factor("posterior", prior + jnp.logaddexp(good, bad).sum())
+        numpyro.deterministic("theta", theta)
+
+    start = {
+        "z": np.zeros(2 * K),
+        "log_j": np.log(0.3 * scale),
+        "logit_f": -3.0,
+        "log_s": np.log(10 * scale),
+    }
+    kernel = numpyro.infer.NUTS(density, init_strategy=numpyro.infer.init_to_value(values=start))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mcmc = numpyro.infer.MCMC(
+            kernel,
+            num_warmup=800,
+            num_samples=draws,
+            num_chains=4,
+            chain_method="vectorized",
+            progress_bar=False,
+        )
+        mcmc.run(jax.random.PRNGKey(seed))
+    got = mcmc.get_samples()
+    return np.column_stack([got["theta"], got["log_j"], got["logit_f"], got["log_s"]])
+
+
+def _ours(posterior):
+    h = {k: v.ravel() for k, v in posterior.hyper.items()}
+    logit = np.log(h["f"]) - np.log1p(-h["f"])
+    return np.column_stack([posterior.flat, np.log(h["j"]), logit, np.log(h["s_out"])])
+
+
+def _simulated(jitter: float, n: int):
+    rng = np.random.default_rng(12)
+    model = DistortionModel(3, (Chip(1, "chip", (1016.0, 1016.0), (508.5, 508.5)),))
+    theta = rng.normal(size=model.n_params)
+    sigma = 0.05 * np.exp(0.3 * rng.normal(size=(n, 2)))
+    matches, _ = simulate_matches(
+        model, theta, n, rng=rng, sigma=(sigma[:, 0], sigma[:, 1]), fraction=0.03, jitter=jitter
+    )
+    return matches, fit_linear(matches, model)
+
+
+def _hst1pass(data_dir):
+    folder = data_dir / "hst1pass_uvis"
+    stars = read_matches(folder / "ie8j01xlq_flt.uvwXYMpq", sigma="by_magnitude")
+    stars = match_table(stars, read_matchup(folder / "MATCHUP_XYMEEE_final"))
+    model = build_model(stars, order=3, size=(1024.0, 1024.0))
+    fit, table, _ = fit_by_magnitude(stars, model)
+    return table, fit
+
+
+@pytest.mark.parametrize("case", ["simulated", "errors exact (j = 0)", "real hst1pass exposure"])
+def test_agrees_with_nuts(case, full, request, capsys):
+    if case.startswith("real"):
+        matches, fit = _hst1pass(request.getfixturevalue("data_dir"))
+    else:
+        matches, fit = _simulated(0.02 if case == "simulated" else 0.0, 2000 if full else 600)
+    # Standard deviations within 3 % ask for some 10^4 effective draws on either side.
+    posterior = sample(fit, matches, outliers=OutlierMixture(), target_ess=30_000, seed=5)
+    assert posterior.convergence.converged
+    ours = _ours(posterior)
+    nuts = _nuts(matches, fit, 12000 if full else 10000, seed=3)
+    sd = nuts.std(axis=0)
+    shift = np.abs(ours.mean(axis=0) - nuts.mean(axis=0)) / sd
+    ratio = ours.std(axis=0) / sd
+    with capsys.disabled():
+        print(
+            f"\n{case}: {len(matches)} stars, {len(sd)} parameters; means differ by at most "
+            f"{shift.max():.3f} sd, sd ratio {ratio.min():.4f} to {ratio.max():.4f}"
+        )
+    assert shift.max() < 0.1
+    assert np.abs(ratio - 1).max() < 0.03
