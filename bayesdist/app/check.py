@@ -11,7 +11,7 @@ import numpy as np
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number
-from bayesdist.app.stages import Session, linear_fit
+from bayesdist.app.stages import Session, rehearse
 from bayesdist.infer import GaussianPriors, OutlierMixture
 from bayesdist.infer.sampler import FIRST_CHECK
 from bayesdist.infer.stars import prepare
@@ -42,11 +42,12 @@ def check(path: str | Path) -> str:
         For whatever would stop the run: bad input, or parameters that the data do not determine.
     """
     config, text = load_config(path)
-    with TemporaryDirectory() as folder:
-        run = RunDirectory.begin(folder, config, text, Path(path).resolve().parent)
-        session = Session(run)
-        matches, model = session.raw_matches, session.model
-        fit, errors = linear_fit(session)
+    with TemporaryDirectory() as nowhere:
+        run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
+    session = Session(run)
+    rehearse(session)
+    matches, model = session.raw_matches, session.model
+    fit, errors = session.linear
     if errors is not None:
         matches = matches.with_sigma(*errors.at(matches.mag))
     target = Target(prepare(model, matches), OutlierMixture(), GaussianPriors.none(model))

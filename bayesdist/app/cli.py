@@ -37,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return options.function(options) or 0
     except BayesdistError as error:
-        print(f"bayesdist: {error}", file=sys.stderr)
+        sentence = " ".join(str(error).split())  # libraries below break their reasons into lines
+        print(f"bayesdist: {sentence}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("bayesdist: interrupted; go on with --resume", file=sys.stderr)
@@ -45,6 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe had enough
         sys.stderr.close()
         return 0
+    except OSError as error:  # the system refuses, and nobody below could say more
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"bayesdist: {where}{error.strerror or error}.", file=sys.stderr)
+        return 1
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -106,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--band", default="W2")
     sub.add_argument("--stars", type=int, default=6000, metavar="N")
     sub.add_argument("--fraction", type=float, default=0.03, help="share of false matches")
+    sub.add_argument("--force", action="store_true", help="replace files that are there")
 
     sub = add("init", _init, "a commented configuration for a file of matches")
     sub.add_argument("config", metavar="CONFIG.toml")
@@ -175,7 +181,7 @@ def _validate(options: argparse.Namespace) -> int:
     requirements = load_requirements(options.requirements)
     session = Session(RunDirectory.open(options.run))
     require(session, "validate", ("fit", "sample"))
-    margins = margins_of(session, requirements)
+    margins = margins_of(session, requirements, session.posterior)
     write_margins(session, margins)
     print(margins_text(margin_rows(margins)))
     for m in margins:
@@ -198,14 +204,21 @@ def _simulate(options: argparse.Namespace) -> None:
     from bayesdist.simulate import simulate_wise
 
     if options.stars < 1 or not 0 <= options.fraction < 1:
-        raise InputError("--stars must be positive and --fraction in [0, 1)")
+        raise InputError(
+            "a simulation needs stars, and true matches among them",
+            do="give --stars 1 or more and --fraction in [0, 1)",
+        )
+    folder = Path(options.output)
+    if (folder / "config.toml").exists() and not options.force:
+        raise InputError(
+            "the folder holds a configuration", where=str(folder), do="replace it by --force"
+        )
     matches, truth = simulate_wise(
         options.stars,
         band=options.band,
         fraction=options.fraction,
         rng=np.random.default_rng(options.seed),
     )
-    folder = Path(options.output)
     write_simulation(folder, matches, truth, simulation_config(options.band))
     print(f"{len(matches)} pairs, {int(truth.false.sum())} of them false: {folder / 'stars.ecsv'}")
     print(f"calibrate them:  bayesdist run {folder / 'config.toml'} -o {folder / 'run'}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,11 +17,13 @@ from pydantic import (
     model_validator,
 )
 
+from bayesdist.app.config_errors import as_config_error
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.errors import ConfigError, InputError
+from bayesdist.infer import OutlierMixture
 from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
 
-__all__ = ["Config", "load_config", "load_requirements", "parse_config"]
+__all__ = ["Config", "load_config", "load_requirements", "load_text", "parse_config"]
 
 Pair = tuple[PositiveFloat, PositiveFloat]
 Unit = Literal["pix", "arcsec", "mas", "deg"]
@@ -203,10 +205,16 @@ class Config(Section):
     def _chips_or_detector(self) -> Config:
         if self.chip and (self.detector.size or self.model.reference_pixel):
             raise ValueError(
-                "[[chip]] blocks stand in place of detector.size and model.reference_pixel"
+                "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
+                "give one of the two"
             )
         if not self.chip and self.detector.size is None:
-            raise ValueError("detector.size is missing (or [[chip]] blocks)")
+            raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
+        numbers = [c.number for c in self.chip]
+        if len(set(numbers)) < len(numbers):
+            raise ValueError("two [[chip]] blocks have one number; number each differently")
+        if sum(c.reference for c in self.chip) > 1:
+            raise ValueError("two [[chip]] blocks are the reference; choose one")
         return self
 
     def chips(self) -> tuple[Chip, ...]:
@@ -223,6 +231,16 @@ class Config(Section):
         epochs = tdd.epoch0 if isinstance(tdd.epoch0, list) else [tdd.epoch0]
         return TimeDependence(tuple(tdd.terms), tuple(epochs), tuple(tdd.breaks))
 
+    def mixture(self) -> OutlierMixture:
+        """The outlier mixture."""
+        o = self.outliers
+        return OutlierMixture(
+            model=o.model,
+            match_radius=o.match_radius,
+            jitter=None if o.jitter == "fit" else o.jitter,
+            fraction_prior=o.fraction_prior,
+        )
+
     def user_terms(self) -> tuple[UserTerm, ...]:
         """The user's terms of the error budget."""
         return tuple(UserTerm(**b.model_dump()) for b in self.budget)
@@ -233,7 +251,7 @@ class Config(Section):
 
 
 class _RequirementFile(Section):
-    requirement: list[RequirementBlock]
+    requirement: Annotated[list[RequirementBlock], Field(min_length=1)]
 
 
 def load_config(path: str | Path) -> tuple[Config, str]:
@@ -254,7 +272,7 @@ def load_config(path: str | Path) -> tuple[Config, str]:
     ConfigError
         With file, key and reason; an unknown key names the nearest known one.
     """
-    text = _read(path)
+    text = load_text(path)
     return parse_config(text, str(path)), text
 
 
@@ -263,6 +281,7 @@ def parse_config(text: str, where: str) -> Config:
     config = _validated(Config, text, where)
     try:
         config.time()
+        config.mixture()
         config.user_terms()
         config.requirements()
     except InputError as error:
@@ -277,83 +296,39 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
     ------
     ConfigError
     """
-    blocks = _validated(_RequirementFile, _read(path), str(path)).requirement
+    blocks = _validated(_RequirementFile, load_text(path), str(path)).requirement
     try:
         return tuple(Requirement(**r.model_dump()) for r in blocks)
     except InputError as error:
         raise ConfigError(error.cause, where=f"{path}: {error.where}", do=error.do) from error
 
 
-def _read(path: str | Path) -> str:
+def load_text(path: str | Path) -> str:
+    """Text of a file as it stands, with its line ends.
+
+    Raises
+    ------
+    ConfigError
+    """
     try:
-        return Path(path).read_text(encoding="utf-8")
+        with open(path, encoding="utf-8", newline="") as stream:
+            return stream.read()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ConfigError(f"cannot be read ({reason})", where=str(path)) from error
+        raise ConfigError(
+            f"cannot be read ({reason})", where=str(path), do="check the path and the file"
+        ) from error
 
 
 def _validated(kind: type[Section], text: str, where: str) -> Any:
     try:
-        raw = tomllib.loads(text)
+        raw = tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not valid TOML ({error})", where=where) from error
+        raise ConfigError(
+            f"is not valid TOML ({error})", where=where, do="correct it there"
+        ) from error
     try:
-        return kind.model_validate(raw)
+        # by way of JSON: there arrays may become tuples, but no text a number
+        return kind.model_validate_json(json.dumps(raw, default=str), strict=True)
     except ValidationError as error:
-        raise _as_sentence(kind, error, where) from error
-
-
-def _as_sentence(kind: type[Section], error: ValidationError, where: str) -> ConfigError:
-    """The first thing that is wrong, with its key."""
-    # an unknown key is usually the cause of a missing one
-    details = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    first = details[0]
-    path = [str(p) for p in first["loc"] if not _is_branch(p)]
-    key = _dotted(first["loc"])
-    if first["type"] == "extra_forbidden":
-        known = _known_keys(kind, first["loc"][:-1])
-        near = get_close_matches(path[-1], known, 1, cutoff=0.4)
-        do = f"did you mean {near[0]!r}" if near else f"known keys are {', '.join(sorted(known))}"
-        return ConfigError(f"unknown key {path[-1]!r}", where=f"{where}: {key}", do=do)
-    if first["type"] == "missing":
-        return ConfigError("this key is missing", where=f"{where}: {key}", do="add it")
-    cause = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "value_error":
-        return ConfigError(cause, where=where)
-    cause = cause[0].lower() + cause[1:]
-    return ConfigError(f"{first['input']!r} does not fit: {cause}", where=f"{where}: {key}")
-
-
-def _is_branch(part: str | int) -> bool:
-    """Whether part of a location names a branch of a union, not a key."""
-    return isinstance(part, str) and ("[" in part or part in ("float", "str", "int"))
-
-
-def _dotted(location: tuple[str | int, ...]) -> str:
-    out = ""
-    for part in location:
-        if isinstance(part, int):
-            out += f"[{part + 1}]"
-        elif not _is_branch(part):
-            out += f".{part}" if out else part
-    return out
-
-
-def _known_keys(kind: type[Section], location: tuple[str | int, ...]) -> list[str]:
-    """Keys of the section at a location."""
-    current: Any = kind
-    for part in location:
-        if isinstance(part, int) or _is_branch(part):
-            continue
-        current = _section_of(current.model_fields[part].annotation)
-    return list(current.model_fields)
-
-
-def _section_of(annotation: Any) -> Any:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for inner in getattr(annotation, "__args__", ()):
-        found = _section_of(inner)
-        if found is not None:
-            return found
-    return None
+        raise as_config_error(kind, error, where) from error

@@ -86,7 +86,9 @@ def write_simulation(folder: Path, matches: MatchTable, truth: Truth, config: st
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"the folder cannot be made ({error.strerror})", where=str(folder)
+            f"the folder cannot be made ({error.strerror})",
+            where=str(folder),
+            do="choose one that you may write to",
         ) from error
     stars = QTable()
     for name in ("x", "y", "u", "v", "sigma_u", "sigma_v"):

@@ -13,13 +13,16 @@ from bayesdist.errors import InputError
 
 __all__ = ["init"]
 
+SIGMA = 0.05  # for tables that say nothing about their errors
+
 _TEMPLATE = """\
 # A calibration of geometric distortion; see docs/configuration.md for every key.
 
 [data]
 matches = {matches}
 # format = "auto"               # auto | table | hst1pass | matchup | astrometry.net
-{columns}sigma = {sigma}
+# columns = {{x = "x", y = "y", u = "u", v = "v"}}  # by default they are found by their names
+{unit_line}sigma = {sigma}
 pixel_origin = 1                # of x, y: 1 as in FITS, or 0
 
 [detector]
@@ -27,10 +30,14 @@ name = "{name}"
 size = [{nx}, {ny}]             # columns, rows; {size_note}
 # scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
 
-[model] order = {order}                       # 1 to 9 # reference_pixel = [{cx}, {cy}] frames =
-"{frames}"               # of each exposure: none | shift | shift_rotation | shift_rotation_scale |
-affine # [model.tdd]                   # terms that drift with time: axis, power of x, power of y #
-epoch0 = 2004.5 # terms = [["u", 1, 0], ["v", 1, 0]]
+[model]
+order = {order}                       # 1 to 9
+# reference_pixel = [{cx}, {cy}]  # zero point of the polynomial; the centre by default
+# of each exposure: none | shift | shift_rotation | shift_rotation_scale | affine
+frames = "{frames}"
+# [model.tdd]                   # terms that drift with time: axis, power of x, power of y
+# epoch0 = 2004.5
+# terms = [["u", 1, 0], ["v", 1, 0]]
 
 [fit]
 clip_chi2 = 25.0                # second pass without pairs beyond this chi-square
@@ -93,13 +100,13 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
     path = Path(path)
     if path.exists() and not force:
         raise InputError("this file exists", where=str(path), do="replace it by --force")
-    table, sigma = _read(matches)
+    table, unit_line, sigma = _read(matches)
     nx, ny = (_guess_size(v) for v in (table.x, table.y))
     relative = os.path.relpath(Path(matches), path.resolve().parent)
     n = len(table)
     text = _TEMPLATE.format(
         matches=_toml(relative),
-        columns='# columns = {x="x", y="y", u="u", v="v", ...}   # found by their names\n',
+        unit_line=unit_line,
         sigma=sigma,
         name=Path(matches).stem.replace('"', ""),
         nx=nx,
@@ -118,17 +125,25 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
     return table
 
 
-def _read(matches: str | Path) -> tuple[MatchTable, str]:
-    """The table, and how its errors are to be had."""
-    table = read_matches(matches)
-    if table.sigma_u is not None:
-        return table, '"columns"'
+def _read(matches: str | Path) -> tuple[MatchTable, str, str]:
+    """The table, the line about its unit, and how its errors are to be had."""
+    unit, line = None, ""
+    try:
+        table = read_matches(matches, sigma=SIGMA)
+    except InputError as error:
+        if error.cause != "has no unit":
+            raise
+        unit, line = "pix", 'unit = "pix"                    # GUESSED: the table does not say\n'
+        table = read_matches(matches, sigma=SIGMA, unit=unit)
+    try:
+        return read_matches(matches, unit=unit), line, '"columns"'
+    except InputError as error:
+        if error.cause != "holds no errors of the positions":
+            raise
     if table.mag is not None:
-        return table, '"by_magnitude"        # the table carries no errors'
-    return (
-        table,
-        "0.05                    # GUESSED: the table carries neither errors nor magnitudes",
-    )
+        return table, line, '"by_magnitude"        # the table carries no errors'
+    guess = f"{SIGMA}                    # GUESSED: the table carries neither errors nor magnitudes"
+    return table, line, guess
 
 
 def _guess_size(values: np.ndarray) -> int:

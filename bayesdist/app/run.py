@@ -8,7 +8,7 @@ from pathlib import Path
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import log_file, progress_bar
-from bayesdist.app.stages import NEEDS, STAGES, Session, require, run_stage
+from bayesdist.app.stages import NEEDS, STAGES, Session, rehearse, require, run_stage
 from bayesdist.errors import NotConvergedError
 
 __all__ = ["continue_stage", "run"]
@@ -55,7 +55,7 @@ def run(
     BayesdistError
     """
     settings, text = load_config(config)
-    directory = RunDirectory.begin(
+    directory = RunDirectory.plan(
         output,
         settings,
         text,
@@ -66,6 +66,7 @@ def run(
         command=command,
     )
     session = Session(directory)
+    _begin(session)
     with log_file(directory / "bayesdist.log"):
         redo = False
         for stage in STAGES:
@@ -88,11 +89,19 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     directory = RunDirectory.open(path)
     session = Session(directory)
     require(session, stage, NEEDS[stage])
+    _begin(session)
     with log_file(directory / "bayesdist.log"):
         _run_stage(session, stage)
     if stage == "sample":
         _judge(session, strict)
     return directory
+
+
+def _begin(session: Session) -> None:
+    """Begin a planned run once it is known that it can be carried out."""
+    if not session.run.begun:
+        rehearse(session)
+        session.run.begin()
 
 
 def _run_stage(session: Session, stage: str) -> None:

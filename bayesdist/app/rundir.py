@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import platform
-import shutil
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.config import Config, parse_config
+from bayesdist.app.config import Config, load_config, load_text
 from bayesdist.data import atomic_path, input_files, sha256_of
 from bayesdist.errors import InputError
 
@@ -26,25 +26,13 @@ __all__ = ["RunDirectory", "as_json", "write_json"]
 SCHEMA = 1
 PACKAGES = ("bayesdist", "arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 
-# what a run writes, and --force removes; nothing else in a folder is ever touched
-OWN_FILES = (
-    "config.toml",
-    "run.json",
-    "bayesdist.log",
-    "fit.nc",
-    "magnitude_errors.ecsv",
-    "chain-*.h5",
-    "posterior.nc",
-    "coefficients.ecsv",
-    "maps.fits",
-    "budget.ecsv",
-    "margins.ecsv",
-    "summary.json",
-    "*_idc.fits",
-    "sip*.hdr",
-    "figures",
-    "report.html",
+# what a run writes beside its products and figures, which it lists itself; --force removes these
+# and nothing else
+OWN_FILES = re.compile(
+    r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
+    r"posterior\.nc|(coefficients|budget|margins)\.ecsv|maps\.fits|summary\.json|report\.html"
 )
+TEMPORARY = re.compile(r"\.[0-9a-f]{8}\.")  # how a file begins that a killed run left half-written
 
 
 def as_json(value: Any) -> Any:
@@ -81,6 +69,7 @@ class RunDirectory:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        self._planned: tuple[dict[str, Any], str] | None = None
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -88,7 +77,7 @@ class RunDirectory:
     # -- beginning --------------------------------------------------------------------------------
 
     @classmethod
-    def begin(
+    def plan(
         cls,
         path: str | Path,
         config: Config,
@@ -100,7 +89,7 @@ class RunDirectory:
         seed: int | None = None,
         command: str = "",
     ) -> RunDirectory:
-        """Open a folder for a run and write down what is about to be done.
+        """A run that may go on in a folder, or may begin there; nothing is written yet.
 
         Parameters
         ----------
@@ -127,7 +116,6 @@ class RunDirectory:
         if run.path.exists() and not run.path.is_dir():
             raise InputError("is a file, not a folder", where=str(path), do="choose another folder")
         inputs = {str(f): sha256_of(f) for f in run._inputs(config, base)}
-        there = run._entries()
         if (run / "run.json").exists() and not force:
             if not resume:
                 raise InputError(
@@ -137,40 +125,59 @@ class RunDirectory:
                 )
             run._check_unchanged(config, text, inputs, seed)
             return run
-        foreign = there - {"config.toml"} if not force else run._foreign()
+        foreign = run._foreign(text)
         if foreign:
             raise InputError(
-                f"the folder holds other files ({sorted(foreign)[0]})",
+                f"the folder holds other files ({foreign[0]})",
                 where=str(path),
                 do="choose an empty folder",
             )
-        if force:
-            run.clear()
-        try:
-            run.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"the folder cannot be made ({error.strerror})", where=str(path)
-            ) from error
         if seed is not None:
             sampler = config.sampler.model_copy(update={"seed": seed})
             config = config.model_copy(update={"sampler": sampler})
-        with atomic_path(run / "config.toml") as temporary:
-            temporary.write_text(text, encoding="utf-8")
-        run.write_record(
-            {
-                "schema": SCHEMA,
-                "config": config.model_dump(),
-                "base": str(base.resolve()),
-                "inputs": inputs,
-                "seed": config.sampler.seed,
-                "versions": versions(),
-                "command": command,
-                "created": _now(),
-                "stages": {},
-            }
-        )
+        record = {
+            "schema": SCHEMA,
+            "config": config.model_dump(),
+            "base": str(base.resolve()),
+            "inputs": inputs,
+            "seed": config.sampler.seed,
+            "versions": versions(),
+            "command": command,
+            "created": _now(),
+            "stages": {},
+        }
+        run._planned = as_json(record), text
         return run
+
+    @property
+    def begun(self) -> bool:
+        """Whether the folder holds this run already."""
+        return self._planned is None
+
+    def begin(self) -> None:
+        """Write down what is about to be done; another run that stands there is removed.
+
+        Raises
+        ------
+        InputError
+            When the folder cannot be made or written.
+        """
+        assert self._planned is not None
+        record, text = self._planned
+        if (self / "run.json").exists():
+            self.clear()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"the folder cannot be made ({error.strerror})",
+                where=str(self.path),
+                do="choose one that you may write to",
+            ) from error
+        with atomic_path(self / "config.toml") as temporary:
+            temporary.write_text(text, encoding="utf-8", newline="")
+        self.write_record(record)
+        self._planned = None
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
@@ -185,37 +192,49 @@ class RunDirectory:
             run._check_inputs()
             return run
         if (run / "config.toml").exists():
-            text = (run / "config.toml").read_text(encoding="utf-8")
-            config = parse_config(text, str(run / "config.toml"))
-            return cls.begin(path, config, text, run.path)
+            config, text = load_config(run / "config.toml")
+            return cls.plan(path, config, text, run.path)
         raise InputError(
             "is no run: it has neither run.json nor config.toml",
             where=str(path),
             do="make one with 'bayesdist run CONFIG.toml -o RUN'",
         )
 
-    def _entries(self) -> set[str]:
-        return {p.name for p in self.path.iterdir()} if self.path.is_dir() else set()
+    def _foreign(self, text: str) -> list[str]:
+        """What forbids a run to begin in a folder that holds none, sorted.
 
-    def _own(self) -> set[str]:
-        if not self.path.is_dir():
-            return set()
-        return {p.name for pattern in OWN_FILES for p in self.path.glob(pattern)}
+        A config.toml that says the same is no obstacle: a stage may be run on it.
+        """
+        if (self / "run.json").exists() or not self.path.is_dir():
+            return []
+        names = {p.name for p in self.path.iterdir()}
+        if "config.toml" in names and load_text(self / "config.toml") == text:
+            names.remove("config.toml")
+        return sorted(names)
 
-    def _foreign(self) -> set[str]:
-        """What --force would have to leave: only a folder that holds a run is cleared."""
-        if (self / "run.json").exists():
-            return set()
-        return self._entries() - {"config.toml"}
+    def _own(self) -> list[Path]:
+        """Files that the run in this folder wrote."""
+        own = [
+            p
+            for p in self.path.iterdir()
+            if OWN_FILES.fullmatch(TEMPORARY.sub("", p.name, count=1)) and not p.is_dir()
+        ]
+        try:
+            summary = self.summary
+        except InputError:  # what it listed stays; the rest can be cleared all the same
+            summary = {}
+        products = [self / Path(p["path"]).name for p in summary.get("products", [])]
+        figures = [self / "figures" / Path(name).name for name in summary.get("figures", [])]
+        return own + products + figures
 
     def clear(self) -> None:
-        """Remove what a run writes, and nothing else."""
-        for name in self._own():
-            target = self / name
-            if target.is_dir():
-                shutil.rmtree(target)
-            else:
-                target.unlink()
+        """Remove what a run wrote, and nothing else."""
+        for path in self._own():
+            path.unlink(missing_ok=True)
+        try:
+            (self / "figures").rmdir()
+        except OSError:  # there is none, or it holds other files
+            pass
 
     @staticmethod
     def _inputs(config: Config, base: Path) -> list[Path]:
@@ -227,7 +246,7 @@ class RunDirectory:
         self, config: Config, text: str, inputs: dict[str, str], seed: int | None
     ) -> None:
         record = self.record
-        if (self / "config.toml").read_text(encoding="utf-8") != text:
+        if load_text(self / "config.toml") != text:
             raise InputError(
                 "the configuration is not the one this run began with",
                 where=str(self / "config.toml"),
@@ -258,7 +277,9 @@ class RunDirectory:
 
     @property
     def record(self) -> dict[str, Any]:
-        """Content of run.json."""
+        """Content of run.json, or of what it will be."""
+        if self._planned is not None:
+            return self._planned[0]
         try:
             return json.loads((self / "run.json").read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:

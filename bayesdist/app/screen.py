@@ -45,7 +45,9 @@ def log_file(path: Path) -> Iterator[None]:
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", where=str(path)) from error
+        raise InputError(
+            f"cannot be written ({error.strerror})", where=str(path), do="check its permissions"
+        ) from error
     handler.setFormatter(logging.Formatter(FORMAT))
     # a full disk must not bury the error that stops the run under logging's own tracebacks
     handler.handleError = lambda record: None  # type: ignore[method-assign]

@@ -15,6 +15,7 @@ from astropy.table import Table
 from bayesdist.app.config import Config
 from bayesdist.app.rundir import RunDirectory, as_json
 from bayesdist.assess import (
+    ErrorBudget,
     Margin,
     Requirement,
     area_map,
@@ -26,12 +27,12 @@ from bayesdist.assess import (
     uncertainty_map,
 )
 from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.solution import Solution
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
-    OutlierMixture,
     Posterior,
     build_model,
     fit_by_magnitude,
@@ -44,6 +45,8 @@ from bayesdist.infer import (
 )
 from bayesdist.model import DistortionModel
 from bayesdist.products import (
+    IdcTab,
+    SipHeader,
     idctab_from_solution,
     lint_idctab,
     lint_sip,
@@ -55,13 +58,14 @@ from bayesdist.products import (
 )
 from bayesdist.products.maps_file import write_maps
 
-__all__ = ["STAGES", "Session", "run_stage"]
+__all__ = ["STAGES", "Session", "rehearse", "run_stage"]
 
 log = logging.getLogger("bayesdist")
 
 STAGES = ("fit", "sample", "assess", "export", "report")
 
 ERROR_COLUMNS = ("mag", "sigma_u", "sigma_v", "n", "scatter_u", "scatter_v")
+REHEARSAL_DRAWS = 100
 VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
 MOST_BINS = 32
 STARS_PER_BIN = 25
@@ -139,6 +143,21 @@ class Session:
         return GaussianPriors.of(self.model, named)
 
     @cached_property
+    def linear(self) -> tuple[LinearFit, MagnitudeErrors | None]:
+        """The linear fit that the configuration asks for, made now; nothing is written."""
+        fit = self.config.fit
+        options: dict[str, Any] = {
+            "clip_chi2": fit.clip_chi2,
+            "clip_abs": fit.clip_abs,
+            "radial_weight": fit.radial_weight,
+            "priors": self.priors,
+        }
+        if self.config.data.sigma == "by_magnitude":
+            solution, _, errors = fit_by_magnitude(self.raw_matches, self.model, **options)
+            return solution, errors
+        return fit_linear(self.raw_matches, self.model, **options), None
+
+    @cached_property
     def fit(self) -> LinearFit:
         """The linear fit of an earlier stage."""
         return load_fit(self.run / "fit.nc")
@@ -148,14 +167,15 @@ class Session:
         """The posterior of an earlier stage."""
         return load_posterior(self.run / "posterior.nc")
 
+    @property
+    def scale_arcsec(self) -> float | None:
+        """Size of a pixel in arcsec, where the configuration gives it."""
+        scale = self.config.detector.scale_mas
+        return None if scale is None else scale / 1000
+
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""
         return np.random.default_rng([self.config.sampler.seed, STAGES.index(stage)])
-
-    @cached_property
-    def pixel_scale(self) -> float | None:
-        """Size of a pixel in mas."""
-        return pixel_scale_of(self.posterior, scale_mas=self.config.detector.scale_mas)
 
     @property
     def epoch(self) -> float | None:
@@ -173,29 +193,34 @@ def run_stage(session: Session, name: str) -> None:
         _FUNCTIONS[name](session)
 
 
-def linear_fit(session: Session) -> tuple[LinearFit, MagnitudeErrors | None]:
-    """The linear fit that a configuration asks for, without writing anything."""
+def rehearse(session: Session) -> None:
+    """All that comes after sampling, on the linear fit and with few draws; nothing is written.
+
+    What is wrong with the data or the configuration shows here, before hours of sampling.
+
+    Raises
+    ------
+    BayesdistError
+    """
     config = session.config
-    options: dict[str, Any] = {
-        "clip_chi2": config.fit.clip_chi2,
-        "clip_abs": config.fit.clip_abs,
-        "radial_weight": config.fit.radial_weight,
-        "priors": session.priors,
-    }
-    if config.data.sigma == "by_magnitude":
-        fit, _, errors = fit_by_magnitude(session.raw_matches, session.model, **options)
-        return fit, errors
-    return fit_linear(session.raw_matches, session.model, **options), None
+    fit, _ = session.linear
+    _budget(session, fit, REHEARSAL_DRAWS)
+    margins_of(session, config.requirements(), fit, REHEARSAL_DRAWS)
+    if config.products.sip is not None:
+        for chip in fit.model.chips:
+            _sip(session, fit, chip.number)
+    if config.products.idctab is not None:
+        _idctab(session, fit)
 
 
 def _fit(session: Session) -> None:
     run = session.run
-    fit, errors = linear_fit(session)
+    fit, errors = session.linear
     if errors is not None:
         table = Table({name: getattr(errors, name) for name in ERROR_COLUMNS})
         _write_table(table, run / "magnitude_errors.ecsv")
     save_fit(fit, run / "fit.nc")
-    for stale in ("matches", "magnitude_errors", "fit"):
+    for stale in ("matches", "magnitude_errors", "fit"):  # this fit is what they go by from now on
         session.__dict__.pop(stale, None)
     matches = session.raw_matches
     run.summarise(
@@ -231,16 +256,11 @@ def _fit(session: Session) -> None:
 
 def _sample(session: Session) -> None:
     config, run = session.config, session.run
-    outliers, s = config.outliers, config.sampler
+    s = config.sampler
     posterior = sample(
         session.fit,
         session.matches,
-        outliers=OutlierMixture(
-            model=outliers.model,
-            match_radius=outliers.match_radius,
-            jitter=None if outliers.jitter == "fit" else outliers.jitter,
-            fraction_prior=outliers.fraction_prior,
-        ),
+        outliers=config.mixture(),
         priors=session.priors,
         seed=s.seed,
         ensembles=s.ensembles,
@@ -303,13 +323,13 @@ def _assess(session: Session) -> None:
     maps = [uncertainty_map(s, grid=grid, epoch=epoch) for s in (session.fit, solution)]
     write_maps(run / "maps.fits", maps, area_map(solution, grid=grid, epoch=epoch))
     _write_table(coefficient_table(session.fit, solution), run / "coefficients.ecsv")
-    budget = _budget(session)
+    budget = _budget(session, solution)
     table = Table(rows=budget.rows())
     for name in ("u", "v", "radial"):
         table[name].unit = solution.unit
     table.meta = {"epoch": epoch, "grid": list(grid), "statistic": "rms over the grid"}
     _write_table(table, run / "budget.ecsv")
-    margins = margins_of(session, config.requirements())
+    margins = margins_of(session, config.requirements(), solution)
     write_margins(session, margins)
     m = maps[1]
     run.summarise(
@@ -327,30 +347,31 @@ def _assess(session: Session) -> None:
     log.info("assess: largest formal radius %.4g %s", m.radius_max, m.unit)
 
 
-def _budget(session: Session):  # type: ignore[no-untyped-def]
-    return error_budget(
-        session.posterior,
-        terms=session.config.user_terms(),
-        grid=session.config.assess.grid,
-        epoch=session.epoch,
-        n_draws=session.config.assess.draws,
-        rng=session.rng("assess"),
-        pixel_scale=session.pixel_scale,
-    )
+def _assessment(session: Session, solution: Solution, n_draws: int | None) -> dict[str, Any]:
+    """What a budget and margins have in common."""
+    config = session.config
+    return {
+        "terms": config.user_terms(),
+        "grid": config.assess.grid,
+        "epoch": session.epoch,
+        "n_draws": n_draws or config.assess.draws,
+        "rng": session.rng("assess"),
+        "pixel_scale": pixel_scale_of(solution, scale_mas=config.detector.scale_mas),
+    }
 
 
-def margins_of(session: Session, requirements: tuple[Requirement, ...]) -> tuple[Margin, ...]:
-    """Margins of a run against requirements."""
-    return check_requirements(
-        session.posterior,
-        requirements,
-        terms=session.config.user_terms(),
-        grid=session.config.assess.grid,
-        epoch=session.epoch,
-        n_draws=session.config.assess.draws,
-        rng=session.rng("assess"),
-        pixel_scale=session.pixel_scale,
-    )
+def _budget(session: Session, solution: Solution, n_draws: int | None = None) -> ErrorBudget:
+    return error_budget(solution, **_assessment(session, solution, n_draws))
+
+
+def margins_of(
+    session: Session,
+    requirements: tuple[Requirement, ...],
+    solution: Solution,
+    n_draws: int | None = None,
+) -> tuple[Margin, ...]:
+    """Margins of a solution against requirements; as many draws as configured by default."""
+    return check_requirements(solution, requirements, **_assessment(session, solution, n_draws))
 
 
 def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
@@ -390,24 +411,36 @@ def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
     session.run.summarise(margins=rows)
 
 
+def _sip(session: Session, solution: Solution, chip: int) -> SipHeader:
+    sip = session.config.products.sip
+    assert sip is not None
+    return sip_from_solution(
+        solution,
+        chip=chip,
+        epoch=session.epoch,
+        inverse_order=sip.inverse_order,
+        linear=sip.linear,
+        crval=sip.crval,
+        scale_arcsec=session.scale_arcsec,
+    )
+
+
+def _idctab(session: Session, solution: Solution) -> IdcTab:
+    idc = session.config.products.idctab
+    assert idc is not None
+    return idctab_from_solution(
+        solution, scale_arcsec=session.scale_arcsec, **idc.model_dump(exclude_none=True)
+    )
+
+
 def _export(session: Session) -> None:
     config, run = session.config, session.run
-    scale = None if config.detector.scale_mas is None else config.detector.scale_mas / 1000
     products: list[dict[str, Any]] = []
-    sip = config.products.sip
-    if sip is not None:
+    if config.products.sip is not None:
         for chip in session.posterior.model.chips:
             several = len(session.posterior.model.chips) > 1
             path = run / (f"sip_{chip.number}.hdr" if several else "sip.hdr")
-            header = sip_from_solution(
-                session.posterior,
-                chip=chip.number,
-                epoch=session.epoch,
-                inverse_order=sip.inverse_order,
-                linear=sip.linear,
-                crval=sip.crval,
-                scale_arcsec=scale,
-            )
+            header = _sip(session, session.posterior, chip.number)
             write_sip(header, path)
             findings = lint_sip(read_sip(path), size=chip.size)
             products.append(
@@ -424,10 +457,7 @@ def _export(session: Session) -> None:
     idc = config.products.idctab
     if idc is not None:
         path = run / f"{idc.instrument}_{idc.detector}_idc.fits".lower()
-        table = idctab_from_solution(
-            session.posterior, scale_arcsec=scale, **idc.model_dump(exclude_none=True)
-        )
-        write_idctab(table, path)
+        write_idctab(_idctab(session, session.posterior), path)
         findings = lint_idctab(read_idctab(path))
         products.append(
             {
@@ -490,9 +520,9 @@ def _report(session: Session) -> None:
             size=chip.size,
         ),
         coefficients=coefficient_table(fit, posterior),
-        budget=_budget(session),
+        budget=_budget(session, posterior),
         # the requirements that were judged last, be it by `assess` or by `validate`
-        margins=margins_of(session, judged_requirements(run)),
+        margins=margins_of(session, judged_requirements(run), posterior),
         products=products,
         magnitude_errors=session.magnitude_errors,
         provenance={
@@ -500,6 +530,10 @@ def _report(session: Session) -> None:
         },
     )
     figures = all_figures(inputs)
+    names = [f"{name}.png" for name in figures]
+    for stale in set(run.summary.get("figures", [])) - set(names):
+        (run / "figures" / stale).unlink(missing_ok=True)
+    run.summarise(figures=names)
     save_figures(figures, run / "figures")
     write_report(run / "report.html", inputs, figures)
     log.info("report: %s", run / "report.html")

@@ -175,12 +175,20 @@ class ArrowFactor:
         x_b = L_S^-T z_b and x_e = L_e^-T z_e - C_e^-1 B_e^T x_b, so that |z|^2 = x^T H x.
         """
         b, l = self.matrix.split(z)
-        top = _solve_lower_transposed(self.chol_border, b)
-        low = l
-        if len(self.chol_blocks):
-            transposed = np.swapaxes(self.chol_blocks, 1, 2)
-            low = np.linalg.solve(transposed, l[..., None])[..., 0]
+        top = b @ self._inverse_border
+        low = np.einsum("nrq,...nr->...nq", self._inverse_blocks, l)
         return self.matrix.join(top, low - np.einsum("nqb,...b->...nq", self.gain, top))
+
+    # Explicit inverses: `colour` is called for every proposal, with few vectors at a time, where
+    # a triangular solve costs a hundred times its arithmetic.
+
+    @cached_property
+    def _inverse_border(self) -> Float:
+        return solve_triangular(self.chol_border, np.eye(len(self.chol_border)), lower=True)
+
+    @cached_property
+    def _inverse_blocks(self) -> Float:
+        return np.linalg.inv(self.chol_blocks)
 
     def whiten(self, x: Float) -> Float:
         """White vectors z from x (..., size): the inverse of `colour`."""
@@ -193,8 +201,3 @@ class ArrowFactor:
         """H^-1 as a dense matrix (size, size)."""
         root = self.colour(np.eye(self.matrix.size))
         return root.T @ root
-
-
-def _solve_lower_transposed(L: Float, z: Float) -> Float:
-    flat = z.reshape(-1, z.shape[-1])
-    return solve_triangular(L, flat.T, lower=True, trans="T").T.reshape(z.shape)

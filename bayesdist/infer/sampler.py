@@ -51,6 +51,8 @@ class Plan:
         Steps that are dropped.
     step : float
         b of the Crank-Nicolson move.
+    thin : int
+        Every so many steps are kept: moves that go slowly would only fill the memory.
     """
 
     method: str
@@ -58,6 +60,7 @@ class Plan:
     walkers: int
     warmup: int
     step: float
+    thin: int = 1
 
 
 def plan_moves(efficiency: float, k: float, n_params: int, walkers: int | None = None) -> Plan:
@@ -80,10 +83,10 @@ def plan_moves(efficiency: float, k: float, n_params: int, walkers: int | None =
     if efficiency > 0.5 and k < 0.7:
         return Plan("independence", (0.95, 0.05, 0.0), walkers or 16, 10, step)
     if efficiency > 0.05 and k < 1.0:
-        return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, 100, step)
+        return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, 100, step, 5)
     # emcee's red-blue moves want two walkers for each parameter
     least = 2 * (n_params + 1)
-    return Plan("DE + pCN + independence", (0.2, 0.3, 0.5), max(walkers or 0, least), 500, step)
+    return Plan("DE + pCN + independence", (0.2, 0.3, 0.5), max(walkers or 0, least), 500, step, 10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,10 +171,10 @@ class Block:
 
     Parameters
     ----------
-    psi : ndarray, shape (steps, walkers, D)
-    log_prob : ndarray, shape (steps, walkers)
+    psi : ndarray, shape (steps kept, walkers, D)
+    log_prob : ndarray, shape (steps kept, walkers)
     accepted : ndarray, shape (walkers,)
-        Number of accepted moves of each walker.
+        Number of accepted moves of each walker among the steps kept.
     state : emcee.State
         After the last step, with the state of the random numbers.
     """
@@ -253,8 +256,8 @@ class Ensembles:
                 return self._block(*_read_block(path))
         sampler = self._sampler
         sampler.reset()
-        for _ in sampler.sample(state, iterations=end - begin, skip_initial_state_check=True):
-            pass
+        thin = self.plan.thin if (end - begin) % self.plan.thin == 0 else 1
+        sampler.run_mcmc(state, (end - begin) // thin, thin_by=thin, skip_initial_state_check=True)
         white, log_prob = sampler.get_chain(), sampler.get_log_prob()
         accepted = sampler.backend.accepted.astype(float)
         random = sampler.random_state

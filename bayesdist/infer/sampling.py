@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from bayesdist.data.files import atomic_path
 from bayesdist.data.matches import MatchTable
@@ -33,6 +34,8 @@ PILOT_STARS = 200_000_000  # star evaluations that the pilot may cost
 MEMBERSHIP_DRAWS = 64  # draws over which the outlier probability of a star is averaged
 
 
+# matrices here are small: more BLAS threads only get in each other's way
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def sample(
     fit: LinearFit,
     matches: MatchTable,
@@ -132,7 +135,8 @@ def sample(
             progress(end, max_steps)
         if end - plan.warmup < 20 and end < max_steps:
             continue
-        kept = slice(min(plan.warmup, end // 2), None)
+        made = sum(len(block) for block in psi[0])
+        kept = slice(min(plan.warmup // plan.thin, made // 2), None)
         chains = np.array([np.concatenate(p) for p in psi])[:, kept]
         verdict = diagnose(chains, target.names, log_weights, limits, coupled=plan.weights[2] > 0)
         if verdict.converged:
@@ -146,7 +150,7 @@ def sample(
         steps=begin,
         warmup=min(plan.warmup, begin // 2),
         passes=n_pilot + 2 * ensembles * plan.walkers + n_moves,
-        acceptance=accepted / n_moves,
+        acceptance=accepted / (ensembles * plan.walkers * made),
         wall_s=time.monotonic() - started,
         seed=seed,
     )
