@@ -1,7 +1,7 @@
 """Mode and curvature of the posterior at a given jitter.
 
 Newton's method on the mixture, with the EM weights wherever the full Hessian is not positive: far
-from the mode every step is an EM step, near it convergence is quadratic.
+from the mode steps are EM steps, near it convergence is quadratic.
 """
 
 from __future__ import annotations
@@ -123,13 +123,10 @@ def conditional_mode(
     """
     value, gradient, full, safe = _expand(target, y, log_j)
     for _ in range(max_steps):
-        try:
-            factor, exact = full.factor(), True
-        except np.linalg.LinAlgError:
-            factor, exact = _factor_safe(safe), False
+        factor = _positive(full, safe, y)
         step = factor.solve(gradient)
         decrement = 0.5 * float(gradient @ step)
-        if exact and decrement < tolerance:
+        if decrement < tolerance:
             y = y + step if _valid(target, y + step) else y
             break
         length, moved = 1.0, False
@@ -137,12 +134,12 @@ def conditional_mode(
             trial = y + length * step
             if _valid(target, trial):
                 gain = _value(target, trial, log_j) - value
-                if gain > 1e-4 * length * decrement or (exact and gain > -1e-9 * abs(value)):
+                if gain > 1e-4 * length * decrement:
                     y, moved = trial, True
                     break
             length /= 2
         if not moved:
-            if exact and decrement < 1e-3:
+            if decrement < 1e-3:
                 break  # rounding limits the gain: this is the mode
             raise DegenerateError(
                 "the search for the posterior mode stalled",
@@ -159,15 +156,39 @@ def conditional_mode(
     return Conditional(log_j, y, factor, value - 0.5 * factor.logdet)
 
 
-def _factor_safe(safe: Arrow) -> ArrowFactor:
-    try:
-        return safe.factor()
-    except np.linalg.LinAlgError as error:
-        raise DegenerateError(
-            "the stars with weight do not determine the model",
-            where="posterior",
-            do="lower model.order, or check how many stars are false matches",
-        ) from error
+def _positive(full: Arrow, safe: Arrow, y: Float) -> ArrowFactor:
+    """Factor of the Hessian, made positive where it is not.
+
+    The distortion part falls back to the EM weights.  The hyperparameters' Schur complement gets
+    eigenvalues of at least one, in units of half their own value: where outliers cannot be told
+    from the core, the posterior is flat in f and s_out, or even curved upwards.
+    """
+    for matrix in (full, safe):
+        try:
+            inner = matrix.without_tail().factor()
+        except np.linalg.LinAlgError:
+            continue
+        t, g = matrix.n_tail, matrix.n_global
+        if not t:
+            return inner
+        coupling = np.array(
+            [inner.matrix.join(matrix.border[:g, g + k], matrix.edge[:, g + k]) for k in range(t)]
+        )
+        explained = coupling @ inner.solve(coupling).T
+        unit = np.abs(y[-t:]) / 2
+        schur = (matrix.border[g:, g:] - explained) * np.outer(unit, unit)
+        values, vectors = np.linalg.eigh((schur + schur.T) / 2)
+        if values[0] >= 1.0:
+            return matrix.factor()
+        mended = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T / np.outer(unit, unit)
+        border = matrix.border.copy()
+        border[g:, g:] = mended + explained
+        return Arrow(border, matrix.edge, matrix.blocks, t).factor()
+    raise DegenerateError(
+        "the stars with weight do not determine the model",
+        where="posterior",
+        do="lower model.order, or check how many stars are false matches",
+    )
 
 
 def _valid(target: Target, y: Float) -> bool:
