@@ -6,7 +6,7 @@ end in a `MatchTable`, where units, errors and row numbers have been checked.
 
 from bayesdist.data.catalog import ReferenceCatalog, catalog_from_table, read_catalog
 from bayesdist.data.columns import matches_from_table
-from bayesdist.data.files import atomic_path, sha256_of
+from bayesdist.data.files import atomic_path, is_leftover, remove_leftovers, sha256_of
 from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
 from bayesdist.data.linear_map import LinearMap
 from bayesdist.data.magnitude_errors import MagnitudeErrors
@@ -28,6 +28,7 @@ __all__ = [
     "atomic_path",
     "catalog_from_table",
     "input_files",
+    "is_leftover",
     "match_table",
     "match_to_catalog",
     "matches_from_table",
@@ -36,6 +37,7 @@ __all__ = [
     "read_hst1pass",
     "read_matches",
     "read_matchup",
+    "remove_leftovers",
     "sha256_of",
     "tangent_plane",
 ]

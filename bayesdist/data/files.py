@@ -11,7 +11,9 @@ from pathlib import Path
 
 from bayesdist.errors import InputError
 
-__all__ = ["atomic_path", "sha256_of"]
+__all__ = ["atomic_path", "is_leftover", "remove_leftovers", "sha256_of"]
+
+_MARK = ".bayesdist-"
 
 
 @contextmanager
@@ -38,7 +40,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         When the system refuses to write, naming the path and the reason (full disk, no permission).
     """
     target = Path(path)
-    temporary = target.with_name(f".{secrets.token_hex(4)}.{target.name}")
+    temporary = target.with_name(f"{_MARK}{secrets.token_hex(4)}-{target.name}")
     try:
         yield temporary
         with temporary.open("rb+") as written:
@@ -61,6 +63,17 @@ def _concerns(error: OSError, temporary: Path, target: Path) -> bool:
     if error.filename is None:  # a full disk carries no name
         return True
     return Path(os.fsdecode(error.filename)) in (temporary, target, target.parent)
+
+
+def is_leftover(name: str) -> bool:
+    """Whether a file name is that of a temporary file, left by a process that was killed."""
+    return name.startswith(_MARK)
+
+
+def remove_leftovers(folder: str | os.PathLike[str]) -> None:
+    """Remove the temporary files that killed processes left in a folder."""
+    for path in Path(folder).glob(f"{_MARK}*"):
+        path.unlink(missing_ok=True)
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:

@@ -1,0 +1,19 @@
+"""The whole job in a dozen lines of Python, on simulated WISE pairs (writes w2.hdr)."""
+
+import numpy as np
+
+import bayesdist as bd
+
+rng = np.random.default_rng(1)
+matches, truth = bd.simulate_wise(6000, rng=rng)  # or bd.read_matches("stars.ecsv")
+model = bd.build_model(matches, order=4, size=(1016, 1016))
+fit = bd.fit_linear(matches, model)
+posterior = bd.sample(fit, matches, seed=1)
+print("converged:", posterior.convergence.converged, *posterior.convergence.reasons)
+print("largest radius, formal:   ", bd.uncertainty_map(fit).radius_max, model.unit)
+print("largest radius, posterior:", bd.uncertainty_map(posterior).radius_max, model.unit)
+catalogue = bd.UserTerm("reference catalogue", "systematic", 0.005, 0.005)
+print(bd.error_budget(posterior, terms=[catalogue], rng=rng).rows()[-1])
+field_wide = bd.Requirement("field-wide", "p95", 0.03, probability=0.95)
+print(bd.check_requirements(posterior, [field_wide], terms=[catalogue], rng=rng)[0].verdict)
+bd.write_sip(bd.sip_from_solution(posterior, linear="sip", scale_arcsec=2.75), "w2.hdr")

@@ -1,0 +1,86 @@
+"""A run that is killed again and again ends as if nothing had happened."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from bayesdist.app.cli import main
+
+pytestmark = pytest.mark.slow
+
+CONFIG = """
+[data]
+matches = "stars.ecsv"
+
+[detector]
+size = [1016, 1016]
+
+[model]
+order = 4
+
+[sampler]
+seed = 3
+target_ess = 1e9                # never reached: the run ends at max_steps
+max_steps = {steps}
+checkpoint_every = 25
+
+[assess]
+grid = [5, 5]
+draws = 100
+"""
+
+
+def _draws(run: Path) -> dict[str, np.ndarray]:
+    with xr.open_dataset(run / "posterior.nc", group="posterior", engine="h5netcdf") as data:
+        return {name: data[name].values for name in data.data_vars}
+
+
+def test_sigkill_changes_nothing(tmp_path, full, capsys):
+    kills, steps = (10, 1500) if full else (3, 500)
+    assert main(["simulate", "wise", "-o", str(tmp_path), "--stars", "3000", "-q"]) == 0
+    config = tmp_path / "config.toml"
+    config.write_text(CONFIG.format(steps=steps))
+    whole, torn = tmp_path / "whole", tmp_path / "torn"
+
+    def command(run: Path, *flags: str) -> list[str]:
+        return [sys.executable, "-m", "bayesdist", "run", str(config), "-o", str(run), *flags]
+
+    started = time.monotonic()
+    subprocess.run(command(whole), check=True, capture_output=True)
+    duration = time.monotonic() - started
+
+    moments = random.Random(17)
+    landed, progress = 0, []
+    for _ in range(kills):
+        flags = ["--resume"] if (torn / "run.json").exists() else []
+        process = subprocess.Popen(
+            command(torn, *flags), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        )
+        time.sleep(moments.uniform(0.1, 0.8) * duration)
+        landed += process.poll() is None
+        os.kill(process.pid, signal.SIGKILL) if process.poll() is None else None
+        _, errors = process.communicate()
+        assert process.returncode in (0, -signal.SIGKILL), errors.decode()
+        progress.append(len(list(torn.glob("chain-*.h5"))))
+    flags = ["--resume"] if (torn / "run.json").exists() else []
+    subprocess.run(command(torn, *flags), check=True, capture_output=True)
+
+    with capsys.disabled():
+        print(f"\n{landed} of {kills} kills struck a live run; checkpoints after each: {progress}")
+    assert landed >= 1
+    expected, got = _draws(whole), _draws(torn)
+    assert expected.keys() == got.keys()
+    for name, values in expected.items():
+        assert np.array_equal(values, got[name]), name
+    # nothing half-written is left behind by the run that ended
+    assert not [p.name for p in torn.iterdir() if p.name.startswith(".")]
