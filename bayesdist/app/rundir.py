@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist import __version__
 from bayesdist.app.config import Config, load_config, load_text
 from bayesdist.data import atomic_path, input_files, sha256_of
 from bayesdist.errors import InputError
@@ -24,7 +25,7 @@ from bayesdist.errors import InputError
 __all__ = ["RunDirectory", "as_json", "write_json"]
 
 SCHEMA = 1
-PACKAGES = ("bayesdist", "arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
+PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 
 # what a run writes beside its products and figures, which it lists itself; --force removes these
 # and nothing else
@@ -115,7 +116,7 @@ class RunDirectory:
         run = cls(path)
         if run.path.exists() and not run.path.is_dir():
             raise InputError("is a file, not a folder", where=str(path), do="choose another folder")
-        inputs = {str(f): sha256_of(f) for f in run._inputs(config, base)}
+        inputs = run._hashes(config, base)
         if (run / "run.json").exists() and not force:
             if not resume:
                 raise InputError(
@@ -189,6 +190,7 @@ class RunDirectory:
         """
         run = cls(path)
         if (run / "run.json").exists():
+            run._check_configuration()
             run._check_inputs()
             return run
         if (run / "config.toml").exists():
@@ -237,10 +239,9 @@ class RunDirectory:
             pass
 
     @staticmethod
-    def _inputs(config: Config, base: Path) -> list[Path]:
-        names = config.data.matches
-        names = [names] if isinstance(names, str) else names
-        return input_files([base / name for name in names])
+    def _hashes(config: Config, base: Path) -> dict[str, str]:
+        """SHA-256 of every file that the configuration names."""
+        return {str(f): sha256_of(f) for f in input_files(_named(config, base))}
 
     def _check_unchanged(
         self, config: Config, text: str, inputs: dict[str, str], seed: int | None
@@ -260,9 +261,25 @@ class RunDirectory:
             )
         self._compare(record["inputs"], inputs)
 
+    def _check_configuration(self) -> None:
+        """Refuse a config.toml that was edited in place: the run goes by what it began with."""
+        path = self / "config.toml"
+        if not path.exists():
+            return
+        now, known = load_config(path)[0], self.config
+        if now.model_copy(update={"sampler": known.sampler}) != known or (
+            # the command line may have given another seed
+            now.sampler.model_copy(update={"seed": known.sampler.seed}) != known.sampler
+        ):
+            raise InputError(
+                "was edited since the run began, which goes by the old one",
+                where=str(path),
+                do="restore it, or start again with --force",
+            )
+
     def _check_inputs(self) -> None:
-        known = self.record["inputs"]
-        self._compare(known, {name: sha256_of(name) for name in known})
+        record = self.record
+        self._compare(record["inputs"], self._hashes(self.config, Path(record["base"])))
 
     def _compare(self, known: dict[str, str], now: dict[str, str]) -> None:
         for name in sorted(known.keys() | now.keys()):
@@ -297,9 +314,9 @@ class RunDirectory:
         return Config.model_validate(self.record["config"])
 
     @property
-    def inputs(self) -> list[Path]:
-        """The files of matches."""
-        return [Path(name) for name in self.record["inputs"]]
+    def matches(self) -> Path | list[Path]:
+        """What the configuration names as matches: a file, a pattern, a folder, or a list."""
+        return _named(self.config, Path(self.record["base"]))
 
     def done(self, stage: str) -> bool:
         """Whether a stage has ended well."""
@@ -335,14 +352,16 @@ class RunDirectory:
         write_json(self / "summary.json", {**self.summary, **sections})
 
 
+def _named(config: Config, base: Path) -> Path | list[Path]:
+    names = config.data.matches
+    return base / names if isinstance(names, str) else [base / name for name in names]
+
+
 def versions() -> dict[str, str]:
     """Versions of Python, the platform, and the packages that matter."""
     out = {"python": sys.version.split()[0], "platform": platform.platform()}
-    for name in PACKAGES:
-        try:
-            out[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:  # run from a source tree
-            out[name] = "not installed"
+    out["bayesdist"] = __version__  # also where it runs from a source tree
+    out |= {name: metadata.version(name) for name in PACKAGES}
     return out
 
 

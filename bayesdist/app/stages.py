@@ -95,7 +95,7 @@ class Session:
         """Matches as read."""
         data = self.config.data
         return read_matches(
-            self.run.inputs,
+            self.run.matches,
             format=data.format,
             columns=data.columns,
             unit=data.unit,

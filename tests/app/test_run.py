@@ -1,0 +1,608 @@
+"""A whole run: every file of a run directory, read by whoever reads such files."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import re
+import shutil
+import warnings
+from html.parser import HTMLParser
+
+import arviz
+import numpy as np
+import pytest
+import xarray as xr
+from astropy.io import fits
+from astropy.table import Table
+from astropy.wcs import WCS, FITSFixedWarning
+
+import bayesdist
+from bayesdist.app import stages
+from bayesdist.app.screen import progress_bar
+from bayesdist.infer import load_fit, load_posterior
+from tests.app.support import (
+    SIZE,
+    begin_stagewise,
+    cli,
+    good,
+    process,
+    summary_of,
+    write_config,
+    write_job,
+)
+
+FILES = (
+    "config.toml run.json bayesdist.log fit.nc posterior.nc coefficients.ecsv maps.fits "
+    "budget.ecsv margins.ecsv summary.json sip.hdr report.html"
+).split()
+
+
+@pytest.fixture(scope="module")
+def posterior(finished):
+    return load_posterior(finished.path)
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    """The finished run, to be changed."""
+    return shutil.copytree(finished.path, tmp_path / "run")
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def test_every_file_is_there(finished):
+    for name in FILES:
+        assert (finished.path / name).stat().st_size > 0, name
+    assert len(list(finished.path.glob("chain-*.h5"))) >= 4
+    assert len(list((finished.path / "figures").glob("*.png"))) >= 8
+    assert not list(finished.path.rglob(".*"))
+
+
+def test_the_configuration_is_kept_verbatim(finished):
+    assert (finished.path / "config.toml").read_bytes() == finished.config.read_bytes()
+
+
+def test_the_record(finished):
+    record = json.loads((finished.path / "run.json").read_text())
+    stars = finished.config.parent / "stars.ecsv"
+    digest = hashlib.sha256(stars.read_bytes()).hexdigest()
+    assert record["inputs"] == {str(stars): digest}
+    assert record["seed"] == 1
+    for package in ("python", "numpy", "scipy", "astropy", "emcee", "numba", "arviz", "bayesdist"):
+        assert re.match(r"\d+\.\d+", record["versions"][package]), package
+    assert list(record["stages"]) == ["fit", "sample", "assess", "export", "report"]
+    assert all(s["wall_s"] > 0 for s in record["stages"].values())
+    assert record["command"].startswith("bayesdist run")
+    # resolved: what the file leaves out stands here with its default
+    assert record["config"]["fit"]["clip_chi2"] == 25.0
+    assert record["config"]["sampler"]["ensembles"] == 4
+
+
+def test_the_log(finished):
+    log = (finished.path / "bayesdist.log").read_text()
+    for stage in ("fit", "sample", "assess", "export", "report"):
+        assert f"{stage}: begins" in log
+    # the screen says the same, and draws no bar where it is no terminal
+    assert "fit: begins" in finished.result.err
+    assert "\r" not in finished.result.err and "%|" not in finished.result.err
+
+
+def test_a_bar_is_drawn_on_a_terminal_only(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    for stream, drawn in ((Terminal(), True), (io.StringIO(), False)):
+        monkeypatch.setattr("sys.stderr", stream)
+        with progress_bar("sample") as update:
+            update(50, 200)
+            update(200, 200)
+        assert ("sample" in stream.getvalue()) == drawn
+
+
+def test_the_screen(finished):
+    out = finished.result.out
+    for word in ("Error budget", "coefficients", "catalogue", "Margins", "too tight", "missed"):
+        assert word in out
+    assert str(finished.path / "report.html") in out
+
+
+# -- summary.json ---------------------------------------------------------------------------------
+
+
+def _leaves(value, path=""):
+    if isinstance(value, dict):
+        for k, v in value.items():
+            yield from _leaves(v, f"{path}.{k}")
+    elif isinstance(value, list):
+        for v in value:
+            yield from _leaves(v, f"{path}[]")
+    else:
+        yield path, value
+
+
+KEYS = {
+    "data": ("n_rows", "n_used", "n_rejected"),
+    "fit": ("order", "chi2", "dof", "rms_u", "rms_v", "unit"),
+    "outliers": ("fraction", "jitter", "n_flagged"),
+    "sampler": (
+        "method converged rhat_max ess_bulk_min ess_tail_min passes acceptance wall_s".split()
+    ),
+    "map": ("unit", "sigma_u_max", "sigma_v_max", "radius_max", "position_of_max"),
+}
+ROWS = {
+    "budget": ("name", "kind", "u", "v", "radial"),
+    "margins": "name statistic limit value interval probability_met verdict".split(),
+    "products": ("path",),
+}
+
+
+def test_the_summary_has_what_the_design_lists(finished):
+    text = (finished.path / "summary.json").read_text()
+    assert "NaN" not in text and "Infinity" not in text
+    summary = json.loads(text)
+    assert summary["schema"] == 1
+    for section, keys in KEYS.items():
+        assert set(keys) <= summary[section].keys(), section
+    for section, keys in ROWS.items():
+        assert summary[section]
+        for row in summary[section]:
+            assert set(keys) <= row.keys(), section
+    for path, value in _leaves(summary):
+        if isinstance(value, float):
+            assert math.isfinite(value), path
+        if isinstance(value, str):  # a number never hides in a string
+            with pytest.raises(ValueError, match="could not convert"):
+                float(value)
+    for key in ("fraction", "jitter"):
+        assert set(summary["outliers"][key]) >= {"mean", "sd"}
+
+
+def test_the_summary_counts_what_there_is(finished, posterior):
+    s = summary_of(finished.path)
+    assert s["data"]["n_rows"] == 400
+    assert s["data"]["n_used"] + s["data"]["n_rejected"] == 400
+    assert s["data"]["n_rejected"] == sum(s["data"]["rejected"].values())
+    fit = load_fit(finished.path / "fit.nc")
+    assert s["data"]["n_used"] == fit.used.sum()
+    assert s["fit"]["dof"] == 2 * fit.used.sum() - 12
+    assert s["fit"]["rms_u"] == pytest.approx(np.sqrt(np.mean(fit.residual[fit.used, 0] ** 2)))
+    assert s["outliers"]["fraction"]["mean"] == pytest.approx(posterior.hyper["f"].mean())
+    assert s["outliers"]["n_flagged"] == (posterior.outlier_probability > 0.5).sum()
+    assert s["sampler"]["converged"] is True
+
+
+def test_the_posterior_finds_the_truth(finished, posterior):
+    """12 coefficients, f, j and s_out: chi-square with 15 degrees of freedom stays below 45."""
+    off = posterior.mean - finished.truth.theta
+    chi2 = off @ np.linalg.solve(posterior.cov, off)
+    for key, true in (("f", "fraction"), ("j", "jitter"), ("s_out", "outlier_scale")):
+        values = posterior.hyper[key]
+        chi2 += ((values.mean() - getattr(finished.truth, true)) / values.std()) ** 2
+    assert chi2 < 45.0
+    false = finished.truth.false
+    flagged = posterior.outlier_probability > 0.5
+    assert (flagged & false).sum() > 0.7 * false.sum()  # those within 2 sigma look like true ones
+    assert (flagged & ~false).sum() <= 2
+
+
+# -- tables and images, read by their own readers -------------------------------------------------
+
+
+def test_the_posterior_opens_in_arviz_and_xarray(finished, posterior):
+    data = arviz.from_netcdf(finished.path / "posterior.nc")
+    groups = ("posterior", "sample_stats", "observed_data", "constant_data")
+    assert set(groups) <= set(data.groups())
+    assert {"log_likelihood", "log_likelihood_summary"} & set(data.groups())
+    np.testing.assert_array_equal(data.posterior["theta"], posterior.theta)
+    with xr.open_datatree(finished.path / "posterior.nc", engine="h5netcdf") as tree:
+        provenance = json.loads(tree.attrs["provenance"])
+    assert provenance["inputs"] == json.loads((finished.path / "run.json").read_text())["inputs"]
+
+
+def test_coefficients_agree_with_the_draws(finished, posterior):
+    table = Table.read(finished.path / "coefficients.ecsv")
+    fit = load_fit(finished.path / "fit.nc")
+    legendre = table[table["form"] == "legendre"]
+    assert list(legendre["name"]) == list(posterior.model.names)
+    np.testing.assert_allclose(legendre["mean"], posterior.mean, rtol=1e-12)
+    np.testing.assert_allclose(legendre["sd"], posterior.sigma, rtol=1e-9)
+    np.testing.assert_allclose(legendre["value"], fit.mean, rtol=1e-12)
+    np.testing.assert_allclose(legendre["sigma"], fit.sigma, rtol=1e-9)
+    inside = (posterior.flat > np.asarray(legendre["lo68"])) & (
+        posterior.flat < np.asarray(legendre["hi68"])
+    )
+    np.testing.assert_allclose(inside.mean(axis=0), 0.683, atol=0.002)
+    np.testing.assert_allclose(legendre["rhat"], posterior.convergence.rhat[:12])
+    # the monomial form is the same polynomial
+    basis, x, y = posterior.model.basis(), 123.0, 678.0
+    monomial = table[(table["form"] == "monomial") & (table["axis"] == "v")]
+    dx, dy = x - basis.reference_pixel[0], y - basis.reference_pixel[1]
+    value = sum(m["mean"] * dx ** int(m["i"]) * dy ** int(m["j"]) for m in monomial)
+    predicted = posterior.model.predict(posterior.mean, np.array([x]), np.array([y]))[0, 1]
+    assert value == pytest.approx(predicted, abs=1e-9)
+
+
+def test_the_budget_adds_up(finished):
+    table = Table.read(finished.path / "budget.ecsv")
+    rows = {r["name"]: r for r in table}
+    assert list(rows) == ["coefficients", "catalogue", "centroid", "total"]
+    assert rows["catalogue"]["u"] == pytest.approx(0.003)
+    assert rows["centroid"]["v"] == pytest.approx(0.2 / 50.0)  # 50 mas in a pixel
+    for axis in ("u", "v", "radial"):
+        assert table[axis].unit == "pix"
+        parts = np.array([rows[n][axis] for n in list(rows)[:-1]])
+        assert rows["total"][axis] == pytest.approx(np.sqrt((parts**2).sum()), rel=1e-9)
+    for row, stated in zip(table, summary_of(finished.path)["budget"], strict=True):
+        assert row["radial"] == pytest.approx(stated["radial"])
+
+
+def test_the_coefficient_term_is_the_spread_of_the_draws(finished, posterior):
+    """rms over the grid of the posterior's own scatter at its points."""
+    x, y = np.meshgrid(np.linspace(1, SIZE[0], 9), np.linspace(1, SIZE[1], 7))
+    drawn = posterior.model.predict(posterior.flat, x.ravel(), y.ravel())
+    rms = np.sqrt(drawn.var(axis=0).mean(axis=0))
+    (row,) = [r for r in summary_of(finished.path)["budget"] if r["name"] == "coefficients"]
+    assert [row["u"], row["v"]] == pytest.approx(rms, rel=0.05)
+    with fits.open(finished.path / "maps.fits") as hdus:
+        field = drawn.std(axis=0).reshape(7, 9, 2)
+        np.testing.assert_allclose(hdus["MIX_SIGMA_U"].data, field[..., 0], rtol=0.05)
+        np.testing.assert_allclose(hdus["MIX_SIGMA_V"].data, field[..., 1], rtol=0.05)
+
+
+def test_margins_agree_in_all_places(finished):
+    table = Table.read(finished.path / "margins.ecsv")
+    stated = summary_of(finished.path)["margins"]
+    assert [m["verdict"] for m in stated] == ["met", "met", "missed"]
+    for row, m in zip(table, stated, strict=True):
+        assert row["name"] == m["name"] and row["verdict"] == m["verdict"]
+        assert row["unit"] == m["unit"]
+        for key in ("limit", "value", "margin", "probability", "probability_met", "mc_error"):
+            assert row[key] == pytest.approx(m[key])
+        assert m["interval"] == [row["lo95"], row["hi95"]]
+        assert m["interval"][0] < m["value"] < m["interval"][1]
+    # the error of the mean position: at most the catalogue's, the centroid's and ours in quadrature
+    rms = next(m for m in stated if m["name"] == "in mas")
+    total = summary_of(finished.path)["budget"][-1]["radial"] * 50.0
+    assert rms["value"] == pytest.approx(total, rel=0.5)
+
+
+def test_maps_say_where_their_points_lie(finished):
+    with fits.open(finished.path / "maps.fits", checksum=True) as hdus:
+        names = [h.name for h in hdus[1:]]
+        assert names[:6] == [
+            f"{kind}_{what}" for kind in ("LSQ", "MIX") for what in ("SIGMA_U", "SIGMA_V", "CORR")
+        ]
+        for hdu in hdus[1:]:
+            assert hdu.data.shape == (7, 9) and np.isfinite(hdu.data).all()
+            wcs = WCS(hdu.header)
+            np.testing.assert_allclose(wcs.pixel_to_world_values(0, 0), (1, 1))
+            np.testing.assert_allclose(wcs.pixel_to_world_values(8, 6), SIZE)
+        sigma = hdus["MIX_SIGMA_U"].data
+        stated = summary_of(finished.path)["map"]
+        assert sigma.max() == pytest.approx(stated["sigma_u_max"])
+        assert stated["position_of_max"][0] in np.linspace(1, SIZE[0], 9)
+        assert np.abs(hdus["MIX_CORR"].data).max() <= 1
+
+
+def test_sip_in_astropy_maps_pixels_as_the_posterior_mean(finished, posterior, rng):
+    header = fits.Header.fromtextfile(finished.path / "sip.hdr")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        wcs = WCS(header)
+    pixels = 0.5 + rng.uniform(size=(1000, 2)) * SIZE
+    focal = wcs.sip_pix2foc(pixels, 1)  # counted from CRPIX
+    u, v = posterior.model.predict(posterior.mean, *pixels.T).T
+    (u0, v0), = posterior.model.predict(posterior.mean, *wcs.wcs.crpix[:, None])  # fmt: skip
+    plane = focal @ wcs.wcs.cd.T * 3600 / 0.050  # 50 mas in a pixel
+    np.testing.assert_allclose(plane, np.column_stack([u - u0, v - v0]), atol=1e-9)
+    # and to the sky
+    ra, dec = np.deg2rad(wcs.all_pix2world(pixels, 1)).T
+    z = np.cos(dec) * np.cos(ra)
+    xi, eta = np.cos(dec) * np.sin(ra) / z, np.sin(dec) / z
+    scale = np.deg2rad(0.050 / 3600)
+    np.testing.assert_allclose(xi / scale, u - u0, atol=1e-6)
+    np.testing.assert_allclose(eta / scale, v - v0, atol=1e-6)
+
+
+def test_the_inverse_closes_as_stated(finished, rng):
+    """AP, BP evaluated by hand: all_world2pix does not use them."""
+    header = fits.Header.fromtextfile(finished.path / "sip.hdr")
+    p = 0.5 + rng.uniform(size=(2000, 2)) * SIZE - [header["CRPIX1"], header["CRPIX2"]]
+
+    def polynomial(prefix, x, y):
+        order = header[f"{prefix}_ORDER"]
+        return sum(
+            header.get(f"{prefix}_{i}_{j}", 0.0) * x**i * y**j
+            for i in range(order + 1)
+            for j in range(order + 1 - i)
+        )
+
+    forward = p + np.column_stack([polynomial(k, *p.T) for k in "AB"])
+    back = forward + np.column_stack([polynomial(k, *forward.T) for k in ("AP", "BP")])
+    assert header["AP_ORDER"] == 4
+    worst = np.abs(back - p).max()
+    (product,) = summary_of(finished.path)["products"]
+    assert worst <= 1.05 * product["closure_pix"] < 1e-3
+    assert np.abs(polynomial("A", *p.T)).max() <= header["A_DMAX"] * (1 + 1e-9)
+    assert np.abs(polynomial("A", *p.T)).max() > 0.9 * header["A_DMAX"]
+
+
+class _Links(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.targets = []
+
+    def handle_starttag(self, tag, attrs):
+        self.targets += [v for k, v in attrs if k in ("src", "href") and v]
+
+
+def test_the_report_is_one_file(finished):
+    text = (finished.path / "report.html").read_text(encoding="utf-8")
+    links = _Links()
+    links.feed(text)
+    assert all(t.startswith(("data:", "#")) for t in links.targets)
+    for word in ("too tight", "catalogue", "u_1_0", "sip.hdr", bayesdist.__version__):
+        assert word in text
+    assert "NOT CONVERGED" not in text
+
+
+# -- stages by themselves, seeds ------------------------------------------------------------------
+
+
+def _tables(folder):
+    return {
+        name: (folder / name).read_text()
+        for name in ("coefficients.ecsv", "budget.ecsv", "margins.ecsv", "sip.hdr")
+    }
+
+
+def test_each_stage_by_itself_gives_the_same_numbers(copy, posterior):
+    before, tables = summary_of(copy), _tables(copy)
+    maps = fits.getdata(copy / "maps.fits", "MIX_CORR")
+    for stage in ("fit", "sample", "assess", "export"):
+        good(stage, copy)
+        after = summary_of(copy)
+        for section in ("data", "fit", "outliers", "map", "budget", "margins", "products"):
+            assert after[section] == before[section], (stage, section)
+        sampler = {k: v for k, v in after["sampler"].items() if k != "wall_s"}
+        assert sampler.items() <= before["sampler"].items()
+    assert _tables(copy) == tables
+    np.testing.assert_array_equal(fits.getdata(copy / "maps.fits", "MIX_CORR"), maps)
+    np.testing.assert_array_equal(load_posterior(copy).theta, posterior.theta)
+
+
+def test_without_its_checkpoints_it_samples_the_same_again(copy, posterior):
+    for path in copy.glob("chain-*.h5"):
+        path.unlink()
+    good("sample", copy)
+    again = load_posterior(copy)
+    np.testing.assert_array_equal(again.theta, posterior.theta)
+    np.testing.assert_array_equal(again.log_prob, posterior.log_prob)
+    for key, values in posterior.hyper.items():
+        np.testing.assert_array_equal(again.hyper[key], values)
+
+
+def test_two_runs_of_one_seed_are_identical(finished, posterior, tmp_path):
+    other = begin_stagewise(tmp_path / "again", finished.config, "fit", "sample")
+    np.testing.assert_array_equal(load_posterior(other).theta, posterior.theta)
+
+
+def test_another_seed_agrees_within_its_monte_carlo_error(finished, posterior, tmp_path):
+    text = finished.config.read_text().replace("[sampler]", "[sampler]\nseed = 2")
+    config = finished.config.with_name("seed2.toml")
+    config.write_text(text)
+    other = load_posterior(begin_stagewise(tmp_path / "two", config, "fit", "sample"))
+    assert other.sampler.seed == 2
+    assert not np.array_equal(other.theta, posterior.theta)
+    mcse = np.hypot(posterior.convergence.mcse_mean[:12], other.convergence.mcse_mean[:12])
+    assert (np.abs(other.mean - posterior.mean) < 5 * mcse).all()
+    np.testing.assert_allclose(other.sigma, posterior.sigma, rtol=0.15)
+
+
+def test_the_seed_of_the_command_line_is_recorded(finished, tmp_path):
+    """... and rules: --seed 1 in place of a configured 2 gives what seed 1 gives."""
+    from bayesdist.app.config import load_config
+    from bayesdist.app.rundir import RunDirectory
+
+    config, text = load_config(finished.config)
+    run = RunDirectory.plan(tmp_path / "r", config, text, finished.config.parent, seed=77)
+    assert run.record["seed"] == 77 and run.config.sampler.seed == 77
+    assert not (tmp_path / "r").exists()
+
+
+def test_resuming_a_finished_run_changes_nothing(copy, finished):
+    before = {n: (copy / n).read_bytes() for n in FILES if n != "bayesdist.log"}
+    good("run", finished.config, "-o", copy, "--resume", "--seed", "1")
+    assert {n: (copy / n).read_bytes() for n in before} == before
+
+
+def test_an_interrupted_run_goes_on(finished, posterior, tmp_path, monkeypatch):
+    def interrupt(session):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setitem(stages._FUNCTIONS, "assess", interrupt)
+        result = cli("run", finished.config, "-o", tmp_path / "run")
+    assert result.code == 130 and "--resume" in result.err and "Traceback" not in result.err
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert list(record["stages"]) == ["fit", "sample"]
+    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)
+    result = good("run", finished.config, "-o", tmp_path / "run", "--resume")
+    assert "sample: done before" in result.err
+    np.testing.assert_array_equal(load_posterior(tmp_path / "run").theta, posterior.theta)
+
+
+# -- not converged --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def unconverged(finished, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("strict")
+    text = finished.config.read_text().replace(
+        '"stars.ecsv"', f'"{finished.config.parent}/stars.ecsv"'
+    )
+    text = re.sub(r"target_ess = \S+", "target_ess = 1e6\nmax_steps = 20", text)
+    (folder / "c.toml").write_text(text)
+    return folder / "run", cli("run", folder / "c.toml", "-o", folder / "run", "--strict")
+
+
+def test_strict_exits_3_with_all_outputs(unconverged):
+    run, result = unconverged
+    assert result.code == 3
+    last = result.err.splitlines()[-1]
+    assert last.startswith("bayesdist: ") and "not converged" in last and "max_steps" in last
+    for name in FILES:
+        assert (run / name).stat().st_size > 0, name
+
+
+def test_nobody_is_left_in_doubt_about_convergence(unconverged):
+    run, _ = unconverged
+    summary = summary_of(run)
+    assert summary["sampler"]["converged"] is False and summary["sampler"]["reasons"]
+    assert summary["sampler"]["steps"] == 20
+    assert {m["verdict"] for m in summary["margins"]} == {"undecided"}
+    assert set(Table.read(run / "margins.ecsv")["verdict"]) == {"undecided"}
+    assert "NOT CONVERGED" in (run / "report.html").read_text(encoding="utf-8")
+    assert "NOT CONVERGED" in (run / "bayesdist.log").read_text()
+    assert "NOT CONVERGED" in good("inspect", run).out
+
+
+def test_max_steps_is_a_total(unconverged, finished):
+    """A resumed run does not get another 20 steps; and it is judged again."""
+    run, _ = unconverged
+    config = run.parent / "c.toml"
+    result = cli("run", config, "-o", run, "--resume", "--strict")
+    assert result.code == 3
+    assert load_posterior(run).sampler.steps == 20
+    assert cli("sample", run, "--strict").code == 3
+    assert cli("sample", run).code == 0
+    assert load_posterior(run).sampler.steps == 20
+
+
+# -- validate, check, init, inspect, demo ---------------------------------------------------------
+
+
+def _requirements(path, *blocks):
+    none = dict.fromkeys(("data", "detector", "model", "sampler", "assess"))
+    return write_config(path, **none, requirement=list(blocks))
+
+
+def test_validate_replaces_the_margins(copy, tmp_path):
+    loose = {"name": "new", "statistic": "u_rms", "limit": 0.5, "probability": 0.9}
+    tight = {"name": "tight", "statistic": "v_max", "limit": 1e-5}
+    before = summary_of(copy)
+    result = cli("validate", copy, "--requirements", _requirements(tmp_path / "a.toml", loose))
+    assert result.code == 0 and "new" in result.out
+    assert [m["name"] for m in summary_of(copy)["margins"]] == ["new"]
+    assert list(Table.read(copy / "margins.ecsv")["name"]) == ["new"]
+    both = _requirements(tmp_path / "b.toml", loose, tight)
+    result = cli("validate", copy, "--requirements", both)
+    assert result.code == 4 and "tight: missed" in result.out and result.err == ""
+    after = summary_of(copy)
+    assert [m["verdict"] for m in after["margins"]] == ["met", "missed"]
+    assert {k: v for k, v in after.items() if k != "margins"} == {
+        k: v for k, v in before.items() if k != "margins"
+    }
+
+
+def test_validate_of_an_unconverged_run_is_not_met(unconverged, tmp_path):
+    loose = {"name": "new", "statistic": "rms", "limit": 100.0}
+    run = shutil.copytree(unconverged[0], tmp_path / "run")
+    path = _requirements(tmp_path / "a.toml", loose)
+    result = cli("validate", run, "--requirements", path)
+    assert result.code == 4 and "undecided" in result.out
+
+
+def test_check_samples_nothing(finished):
+    before = sorted(finished.config.parent.iterdir())
+    out = good("check", finished.config).out
+    assert "12 of 12" in out and "cost" in out and "400 of 400 rows" in out and "pix" in out
+    assert sorted(finished.config.parent.iterdir()) == before
+
+
+def test_check_names_what_is_degenerate(tmp_path):
+    """Two exposures of one epoch: a drift cannot be told from the constant part."""
+    table = Table.read(write_job(tmp_path / "job").with_name("stars.ecsv"))
+    table["epoch"] = 2010.0
+    table.write(tmp_path / "job" / "stars.ecsv", overwrite=True)
+    config = write_config(
+        tmp_path / "job" / "c.toml", **{"model.tdd": {"epoch0": 2004.0, "terms": [["u", 1, 0]]}}
+    )
+    result = cli("check", config)
+    assert result.code == 1 and "u_1_0" in result.err and "rate" in result.err
+
+
+@pytest.mark.parametrize("suffix", ["ecsv", "csv", "fits", "parquet"])
+@pytest.mark.parametrize("errors", ["columns", "by_magnitude", "none"])
+def test_init_writes_what_check_accepts(tmp_path, finished, suffix, errors):
+    table = Table.read(finished.config.parent / "stars.ecsv")
+    if errors != "columns":
+        table.remove_columns(["sigma_u", "sigma_v"])
+    if errors == "none":
+        table.remove_column("mag")
+    if suffix == "csv":
+        table = Table({name: np.asarray(table[name]) for name in table.colnames})
+    table.write(tmp_path / f"stars.{suffix}")
+    good("init", tmp_path / "c.toml", "--matches", tmp_path / f"stars.{suffix}")
+    out = good("check", tmp_path / "c.toml").out
+    assert ("by magnitude" in out) == (errors == "by_magnitude")
+    text = (tmp_path / "c.toml").read_text()
+    nx, ny = map(int, re.search(r"size = \[(\d+), (\d+)\]", text).groups())
+    for size, axis in ((nx, "x"), (ny, "y")):  # from the outermost stars
+        assert table[axis].max() <= size + 0.5 < 1.05 * table[axis].max()
+    assert ("GUESSED: the table does not say" in text) == (suffix == "csv")
+
+
+def test_inspect(finished, posterior):
+    out = good("inspect", finished.path / "posterior.nc").out
+    for name in posterior.model.names:
+        assert name in out
+    assert "converged" in out and "NOT CONVERGED" not in out
+    assert good("inspect", finished.path).out == out
+    out = good("inspect", finished.path / "sip.hdr").out
+    assert "A_ORDER 2" in out and "Findings" in out and "A_2_0" in out
+
+
+def test_simulate_gives_a_job_that_check_accepts(tmp_path):
+    good("simulate", "wise", "-o", tmp_path / "sim", "--stars", 900, "--seed", 3)
+    truth = Table.read(tmp_path / "sim" / "truth.ecsv")
+    assert len(truth) == 30 and truth.meta["fraction"] == 0.03
+    assert "30 of 30" in good("check", tmp_path / "sim" / "config.toml").out
+    stars = (tmp_path / "sim" / "stars.ecsv").read_bytes()
+    good("simulate", "wise", "-o", tmp_path / "sim", "--stars", 900, "--seed", 3, "--force")
+    assert (tmp_path / "sim" / "stars.ecsv").read_bytes() == stars
+
+
+def test_demo(tmp_path):
+    """In a process of its own: as a user sees it, and without a bar where there is no terminal."""
+    done = process("demo", "-o", "demo", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "\r" not in done.stderr and "Traceback" not in done.stderr
+    header, _, *rows = done.stdout.splitlines()[1:]
+    assert header.split()[:2] == ["coefficient", "truth"]
+    offsets = [float(r.split()[-1]) for r in rows if re.match(r"[uv]_\d_\d|j |f |s_out", r)]
+    assert len(offsets) == 33
+    # 33 numbers of unit variance: all within 4.5, sum of squares within 33 +- 5 sqrt(66)
+    assert max(map(abs, offsets)) < 4.5 and sum(o**2 for o in offsets) < 74
+    for word in ("Error budget", "Margins", "report.html", "converged"):
+        assert word in done.stdout
+    run = tmp_path / "demo" / "run"
+    summary = summary_of(run)
+    assert summary["sampler"]["converged"] is True
+    assert min(summary["sampler"]["ess_bulk_min"], summary["sampler"]["ess_tail_min"]) >= 400
+    assert summary["sampler"]["rhat_max"] < 1.01
+    stages = json.loads((run / "run.json").read_text())["stages"]
+    assert sum(s["wall_s"] for s in stages.values()) < 60
+    again = cli("demo", "-o", tmp_path / "demo")
+    assert again.code == 1 and "--force" in again.err
+
+
+def test_the_version(tmp_path):
+    done = process("--version", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"bayesdist {bayesdist.__version__}\n")
+    assert cli("--help").code == 0

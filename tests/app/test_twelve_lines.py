@@ -1,0 +1,79 @@
+"""The whole job in Python, as the README shows it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import bayesdist as bd
+from tests.app.support import as_table
+
+
+def test_the_session_of_the_readme(tmp_path, monkeypatch):
+    rng = np.random.default_rng(1)
+    simulated, truth = bd.simulate_wise(1500, rng=rng)
+    as_table(simulated).write(tmp_path / "stars.ecsv")
+    monkeypatch.chdir(tmp_path)
+
+    matches = bd.read_matches("stars.ecsv")
+    model = bd.build_model(matches, order=4, size=(1016, 1016))
+    fit = bd.fit_linear(matches, model)
+    posterior = bd.sample(fit, matches, seed=1, folder=".")
+    bd.save_posterior(posterior, matches, "posterior.nc")
+    again = bd.load_posterior("posterior.nc")
+    errors = bd.uncertainty_map(again, grid=(17, 17))
+    catalogue = bd.UserTerm("catalogue", "systematic", 0.005, 0.005)
+    budget = bd.error_budget(again, terms=[catalogue], rng=rng)
+    goal = bd.Requirement("field-wide", "p95", 0.1)
+    (margin,) = bd.check_requirements(again, [goal], terms=[catalogue], rng=rng)
+    bd.write_sip(bd.sip_from_solution(again, linear="sip"), "sip.hdr")
+
+    assert posterior.convergence.converged
+    off = again.mean - truth.theta
+    assert off @ np.linalg.solve(again.cov, off) < 60  # 30 degrees of freedom, p = 1e-3
+    assert again.sigma == pytest.approx(posterior.sigma)
+    assert errors.sigma_u.shape == (17, 17) and 0 < errors.sigma_u_max < 0.1
+    names = [row["name"] for row in budget.rows()]
+    assert names == ["coefficients", "catalogue", "total"]
+    assert margin.verdict == "met" and 0 < margin.value < 0.1
+    header = bd.read_sip("sip.hdr")
+    assert header.order == (4, 4)
+    bd.write_sip(header, "again.hdr")
+    assert (tmp_path / "again.hdr").read_text() == (tmp_path / "sip.hdr").read_text()
+
+
+def test_the_sip_terms_are_those_that_were_published(tmp_path):
+    """From simulated pairs back to Appendix B of the WISE report, within the errors stated."""
+    from bayesdist.simulate.wise import WISE_COEFFICIENTS
+
+    matches, _ = bd.simulate_wise(3000, rng=np.random.default_rng(2))
+    fit = bd.fit_linear(matches, bd.build_model(matches, order=4, size=(1016, 1016)))
+    header = bd.sip_from_solution(fit, linear="sip")
+    terms = bd.PolynomialBasis(4, (1016, 1016), (508.5, 508.5)).terms
+    for found, sigma, published in (
+        (header.a, header.sigma_a, WISE_COEFFICIENTS["W2"][0]),
+        (header.b, header.sigma_b, WISE_COEFFICIENTS["W2"][1]),
+    ):
+        # jitter makes the formal errors too small by the square root of chi-square per degree
+        stretch = np.sqrt(fit.chi2 / fit.dof)
+        pull = [
+            (found[t] - value) / (stretch * sigma[t])
+            for t, value in zip(terms, published, strict=True)
+        ]
+        assert np.abs(pull).max() < 4.5
+
+
+def test_everything_that_is_public_is_there():
+    for name in bd.__all__:
+        assert getattr(bd, name) is not None
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        bd.no_such_thing  # noqa: B018
+    assert set(bd.__all__) <= set(dir(bd))
+
+
+def test_run_is_the_command_as_a_function(tmp_path):
+    from bayesdist.errors import BayesdistError
+
+    with pytest.raises(BayesdistError, match=r"none\.toml"):
+        bd.run(tmp_path / "none.toml", tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
