@@ -11,7 +11,8 @@ import numpy as np
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number
-from bayesdist.app.stages import Session, rehearse
+from bayesdist.app.session import Session
+from bayesdist.app.stages import rehearse
 from bayesdist.infer import GaussianPriors, OutlierMixture
 from bayesdist.infer.sampler import FIRST_CHECK
 from bayesdist.infer.stars import prepare

@@ -146,7 +146,7 @@ def _run(options: argparse.Namespace) -> None:
     from bayesdist.app.demo import results_text
     from bayesdist.app.run import run
     from bayesdist.app.rundir import RunDirectory
-    from bayesdist.app.stages import Session
+    from bayesdist.app.session import Session
 
     path = run(
         options.config,
@@ -176,7 +176,9 @@ def _validate(options: argparse.Namespace) -> int:
     from bayesdist.app.config import load_requirements
     from bayesdist.app.demo import margins_text
     from bayesdist.app.rundir import RunDirectory
-    from bayesdist.app.stages import Session, margin_rows, margins_of, require, write_margins
+    from bayesdist.app.session import Session
+    from bayesdist.app.stages import require
+    from bayesdist.app.stages.assess import margin_rows, margins_of, write_margins
 
     requirements = load_requirements(options.requirements)
     session = Session(RunDirectory.open(options.run))

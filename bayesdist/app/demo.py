@@ -10,7 +10,7 @@ from astropy.table import QTable
 from bayesdist.app.run import run
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
-from bayesdist.app.stages import Session
+from bayesdist.app.session import Session
 from bayesdist.data import MatchTable, atomic_path
 from bayesdist.errors import InputError
 from bayesdist.simulate import Truth, simulate_wise

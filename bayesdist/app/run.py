@@ -8,7 +8,8 @@ from pathlib import Path
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import log_file, progress_bar
-from bayesdist.app.stages import NEEDS, STAGES, Session, rehearse, require, run_stage
+from bayesdist.app.session import STAGES, Session
+from bayesdist.app.stages import NEEDS, rehearse, require, run_stage
 from bayesdist.errors import NotConvergedError
 
 __all__ = ["continue_stage", "run"]

@@ -1,0 +1,79 @@
+"""The stages of a run: fit, sample, assess, export, report; each can be run by itself."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from bayesdist.app.session import Session
+from bayesdist.app.stages.assess import budget_of, margins_of, run_assess
+from bayesdist.app.stages.export import idctab_of, run_export, sip_of
+from bayesdist.app.stages.fit import run_fit
+from bayesdist.app.stages.report import run_report
+from bayesdist.app.stages.sample import run_sample
+from bayesdist.errors import InputError
+
+__all__ = ["NEEDS", "rehearse", "require", "run_stage"]
+
+log = logging.getLogger("bayesdist")
+
+REHEARSAL_DRAWS = 100
+
+NEEDS = {
+    "fit": (),
+    "sample": ("fit",),
+    "assess": ("fit", "sample"),
+    "export": ("fit", "sample"),
+    "report": ("fit", "sample", "assess"),
+}
+
+_FUNCTIONS: dict[str, Callable[[Session], None]] = {
+    "fit": run_fit,
+    "sample": run_sample,
+    "assess": run_assess,
+    "export": run_export,
+    "report": run_report,
+}
+
+
+def run_stage(session: Session, name: str) -> None:
+    """Run one stage and note it as done."""
+    log.info("%s: begins", name)
+    with session.run.stage(name):
+        _FUNCTIONS[name](session)
+
+
+def rehearse(session: Session) -> None:
+    """All that comes after sampling, on the linear fit and with few draws; nothing is written.
+
+    What is wrong with the data or the configuration shows here, before hours of sampling.
+
+    Raises
+    ------
+    BayesdistError
+    """
+    config = session.config
+    fit, _ = session.linear
+    budget_of(session, fit, REHEARSAL_DRAWS)
+    margins_of(session, config.requirements(), fit, REHEARSAL_DRAWS)
+    if config.products.sip is not None:
+        for chip in fit.model.chips:
+            sip_of(session, fit, chip.number)
+    if config.products.idctab is not None:
+        idctab_of(session, fit)
+
+
+def require(session: Session, stage: str, needs: tuple[str, ...]) -> None:
+    """Refuse a stage whose predecessors have not been run.
+
+    Raises
+    ------
+    InputError
+    """
+    for earlier in needs:
+        if not session.run.done(earlier):
+            raise InputError(
+                f"stage '{stage}' needs stage '{earlier}', which has not been run",
+                where=str(session.run.path),
+                do=f"run 'bayesdist {earlier} {session.run.path}' first",
+            )

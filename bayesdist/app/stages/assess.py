@@ -1,0 +1,136 @@
+"""Stage 3: maps, coefficients, budget, margins."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.session import Session, write_table
+from bayesdist.assess import (
+    ErrorBudget,
+    Margin,
+    Requirement,
+    area_map,
+    check_requirements,
+    error_budget,
+    pixel_scale_of,
+    uncertainty_map,
+)
+from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.solution import Solution
+from bayesdist.products.maps_file import write_maps
+
+__all__ = [
+    "budget_of",
+    "judged_requirements",
+    "margin_rows",
+    "margins_of",
+    "run_assess",
+    "write_margins",
+]
+
+log = logging.getLogger("bayesdist")
+
+
+def run_assess(session: Session) -> None:
+    config, run = session.config, session.run
+    solution, grid, epoch = session.posterior, config.assess.grid, session.epoch
+    maps = [uncertainty_map(s, grid=grid, epoch=epoch) for s in (session.fit, solution)]
+    write_maps(run / "maps.fits", maps, area_map(solution, grid=grid, epoch=epoch))
+    write_table(coefficient_table(session.fit, solution), run / "coefficients.ecsv")
+    budget = budget_of(session, solution)
+    table = Table(rows=budget.rows())
+    for name in ("u", "v", "radial"):
+        table[name].unit = solution.unit
+    table.meta = {"epoch": epoch, "grid": list(grid), "statistic": "rms over the grid"}
+    write_table(table, run / "budget.ecsv")
+    margins = margins_of(session, config.requirements(), solution)
+    write_margins(session, margins)
+    m = maps[1]
+    run.summarise(
+        map={
+            "unit": m.unit,
+            "epoch": m.epoch,
+            "sigma_u_max": m.sigma_u_max,
+            "sigma_v_max": m.sigma_v_max,
+            "radius_max": m.radius_max,
+            "position_of_max": list(m.position_of_max),
+            "radius_max_least_squares": maps[0].radius_max,
+        },
+        budget=budget.rows(),
+    )
+    log.info("assess: largest formal radius %.4g %s", m.radius_max, m.unit)
+
+
+def _assessment(session: Session, solution: Solution, n_draws: int | None) -> dict[str, Any]:
+    """What a budget and margins have in common."""
+    config = session.config
+    return {
+        "terms": config.user_terms(),
+        "grid": config.assess.grid,
+        "epoch": session.epoch,
+        "n_draws": n_draws or config.assess.draws,
+        "rng": session.rng("assess"),
+        "pixel_scale": pixel_scale_of(solution, scale_mas=config.detector.scale_mas),
+    }
+
+
+def budget_of(session: Session, solution: Solution, n_draws: int | None = None) -> ErrorBudget:
+    return error_budget(solution, **_assessment(session, solution, n_draws))
+
+
+def margins_of(
+    session: Session,
+    requirements: tuple[Requirement, ...],
+    solution: Solution,
+    n_draws: int | None = None,
+) -> tuple[Margin, ...]:
+    """Margins of a solution against requirements; as many draws as configured by default."""
+    return check_requirements(solution, requirements, **_assessment(session, solution, n_draws))
+
+
+def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
+    """Margins as plain rows, for files and for the screen."""
+    return [
+        {
+            "name": m.requirement.name,
+            "statistic": m.requirement.statistic,
+            "limit": m.requirement.limit,
+            "value": m.value,
+            "interval": list(m.interval),
+            "margin": m.margin,
+            "unit": m.unit,
+            "epoch": m.epoch,
+            "probability": m.requirement.probability,
+            "probability_met": m.probability_met,
+            "mc_error": m.mc_error,
+            "verdict": m.verdict,
+            "reason": m.reason,
+        }
+        for m in margins
+    ]
+
+
+def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
+    """Replace the margins of a run: margins.ecsv and summary.json."""
+    rows = margin_rows(margins)
+    columns: dict[str, list[Any]] = {}
+    for row in rows:
+        low, high = row["interval"]
+        flat = {**row, "lo95": low, "hi95": high}
+        del flat["interval"]
+        flat["epoch"] = np.nan if flat["epoch"] is None else flat["epoch"]
+        for name, value in flat.items():
+            columns.setdefault(name, []).append(value)
+    write_table(Table(columns), session.run / "margins.ecsv")
+    session.run.summarise(margins=rows)
+
+
+def judged_requirements(run: RunDirectory) -> tuple[Requirement, ...]:
+    """The requirements behind the margins in summary.json."""
+    keys = ("name", "statistic", "limit", "unit", "probability", "epoch")
+    return tuple(Requirement(**{k: row[k] for k in keys}) for row in run.summary.get("margins", []))

@@ -1,0 +1,84 @@
+"""Stage 4: files for pipelines."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from bayesdist.app.session import Session
+from bayesdist.assess.solution import Solution
+from bayesdist.products import (
+    IdcTab,
+    SipHeader,
+    idctab_from_solution,
+    lint_idctab,
+    lint_sip,
+    read_idctab,
+    read_sip,
+    sip_from_solution,
+    write_idctab,
+    write_sip,
+)
+
+__all__ = ["idctab_of", "run_export", "sip_of"]
+
+log = logging.getLogger("bayesdist")
+
+
+def run_export(session: Session) -> None:
+    config, run = session.config, session.run
+    products: list[dict[str, Any]] = []
+    if config.products.sip is not None:
+        for chip in session.posterior.model.chips:
+            several = len(session.posterior.model.chips) > 1
+            path = run / (f"sip_{chip.number}.hdr" if several else "sip.hdr")
+            header = sip_of(session, session.posterior, chip.number)
+            write_sip(header, path)
+            findings = lint_sip(read_sip(path), size=chip.size)
+            products.append(
+                {
+                    "path": path.name,
+                    "kind": "SIP",
+                    "chip": chip.number,
+                    "closure_pix": header.closure,
+                    "a_dmax": header.a_dmax,
+                    "b_dmax": header.b_dmax,
+                    "findings": [f"{f.level}: {f.where}: {f.message}" for f in findings],
+                }
+            )
+    idc = config.products.idctab
+    if idc is not None:
+        path = run / f"{idc.instrument}_{idc.detector}_idc.fits".lower()
+        write_idctab(idctab_of(session, session.posterior), path)
+        findings = lint_idctab(read_idctab(path))
+        products.append(
+            {
+                "path": path.name,
+                "kind": "IDCTAB",
+                "findings": [f"{f.level}: {f.where}: {f.message}" for f in findings],
+            }
+        )
+    run.summarise(products=products)
+    log.info("export: %s", ", ".join(p["path"] for p in products) or "no products asked for")
+
+
+def sip_of(session: Session, solution: Solution, chip: int) -> SipHeader:
+    sip = session.config.products.sip
+    assert sip is not None
+    return sip_from_solution(
+        solution,
+        chip=chip,
+        epoch=session.epoch,
+        inverse_order=sip.inverse_order,
+        linear=sip.linear,
+        crval=sip.crval,
+        scale_arcsec=session.scale_arcsec,
+    )
+
+
+def idctab_of(session: Session, solution: Solution) -> IdcTab:
+    idc = session.config.products.idctab
+    assert idc is not None
+    return idctab_from_solution(
+        solution, scale_arcsec=session.scale_arcsec, **idc.model_dump(exclude_none=True)
+    )

@@ -1,0 +1,57 @@
+"""Stage 1: the linear fit."""
+
+from __future__ import annotations
+
+import logging
+
+from astropy.table import Table
+
+from bayesdist.app.session import ERROR_COLUMNS, Session, write_table
+from bayesdist.infer import (
+    save_fit,
+)
+
+__all__ = ["run_fit"]
+
+log = logging.getLogger("bayesdist")
+
+
+def run_fit(session: Session) -> None:
+    run = session.run
+    fit, errors = session.linear
+    if errors is not None:
+        table = Table({name: getattr(errors, name) for name in ERROR_COLUMNS})
+        write_table(table, run / "magnitude_errors.ecsv")
+    save_fit(fit, run / "fit.nc")
+    for stale in ("matches", "magnitude_errors", "fit"):  # this fit is what they go by from now on
+        session.__dict__.pop(stale, None)
+    matches = session.raw_matches
+    run.summarise(
+        data={
+            "n_rows": matches.n_rows,
+            "n_used": int(fit.used.sum()),
+            "n_rejected": matches.n_rows - int(fit.used.sum()),
+            "rejected": {**matches.rejected, **fit.rejected},
+            "n_exposures": len(matches.exposure_names),
+            "sources": list(matches.sources),
+        },
+        fit={
+            "order": fit.model.order,
+            "chi2": fit.chi2,
+            "dof": fit.dof,
+            "rms_u": fit.rms_u,
+            "rms_v": fit.rms_v,
+            "unit": fit.unit,
+            "condition": fit.condition,
+            "n_parameters": fit.model.n_params,
+        },
+    )
+    log.info(
+        "fit: %d stars, %d rejected, rms %.4g and %.4g %s, chi2/dof %.3f",
+        fit.used.size,
+        int((~fit.used).sum()),
+        fit.rms_u,
+        fit.rms_v,
+        fit.unit,
+        fit.chi2 / max(fit.dof, 1),
+    )

@@ -1,0 +1,116 @@
+"""Stage 5: figures and report.html."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.rundir import as_json
+from bayesdist.app.session import Session
+from bayesdist.app.stages.assess import budget_of, judged_requirements, margins_of
+from bayesdist.assess import (
+    area_map,
+    binned_residuals,
+    distortion_vectors,
+    uncertainty_map,
+)
+from bayesdist.assess.coefficients import coefficient_table
+
+__all__ = ["run_report"]
+
+log = logging.getLogger("bayesdist")
+
+VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
+MOST_BINS = 32
+STARS_PER_BIN = 25
+
+
+def run_report(session: Session) -> None:
+    # figures take seconds to import
+    from bayesdist.report import (
+        Check,
+        Product,
+        ReportInput,
+        all_figures,
+        save_figures,
+        write_report,
+    )
+
+    run, config = session.run, session.config
+    fit, posterior, epoch = session.fit, session.posterior, session.epoch
+    chip, grid = fit.model.chips[0], config.assess.grid
+    vectors = {"grid": _vector_grid(chip.size), "epoch": epoch}
+    matches = session.matches
+    on_chip = np.asarray(matches.chip_numbers)[matches.chip] == chip.number
+    if len(fit.model.chips) == 1:
+        on_chip = np.ones(len(matches), bool)
+    good = on_chip & fit.used
+    side = int(np.clip(np.sqrt(good.sum() / STARS_PER_BIN), 4, MOST_BINS))
+    record = run.record
+    products = tuple(
+        Product(
+            path=p["path"],
+            what=p["kind"],
+            checks=tuple(_product_checks(p, Check)),
+        )
+        for p in run.summary.get("products", [])
+    )
+    inputs = ReportInput(
+        name=run.path.resolve().name,
+        config=as_json(config.model_dump(exclude_none=True)),
+        matches=matches,
+        fit=fit,
+        posterior=posterior,
+        formal_map=uncertainty_map(fit, grid=grid, epoch=epoch),
+        posterior_map=uncertainty_map(posterior, grid=grid, epoch=epoch),
+        displacement=distortion_vectors(posterior, part="no_constant", **vectors),
+        non_linear=distortion_vectors(posterior, part="non_linear", **vectors),
+        area=area_map(posterior, grid=grid, epoch=epoch),
+        binned=binned_residuals(
+            matches.x[good],
+            matches.y[good],
+            fit.residual[good, 0],
+            fit.residual[good, 1],
+            bins=side,
+            size=chip.size,
+        ),
+        coefficients=coefficient_table(fit, posterior),
+        budget=budget_of(session, posterior),
+        # the requirements that were judged last, be it by `assess` or by `validate`
+        margins=margins_of(session, judged_requirements(run), posterior),
+        products=products,
+        magnitude_errors=session.magnitude_errors,
+        provenance={
+            k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")
+        },
+    )
+    figures = all_figures(inputs)
+    names = [f"{name}.png" for name in figures]
+    for stale in set(run.summary.get("figures", [])) - set(names):
+        (run / "figures" / stale).unlink(missing_ok=True)
+    run.summarise(figures=names)
+    save_figures(figures, run / "figures")
+    write_report(run / "report.html", inputs, figures)
+    log.info("report: %s", run / "report.html")
+
+
+def _product_checks(product: dict[str, Any], check: Callable[..., Any]) -> list[Any]:
+    out = []
+    if product.get("closure_pix") is not None:
+        out.append(check("worst closure of the inverse (pix)", product["closure_pix"]))
+        out.append(check("A_DMAX (pix)", product["a_dmax"]))
+        out.append(check("B_DMAX (pix)", product["b_dmax"]))
+    levels = {"error": "fail", "warning": "warn", "note": "note"}
+    for finding in product["findings"]:
+        level, _, text = finding.partition(": ")
+        out.append(check(text, level, "", levels.get(level, "note")))
+    return out
+
+
+def _vector_grid(size: tuple[float, float]) -> tuple[int, int]:
+    longest = max(size)
+    nx, ny = (max(3, round(VECTOR_GRID * s / longest)) for s in size)
+    return nx, ny

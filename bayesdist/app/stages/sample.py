@@ -1,0 +1,79 @@
+"""Stage 2: the posterior."""
+
+from __future__ import annotations
+
+import logging
+
+from bayesdist.app.session import Session
+from bayesdist.infer import (
+    Posterior,
+    sample,
+    save_posterior,
+)
+
+__all__ = ["run_sample"]
+
+log = logging.getLogger("bayesdist")
+
+
+def run_sample(session: Session) -> None:
+    config, run = session.config, session.run
+    s = config.sampler
+    posterior = sample(
+        session.fit,
+        session.matches,
+        outliers=config.mixture(),
+        priors=session.priors,
+        seed=s.seed,
+        ensembles=s.ensembles,
+        walkers=s.walkers,
+        target_ess=s.target_ess,
+        target_rhat=s.target_rhat,
+        max_steps=s.max_steps,
+        checkpoint_every=s.checkpoint_every,
+        folder=run.path,
+        progress=session.progress,
+    )
+    record = run.record
+    provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
+    save_posterior(posterior, session.matches, run / "posterior.nc", provenance=provenance)
+    session.__dict__["posterior"] = posterior
+    c, i = posterior.convergence, posterior.sampler
+    run.summarise(
+        outliers=_outliers(posterior),
+        sampler={
+            "method": i.method,
+            "converged": c.converged,
+            "reasons": list(c.reasons),
+            "rhat_max": c.rhat_max,
+            "ess_bulk_min": c.ess_bulk_min,
+            "ess_tail_min": c.ess_tail_min,
+            "pareto_k": c.pareto_k,
+            "importance_efficiency": c.importance_efficiency,
+            "ensembles": i.ensembles,
+            "walkers": i.walkers,
+            "steps": i.steps,
+            "passes": i.passes,
+            "acceptance": i.acceptance,
+            "wall_s": i.wall_s,
+        },
+    )
+    if c.converged:
+        log.info("sample: converged after %d steps, %d passes", i.steps, i.passes)
+    else:
+        log.warning("sample: NOT CONVERGED after %d steps: %s", i.steps, "; ".join(c.reasons))
+
+
+def _outliers(posterior: Posterior) -> dict[str, object]:
+    out: dict[str, object] = {"model": posterior.mixture.model, "unit": posterior.unit}
+    names = {"f": "fraction", "j": "jitter", "s_out": "scale"}
+    for key, name in names.items():
+        values = posterior.hyper.get(key)
+        if values is not None:
+            out[name] = {"mean": float(values.mean()), "sd": float(values.std(ddof=1))}
+        elif key == "j":
+            out[name] = {"mean": posterior.mixture.jitter, "sd": 0.0}
+        elif key == "f":
+            out[name] = {"mean": 0.0, "sd": 0.0}
+    out["n_flagged"] = int((posterior.outlier_probability > 0.5).sum())
+    return out
