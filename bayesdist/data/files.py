@@ -50,12 +50,19 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         if not _concerns(error, temporary, target):
             raise
         raise InputError(
-            f"cannot be written ({error.strerror or error})",
+            f"cannot be written ({_reason(error)})",
             where=str(target),
             do="make room, or choose a folder that exists and that you may write to",
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _reason(error: OSError) -> str:
+    """What the system says; HDF5 wraps it in lines of its own."""
+    if error.errno:
+        return os.strerror(error.errno)
+    return str(error).strip().splitlines()[0][:160] if str(error).strip() else "unknown reason"
 
 
 def _concerns(error: OSError, temporary: Path, target: Path) -> bool:

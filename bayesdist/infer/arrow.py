@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from scipy.linalg import cho_solve, solve_triangular
 
 __all__ = ["Arrow", "ArrowFactor"]
 
-Float = NDArray[np.float64]
+Float = NDArray[Any]  # numpy's stubs lose float64 in its linear algebra
 
 
 @dataclass(frozen=True, eq=False)

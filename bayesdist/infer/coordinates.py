@@ -28,10 +28,10 @@ def to_cube_root(names: tuple[str, ...], h: Float) -> Float:
 
 def inside(names: tuple[str, ...], z: Float) -> NDArray[np.bool_]:
     """Which points (..., k) lie in the support."""
-    ok = (z > 0).all(axis=-1)
+    ok = np.all(z > 0, axis=-1)
     if "f" in names:
         ok &= z[..., names.index("f")] < 1
-    return ok
+    return np.asarray(ok)
 
 
 def from_cube_root(names: tuple[str, ...], z: Float) -> tuple[Float, Float, Float, Float, Float]:

@@ -19,6 +19,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 BLOCK = 256  # stars whose scratch arrays stay in the first-level cache
+THREADS_PAY = 200_000  # evaluations of a star below which one thread is faster
 LOG_EVERY = 8  # stars multiplied together before one logarithm
 
 NO_OUTLIERS, GAUSSIAN, UNIFORM = 0, 1, 2
@@ -126,7 +127,11 @@ def log_likelihood(
     -------
     ndarray, shape (D,)
     """
+    # threads that wait for each other cost more than they bring on little work
+    threads = nb.get_num_threads()
+    nb.set_num_threads(threads if len(columns[0]) * len(coef) > THREADS_PAY else 1)
     sums = _partial_sums(
         blocks, *columns, np.ascontiguousarray(coef), order, *constants, kind, unit2
     )
+    nb.set_num_threads(threads)
     return sums.sum(axis=0)

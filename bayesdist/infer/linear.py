@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -257,7 +258,7 @@ def fit_linear(
         mean=theta,
         cov=cov,
         residual=stars.in_table_order(residual),
-        used=stars.in_table_order(used),
+        used=stars.in_table_order(used).astype(bool),
         rejected={
             "chi-square": int((too_unlikely & ~too_far).sum()),
             "absolute residual": int(too_far.sum()),
@@ -274,7 +275,7 @@ def fit_by_magnitude(
     *,
     max_iterations: int = 10,
     priors: GaussianPriors | None = None,
-    **options: float | None,
+    **options: Any,
 ) -> tuple[LinearFit, MatchTable, MagnitudeErrors]:
     """Fit and errors by magnitude, in turn, until both stand still.
 

@@ -135,8 +135,8 @@ class Whitening:
 def _independence(proposal: GridProposal, whitening: Whitening) -> MHMove:
     def propose(coords: Float, random: np.random.RandomState) -> tuple[Float, Float]:
         psi = proposal.draw(len(coords), random)
-        lost = ~np.isfinite(psi).all(axis=1)  # outside the support: target density zero
-        white = np.where(lost[:, None], coords, whitening.to_white(np.nan_to_num(psi)))
+        lost = ~np.all(np.isfinite(psi), axis=1)  # outside the support: target density zero
+        white = np.where(np.asarray(lost)[:, None], coords, whitening.to_white(np.nan_to_num(psi)))
         # evaluated through the same coordinates on both sides, so that ratios are exact
         factor = proposal.log_density(whitening.to_psi(coords)) - proposal.log_density(
             whitening.to_psi(white)

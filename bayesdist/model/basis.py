@@ -167,7 +167,9 @@ class PolynomialBasis:
     def evaluate_scaled(self, X: ArrayLike, Y: ArrayLike) -> Float:
         """As `evaluate`, of positions that `scaled` has brought to [-1, 1]."""
         i, j = np.array(self.terms).T
-        return legendre.legvander(X, self.order)[..., i] * legendre.legvander(Y, self.order)[..., j]
+        px: Float = legendre.legvander(np.asarray(X, float), self.order)
+        py: Float = legendre.legvander(np.asarray(Y, float), self.order)
+        return px[..., i] * py[..., j]
 
     @cached_property
     def _to_scaled_powers(self) -> Float:

@@ -512,7 +512,7 @@ class DistortionModel:
         jacobians = self.effective_jacobian(theta, groups)
         for g, (rows, (columns, d)) in enumerate(zip(groups.members(), jacobians, strict=True)):
             phi = self._bases[groups.chip[g]].evaluate(x[rows], y[rows])
-            out[np.ix_(rows, [0, 1], columns)] = np.einsum("nk,akm->nam", phi, d)
+            out[np.ix_(rows, np.arange(2), columns)] = np.einsum("nk,akm->nam", phi, d)
         return out
 
     def _checked(self, theta: ArrayLike) -> Float:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.data.files import atomic_path
-from bayesdist.errors import FormatError
+from bayesdist.infer.labelled import netcdf
 from bayesdist.infer.linear import LinearFit
 from bayesdist.model import DistortionModel
 
@@ -37,8 +36,7 @@ def save_fit(fit: LinearFit, path: str | Path) -> None:
             "condition": fit.condition,
         },
     )
-    with atomic_path(path) as temporary:
-        data.to_netcdf(temporary, engine="h5netcdf")
+    netcdf.write(data, path)
 
 
 def load_fit(path: str | Path) -> LinearFit:
@@ -52,10 +50,8 @@ def load_fit(path: str | Path) -> LinearFit:
     import xarray as xr
 
     path = Path(path)
-    if not path.exists():
-        raise FormatError("there is no such file", where=str(path), do="run 'bayesdist fit' first")
-    try:
-        with xr.open_dataset(path, engine="h5netcdf") as data:
+    with netcdf.reading(path, "a fit", "fit"):
+        with xr.open_dataset(path, engine=netcdf.ENGINE) as data:
             data.load()
         return LinearFit(
             model=DistortionModel.from_dict(json.loads(data.attrs["model"])),
@@ -68,7 +64,3 @@ def load_fit(path: str | Path) -> LinearFit:
             dof=int(data.attrs["dof"]),
             condition=float(data.attrs["condition"]),
         )
-    except (OSError, KeyError, ValueError) as error:
-        raise FormatError(
-            "this is not a fit that bayesdist wrote, or it is damaged", where=str(path)
-        ) from error

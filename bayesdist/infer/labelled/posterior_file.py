@@ -10,13 +10,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
 from bayesdist.data.matches import MatchTable
-from bayesdist.errors import FormatError
+from bayesdist.infer.labelled import netcdf
 from bayesdist.infer.labelled.convergence import Convergence, Limits
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
@@ -96,8 +96,7 @@ def save_posterior(
         "provenance": json.dumps(dict(provenance or {}), default=str),
         "n_parameters": n_theta,
     }
-    with atomic_path(path) as temporary:
-        tree.to_netcdf(temporary, engine="h5netcdf")
+    netcdf.write(tree, path)
 
 
 def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[no-untyped-def]
@@ -175,26 +174,24 @@ def load_posterior(path: str | Path) -> Posterior:
     path = Path(path)
     if path.is_dir():
         path = path / "posterior.nc"
-    if not path.exists():
-        raise FormatError(
-            "there is no such file", where=str(path), do="run 'bayesdist sample' first"
-        )
-    try:
-        with xr.open_datatree(path, engine="h5netcdf") as tree:
+    with netcdf.reading(path, "a posterior", "sample"):
+        with xr.open_datatree(path, engine=netcdf.ENGINE) as tree:
             tree.load()
-        attrs, draws, checks = tree.attrs, tree["posterior"], tree["diagnostics"]
+        attrs = tree.attrs
+        draws, checks = tree["posterior"].to_dataset(), tree["diagnostics"].to_dataset()
+        stats = tree["sample_stats"].to_dataset()
         if attrs.get("creator") != "bayesdist":
             raise KeyError("creator")
         mixture = json.loads(attrs["mixture"])
         mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
-        info = {k: _plain(v) for k, v in tree["sample_stats"].attrs.items()}
+        info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
         return Posterior(
             model=DistortionModel.from_dict(json.loads(attrs["model"])),
             mixture=OutlierMixture(**mixture),
             theta=draws["theta"].values,
             hyper={k: draws[k].values for k in ("j", "f", "s_out") if k in draws},
-            log_prob=tree["sample_stats"]["lp"].values,
-            outlier_probability=tree["constant_data"]["outlier_probability"].values,
+            log_prob=stats["lp"].values,
+            outlier_probability=tree["constant_data"].to_dataset()["outlier_probability"].values,
             convergence=Convergence(
                 names=tuple(str(n) for n in checks["sampled"].values),
                 rhat=checks["rhat"].values,
@@ -210,10 +207,6 @@ def load_posterior(path: str | Path) -> Posterior:
             ),
             sampler=SamplerInfo(**info),
         )
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise FormatError(
-            "this is not a posterior that bayesdist wrote, or it is damaged", where=str(path)
-        ) from error
 
 
 def _plain(value: object) -> object:

@@ -1,0 +1,111 @@
+"""Small data sets with known truth, and design matrices that owe nothing to the library."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer import GaussianPriors, LinearFit, OutlierMixture, fit_linear
+from bayesdist.infer.stars import prepare
+from bayesdist.infer.target import Target
+from bayesdist.model import Chip, DistortionModel, TimeDependence
+from bayesdist.simulate import simulate_matches
+
+SIZE = (1000.0, 800.0)
+CHIP = Chip(1, "A", SIZE, (500.0, 400.0))
+TWO_CHIPS = (CHIP, Chip(2, "B", (900.0, 850.0), (450.0, 425.0)))
+UNCLIPPED = {"clip_chi2": np.inf, "clip_abs": None}
+
+
+def legendre_design(order: int, x, y, size=SIZE) -> np.ndarray:
+    """Rows of P_i(X) P_j(Y), i + j <= order, by total order, then falling power of x."""
+    X, Y = ((2 * np.asarray(p) - n - 1) / n for p, n in zip((x, y), size, strict=True))
+    full = legendre.legvander2d(X, Y, [order, order]).reshape(len(X), order + 1, order + 1)
+    return np.stack([full[:, t - j, j] for t in range(order + 1) for j in range(t + 1)], axis=1)
+
+
+def exposures(n: int) -> tuple[str, ...]:
+    return tuple(f"e{k + 1}" for k in range(n))
+
+
+def truth_of(model: DistortionModel, rng: np.random.Generator) -> np.ndarray:
+    """A plausible distortion: pixels, a linear part of about one, a few pixels of higher order."""
+    theta = np.zeros(model.n_params)
+    for chip in model.chips:
+        half = (chip.size[0] / 2, chip.size[1] / 2)
+        for axis in (0, 1):
+            c = rng.standard_normal(model.n_terms) * 3.0 / (1 + np.arange(model.n_terms))
+            c[0] += chip.size[axis] / 2 + 50 * chip.number
+            c[1 + axis] += half[axis]
+            theta[model.coefficient_slice(chip.number, axis)] = c
+        theta[model.tdd_slice(chip.number)] = 0.2 * rng.standard_normal(model.n_tdd)
+    for block in model.local_blocks:
+        theta[block] = 0.01 * rng.standard_normal(model.n_frame)
+        theta[block][:2] = 5.0 * rng.standard_normal(2)
+    return theta
+
+
+def simulated(
+    seed: int,
+    n: int,
+    *,
+    order: int = 2,
+    frames: str = "none",
+    n_exposures: int = 1,
+    chips: tuple[Chip, ...] = (CHIP,),
+    time: TimeDependence | None = None,
+    epochs=None,
+    theta=None,
+    **options,
+):
+    """Model, matches and truth; no false matches and exact errors unless asked for."""
+    rng = np.random.default_rng(seed)
+    model = DistortionModel(
+        order,
+        chips,
+        frames=frames,
+        exposures=exposures(n_exposures),
+        time=time,
+        origin=(500.0, 400.0),
+    )
+    theta = truth_of(model, rng) if theta is None else theta
+    options = {"fraction": 0.0} | options
+    matches, truth = simulate_matches(model, theta, n, rng=rng, epochs=epochs, **options)
+    return model, matches, truth
+
+
+def table(x, y, u, v, sigma=0.05, **columns) -> MatchTable:
+    n = len(x)
+    sigma_u, sigma_v = (np.broadcast_to(s, n) for s in np.broadcast_arrays(sigma, sigma))
+    return MatchTable(x, y, u, v, sigma_u=sigma_u, sigma_v=sigma_v, **columns)
+
+
+def target_of(
+    model: DistortionModel,
+    matches: MatchTable,
+    mixture: OutlierMixture,
+    priors: GaussianPriors | None = None,
+    **fit_options,
+) -> tuple[Target, LinearFit]:
+    fit = fit_linear(matches, model, priors=priors, **fit_options)
+    return Target(prepare(model, matches), mixture, priors or GaussianPriors.none(model)), fit
+
+
+def numerical_gradient(function, point: np.ndarray, step) -> np.ndarray:
+    """Central differences of fourth order."""
+    out = []
+    steps = np.broadcast_to(step, point.shape)
+    for k in range(len(point)):
+        e = np.zeros(len(point))
+        e[k] = steps[k]
+        outer = np.asarray(function(point + 2 * e)) - np.asarray(function(point - 2 * e))
+        inner = np.asarray(function(point + e)) - np.asarray(function(point - e))
+        out.append((8 * inner - outer) / (12 * steps[k]))
+    return np.stack(out, axis=-1)
+
+
+def pieces(n: int, cuts: list[int]) -> list[np.ndarray]:
+    return [np.arange(a, b) for a, b in pairwise([0, *cuts, n])]

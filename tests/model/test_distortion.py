@@ -1,0 +1,294 @@
+"""The model against the formula written out star by star, and its derivatives by differences."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from numpy.polynomial import legendre
+
+from bayesdist.errors import InputError
+from bayesdist.model import FRAME_KINDS, Chip, DistortionModel, TimeDependence
+
+CHIPS = (
+    Chip(2, "WFC2", (400.0, 200.0), (200.0, 100.0)),
+    Chip(1, "WFC1", (380.0, 220.0), (190.0, 115.0)),
+)
+TIME = TimeDependence((("u", 1, 0), ("v", 1, 0), ("v", 0, 2)), (2004.5, 2012.5), (2009.4,))
+EXPOSURES = ("a", "b", "c")
+
+
+def model_of(frames: str, *, order: int = 3, **changes) -> DistortionModel:
+    options = {
+        "order": order,
+        "chips": CHIPS,
+        "unit": "mas",
+        "time": TIME,
+        "frames": frames,
+        "exposures": EXPOSURES,
+        "origin": (30.0, -20.0),
+    } | changes
+    return DistortionModel(**options)
+
+
+def some_theta(model: DistortionModel, seed: int = 1) -> np.ndarray:
+    theta = np.random.default_rng(seed).standard_normal(model.n_params)
+    theta[: model.n_polynomial] *= 50
+    theta[model.n_global :] *= 0.3
+    return theta
+
+
+def some_stars(n: int = 60, seed: int = 2) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {
+        "x": rng.uniform(1, 380, n),
+        "y": rng.uniform(1, 200, n),
+        "epoch": rng.choice([2003.2, 2009.4, 2013.7], n),
+        "exposure": rng.integers(3, size=n),
+        "chip": rng.choice([1, 2], n),
+    }
+
+
+def named(model: DistortionModel, theta: np.ndarray) -> dict[str, float]:
+    return dict(zip(model.names, theta, strict=True))
+
+
+def formula(model: DistortionModel, theta, x, y, epoch, exposure, chip) -> np.ndarray:
+    """(u, v) of one star, from the documented meaning of the parameters' *names*."""
+    value = named(model, theta)
+    c = next(c for c in model.chips if c.number == chip)
+    prefix = f"{c.name}." if len(model.chips) > 1 else ""
+    (nx, ny), (xref, yref) = c.size, c.reference_pixel
+    X, Y = (x - (nx + 1) / 2) / (nx / 2), (y - (ny + 1) / 2) / (ny / 2)
+    w = np.zeros(2)
+    for a, axis in enumerate("uv"):
+        for i in range(model.order + 1):
+            for j in range(model.order + 1 - i):
+                P = legendre.legval(X, np.eye(i + 1)[i]) * legendre.legval(Y, np.eye(j + 1)[j])
+                w[a] += value[f"{prefix}{axis}_{i}_{j}"] * P
+    if model.time is not None:
+        for axis, i, j in model.time.terms:
+            name = f"{prefix}tdd.{axis}_{i}_{j}"
+            if epoch < 2009.4:
+                coefficient = value[f"{name}.rate"] * (epoch - 2004.5)
+            else:
+                coefficient = value[f"{name}.step_2"] + value[f"{name}.rate_2"] * (epoch - 2012.5)
+            monomial = ((x - xref) / (nx / 2)) ** i * ((y - yref) / (ny / 2)) ** j
+            w["uv".index(axis)] += coefficient * monomial
+    e = model.exposures[exposure]
+    if exposure == 0 or model.frames == "none":
+        return w
+    d = np.array([value[f"{e}.shift_u"], value[f"{e}.shift_v"]])
+    M = np.eye(2)
+    if model.frames == "shift_rotation":
+        a = value[f"{e}.rotation"]
+        M = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    elif model.frames == "shift_rotation_scale":
+        s, r = value[f"{e}.scale"], value[f"{e}.rotation"]
+        M = np.array([[1 + s, -r], [r, 1 + s]])
+    elif model.frames == "affine":
+        M += [
+            [value[f"{e}.m_uu"], value[f"{e}.m_uv"]],
+            [value[f"{e}.m_vu"], value[f"{e}.m_vv"]],
+        ]
+    o = np.array(model.origin)
+    return o + d + M @ (w - o)
+
+
+@pytest.mark.parametrize("frames", FRAME_KINDS)
+def test_predict_is_the_formula(frames):
+    model = model_of(frames)
+    theta, stars = some_theta(model), some_stars()
+    expected = [
+        formula(model, theta, *(stars[k][n] for k in ("x", "y", "epoch", "exposure", "chip")))
+        for n in range(len(stars["x"]))
+    ]
+    np.testing.assert_allclose(model.predict(theta, **stars), expected, rtol=1e-12, atol=1e-10)
+
+
+def test_predict_of_one_chip_without_anything_else():
+    model = DistortionModel(5, CHIPS[:1])
+    theta, stars = some_theta(model), some_stars()
+    X, Y = (stars["x"] - 200.5) / 200, (stars["y"] - 100.5) / 100
+    for axis in (0, 1):
+        grid = np.zeros((6, 6))
+        for (i, j), c in zip(
+            model.basis().terms, theta[model.coefficient_slice(None, axis)], strict=True
+        ):
+            grid[i, j] = c
+        np.testing.assert_allclose(
+            model.predict(theta, stars["x"], stars["y"])[:, axis],
+            legendre.legval2d(X, Y, grid),
+            atol=1e-10,
+        )
+
+
+def test_predict_of_many_thetas_is_that_of_each():
+    model = model_of("affine")
+    stars = some_stars()
+    thetas = np.array([[some_theta(model, s) for s in (1, 2, 3)], [some_theta(model, 4)] * 3])
+    out = model.predict(thetas, **stars)
+    assert out.shape == (2, 3, 60, 2)
+    for k in np.ndindex(2, 3):
+        np.testing.assert_allclose(out[k], model.predict(thetas[k], **stars), rtol=1e-12)
+
+
+def test_one_value_serves_all_stars_and_names_serve_as_codes():
+    model = model_of("shift_rotation")
+    theta, stars = some_theta(model), some_stars()
+    x, y, n = stars["x"], stars["y"], len(stars["x"])
+    one = model.predict(theta, x, y, epoch=2003.0, exposure="c", chip=1)
+    every = model.predict(
+        theta, x, y, epoch=np.full(n, 2003.0), exposure=np.full(n, 2), chip=np.ones(n, int)
+    )
+    np.testing.assert_array_equal(one, every)
+    names = np.array(EXPOSURES)[stars["exposure"]]
+    np.testing.assert_array_equal(
+        model.predict(theta, **stars | {"exposure": names}), model.predict(theta, **stars)
+    )
+
+
+def test_no_exposure_means_the_gauge_frame():
+    model = model_of("affine")
+    theta, stars = some_theta(model), some_stars()
+    without = {k: v for k, v in stars.items() if k != "exposure"}
+    np.testing.assert_array_equal(
+        model.predict(theta, **without), model.predict(theta, **without, exposure=0)
+    )
+    other = theta.copy()
+    other[model.n_global :] += 1.0  # frames of the others do not matter
+    np.testing.assert_array_equal(model.predict(other, **without), model.predict(theta, **without))
+
+
+def test_inputs_are_not_changed():
+    model = model_of("affine")
+    theta, stars = some_theta(model), some_stars()
+    before = theta.copy(), {k: v.copy() for k, v in stars.items()}
+    model.predict(theta, **stars)
+    model.jacobian(theta, **stars)
+    np.testing.assert_array_equal(theta, before[0])
+    for k, v in stars.items():
+        np.testing.assert_array_equal(v, before[1][k])
+
+
+@pytest.mark.parametrize("frames", FRAME_KINDS)
+def test_effective_coefficients_are_the_whole_model(frames):
+    model = model_of(frames)
+    theta, stars = some_theta(model), some_stars()
+    groups = model.groups(60, **{k: stars[k] for k in ("epoch", "exposure", "chip")})
+    E = model.effective(theta, groups)
+    out = np.empty((60, 2))
+    for n, g in enumerate(groups.index):
+        number = model.chips[groups.chip[g]].number
+        assert number == stars["chip"][n]
+        phi = model.basis(number).evaluate(stars["x"][n : n + 1], stars["y"][n : n + 1])[0]
+        out[n] = E[g] @ phi
+    np.testing.assert_allclose(out, model.predict(theta, **stars), rtol=1e-12)
+
+
+@pytest.mark.parametrize("frames", FRAME_KINDS)
+def test_jacobian_by_differences(frames):
+    model = model_of(frames)
+    theta, stars = some_theta(model), some_stars(25)
+    J = model.jacobian(theta, **stars)
+    assert J.shape == (25, 2, model.n_params)
+    step = 1e-3
+    sides = theta + step * np.concatenate([np.eye(model.n_params), -np.eye(model.n_params)])
+    plus, minus = np.split(model.predict(sides, **stars), 2)
+    # a cosine's third derivative times step^2 / 6 times 100 mas is below 2e-5
+    np.testing.assert_allclose(np.moveaxis((plus - minus) / (2 * step), 0, -1), J, atol=3e-5)
+
+
+def test_layout():
+    model = model_of("shift_rotation_scale", order=2)
+    assert model.n_polynomial == 2 * 2 * 6
+    assert model.n_global == 24 + 2 * 3 * 3
+    assert model.n_params == 24 + 18 + 2 * 4 == len(model.names) == len(model.units)
+    assert len(set(model.names)) == model.n_params
+    assert model.names[:3] == ("WFC2.u_0_0", "WFC2.u_1_0", "WFC2.u_0_1")
+    pick = np.array(model.names)
+    assert pick[model.coefficient_slice(1, 1)][0] == "WFC1.v_0_0"
+    assert list(pick[model.tdd_slice(1)][:3]) == [
+        "WFC1.tdd.u_1_0.rate",
+        "WFC1.tdd.u_1_0.step_2",
+        "WFC1.tdd.u_1_0.rate_2",
+    ]
+    assert list(pick[model.frame_slice(2)]) == ["c.shift_u", "c.shift_v", "c.scale", "c.rotation"]
+    units = dict(zip(model.names, model.units, strict=True))
+    assert units["WFC1.u_1_1"] == "mas"
+    assert units["WFC1.tdd.v_0_2.rate_2"] == "mas/yr"
+    assert units["WFC1.tdd.v_0_2.step_2"] == "mas"
+    assert units["b.shift_u"] == "mas" and units["b.rotation"] == ""
+
+
+@pytest.mark.parametrize("frames", FRAME_KINDS)
+def test_slices_cover_theta_once(frames):
+    model = model_of(frames)
+    slices = [model.coefficient_slice(c.number, a) for c in CHIPS for a in (0, 1)]
+    slices += [model.tdd_slice(c.number) for c in CHIPS]
+    slices += list(model.local_blocks)
+    covered = np.concatenate([np.arange(model.n_params)[s] for s in slices])
+    np.testing.assert_array_equal(np.sort(covered), np.arange(model.n_params))
+    assert model.frame_slice(0) == slice(0, 0)
+
+
+@pytest.mark.parametrize("frames", FRAME_KINDS)
+def test_dict_round_trip_through_json(frames):
+    model = model_of(frames)
+    again = DistortionModel.from_dict(json.loads(json.dumps(model.to_dict())))
+    assert again == model
+    assert again.names == model.names
+    theta, stars = some_theta(model), some_stars()
+    np.testing.assert_array_equal(again.predict(theta, **stars), model.predict(theta, **stars))
+    still = DistortionModel(2, CHIPS[:1])
+    assert DistortionModel.from_dict(json.loads(json.dumps(still.to_dict()))) == still
+
+
+def test_errors_of_the_structure():
+    with pytest.raises(InputError, match=r"unknown kind of frame 'twist'.*shift_rotation"):
+        model_of("twist")
+    with pytest.raises(InputError, match="no chip"):
+        model_of("none", chips=())
+    with pytest.raises(InputError, match="v_0_2 is above the polynomial order 1"):
+        model_of("none", order=1)
+
+
+def test_errors_of_prediction():
+    model = model_of("affine")
+    theta = some_theta(model)
+    x = y = np.array([10.0, 20.0])
+    with pytest.raises(InputError, match="time and no epoch"):
+        model.predict(theta, x, y)
+    with pytest.raises(InputError, match="no chip 7"):
+        model.predict(theta, x, y, epoch=2005.0, chip=7)
+    with pytest.raises(InputError, match="no exposure 'z'"):
+        model.predict(theta, x, y, epoch=2005.0, exposure="z")
+    with pytest.raises(InputError, match=r"0\.\.2"):
+        model.predict(theta, x, y, epoch=2005.0, exposure=3)
+    for wrong in (theta[:-1], np.append(theta, 0.0), np.float64(1.0)):
+        with pytest.raises(InputError, match="parameters"):
+            model.predict(wrong, x, y, epoch=2005.0)
+
+
+def test_a_chip_that_a_model_does_not_have_is_refused():
+    """As the documentation of `groups` says, for one chip as for many."""
+    model = DistortionModel(2, CHIPS[:1])
+    with pytest.raises(InputError, match="no chip 7"):
+        model.predict(np.zeros(model.n_params), [10.0], [10.0], chip=7)
+
+
+def test_names_are_unique_or_refused():
+    """Priors, files and error messages find parameters by name."""
+    twin = Chip(1, "WFC2", (400.0, 200.0), (200.0, 100.0))
+    with pytest.raises(InputError):
+        DistortionModel(2, (CHIPS[0], twin))
+    with pytest.raises(InputError):
+        DistortionModel(2, CHIPS[:1], frames="shift", exposures=("a", "b", "b"))
+
+
+def test_no_stars_give_no_positions():
+    model = model_of("affine")
+    theta, none = some_theta(model), np.zeros(0)
+    assert model.predict(theta, none, none, epoch=2005.0).shape == (0, 2)
+    assert model.jacobian(theta, none, none, epoch=2005.0).shape == (0, 2, model.n_params)
