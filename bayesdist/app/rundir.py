@@ -19,7 +19,7 @@ import numpy as np
 
 from bayesdist import __version__
 from bayesdist.app.config import Config, load_config, load_text
-from bayesdist.data import atomic_path, input_files, sha256_of
+from bayesdist.data import atomic_path, input_files, is_leftover, remove_leftovers, sha256_of
 from bayesdist.errors import InputError
 
 __all__ = ["RunDirectory", "as_json", "write_json"]
@@ -33,7 +33,6 @@ OWN_FILES = re.compile(
     r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
     r"posterior\.nc|(coefficients|budget|margins)\.ecsv|maps\.fits|summary\.json|report\.html"
 )
-TEMPORARY = re.compile(r"\.[0-9a-f]{8}\.")  # how a file begins that a killed run left half-written
 
 
 def as_json(value: Any) -> Any:
@@ -167,6 +166,7 @@ class RunDirectory:
         record, text = self._planned
         if (self / "run.json").exists():
             self.clear()
+        remove_leftovers(self.path)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -209,18 +209,14 @@ class RunDirectory:
         """
         if (self / "run.json").exists() or not self.path.is_dir():
             return []
-        names = {p.name for p in self.path.iterdir()}
+        names = {p.name for p in self.path.iterdir() if not is_leftover(p.name)}
         if "config.toml" in names and load_text(self / "config.toml") == text:
             names.remove("config.toml")
         return sorted(names)
 
     def _own(self) -> list[Path]:
         """Files that the run in this folder wrote."""
-        own = [
-            p
-            for p in self.path.iterdir()
-            if OWN_FILES.fullmatch(TEMPORARY.sub("", p.name, count=1)) and not p.is_dir()
-        ]
+        own = [p for p in self.path.iterdir() if OWN_FILES.fullmatch(p.name) and not p.is_dir()]
         try:
             summary = self.summary
         except InputError:  # what it listed stays; the rest can be cleared all the same
@@ -325,6 +321,7 @@ class RunDirectory:
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Time a stage, and note it as done when the block ends well."""
+        remove_leftovers(self.path)
         record = self.record
         record["stages"].pop(name, None)
         self.write_record(record)

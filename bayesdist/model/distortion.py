@@ -11,6 +11,7 @@ are all that fits, samplers and predictions need to know of the model.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -128,6 +129,16 @@ class DistortionModel:
             )
         if not self.chips:
             raise InputError("no chip is given", where="chip", do="describe at least one chip")
+        for what, given in (
+            ("chip number", [c.number for c in self.chips]),
+            ("chip name", [c.name for c in self.chips]),
+            ("exposure", self.exposures),
+        ):
+            name, count = Counter(given).most_common(1)[0]
+            if count > 1:
+                raise InputError(
+                    f"{what} {name!r} stands twice", where="model", do="name each one once"
+                )
         for axis, i, j in self.time.terms if self.time else ():
             if i + j > self.order:
                 raise InputError(
@@ -287,7 +298,7 @@ class DistortionModel:
             For an unknown chip or exposure, or a missing epoch.
         """
         codes = np.zeros(n, np.int64)
-        if chip is not None and len(self.chips) > 1:
+        if chip is not None:
             numbers = np.broadcast_to(np.asarray(chip), (n,))
             for number in np.unique(numbers):
                 codes[numbers == number] = self.chip_code(int(number))

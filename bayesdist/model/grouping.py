@@ -42,6 +42,8 @@ class Groups:
 
     def members(self) -> list[Int]:
         """Indices of the stars of each group, each list in rising order."""
+        if not len(self):
+            return []
         order = np.argsort(self.index, kind="stable")
         ends = np.cumsum(np.bincount(self.index, minlength=len(self)))
         return np.split(order, ends[:-1])
