@@ -220,7 +220,9 @@ def fit_linear(
 
     zero = np.zeros((len(stars.groups), 2, model.n_terms))
     first = accumulate(stars, zero, inverse * extra[:, None])
-    theta = _gauss_newton(first, _start(first, stars, priors), stars, priors, matches)
+    theta = _start(first, stars, priors)
+    _refuse_absorbed_drift(first, theta, stars, priors, matches)
+    theta = _gauss_newton(first, theta, stars, priors, matches)
 
     residual = stars.residuals(theta)
     chi2 = (residual**2 * inverse).sum(axis=1)
@@ -367,6 +369,30 @@ def _start(first: NormalEquations, stars: Stars, priors: GaussianPriors) -> Floa
         matrix.border + prior.border, right[:n] + priors.pull(theta)[:n], rcond=1e-13
     )[0]
     return theta
+
+
+def _refuse_absorbed_drift(
+    equations: NormalEquations,
+    theta: Float,
+    stars: Stars,
+    priors: GaussianPriors,
+    matches: MatchTable,
+) -> None:
+    """Refuse frames that absorb the drift of the linear terms.
+
+    With a curved polynomial such a degeneracy is not exact, and the fit would follow its valley to
+    numbers that mean nothing.  On the linear part of the model it is exact, and shows.
+    """
+    model = stars.model
+    if model.time is None or not model.n_frame:
+        return
+    flat = np.zeros_like(theta)
+    for chip in model.chips:
+        for axis in (0, 1):
+            part = model.coefficient_slice(chip.number, axis)
+            flat[part][:3] = theta[part][:3]
+    matrix, _ = equations.assemble(model, flat, stars.groups)
+    require_full_rank(matrix + priors.matrix(model), model, matches)
 
 
 def _affine(weight: Float, right: Float) -> Float:

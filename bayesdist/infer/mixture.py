@@ -53,7 +53,7 @@ class OutlierMixture:
     Raises
     ------
     InputError
-        For an unknown model, a missing or needless radius, a negative jitter, or an improper prior.
+        For an unknown model, a missing radius, a negative jitter, or an improper prior.
     """
 
     model: str = "gaussian"
@@ -68,17 +68,18 @@ class OutlierMixture:
                 where="outliers.model",
                 do="choose gaussian, uniform or none",
             )
-        if self.model == "uniform" and not (self.match_radius and self.match_radius > 0):
+        radius = self.match_radius
+        if self.model == "uniform" and not (radius and 0 < radius < np.inf):
             raise InputError(
                 "uniform outliers need the radius of the match circle",
                 where="outliers.match_radius",
                 do="give it in the unit of u, v",
             )
-        if self.jitter is not None and self.jitter < 0:
+        if self.jitter is not None and not 0 <= self.jitter < np.inf:
             raise InputError(
                 f"jitter is {self.jitter}", where="outliers.jitter", do="give 0 or more"
             )
-        if min(self.fraction_prior) <= 0:
+        if not all(0 < p < np.inf for p in self.fraction_prior):
             raise InputError(
                 f"Beta{self.fraction_prior} is not a proper prior",
                 where="outliers.fraction_prior",

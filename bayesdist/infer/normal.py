@@ -8,7 +8,7 @@ Gauss-Newton over the exposure frames runs without another pass.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ class NormalEquations:
         Rows with weight.
     cross : ndarray, shape (G, h, 2, K)
         Mixed second derivatives with h further parameters; h = 0 in least squares.
+    groups : Groups
     """
 
     weight: Float
@@ -48,11 +49,12 @@ class NormalEquations:
     chi2: float
     n_rows: int
     cross: Float
+    groups: Groups
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
         """Sum over both pieces of data; the pieces share their groups and `about`."""
-        if not np.array_equal(self.about, other.about):
-            raise ValueError("normal equations about different coefficients do not add")
+        if not (np.array_equal(self.about, other.about) and self.groups.same(other.groups)):
+            raise ValueError("normal equations of other groups or coefficients do not add")
         return NormalEquations(
             self.weight + other.weight,
             self.right + other.right,
@@ -60,6 +62,7 @@ class NormalEquations:
             self.chi2 + other.chi2,
             self.n_rows + other.n_rows,
             self.cross + other.cross,
+            self.groups,
         )
 
     def moved(self, about: Float) -> NormalEquations:
@@ -67,7 +70,7 @@ class NormalEquations:
         step = about - self.about
         pull = self._apply(step)
         chi2 = self.chi2 - 2 * float((self.right * step).sum()) + float((pull * step).sum())
-        return NormalEquations(self.weight, self.right - pull, about, chi2, self.n_rows, self.cross)
+        return replace(self, right=self.right - pull, about=about, chi2=chi2)
 
     def _apply(self, E: Float) -> Float:
         uu, uv, vv = self.weight[:, 0], self.weight[:, 1], self.weight[:, 2]
@@ -164,4 +167,6 @@ def accumulate(
         weight[g, 2] += phi.T @ (wv[:, None] * phi)
         if cross is not None:
             mixed[g] += (cross[rows].reshape(len(phi), 2 * h).T @ phi).reshape(h, 2, K)
-    return NormalEquations(weight, right, about.copy(), chi2, int((weights[:, 0] > 0).sum()), mixed)
+    return NormalEquations(
+        weight, right, about.copy(), chi2, int((weights[:, 0] > 0).sum()), mixed, stars.groups
+    )

@@ -106,7 +106,7 @@ def sample(
     folder = None if folder is None else Path(folder)
     seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
 
-    known = _fingerprint(target, seed, ensembles, walkers)
+    known = _fingerprint(target, seed, ensembles, walkers, checkpoint_every)
     proposal = _proposal(target, fit, folder, known)
     n_pilot = int(np.clip(PILOT_STARS // len(matches), 64, PILOT))
     pilot = proposal.draw(n_pilot, np.random.default_rng(int(seeds[-1])))
@@ -183,14 +183,15 @@ def _posterior(
     )
 
 
-def _fingerprint(target: Target, seed: int, ensembles: int, walkers: int | None) -> str:
+def _fingerprint(target: Target, *settings: int | None) -> str:
     """What must not change between a run and its resumption."""
     digest = hashlib.sha256()
     stars = target.stars
-    for column in (stars.X, stars.Y, stars.u, stars.v, stars.var_u, stars.var_v):
+    columns = (stars.X, stars.Y, stars.u, stars.v, stars.var_u, stars.var_v, stars.starts)
+    for column in (*columns, stars.groups.chip, stars.groups.exposure, stars.groups.epoch):
         digest.update(np.ascontiguousarray(column).tobytes())
     digest.update(target.priors.centre.tobytes() + target.priors.precision.tobytes())
-    digest.update(repr((stars.model.to_dict(), target.mixture, seed, ensembles, walkers)).encode())
+    digest.update(repr((stars.model.to_dict(), target.mixture, settings)).encode())
     return digest.hexdigest()
 
 

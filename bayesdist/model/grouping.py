@@ -40,6 +40,13 @@ class Groups:
     def __len__(self) -> int:
         return len(self.chip)
 
+    def same(self, other: Groups) -> bool:
+        """Whether the groups mean the same, whoever their members are."""
+        return all(
+            np.array_equal(getattr(self, name), getattr(other, name))
+            for name in ("chip", "exposure", "epoch")
+        )
+
     def members(self) -> list[Int]:
         """Indices of the stars of each group, each list in rising order."""
         if not len(self):

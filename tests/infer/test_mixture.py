@@ -235,7 +235,6 @@ def test_prior_derivatives_by_differences(hyper):
         ({"model": "uniform", "match_radius": 0.0}, r"outliers\.match_radius"),
         ({"model": "uniform", "match_radius": np.nan}, r"outliers\.match_radius"),
         ({"model": "uniform", "match_radius": np.inf}, r"outliers\.match_radius"),
-        ({"model": "gaussian", "match_radius": 2.0}, "radius"),  # needless, says the docstring
         ({"jitter": -0.1}, r"outliers\.jitter"),
         ({"jitter": np.nan}, r"outliers\.jitter"),
         ({"fraction_prior": (0.0, 9.0)}, r"outliers\.fraction_prior"),

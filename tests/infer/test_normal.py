@@ -101,7 +101,7 @@ def test_pieces_about_different_points_do_not_add(problem):
     model, stars, _, theta = problem
     about = model.effective(theta, stars.groups)
     one = accumulate(stars, about, weights_of(stars))
-    with pytest.raises(ValueError, match="different coefficients"):
+    with pytest.raises(ValueError, match="other groups or coefficients"):
         one + accumulate(stars, about + 1e-9, weights_of(stars))
 
 

@@ -1,4 +1,4 @@
-"""The same posterior by another sampler: NumPyro's NUTS on a density that is written down anew here."""
+"""The same posterior by another sampler: NumPyro's NUTS, on a density written down anew."""
 
 from __future__ import annotations
 

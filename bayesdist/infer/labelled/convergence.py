@@ -127,8 +127,9 @@ def diagnose(
         bulk = np.minimum(bulk, _coupled_ess(chains, each))
         for outside in (chains <= low, chains >= high):
             tail = np.minimum(tail, _coupled_ess(outside.astype(float), each))
-    bulk[~np.isfinite(bulk)] = 0.0
-    tail[~np.isfinite(tail)] = 0.0
+    frozen = np.ptp(in_time.reshape(-1, D), axis=0) == 0
+    bulk[frozen | ~np.isfinite(bulk)] = 0.0
+    tail[frozen | ~np.isfinite(tail)] = 0.0
     spread = in_time.reshape(-1, D).std(axis=0)
     # delta method; arviz.mcse(method="sd") of 0.23 fails on numpy 2.4
     squares = (by_walker - by_walker.reshape(-1, D).mean(axis=0)) ** 2

@@ -53,7 +53,7 @@ def reading(path: Path, what: str, stage: str) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # foreign HDF5 files are told of below
             yield
-    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise FormatError(
             f"this is not {what} that bayesdist wrote, or it is damaged",
             where=str(path),
