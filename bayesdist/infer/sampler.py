@@ -32,6 +32,7 @@ __all__ = ["Block", "Ensembles", "Plan", "Whitening", "boundaries", "plan_moves"
 
 Float = NDArray[np.float64]
 
+START_DRAWS = 4  # proposals for each walker's start: some fall outside the support
 FIRST_CHECK = 50  # steps after which convergence is first judged
 
 
@@ -227,7 +228,7 @@ class Ensembles:
     def start(self, ensemble: int) -> emcee.State:
         """First state of an ensemble: draws of the proposal."""
         random = np.random.RandomState(self.seeds[ensemble])
-        psi = self.proposal.draw(4 * self.plan.walkers, random)
+        psi = self.proposal.draw(START_DRAWS * self.plan.walkers, random)
         psi = psi[np.isfinite(psi).all(axis=1)]
         psi = psi[np.isfinite(self.target.log_density(psi))][: self.plan.walkers]
         if len(psi) < self.plan.walkers:

@@ -21,7 +21,7 @@ from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.proposal import GridProposal, build_proposal
-from bayesdist.infer.sampler import Ensembles, Whitening, boundaries, plan_moves
+from bayesdist.infer.sampler import START_DRAWS, Ensembles, Whitening, boundaries, plan_moves
 from bayesdist.infer.stars import prepare
 from bayesdist.infer.target import Target
 
@@ -149,7 +149,7 @@ def sample(
         walkers=plan.walkers,
         steps=begin,
         warmup=min(plan.warmup, begin // 2),
-        passes=n_pilot + 2 * ensembles * plan.walkers + n_moves,
+        passes=n_pilot + (START_DRAWS + 1) * ensembles * plan.walkers + n_moves,
         acceptance=accepted / (ensembles * plan.walkers * made),
         wall_s=time.monotonic() - started,
         seed=seed,

@@ -2,8 +2,9 @@
 
 Usage: python match.py FOLDER    (writes stars.ecsv beside this script)
 
-FOLDER holds the *.uvwXYMpq lists and MATCHUP_XYMEEE_final.  Raw pixels (X, Y) become x, y; positions in
-the master frame become u, v.  The lists carry no errors: config.toml asks for them by magnitude.
+FOLDER holds the *.uvwXYMpq lists and MATCHUP_XYMEEE_final.  Raw pixels (X, Y) become x, y;
+positions in the master frame become u, v.  The lists carry no errors: config.toml asks for them by
+magnitude.
 """
 
 import sys
