@@ -279,13 +279,13 @@ def test_force_replaces_a_run_and_leaves_foreign_files(finished, tmp_path, no_re
     foreign = ["notes.txt", "0461802ej_idc.fits", "sip_by_hand.hdr", "figures/mine.png", ".hidden"]
     for name in foreign:
         (path / name).write_text("precious")
-    (path / ".0a1b2c3d.posterior.nc").write_text("left by a killed run")
+    (path / ".bayesdist-0a1b2c3d-posterior.nc").write_text("left by a killed run")
     config = write_config(
         finished.config.with_name("other.toml"), sampler={"seed": 5, "target_ess": 50}
     )
     good("run", config, "-o", path, "--force")
     assert all((path / name).read_text() == "precious" for name in foreign)
-    assert not (path / ".0a1b2c3d.posterior.nc").exists()
+    assert not (path / ".bayesdist-0a1b2c3d-posterior.nc").exists()
     assert not (path / "report.html").exists()
     assert not (path / "sip.hdr").exists()  # the new configuration asks for no product
     assert [p.name for p in (path / "figures").iterdir()] == ["mine.png"]

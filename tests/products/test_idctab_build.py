@@ -112,7 +112,7 @@ def test_linear_term_of_exactly_one_is_not_taken_for_a_unit() -> None:
 def with_time(terms, breaks=(), sigma: float = 1.0) -> StandIn:
     """Two chips with drifting terms, in arcseconds."""
     base = some_solution(3, unit="arcsec", pixel=0.05)
-    chips = tuple(replace(base.model.chips[0], number=n) for n in (1, 2))
+    chips = tuple(replace(base.model.chips[0], number=n, name=f"WFC{n}") for n in (1, 2))
     time = TimeDependence(terms, (2004.5,), breaks)
     model = DistortionModel(3, chips, "arcsec", time)
     theta = np.zeros(model.n_params)
