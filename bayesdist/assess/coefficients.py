@@ -90,7 +90,7 @@ class _Block:
     def of(cls, value: Float, sigma: Float, draws: Float | None) -> _Block:
         columns = {"value": value, "sigma": sigma}
         if draws is not None:
-            tails = (0.1587, 0.8413, 0.0228, 0.9772)  # one and two standard deviations
+            tails = (0.16, 0.84, 0.025, 0.975)
             quantiles = np.quantile(draws, tails, axis=0)
             columns |= {"mean": draws.mean(axis=0), "sd": draws.std(axis=0, ddof=1)}
             columns |= dict(zip(("lo68", "hi68", "lo95", "hi95"), quantiles, strict=True))

@@ -49,7 +49,7 @@ class Plan:
     walkers : int
         Walkers of one ensemble.
     warmup : int
-        Steps that are dropped.
+        Steps that are dropped at least; of moves that go slowly, the first half is dropped.
     step : float
         b of the Crank-Nicolson move.
     thin : int
@@ -83,7 +83,7 @@ def plan_moves(efficiency: float, k: float, n_params: int, walkers: int | None =
     step = min(0.5, 2.0 / np.sqrt(n_params))
     if efficiency > 0.5 and k < 0.7:
         return Plan("independence", (0.95, 0.05, 0.0), walkers or 16, 10, step)
-    if efficiency > 0.05 and k < 1.0:
+    if efficiency > 0.05 and k < 0.7:
         return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, 100, step, 5)
     # emcee's red-blue moves want two walkers for each parameter
     least = 2 * (n_params + 1)
@@ -158,11 +158,15 @@ def _crank_nicolson(step: float) -> MHMove:
     return MHMove(propose)
 
 
-def boundaries(every: int, max_steps: int) -> Iterator[int]:
-    """Steps at which blocks end: 50, 100, 200, ... then every `every` steps up to `max_steps`."""
-    end = 0
-    while end < max_steps:
-        end = min(end + min(max(end, FIRST_CHECK), every), max_steps)
+def boundaries(every: int, max_steps: int, thin: int = 1) -> Iterator[int]:
+    """Steps at which blocks end: 50, 100, 200, ... then every `every` steps up to `max_steps`.
+
+    All are multiples of `thin`, so that every row that is kept stands for as many steps.
+    """
+    last, end = max_steps - max_steps % thin, 0
+    while end < last:
+        step = min(max(end, FIRST_CHECK), every)
+        end = min(end + step + -step % thin, last)
         yield end
 
 
@@ -200,6 +204,8 @@ class Ensembles:
         One for each ensemble.
     folder : Path or None
         Where the blocks go; None keeps them in memory.
+    fingerprint : str
+        Of data and settings; kept in each block.
     """
 
     target: Target
@@ -208,6 +214,7 @@ class Ensembles:
     plan: Plan
     seeds: tuple[int, ...]
     folder: Path | None = None
+    fingerprint: str = ""
 
     @cached_property
     def _sampler(self) -> emcee.EnsembleSampler:
@@ -254,16 +261,17 @@ class Ensembles:
         if self.folder is not None:
             path = self.folder / f"chain-{ensemble + 1}-{end:06d}.h5"
             if path.exists():
-                return self._block(*_read_block(path))
+                return self._block(*_read_block(path, f"{self.fingerprint} {begin}"))
         sampler = self._sampler
         sampler.reset()
-        thin = self.plan.thin if (end - begin) % self.plan.thin == 0 else 1
+        thin = self.plan.thin
         sampler.run_mcmc(state, (end - begin) // thin, thin_by=thin, skip_initial_state_check=True)
         white, log_prob = sampler.get_chain(), sampler.get_log_prob()
         accepted = sampler.backend.accepted.astype(float)
         random = sampler.random_state
         if path is not None:
-            _write_block(path, white, log_prob, accepted, random)
+            mark = f"{self.fingerprint} {begin}"
+            _write_block(path, mark, white, log_prob, accepted, random)
         return self._block(white, log_prob, accepted, random)
 
     def _block(self, white: Float, log_prob: Float, accepted: Float, random: tuple) -> Block:
@@ -273,18 +281,23 @@ class Ensembles:
         return Block(psi, log_prob, accepted, state)
 
 
-def _write_block(path: Path, white: Float, log_prob: Float, accepted: Float, random: tuple) -> None:
+def _write_block(
+    path: Path, mark: str, white: Float, log_prob: Float, accepted: Float, random: tuple
+) -> None:
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file["chain"], file["log_prob"], file["accepted"] = white, log_prob, accepted
         _, file["random_keys"], position, has_gauss, gauss = random
+        file.attrs["belongs_to"] = mark
         file.attrs["random_position"] = position
         file.attrs["random_has_gauss"] = has_gauss
         file.attrs["random_gauss"] = gauss
 
 
-def _read_block(path: Path) -> tuple[Float, Float, Float, tuple]:
+def _read_block(path: Path, mark: str) -> tuple[Float, Float, Float, tuple]:
     try:
         with h5py.File(path, "r") as file:
+            if file.attrs["belongs_to"] != mark:
+                raise KeyError("belongs_to")
             random = (
                 "MT19937",
                 file["random_keys"][...],
@@ -295,7 +308,7 @@ def _read_block(path: Path) -> tuple[Float, Float, Float, tuple]:
             return file["chain"][...], file["log_prob"][...], file["accepted"][...], random
     except (OSError, KeyError) as error:
         raise InputError(
-            "the checkpoint cannot be read",
+            "the checkpoint cannot be read, or belongs to another run",
             where=str(path),
             do="delete it and resume: its steps are run again",
         ) from error

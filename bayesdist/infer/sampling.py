@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 
 import h5py
@@ -14,8 +16,14 @@ from threadpoolctl import threadpool_limits
 
 from bayesdist.data.files import atomic_path
 from bayesdist.data.matches import MatchTable
-from bayesdist.errors import InputError
-from bayesdist.infer.labelled.convergence import Convergence, Limits, diagnose, pareto_k
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.labelled.convergence import (
+    Convergence,
+    Limits,
+    diagnose,
+    importance_efficiency,
+    pareto_k,
+)
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
@@ -29,6 +37,8 @@ __all__ = ["sample"]
 
 Float = NDArray[np.float64]
 
+ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may give other bits
+LEAST_ROWS = 10  # rows of a chain that diagnostics make sense of
 PILOT = 512  # proposals that judge the proposal
 PILOT_STARS = 200_000_000  # star evaluations that the pilot may cost
 MEMBERSHIP_DRAWS = 64  # draws over which the outlier probability of a star is averaged
@@ -111,19 +121,28 @@ def sample(
     n_pilot = int(np.clip(PILOT_STARS // len(matches), 64, PILOT))
     pilot = proposal.draw(n_pilot, np.random.default_rng(int(seeds[-1])))
     ok = np.isfinite(pilot).all(axis=1)
+    if ok.sum() < 2:
+        raise DegenerateError(
+            "the Laplace approximation has no mass inside the support",
+            where="posterior",
+            do="check the match, the errors and the outlier model",
+        )
     log_weights = target.log_density(pilot[ok]) - proposal.log_density(pilot[ok])
-    weights = np.exp(log_weights - log_weights.max())
-    efficiency = weights.sum() ** 2 / (weights**2).sum() / n_pilot
+    n_outside = int((~ok).sum())
+    efficiency = importance_efficiency(log_weights, n_outside)
     plan = plan_moves(efficiency, pareto_k(log_weights), len(target.names), walkers)
+    if max_steps < 10 * plan.thin:
+        plan = replace(plan, thin=1)  # too few steps to leave any out
     whitening = Whitening.of(target, proposal, pilot[ok])
-    runs = Ensembles(target, proposal, whitening, plan, tuple(int(s) for s in seeds[:-1]), folder)
+    starts = tuple(int(s) for s in seeds[:-1])
+    runs = Ensembles(target, proposal, whitening, plan, starts, folder, known)
 
     states = [runs.start(e) for e in range(ensembles)]
     psi: list[list[Float]] = [[] for _ in range(ensembles)]
     log_prob: list[list[Float]] = [[] for _ in range(ensembles)]
     accepted = 0.0
     begin, verdict = 0, None
-    for end in boundaries(checkpoint_every, max_steps):
+    for end in boundaries(checkpoint_every, max_steps, plan.thin):
         for e in range(ensembles):
             block = runs.block(e, states[e], begin, end)
             psi[e].append(block.psi)
@@ -133,12 +152,22 @@ def sample(
         begin = end
         if progress is not None:
             progress(end, max_steps)
-        if end - plan.warmup < 20 and end < max_steps:
-            continue
         made = sum(len(block) for block in psi[0])
-        kept = slice(min(plan.warmup // plan.thin, made // 2), None)
+        warmup = min(plan.warmup // plan.thin, made // 2)
+        if plan.weights[0] < 0.9:
+            warmup = made // 2
+        if made - warmup < LEAST_ROWS and end + plan.thin <= max_steps:
+            continue
+        kept = slice(warmup, None)
         chains = np.array([np.concatenate(p) for p in psi])[:, kept]
-        verdict = diagnose(chains, target.names, log_weights, limits, coupled=plan.weights[2] > 0)
+        verdict = diagnose(
+            chains,
+            target.names,
+            log_weights,
+            limits,
+            coupled=plan.weights[2] > 0,
+            n_outside=n_outside,
+        )
         if verdict.converged:
             break
     assert verdict is not None
@@ -148,7 +177,7 @@ def sample(
         ensembles=ensembles,
         walkers=plan.walkers,
         steps=begin,
-        warmup=min(plan.warmup, begin // 2),
+        warmup=warmup * plan.thin,
         passes=n_pilot + (START_DRAWS + 1) * ensembles * plan.walkers + n_moves,
         acceptance=accepted / (ensembles * plan.walkers * made),
         wall_s=time.monotonic() - started,
@@ -190,6 +219,7 @@ def _fingerprint(target: Target, *settings: int | None) -> str:
     columns = (stars.X, stars.Y, stars.u, stars.v, stars.var_u, stars.var_v, stars.starts)
     for column in (*columns, stars.groups.chip, stars.groups.exposure, stars.groups.epoch):
         digest.update(np.ascontiguousarray(column).tobytes())
+    digest.update(repr([(name, metadata.version(name)) for name in ENGINES]).encode())
     digest.update(target.priors.centre.tobytes() + target.priors.precision.tobytes())
     digest.update(repr((stars.model.to_dict(), target.mixture, settings)).encode())
     return digest.hexdigest()

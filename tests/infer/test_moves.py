@@ -128,7 +128,7 @@ def test_boundaries_are_those_documented():
 
 def test_plan_falls_back_as_the_proposal_gets_worse():
     good = plan_moves(0.95, 0.2, 45)
-    fair = plan_moves(0.3, 0.8, 45)
+    fair = plan_moves(0.3, 0.6, 45)
     poor = plan_moves(0.01, 1.2, 45)
     assert good.weights[0] > fair.weights[0] > poor.weights[0] > 0
     assert good.weights[2] == fair.weights[2] == 0 < poor.weights[2]

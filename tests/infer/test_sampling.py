@@ -31,7 +31,7 @@ def thinned(posterior, name: str, every: int) -> np.ndarray:
 def test_jitter_at_its_bound_is_sampled_as_the_closed_form_says():
     model, matches, _ = simulated(71, 60, order=1)
     fit = fit_linear(matches, model, **UNCLIPPED)
-    posterior = sample(fit, matches, outliers=OutlierMixture("none"), seed=1)
+    posterior = sample(fit, matches, outliers=OutlierMixture("none"), seed=1, target_ess=2000)
     assert posterior.convergence.converged
     oracle = JitterOracle.of(1, matches)
     log_j = np.log(thinned(posterior, "j", 4))

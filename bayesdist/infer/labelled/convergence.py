@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Convergence", "Limits", "diagnose", "pareto_k"]
+__all__ = ["Convergence", "Limits", "diagnose", "importance_efficiency", "pareto_k"]
 
 Float = NDArray[np.float64]
+
+LEAST_PER_WALKER = 5.0  # effective draws that each walker must have made
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,7 @@ def diagnose(
     limits: Limits,
     *,
     coupled: bool,
+    n_outside: int = 0,
 ) -> Convergence:
     """Diagnostics from the draws after warm-up.
 
@@ -100,6 +103,8 @@ def diagnose(
     limits : Limits
     coupled : bool
         Whether the walkers of an ensemble influence each other.
+    n_outside : int
+        Further proposals, which fell outside the support and have weight zero.
 
     Returns
     -------
@@ -136,9 +141,6 @@ def diagnose(
     ess_squares = np.maximum(each(az.ess, squares, method="mean"), 1.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mcse_sd = squares.reshape(-1, D).std(axis=0) / np.sqrt(ess_squares) / (2 * spread)
-    weights = np.exp(log_weights - log_weights.max())
-    efficiency = float(weights.sum() ** 2 / (weights**2).sum() / len(weights))
-
     reasons = []
     for label, values, bad, limit in (
         ("R-hat", rhat, rhat > limits.rhat, limits.rhat),
@@ -152,6 +154,15 @@ def diagnose(
                 f"{'at most' if label == 'R-hat' else 'at least'} {limit:g}"
                 f" ({int(bad.sum())} of {D} parameters)"
             )
+    # every walker counts at least as one draw, even if it never moved: many walkers must not
+    # make up for walkers that do not mix
+    each_walker = float(np.minimum(bulk, tail).min()) / (E * W)
+    if each_walker < LEAST_PER_WALKER:
+        k = int(np.argmin(np.minimum(bulk, tail)))
+        reasons.append(
+            f"a walker has made {each_walker:.2g} effective draws of {names[k]} and must have made "
+            f"at least {LEAST_PER_WALKER:g}"
+        )
     return Convergence(
         names=names,
         rhat=rhat,
@@ -160,7 +171,7 @@ def diagnose(
         mcse_mean=spread / np.sqrt(np.maximum(bulk, 1.0)),
         mcse_sd=np.nan_to_num(mcse_sd),
         pareto_k=pareto_k(log_weights),
-        importance_efficiency=efficiency,
+        importance_efficiency=importance_efficiency(log_weights, n_outside),
         converged=not reasons,
         reasons=tuple(reasons),
         limits=limits,
@@ -178,6 +189,14 @@ def _coupled_ess(chains: Float, each) -> Float:
     with np.errstate(invalid="ignore", divide="ignore"):
         ess = each(az.ess, averages, method="mean") * total / share
     return np.where(np.isfinite(ess), ess, 0.0)
+
+
+def importance_efficiency(log_weights: Float, n_outside: int = 0) -> float:
+    """Effective share of draws with these log weights, and of others with weight zero."""
+    if not len(log_weights):
+        return 0.0
+    weights = np.exp(log_weights - log_weights.max())
+    return float(weights.sum() ** 2 / (weights**2).sum() / (len(weights) + n_outside))
 
 
 def pareto_k(log_weights: Float) -> float:
