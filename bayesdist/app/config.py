@@ -203,6 +203,8 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _chips_or_detector(self) -> Config:
+        if len(self.chip) > 1:
+            raise ValueError("a run takes one chip for now: give a single [[chip]] block")
         if self.chip and (self.detector.size or self.model.reference_pixel):
             raise ValueError(
                 "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "

@@ -201,6 +201,7 @@ def results_text(session: Session) -> str:
         "",
         f"Sampler: {state}; R-hat {number(c['rhat_max'], 5)}, ESS bulk {number(c['ess_bulk_min'])} "
         f"and tail {number(c['ess_tail_min'])}, {c['passes']} passes, {number(c['wall_s'], 3)} s",
+        *(f"WARNING: {text}" for text in summary.get("warnings", [])),
         f"Report:  {session.run / 'report.html'}",
     ]
     return "\n".join(parts)

@@ -100,7 +100,9 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
 
 def _begin(session: Session) -> None:
     """Begin a planned run once it is known that it can be carried out."""
-    if not session.run.begun:
+    if session.run.begun:
+        session.run.follow()
+    else:
         rehearse(session)
         session.run.begin()
 

@@ -35,6 +35,10 @@ OWN_FILES = re.compile(
 )
 
 
+# when to stop: a resumed run may be given other limits
+LIMITS = ("max_steps", "target_ess", "target_rhat")
+
+
 def as_json(value: Any) -> Any:
     """A value as plain JSON: arrays as lists, and null for what is not a finite number."""
     if isinstance(value, Mapping):
@@ -70,6 +74,7 @@ class RunDirectory:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._planned: tuple[dict[str, Any], str] | None = None
+        self._follow: tuple[Config, str] | None = None
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -124,6 +129,7 @@ class RunDirectory:
                     do="go on with it by --resume, replace it by --force, or choose another folder",
                 )
             run._check_unchanged(config, text, inputs, seed)
+            run._follow = config, text
             return run
         foreign = run._foreign(text)
         if foreign:
@@ -153,6 +159,26 @@ class RunDirectory:
     def begun(self) -> bool:
         """Whether the folder holds this run already."""
         return self._planned is None
+
+    def follow(self) -> None:
+        """Take over the limits of the sampler that a resumed run was given.
+
+        A posterior that had not converged is then sampled further.
+        """
+        if self._follow is None:
+            return
+        (config, text), record = self._follow, self.record
+        known = self.config
+        limits = {key: getattr(config.sampler, key) for key in LIMITS}
+        if limits == {key: getattr(known.sampler, key) for key in LIMITS}:
+            return
+        now = known.model_copy(update={"sampler": known.sampler.model_copy(update=limits)})
+        record["config"] = as_json(now.model_dump())
+        for stage in ("sample", "assess", "export", "report"):
+            record["stages"].pop(stage, None)
+        with atomic_path(self / "config.toml") as temporary:
+            temporary.write_text(text, encoding="utf-8", newline="")
+        self.write_record(record)
 
     def begin(self) -> None:
         """Write down what is about to be done; another run that stands there is removed.
@@ -243,7 +269,8 @@ class RunDirectory:
         self, config: Config, text: str, inputs: dict[str, str], seed: int | None
     ) -> None:
         record = self.record
-        if load_text(self / "config.toml") != text:
+        changed = load_text(self / "config.toml") != text
+        if changed and _without_limits(config) != _without_limits(self.config):
             raise InputError(
                 "the configuration is not the one this run began with",
                 where=str(self / "config.toml"),
@@ -352,6 +379,15 @@ class RunDirectory:
 def _named(config: Config, base: Path) -> Path | list[Path]:
     names = config.data.matches
     return base / names if isinstance(names, str) else [base / name for name in names]
+
+
+def _without_limits(config: Config) -> dict[str, Any]:
+    """A configuration without what may change when a run is resumed: its limits, and its seed,
+    which the command line may have given."""
+    out = config.model_dump()
+    for key in (*LIMITS, "seed"):
+        out["sampler"].pop(key)
+    return out
 
 
 def versions() -> dict[str, str]:

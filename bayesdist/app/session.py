@@ -13,6 +13,7 @@ from astropy.table import Table
 
 from bayesdist.app.config import Config
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.assess import Misfit, misfit_of
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path, read_matches
 from bayesdist.infer import (
     GaussianPriors,
@@ -134,6 +135,22 @@ class Session:
         """Size of a pixel in arcsec, where the configuration gives it."""
         scale = self.config.detector.scale_mas
         return None if scale is None else scale / 1000
+
+    @cached_property
+    def misfit(self) -> Misfit:
+        """Structure that the least-squares fit leaves in the residuals of the first chip."""
+        fit, matches = self.fit, self.matches
+        chip = fit.model.chips[0]
+        numbers = np.asarray(matches.chip_numbers)[matches.chip]
+        good = fit.used & ((numbers == chip.number) | (len(fit.model.chips) == 1))
+        return misfit_of(
+            matches.x[good],
+            matches.y[good],
+            fit.residual[good],
+            size=chip.size,
+            n_params=2 * fit.model.n_terms,
+            unit=fit.unit,
+        )
 
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""

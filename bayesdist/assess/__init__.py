@@ -5,6 +5,7 @@ from bayesdist.assess.budget import BudgetTerm, ErrorBudget, error_budget
 from bayesdist.assess.fields import ErrorFields, error_fields
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
+from bayesdist.assess.misfit import Misfit, misfit_of
 from bayesdist.assess.requirements import Margin, Requirement, check_requirements
 from bayesdist.assess.residuals import BinnedResiduals, binned_residuals, residual_statistics
 from bayesdist.assess.solution import Solution
@@ -24,6 +25,7 @@ __all__ = [
     "ErrorBudget",
     "ErrorFields",
     "Margin",
+    "Misfit",
     "Requirement",
     "Solution",
     "UncertaintyMap",
@@ -38,6 +40,7 @@ __all__ = [
     "error_fields",
     "field_statistic",
     "grid_pixels",
+    "misfit_of",
     "pixel_scale_of",
     "residual_statistics",
     "uncertainty_map",

@@ -136,6 +136,7 @@ def check_requirements(
     rng: np.random.Generator,
     pixel_scale: float | None = None,
     converged: bool | None = None,
+    doubt: str = "",
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws of the position error.
 
@@ -163,6 +164,8 @@ def check_requirements(
     converged : bool, optional
         Whether the posterior may be trusted; by default what its convergence says.  If not, every
         verdict is 'undecided'.
+    doubt : str
+        Any other reason why no verdict can be given: every one is then 'undecided'.
 
     Returns
     -------
@@ -203,7 +206,7 @@ def check_requirements(
         for name, values in _statistics(fields, sorted(names), offsets, random, rng).items():
             statistics[t, name] = values
 
-    doubt = _doubt(solution, converged)
+    doubt = _doubt(solution, converged) or doubt
     n_effective = effective_draws(solution, len(theta))
     margins = []
     for r, t in zip(requirements, epochs, strict=True):

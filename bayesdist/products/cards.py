@@ -26,6 +26,19 @@ def text_card(keyword: str, value: str, comment: str = "") -> str:
     return fits.Card(keyword, value, comment).image
 
 
+def convergence_cards(solution: object) -> list[str]:
+    """Whether the posterior behind a product may be relied on; nothing for a linear fit."""
+    convergence = getattr(solution, "convergence", None)
+    if convergence is None:
+        return []
+    if convergence.converged:
+        return [text_card("BDCONV", "YES", "has the sampler converged?")]
+    return [
+        text_card("BDCONV", "NO", "has the sampler converged?"),
+        text_card("COMMENT", "NOT CONVERGED: provisional, not to be released."),
+    ]
+
+
 def keyword_of(card: str) -> str:
     """Keyword of a card."""
     return card[:8].rstrip()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.products.blocks import blocks_of
-from bayesdist.products.cards import number_card, text_card
+from bayesdist.products.cards import convergence_cards, number_card, text_card
 from bayesdist.products.idctab import IdcTab
 from bayesdist.products.idctab_numbers import ChipNumbers, check_time, chip_numbers
 from bayesdist.products.parity import parity_of
@@ -120,6 +120,7 @@ def idctab_from_solution(
         *([text_card("PEDIGREE", pedigree)] if pedigree else []),
         *(_tdd_cards(fitted, model.time.epoch0[0] if model.time else None) if acs_wfc else ()),
         *_provenance_cards(fitted, vafactor, model.unit),
+        *convergence_cards(solution),
     ]:
         primary.header.append(fits.Card.fromstring(card), end=True)
     hdus = [

@@ -18,7 +18,11 @@ PREFIX = {"least squares": "LSQ", "posterior": "MIX"}
 
 
 def write_maps(
-    path: str | Path, maps: Sequence[UncertaintyMap], area: AreaMap | None = None
+    path: str | Path,
+    maps: Sequence[UncertaintyMap],
+    area: AreaMap | None = None,
+    *,
+    converged: bool = True,
 ) -> None:
     """Write uncertainty maps of one chip.
 
@@ -32,9 +36,12 @@ def write_maps(
         Replaced atomically.
     maps : sequence of UncertaintyMap
     area : AreaMap, optional
+    converged : bool
+        Whether the posterior may be relied on; noted in the primary header.
     """
     hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU()]
     hdus[0].header["CREATOR"] = "bayesdist"
+    hdus[0].header["BDCONV"] = (converged, "has the sampler converged?")
     for m in maps:
         prefix = PREFIX[m.kind]
         for name, values, unit in (

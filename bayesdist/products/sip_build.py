@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.products.bivariate import largest_magnitude
-from bayesdist.products.cards import number_card, text_card
+from bayesdist.products.cards import convergence_cards, number_card, text_card
 from bayesdist.products.monomials import ChipPolynomial, chip_polynomial
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
 from bayesdist.products.sip_inverse import fit_inverse, worst_closure
@@ -112,6 +112,7 @@ def sip_from_solution(
     cards = _cards(
         poly, linear, epoch if model.time is not None else None, model.unit, scale_arcsec
     )
+    cards += tuple(convergence_cards(solution))
     size = (int(poly.chip.size[0]), int(poly.chip.size[1]))
     sip = SipHeader(
         crpix=poly.chip.reference_pixel,

@@ -95,6 +95,8 @@ class ReportInput:
     budget : ErrorBudget or None
     margins : tuple of Margin
     products : tuple of Product
+    warnings : tuple of str
+        Sentences that belong on top.
     magnitude_errors : MagnitudeErrors or None
         Errors by magnitude, where the stars carried none.
     provenance : mapping
@@ -116,6 +118,7 @@ class ReportInput:
     budget: ErrorBudget | None = None
     margins: tuple[Margin, ...] = ()
     products: tuple[Product, ...] = ()
+    warnings: tuple[str, ...] = ()
     magnitude_errors: MagnitudeErrors | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 

@@ -187,6 +187,9 @@ def verdict(inputs: ReportInput) -> Verdict:
         headline, level = "Least squares only: no posterior was sampled", "warn"
     else:
         headline, level = "The posterior is converged", "pass"
+    if inputs.warnings:
+        sentences[:0] = [f"{text}." for text in inputs.warnings]
+        headline, level = f"{headline}, but read the warnings", _worse(level, "warn")
     if "missed" in verdicts:
         headline, level = f"{headline}; not every requirement is met", "fail"
     elif "undecided" in verdicts:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -35,18 +36,27 @@ __all__ = [
 
 log = logging.getLogger("bayesdist")
 
+LEAST_CHI2, MOST_CHI2 = 0.67, 1.5
+
 
 def run_assess(session: Session) -> None:
     config, run = session.config, session.run
     solution, grid, epoch = session.posterior, config.assess.grid, session.epoch
     maps = [uncertainty_map(s, grid=grid, epoch=epoch) for s in (session.fit, solution)]
-    write_maps(run / "maps.fits", maps, area_map(solution, grid=grid, epoch=epoch))
-    write_table(coefficient_table(session.fit, solution), run / "coefficients.ecsv")
+    area = area_map(solution, grid=grid, epoch=epoch)
+    write_maps(run / "maps.fits", maps, area, converged=solution.convergence.converged)
+    coefficients = coefficient_table(session.fit, solution)
+    coefficients.meta["converged"] = solution.convergence.converged
+    write_table(coefficients, run / "coefficients.ecsv")
+    warnings = warnings_of(session)
+    for text in warnings:
+        log.warning("assess: WARNING: %s", text)
     budget = budget_of(session, solution)
     table = Table(rows=budget.rows())
     for name in ("u", "v", "radial"):
         table[name].unit = solution.unit
     table.meta = {"epoch": epoch, "grid": list(grid), "statistic": "rms over the grid"}
+    table.meta["converged"] = solution.convergence.converged
     write_table(table, run / "budget.ecsv")
     margins = margins_of(session, config.requirements(), solution)
     write_margins(session, margins)
@@ -62,6 +72,8 @@ def run_assess(session: Session) -> None:
             "radius_max_least_squares": maps[0].radius_max,
         },
         budget=budget.rows(),
+        misfit=asdict(session.misfit) | {"significant": session.misfit.significant},
+        warnings=warnings,
     )
     log.info("assess: largest formal radius %.4g %s", m.radius_max, m.unit)
 
@@ -90,7 +102,31 @@ def margins_of(
     n_draws: int | None = None,
 ) -> tuple[Margin, ...]:
     """Margins of a solution against requirements; as many draws as configured by default."""
-    return check_requirements(solution, requirements, **_assessment(session, solution, n_draws))
+    doubt = ""
+    if n_draws is None and session.misfit.significant:
+        doubt = session.misfit.sentence
+    return check_requirements(
+        solution, requirements, doubt=doubt, **_assessment(session, solution, n_draws)
+    )
+
+
+def warnings_of(session: Session) -> list[str]:
+    """What a reader of the numbers has to know, each as a sentence."""
+    fit, out = session.fit, []
+    if session.misfit.significant:
+        out.append(session.misfit.sentence)
+    ratio = fit.chi2 / max(fit.dof, 1)
+    if ratio < LEAST_CHI2:
+        out.append(
+            f"chi-square per degree of freedom is {ratio:.2g}: the quoted errors are too large, "
+            "and with them all uncertainties"
+        )
+    if ratio > MOST_CHI2:
+        out.append(
+            f"chi-square per degree of freedom is {ratio:.3g} with the quoted errors: they are too "
+            "small, which the jitter takes up, or the model does not fit"
+        )
+    return [text[0].upper() + text[1:] for text in out]
 
 
 def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:

@@ -10,7 +10,12 @@ import numpy as np
 
 from bayesdist.app.rundir import as_json
 from bayesdist.app.session import Session
-from bayesdist.app.stages.assess import budget_of, judged_requirements, margins_of
+from bayesdist.app.stages.assess import (
+    budget_of,
+    judged_requirements,
+    margins_of,
+    warnings_of,
+)
 from bayesdist.assess import (
     area_map,
     binned_residuals,
@@ -82,6 +87,7 @@ def run_report(session: Session) -> None:
         # the requirements that were judged last, be it by `assess` or by `validate`
         margins=margins_of(session, judged_requirements(run), posterior),
         products=products,
+        warnings=tuple(warnings_of(session)),
         magnitude_errors=session.magnitude_errors,
         provenance={
             k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")

@@ -19,7 +19,7 @@ def coefficient_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
     kinds = {p.name: p.kind for p in inputs.fit.model.parameters}
     rows = list(inputs.coefficients)
     polynomial = [r for r in rows if kinds.get(str(r["name"])) == "polynomial"]
-    others = [r for r in rows if kinds.get(str(r["name"])) != "polynomial"]
+    others = [r for r in rows if kinds.get(str(r["name"])) in ("tdd", "frame")]
     out = [
         _parameter_table(
             inputs,

@@ -1,0 +1,112 @@
+"""Does the model describe the stars?  Structure left in the residuals, and errors that do not fit.
+
+The posterior is that of the model: where the model leaves structure behind, its uncertainty says
+nothing of it, and no requirement can be called met.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
+
+__all__ = ["Misfit", "misfit_of"]
+
+Float = NDArray[np.float64]
+
+STARS_PER_BIN = 25
+MOST_BINS = 32  # along each side
+SIGNIFICANT = 1e-4  # probability of as much structure by chance, over all three tests together
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Structure in binned residuals.
+
+    Parameters
+    ----------
+    p_value : float
+        Probability of as much structure by chance, of the most telling of three partitions: cells,
+        columns, rows; multiplied by three.
+    partition : str
+        Which one that is.
+    structure : float
+        Rms over that partition of the mean residual, its noise subtracted (both axes together).
+    unit : str
+    """
+
+    p_value: float
+    partition: str
+    structure: float
+    unit: str
+
+    @property
+    def significant(self) -> bool:
+        """Whether the structure is more than chance."""
+        return self.p_value < SIGNIFICANT
+
+    @property
+    def sentence(self) -> str:
+        """What it means, as a clause."""
+        return (
+            f"the residuals hold structure that the model does not describe ({self.structure:.2g} "
+            f"{self.unit} rms in {self.partition} of the detector, p = {self.p_value:.1g}), so "
+            "that errors are larger than the posterior says"
+        )
+
+
+def misfit_of(
+    x: ArrayLike,
+    y: ArrayLike,
+    residual: ArrayLike,
+    *,
+    size: tuple[float, float],
+    n_params: int,
+    unit: str,
+) -> Misfit:
+    """Test residuals for structure over the detector.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (N,)
+        FITS 1-based pixels of the stars that were not rejected.
+    residual : array_like, shape (N, 2)
+        Data minus model.
+    size : tuple of float
+    n_params : int
+        Polynomial coefficients of both axes, which the fit has taken out of the residuals.
+    unit : str
+        Of the residuals.
+
+    Returns
+    -------
+    Misfit
+    """
+    residual = np.asarray(residual, float)
+    n = len(residual)
+    side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 3, MOST_BINS))
+    strips = int(np.clip(n / STARS_PER_BIN, 3, 2 * MOST_BINS))
+    found = []
+    for name, bins in (("cells", (side, side)), ("columns", (strips, 1)), ("rows", (1, strips))):
+        cells = binned_residuals(x, y, residual[:, 0], residual[:, 1], bins=bins, size=size)
+        found.append((*_test(cells, n_params), name))
+    p, structure, name = min(found)
+    return Misfit(min(1.0, 3 * p), name, structure, unit)
+
+
+def _test(cells: BinnedResiduals, n_params: int) -> tuple[float, float]:
+    good = cells.count >= 5
+    n = cells.count[good]
+    # the square of a t variable is larger than that of a normal one
+    shrink = np.sqrt((n - 3) / (n - 1))
+    mean = np.stack([cells.mean_u[good], cells.mean_v[good]])
+    sem = np.stack([cells.sem_u[good], cells.sem_v[good]]) / shrink
+    total = float(((mean / sem) ** 2).sum())
+    # a fit of few stars has taken most of the structure that bins could show
+    dof = max(mean.size - (n_params if mean.size > 2 * n_params else 0), 1)
+    excess = (mean**2 - sem**2).sum(axis=0).mean() if n.size else 0.0
+    return float(chi2.sf(total, dof)), float(np.sqrt(max(excess, 0.0)))
