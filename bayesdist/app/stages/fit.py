@@ -34,6 +34,7 @@ def run_fit(session: Session) -> None:
             "rejected": {**matches.rejected, **fit.rejected},
             "n_exposures": len(matches.exposure_names),
             "sources": list(matches.sources),
+            "tangent_point": matches.tangent_point,
         },
         fit={
             "order": fit.model.order,
