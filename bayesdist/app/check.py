@@ -13,6 +13,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number
 from bayesdist.app.session import Session
 from bayesdist.app.stages import rehearse
+from bayesdist.app.stages.assess import warnings_of
 from bayesdist.infer import GaussianPriors, OutlierMixture
 from bayesdist.infer.sampler import FIRST_CHECK
 from bayesdist.infer.stars import prepare
@@ -78,4 +79,6 @@ def check(path: str | Path) -> str:
         f"cost         {number(1e3 * per_pass, 3)} ms a pass, about {PASSES} passes: "
         f"{number(total, 2)} s to the posterior if it is well behaved",
     ]
+    session.fit, session.matches = fit, matches  # what a run would read from its files
+    lines += [f"WARNING      {text}" for text in warnings_of(session)]
     return "\n".join(lines)
