@@ -212,11 +212,6 @@ class Config(Section):
             )
         if not self.chip and self.detector.size is None:
             raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
-        numbers = [c.number for c in self.chip]
-        if len(set(numbers)) < len(numbers):
-            raise ValueError("two [[chip]] blocks have one number; number each differently")
-        if sum(c.reference for c in self.chip) > 1:
-            raise ValueError("two [[chip]] blocks are the reference; choose one")
         return self
 
     def chips(self) -> tuple[Chip, ...]:

@@ -260,14 +260,13 @@ def test_chip_blocks_and_the_detector_exclude_each_other():
         assert "[[chip]]" in str(refusal(config_text(**(bare | more), chip=[CHIP])))
 
 
-def test_the_reference_chip_stands_first():
-    one = CHIP | {"number": 1, "name": "WFC1", "reference": True}
+def test_a_run_takes_one_chip():
+    """What is assessed is one chip: a second one must not pass unseen."""
     bare = {"detector": None, "model": {"order": 2}}
-    assert [c.number for c in parsed(config_text(**bare, chip=[CHIP, one])).chips()] == [1, 2]
-    twice = [CHIP, one, one]
-    assert "one number" in str(refusal(config_text(**bare, chip=twice)))
-    both = [CHIP | {"reference": True}, one]
-    assert "reference" in str(refusal(config_text(**bare, chip=both)))
+    (chip,) = parsed(config_text(**bare, chip=[CHIP])).chips()
+    assert chip.number == CHIP["number"] and chip.size == tuple(CHIP["size"])
+    two = [CHIP, CHIP | {"number": 1, "name": "WFC1"}]
+    assert "one chip" in str(refusal(config_text(**bare, chip=two)))
 
 
 def test_text_is_kept_as_written(tmp_path):
