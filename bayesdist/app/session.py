@@ -136,18 +136,24 @@ class Session:
         scale = self.config.detector.scale_mas
         return None if scale is None else scale / 1000
 
+    @property
+    def fitted(self) -> np.ndarray:
+        """Which stars of the first chip the least-squares fit used."""
+        fit, matches = self.fit, self.matches
+        if len(fit.model.chips) == 1:
+            return fit.used
+        numbers = np.asarray(matches.chip_numbers)[matches.chip]
+        return fit.used & (numbers == fit.model.chips[0].number)
+
     @cached_property
     def misfit(self) -> Misfit:
         """Structure that the least-squares fit leaves in the residuals of the first chip."""
-        fit, matches = self.fit, self.matches
-        chip = fit.model.chips[0]
-        numbers = np.asarray(matches.chip_numbers)[matches.chip]
-        good = fit.used & ((numbers == chip.number) | (len(fit.model.chips) == 1))
+        fit, matches, good = self.fit, self.matches, self.fitted
         return misfit_of(
             matches.x[good],
             matches.y[good],
             fit.residual[good],
-            size=chip.size,
+            size=fit.model.chips[0].size,
             n_params=2 * fit.model.n_terms,
             unit=fit.unit,
         )

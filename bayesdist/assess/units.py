@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from bayesdist.assess.names import require_known
 from bayesdist.assess.solution import Solution
 from bayesdist.data.units import UNITS
@@ -102,9 +100,4 @@ def pixel_scale_of(
     model = solution.model
     if model.unit == "pix":
         return None
-    basis = model.basis(chip)
-    linear = [
-        basis.to_monomials(np.asarray(solution.mean)[model.coefficient_slice(chip, axis)])[1:3]
-        for axis in (0, 1)
-    ]
-    return convert(math.sqrt(abs(float(np.linalg.det(linear)))), model.unit, "mas")
+    return convert(model.pixel_size(solution.mean, chip), model.unit, "mas")

@@ -230,7 +230,7 @@ def fit_linear(
     too_unlikely = chi2 > clip_chi2 * spread
     too_far = np.zeros(len(stars), bool)
     if clip_abs is not None:
-        limit = clip_abs * _pixel(model, theta)
+        limit = clip_abs * model.pixel_size(theta)
         too_far = np.hypot(residual[:, 0], residual[:, 1]) > limit
     used = ~(too_unlikely | too_far)
     if used.sum() * 2 < model.n_params or used.mean() < 0.05:
@@ -331,15 +331,6 @@ def fit_by_magnitude(
     )
 
 
-def _pixel(model: DistortionModel, theta: Float) -> float:
-    """Size of a pixel at the first chip's reference pixel, in the unit of u, v."""
-    if model.unit == "pix":
-        return 1.0
-    basis = model.basis()
-    linear = [basis.to_monomials(theta[model.coefficient_slice(None, a)])[1:3] for a in (0, 1)]
-    return float(np.sqrt(abs(np.linalg.det(linear))))
-
-
 def _corner_weight(stars: Stars, factor: float) -> Float:
     radius2 = (stars.X**2 + stars.Y**2) / 2  # 1 in the corners
     return 1.0 + (factor - 1.0) * radius2
@@ -427,7 +418,7 @@ def _gauss_newton(
         theta = theta + step
         before, about = about, model.effective(theta, groups)
         moved = np.abs(about - before).sum(axis=2).max()
-        if moved < RELINEARISED * _pixel(model, theta):
+        if moved < RELINEARISED * model.pixel_size(theta):
             return theta
     raise DegenerateError(
         "the exposure frames did not settle in 50 iterations",

@@ -526,6 +526,29 @@ class DistortionModel:
             out[np.ix_(rows, np.arange(2), columns)] = np.einsum("nk,akm->nam", phi, d)
         return out
 
+    def pixel_size(self, theta: ArrayLike, chip: int | None = None) -> float:
+        """Size of a pixel at a chip's reference pixel, in the unit of u, v.
+
+        Parameters
+        ----------
+        theta : array_like, shape (n_params,)
+        chip : int, optional
+            Chip number; the first chip by default.
+
+        Returns
+        -------
+        float
+            1 where u and v are pixels, else the square root of the pixel's area, without drift and
+            frames.
+        """
+        if self.unit == "pix":
+            return 1.0
+        theta, basis = np.asarray(theta, float), self.basis(chip)
+        linear = [
+            basis.to_monomials(theta[self.coefficient_slice(chip, axis)])[1:3] for axis in (0, 1)
+        ]
+        return float(np.sqrt(abs(np.linalg.det(linear))))
+
     def _checked(self, theta: ArrayLike) -> Float:
         theta = np.asarray(theta, float)
         if theta.shape[-1:] != (self.n_params,):

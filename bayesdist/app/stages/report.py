@@ -23,14 +23,13 @@ from bayesdist.assess import (
     uncertainty_map,
 )
 from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN
 
 __all__ = ["run_report"]
 
 log = logging.getLogger("bayesdist")
 
 VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
-MOST_BINS = 32
-STARS_PER_BIN = 25
 
 
 def run_report(session: Session) -> None:
@@ -49,10 +48,7 @@ def run_report(session: Session) -> None:
     chip, grid = fit.model.chips[0], config.assess.grid
     vectors = {"grid": _vector_grid(chip.size), "epoch": epoch}
     matches = session.matches
-    on_chip = np.asarray(matches.chip_numbers)[matches.chip] == chip.number
-    if len(fit.model.chips) == 1:
-        on_chip = np.ones(len(matches), bool)
-    good = on_chip & fit.used
+    good = session.fitted
     side = int(np.clip(np.sqrt(good.sum() / STARS_PER_BIN), 4, MOST_BINS))
     record = run.record
     products = tuple(
