@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from astropy.table import Table
@@ -13,10 +14,20 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.data.naming import find_columns
 from bayesdist.data.tangent import mean_direction, tangent_plane
 from bayesdist.data.units import check_unit, conversion
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.values import Place, SourceColumn, row_number
 from bayesdist.errors import InputError
 
-__all__ = ["ALIASES", "matches_from_table", "position_unit", "sky_positions"]
+__all__ = [
+    "ALIASES",
+    "Columns",
+    "match_columns",
+    "matches_from_table",
+    "needed_columns",
+    "plane_unit",
+    "position_unit",
+    "sky_columns",
+    "sky_positions",
+]
 
 Float = NDArray[np.float64]
 
@@ -86,8 +97,32 @@ def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> 
     return own_unit or unit or ""
 
 
-def _column(table: Table, found: Mapping[str, str], key: str, source: str) -> SourceColumn:
-    return SourceColumn(table[found[key]], source, found[key])
+class Columns(Protocol):
+    """Named columns of one length, as an astropy Table has them."""
+
+    @property
+    def colnames(self) -> Sequence[str]:
+        """Names."""
+
+    def __len__(self) -> int:
+        """Rows."""
+
+    def __getitem__(self, name: str) -> Any:
+        """What `SourceColumn` takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Quantities:
+    """The columns of a table by what they are."""
+
+    table: Columns
+    found: Mapping[str, str]
+    source: str
+    place: Place
+
+    def __getitem__(self, key: str) -> SourceColumn:
+        name = self.found[key]
+        return SourceColumn(self.table[name], self.source, name, self.place)
 
 
 def _as_table(data: Any, source: str) -> Table:
@@ -126,11 +161,33 @@ def sky_positions(
     found = find_columns(table.colnames, columns, ALIASES, source=source)
     if not _on_sky(found, columns, source):
         return None
-    ra, dec = (_degrees(_column(table, found, key, source)) for key in ("ra", "dec"))
+    return sky_columns(table, found, source=source)
+
+
+def sky_columns(
+    table: Columns, found: Mapping[str, str], *, source: str, place: Place = row_number
+) -> tuple[Float, Float]:
+    """Right ascension and declination of some rows of a table.
+
+    Parameters
+    ----------
+    table, found, source, place
+        As `match_columns`.
+
+    Returns
+    -------
+    tuple of ndarray, shape (N,)
+        Degrees.
+    """
+    return _sky(_Quantities(table, found, source, place))
+
+
+def _sky(quantities: _Quantities) -> tuple[Float, Float]:
+    ra, dec = (_degrees(quantities[key]) for key in ("ra", "dec"))
     beyond = np.abs(dec) > 90.0
     if beyond.any():
         bad = int(np.argmax(beyond))
-        raise _column(table, found, "dec", source).fail(bad, f"declination is {dec[bad]:g} degrees")
+        raise quantities["dec"].fail(bad, f"declination is {dec[bad]:g} degrees")
     return ra, dec
 
 
@@ -192,25 +249,102 @@ def matches_from_table(
         contradict each other, no rows, and all that `MatchTable` refuses.
     """
     table = _as_table(data, source)
-    found = find_columns(table.colnames, columns, ALIASES, source=source)
+    found = needed_columns(table.colnames, columns, source=source, read_sigma=read_sigma)
+    if len(table) == 0:
+        raise InputError("holds no rows", where=source, do="give a table with matched stars")
+    out = match_columns(
+        table,
+        found,
+        source=source,
+        unit=unit,
+        pixel_origin=pixel_origin,
+        tangent_point=tangent_point,
+    )
+    if exposure_name is not None:
+        out.setdefault("exposure_names", (exposure_name,))
+    return MatchTable(**out, sources=(source,))
+
+
+def needed_columns(
+    names: Iterable[str],
+    columns: Mapping[str, str] | None,
+    *,
+    source: str,
+    read_sigma: bool = True,
+) -> dict[str, str]:
+    """Column of each quantity that is read from a table.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Columns of the table.
+    columns, source, read_sigma
+        As `matches_from_table`.
+
+    Returns
+    -------
+    dict of str to str
+        With either u and v or ra and dec.
+
+    Raises
+    ------
+    InputError
+        For a missing column.
+    """
+    names = list(names)
+    found = find_columns(names, columns, ALIASES, source=source)
     on_sky = _on_sky(found, columns, source)
     for key in ("x", "y") if on_sky else ("x", "y", "u", "v"):
         if key not in found:
             raise InputError(
-                f"no column for {key!r} among {', '.join(table.colnames) or 'none'}",
+                f"no column for {key!r} among {', '.join(names) or 'none'}",
                 where=source,
                 do="name it in the option 'columns'",
             )
-    if len(table) == 0:
-        raise InputError("holds no rows", where=source, do="give a table with matched stars")
+    unread = {"u", "v"} if on_sky else {"ra", "dec"}
+    if not read_sigma:
+        unread |= {"sigma_u", "sigma_v"}
+    return {key: name for key, name in found.items() if key not in unread}
 
-    def column(key: str) -> SourceColumn:
-        return _column(table, found, key, source)
 
+def match_columns(
+    table: Columns,
+    found: Mapping[str, str],
+    *,
+    source: str,
+    unit: str | None = None,
+    pixel_origin: int = 1,
+    tangent_point: tuple[float, float] | None = None,
+    place: Place = row_number,
+) -> dict[str, Any]:
+    """What a MatchTable is made of, from some rows of a table.
+
+    Parameters
+    ----------
+    table : astropy Table, or what has columns like one
+    found : mapping of str to str
+        Column of each quantity, as `needed_columns` gives it.
+    source, unit, pixel_origin, tangent_point
+        As `matches_from_table`.
+    place : callable, optional
+        Name of a row, by its index.
+
+    Returns
+    -------
+    dict
+        Arguments of `MatchTable`: the columns, their labels, unit and tangent point.
+
+    Raises
+    ------
+    InputError
+        As `matches_from_table`.
+    """
+    quantities = _Quantities(table, found, source, place)
+    column = quantities.__getitem__
     out: dict[str, Any] = {}
     out["x"], out["y"] = (_pixels(column(key), pixel_origin) for key in ("x", "y"))
-    if on_sky:
-        out |= _projected(table, columns, source, unit, tangent_point)
+    if "ra" in found:
+        out |= _projected(quantities, unit, tangent_point)
     else:
         if tangent_point is not None:
             raise InputError(
@@ -220,24 +354,21 @@ def matches_from_table(
             )
         out["u"], out["v"] = (column(key).numbers() for key in ("u", "v"))
         out["unit"] = position_unit((column("u"), column("v")), unit)
-    if read_sigma:
-        for key in ("sigma_u", "sigma_v"):
-            if key in found:
-                out[key] = _sigma(column(key), out["unit"])
+    for key in ("sigma_u", "sigma_v"):
+        if key in found:
+            out[key] = _sigma(column(key), out["unit"])
     if "epoch" in found:
         out["epoch"] = column("epoch").years()
     if "mag" in found:
         out["mag"] = column("mag").numbers()
     if "exposure" in found:
         out["exposure"], out["exposure_names"] = column("exposure").labels()
-    elif exposure_name is not None:
-        out["exposure_names"] = (exposure_name,)
     if "filter" in found:
         out["filter"], out["filter_names"] = column("filter").labels()
     if "chip" in found:
         numbers, out["chip"] = np.unique(column("chip").integers(), return_inverse=True)
         out["chip_numbers"] = tuple(numbers.tolist())
-    return MatchTable(**out, sources=(source,))
+    return out
 
 
 def _pixels(column: SourceColumn, pixel_origin: int) -> Float:
@@ -256,24 +387,25 @@ def _pixels(column: SourceColumn, pixel_origin: int) -> Float:
 
 
 def _projected(
-    table: Table,
-    columns: Mapping[str, str] | None,
-    source: str,
-    unit: str | None,
-    tangent_point: tuple[float, float] | None,
+    quantities: _Quantities, unit: str | None, tangent_point: tuple[float, float] | None
 ) -> dict[str, Any]:
     """u, v on the tangent plane."""
+    unit = plane_unit(unit, source=quantities.source)
+    sky = _sky(quantities)
+    point = mean_direction(*sky) if tangent_point is None else tangent_point
+    u, v = tangent_plane(*sky, point, where=quantities.source, place=quantities.place)
+    return {"u": u, "v": v, "unit": unit, "tangent_point": (float(point[0]), float(point[1]))}
+
+
+def plane_unit(unit: str | None, *, source: str) -> str:
+    """Unit of u and v that come from the sky; an option that says another is refused."""
     if unit not in (None, "arcsec"):
         raise InputError(
             f"unit is {unit}, but sky positions come to the tangent plane in arcsec",
             where=source,
             do="set the unit to arcsec or leave it out",
         )
-    sky = sky_positions(table, columns, source=source)
-    assert sky is not None
-    point = mean_direction(*sky) if tangent_point is None else tangent_point
-    u, v = tangent_plane(*sky, point, where=source)
-    return {"u": u, "v": v, "unit": "arcsec", "tangent_point": (float(point[0]), float(point[1]))}
+    return "arcsec"
 
 
 def _sigma(column: SourceColumn, unit: str) -> Float:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.duplicates import first_duplicate
 from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
+from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
 from bayesdist.data.units import check_unit
 from bayesdist.errors import InputError
 
@@ -94,6 +97,50 @@ class MatchTable:
     tangent_point: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        self._complete()
+        self._check_values()
+        self._check_duplicates()
+
+    @classmethod
+    def of_distinct_rows(cls, **columns: Any) -> MatchTable:
+        """A table of rows that are known to differ.
+
+        All is as in the constructor, but repeated rows are not looked for.
+
+        Parameters
+        ----------
+        **columns
+            As the constructor's.
+
+        Returns
+        -------
+        MatchTable
+
+        Raises
+        ------
+        InputError
+            As the constructor, but for the same star twice.
+        """
+        table = object.__new__(cls)
+        for one in fields(cls):
+            if one.name not in columns and one.default is not MISSING:
+                columns[one.name] = one.default
+        columns.setdefault("rejected", {})
+        if set(columns) != {one.name for one in fields(cls)}:
+            raise TypeError(f"{', '.join(columns)} are not the columns of a table")
+        for name, value in columns.items():
+            object.__setattr__(table, name, value)
+        table._complete()
+        table._check_values()
+        return table
+
+    def _with(self, *, distinct: bool = True, **changes: Any) -> MatchTable:
+        """The table with other columns."""
+        columns = {one.name: getattr(self, one.name) for one in fields(self)} | changes
+        return MatchTable.of_distinct_rows(**columns) if distinct else MatchTable(**columns)
+
+    def _complete(self) -> None:
+        """Give what was left out its default, and every array its type."""
         n = np.size(self.x)
         if n == 0:
             raise InputError(
@@ -116,8 +163,6 @@ class MatchTable:
                 )
         object.__setattr__(self, "n_rows", n if self.n_rows is None else int(self.n_rows))
         object.__setattr__(self, "rejected", dict(self.rejected))
-        self._check_values()
-        self._check_duplicates()
 
     def _array_names(self) -> Iterator[str]:
         for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL, *_CODES, "row", "source"):
@@ -180,6 +225,21 @@ class MatchTable:
         return len(self.x)
 
     @property
+    def has_sigma(self) -> bool:
+        """Whether the stars have errors."""
+        return self.sigma_u is not None
+
+    @property
+    def has_epoch(self) -> bool:
+        """Whether the stars have epochs."""
+        return self.epoch is not None
+
+    @property
+    def has_mag(self) -> bool:
+        """Whether the stars have magnitudes."""
+        return self.mag is not None
+
+    @property
     def exposures(self) -> tuple[str, ...]:
         """Names of the exposures that have stars, in the order of `exposure_names`."""
         return tuple(self.exposure_names[k] for k in np.unique(self.exposure))
@@ -208,12 +268,50 @@ class MatchTable:
         if not which.size:  # an empty list has no integer type of its own
             which = which.astype(np.int64)
         index = np.arange(len(self))[which]
+        # rows of one table differ: only an index that stands twice repeats one
+        distinct = which.dtype == bool or len(np.unique(index)) == len(index)
         picked = {name: getattr(self, name)[index] for name in self._array_names()}
         rejected = dict(self.rejected)
         dropped = len(self) - len(index)
         if reason is not None and dropped:
             rejected[reason] = rejected.get(reason, 0) + dropped
-        return replace(self, **picked, rejected=rejected)
+        return self._with(distinct=distinct, **picked, rejected=rejected)
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """The rows in consecutive pieces of about equal size.
+
+        Returns
+        -------
+        tuple of Piece
+            Of at most `PIECE` rows each.
+        """
+        edges = even_edges(len(self), PIECE)
+        out: list[Piece] = []
+        for a, b in pairwise(edges):
+            part = {name: getattr(self, name)[a:b] for name in self._array_names()}
+            out.append(TablePiece(self._with(**part, n_rows=b - a, rejected={})))
+        return tuple(out)
+
+    def sample(self, n: int) -> MatchTable:
+        """Every k-th row.
+
+        Parameters
+        ----------
+        n : int
+            How many rows the sample may have; k is as small as this allows.
+
+        Returns
+        -------
+        MatchTable
+            In the order of the rows; the table itself where it has no more than `n`.
+
+        Raises
+        ------
+        InputError
+            For less than one row.
+        """
+        k = every_kth(len(self), n)
+        return self if k == 1 else self.select(np.arange(0, len(self), k))
 
     def with_sigma(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MatchTable:
         """The same stars with other errors.
@@ -228,8 +326,7 @@ class MatchTable:
         MatchTable
         """
         shape = (len(self),)
-        return replace(
-            self,
+        return self._with(
             sigma_u=np.broadcast_to(np.asarray(sigma_u, float), shape),
             sigma_v=np.broadcast_to(np.asarray(sigma_v, float), shape),
         )

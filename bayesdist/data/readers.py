@@ -21,7 +21,14 @@ from bayesdist.data.tables import TABLE_SUFFIXES, read_lines, read_table
 from bayesdist.data.tangent import mean_direction
 from bayesdist.errors import FormatError, InputError
 
-__all__ = ["FORMATS", "input_files", "read_matches"]
+__all__ = [
+    "FORMATS",
+    "check_sigma",
+    "exposure_names",
+    "input_files",
+    "read_matches",
+    "refuse_missing_errors",
+]
 
 FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")
 
@@ -143,7 +150,7 @@ def read_matches(
         raise InputError(
             f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(FORMATS)}"
         )
-    _check_sigma(sigma)
+    check_sigma(sigma)
     files = input_files(path)
     options = _Options(columns, unit, sigma == "columns", pixel_origin, tangent_point)
     kinds = [_kind(file, columns) if format == "auto" else format for file in files]
@@ -156,7 +163,8 @@ def read_matches(
     return _with_errors(table, sigma)
 
 
-def _check_sigma(sigma: str | float) -> None:
+def check_sigma(sigma: str | float) -> None:
+    """Refuse what the option `sigma` cannot be."""
     if isinstance(sigma, str):
         good = sigma in ("columns", "by_magnitude")
     else:
@@ -170,24 +178,34 @@ def _check_sigma(sigma: str | float) -> None:
 
 
 def _with_errors(table: MatchTable, sigma: str | float) -> MatchTable:
-    where = ", ".join(table.sources)
-    if sigma == "columns":
-        if table.sigma_u is None:
-            raise InputError(
-                "holds no errors of the positions",
-                where=where,
-                do="name sigma_u and sigma_v, or set sigma to 'by_magnitude' or a number",
-            )
-        return table
-    if sigma == "by_magnitude":
-        if table.mag is None:
-            raise InputError(
-                "holds no magnitudes, and errors by magnitude need them",
-                where=where,
-                do="name the column mag, or set sigma to a number",
-            )
+    refuse_missing_errors(sigma, table.has_sigma, table.has_mag, where=", ".join(table.sources))
+    if isinstance(sigma, str):
         return table
     return table.with_sigma(float(sigma), float(sigma))
+
+
+def refuse_missing_errors(
+    sigma: str | float, has_sigma: bool, has_mag: bool, *, where: str
+) -> None:
+    """Refuse matches that lack the columns which the option `sigma` asks for.
+
+    Raises
+    ------
+    InputError
+        For 'columns' without errors and 'by_magnitude' without magnitudes.
+    """
+    if sigma == "columns" and not has_sigma:
+        raise InputError(
+            "holds no errors of the positions",
+            where=where,
+            do="name sigma_u and sigma_v, or set sigma to 'by_magnitude' or a number",
+        )
+    if sigma == "by_magnitude" and not has_mag:
+        raise InputError(
+            "holds no magnitudes, and errors by magnitude need them",
+            where=where,
+            do="name the column mag, or set sigma to a number",
+        )
 
 
 def _kind(file: Path, columns: Mapping[str, str] | None) -> str:
@@ -211,7 +229,7 @@ def _kind(file: Path, columns: Mapping[str, str] | None) -> str:
     )
 
 
-def _exposure_names(files: Sequence[Path]) -> list[str]:
+def exposure_names(files: Sequence[Path]) -> list[str]:
     """Names of files as exposures: the stem, with as many folders before it as tell all apart."""
     stems = [file.name.split(".")[0] or file.name for file in files]
     parents = [file.parent for file in files]
@@ -231,7 +249,7 @@ def _read_plain(
     files: Sequence[Path], kinds: Sequence[str], options: _Options, *, in_parts: bool
 ) -> MatchTable:
     """Files that hold matches themselves."""
-    names: Sequence[str | None] = _exposure_names(files)
+    names: Sequence[str | None] = exposure_names(files)
     if in_parts or (len(files) == 1 and kinds[0] == "table"):
         names = [None] * len(files)
     tables = {
@@ -305,7 +323,7 @@ def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: _Opt
             where=", ".join(str(file) for file in files),
             do="name one master together with the hst1pass lists to match with it",
         )
-    names = _exposure_names(lists)
+    names = exposure_names(lists)
     detections = MatchTable.concatenate(
         [_read_list(file, name, options) for file, name in zip(lists, names, strict=True)]
     )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from astropy.io import fits
-from astropy.table import MaskedColumn, Table
+from astropy.table import Column, MaskedColumn, Table
 from astropy.table.meta import get_header_from_yaml
 
 from bayesdist.errors import FormatError, InputError
@@ -19,15 +19,42 @@ from bayesdist.errors import FormatError, InputError
 if TYPE_CHECKING:
     import pyarrow
 
-__all__ = ["TABLE_SUFFIXES", "read_lines", "read_table", "reading"]
+__all__ = [
+    "TABLE_SUFFIXES",
+    "naming_faults",
+    "parquet_column",
+    "parquet_units",
+    "read_lines",
+    "read_table",
+    "reading",
+]
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
+    """`naming_faults`, with the warnings of readers silenced.
+
+    Python keeps its rules for warnings once for all threads: what several of them do at a time does
+    without.
+    """
+    with naming_faults(path), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # units are judged later, column by column
+        warnings.filterwarnings("error", message=".*truncated.*")
+        yield
+
+
+@contextmanager
+def naming_faults(path: Path, where: str = "") -> Iterator[None]:
     """Turn whatever goes wrong while a file is read into an error that names the file.
 
     Readers of damaged files raise exceptions of every kind, so all are taken; only our own pass as
     they are.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    where : str, optional
+        File and part of it, for damage.
 
     Raises
     ------
@@ -37,10 +64,7 @@ def reading(path: Path) -> Iterator[None]:
         When the content is not what the format demands.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # units are judged later, column by column
-            warnings.filterwarnings("error", message=".*truncated.*")
-            yield
+        yield
     except InputError:
         raise
     except FileNotFoundError as error:
@@ -53,7 +77,7 @@ def reading(path: Path) -> Iterator[None]:
         reason = next(iter(str(error).strip().splitlines()), "") or type(error).__name__
         raise FormatError(
             f"cannot be read as {path.suffix.lower() or 'a table'} ({reason[:160].rstrip('.')})",
-            where=str(path),
+            where=where or str(path),
             do="it may be truncated or of another format: fetch or write it again",
         ) from error
 
@@ -100,19 +124,22 @@ def _read_parquet(path: Path) -> Table:
     import pyarrow.parquet  # 0.1 s that other formats need not wait for
 
     stored = pyarrow.parquet.ParquetFile(path)
-    units = _parquet_units(stored.schema_arrow)
+    units = parquet_units(stored.schema_arrow)
     table = Table()
     for name, column in zip(stored.schema_arrow.names, stored.read().columns, strict=True):
-        values = column.to_numpy()
-        if column.null_count:
-            values = MaskedColumn(values, mask=column.is_null().to_numpy())
-        table[name] = values
-        if name in units:
-            table[name].unit = units[name]
+        table[name] = parquet_column(column, units.get(name))
     return table
 
 
-def _parquet_units(schema: pyarrow.Schema) -> dict[str, str]:
+def parquet_column(values: pyarrow.ChunkedArray, unit: str | None) -> Column:
+    """A column of a Parquet file as one of an astropy Table; its nulls are masked."""
+    if values.null_count:
+        mask = values.is_null().to_numpy()
+        return MaskedColumn(values.to_numpy(), mask=mask, unit=unit)
+    return Column(values.to_numpy(), unit=unit)
+
+
+def parquet_units(schema: pyarrow.Schema) -> dict[str, str]:
     """Units of columns: of each field's own metadata, or of the header that astropy stores."""
     units: dict[str, str] = {}
     header = (schema.metadata or {}).get(b"table_meta_yaml")

@@ -12,9 +12,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.data.values import Place, row_number
 from bayesdist.errors import InputError
 
-__all__ = ["ARCSEC", "mean_direction", "tangent_jacobian", "tangent_plane"]
+__all__ = [
+    "ARCSEC",
+    "direction_of",
+    "direction_sum",
+    "mean_direction",
+    "tangent_jacobian",
+    "tangent_plane",
+]
 
 Float = NDArray[np.float64]
 
@@ -34,14 +42,43 @@ def mean_direction(ra: ArrayLike, dec: ArrayLike) -> tuple[float, float]:
     ra0, dec0 : float
         Degrees, ra0 in [0, 360).
     """
+    return direction_of(direction_sum(ra, dec))
+
+
+def direction_sum(ra: ArrayLike, dec: ArrayLike) -> tuple[int, int, int]:
+    """Sum of unit vectors, exact to the last digit: sums of parts add up to that of the whole.
+
+    Parameters
+    ----------
+    ra, dec : array_like, shape (N,)
+        Degrees.
+
+    Returns
+    -------
+    tuple of int
+        Components in units of 2^-62.
+    """
     a, d = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
-    x, y, z = np.mean(np.cos(d) * np.cos(a)), np.mean(np.cos(d) * np.sin(a)), np.mean(np.sin(d))
+    x, y, z = (_exact_sum(c) for c in (np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)))
+    return x, y, z
+
+
+def _exact_sum(values: Float) -> int:
+    """Sum of numbers within [-1, 1] in units of 2^-62: two halves of 31 bits cannot overflow."""
+    upper = np.rint(values * 2.0**31)
+    lower = np.rint((values * 2.0**31 - upper) * 2.0**31)
+    return (int(upper.astype(np.int64).sum()) << 31) + int(lower.astype(np.int64).sum())
+
+
+def direction_of(vector: tuple[int, int, int]) -> tuple[float, float]:
+    """Direction of a vector of any length, as `mean_direction` gives it."""
+    x, y, z = (float(component) for component in vector)
     ra0 = float(np.degrees(np.arctan2(y, x)) % 360.0)
     return ra0, float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
 def _angles(
-    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], where: str
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], where: str, place: Place
 ) -> tuple[Float, Float, float, Float]:
     """Hour angle from the point, declination, the point's declination, and D; radians."""
     delta = np.radians(np.asarray(ra, float) - point[0])
@@ -49,17 +86,22 @@ def _angles(
     d0 = float(np.radians(point[1]))
     D = np.sin(d) * np.sin(d0) + np.cos(d) * np.cos(d0) * np.cos(delta)
     if np.any(D <= 0):
-        row = int(np.argmax(D <= 0)) + 1
+        row = place(int(np.argmax(D <= 0)))
         raise InputError(
             f"the position lies 90 degrees or more from the tangent point {point}",
-            where=f"{where}, row {row}" if where else f"row {row}",
+            where=f"{where}, {row}" if where else row,
             do="give a tangent point inside the field",
         )
     return delta, d, d0, D
 
 
 def tangent_plane(
-    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], *, where: str = ""
+    ra: ArrayLike,
+    dec: ArrayLike,
+    point: tuple[float, float],
+    *,
+    where: str = "",
+    place: Place = row_number,
 ) -> tuple[Float, Float]:
     """Sky positions on the plane that touches the sky at a point.
 
@@ -71,6 +113,8 @@ def tangent_plane(
         Tangent point (ra0, dec0), degrees.
     where : str, optional
         File, for the error.
+    place : callable, optional
+        Name of a row in it, by its index in the arrays.
 
     Returns
     -------
@@ -82,7 +126,7 @@ def tangent_plane(
     InputError
         When a position is 90 degrees or more from the point.
     """
-    delta, d, d0, D = _angles(ra, dec, point, where)
+    delta, d, d0, D = _angles(ra, dec, point, where, place)
     xi = np.cos(d) * np.sin(delta) / D
     eta = (np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * np.cos(delta)) / D
     return ARCSEC * xi, ARCSEC * eta
@@ -103,7 +147,7 @@ def tangent_jacobian(
     ndarray, shape (N, 2, 2)
         ``J[:, 0, 1]`` is d xi / d dec; a step to the east counts as d ra cos(dec).
     """
-    delta, d, d0, D = _angles(ra, dec, point, where)
+    delta, d, d0, D = _angles(ra, dec, point, where, row_number)
     out = np.empty((*np.shape(D), 2, 2))
     out[..., 0, 0] = (np.sin(d) * np.sin(d0) * np.cos(delta) + np.cos(d) * np.cos(d0)) / D**2
     out[..., 0, 1] = -np.sin(d0) * np.sin(delta) / D**2

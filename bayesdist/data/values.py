@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import astropy.units as apu
 import numpy as np
+from astropy.table import Column
 from astropy.time import Time
 from numpy.typing import NDArray
 
@@ -15,12 +16,42 @@ from bayesdist.data.merging import encoded
 from bayesdist.data.units import unit_of
 from bayesdist.errors import InputError
 
-__all__ = ["SourceColumn"]
+__all__ = ["EncodedColumn", "Place", "SourceColumn", "row_number"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+Place = Callable[[int], str]  # what a row is called in an error, by its index in the arrays
+Array = TypeVar("Array", Float, Int)
 
 _YEARS = (1800.0, 2200.0)  # epochs outside are a wrong unit, not a date
+
+
+def row_number(index: int) -> str:
+    """Name of a row, counted from 1."""
+    return f"row {index + 1}"
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedColumn:
+    """A column of few different values, each of which is read only once.
+
+    Parameters
+    ----------
+    codes : ndarray of int, shape (N,)
+        Which of `labels` each row has.
+    labels : ndarray, shape (L,)
+        In the order of their first appearance.
+    unit : str, optional
+    """
+
+    codes: Int
+    labels: NDArray[Any]
+    unit: str | None = None
+
+    @property
+    def plain(self) -> NDArray[Any]:
+        """The value of each row."""
+        return self.labels[self.codes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +60,19 @@ class SourceColumn:
 
     Parameters
     ----------
-    values : astropy Column, Quantity, Time or array, shape (N,)
+    values : astropy Column, Quantity, Time, `EncodedColumn` or array, shape (N,)
     source : str
         File.
     name : str
         Column.
+    place : callable, optional
+        Name of a row, by its index in `values`.
     """
 
     values: Any
     source: str
     name: str
+    place: Place = row_number
 
     @property
     def where(self) -> str:
@@ -52,7 +86,7 @@ class SourceColumn:
 
     def fail(self, index: int, cause: str, do: str = "correct the row or drop it") -> InputError:
         """The error about one value."""
-        where = f"{self.source}, row {index + 1}, column {self.name!r}"
+        where = f"{self.source}, {self.place(index)}, column {self.name!r}"
         return InputError(cause, where=where, do=do)
 
     def _plain(self) -> NDArray[Any]:
@@ -73,6 +107,14 @@ class SourceColumn:
         plain = getattr(self.values, "unmasked", self.values)
         return np.asarray(getattr(plain, "value", plain))
 
+    def _by_label(self, read: Callable[[SourceColumn], Array]) -> Array:
+        """What is read from the labels, for each row."""
+        column = self.values
+        try:
+            return read(replace(self, values=Column(column.labels, unit=column.unit)))[column.codes]
+        except InputError:  # again row by row, for an error that names the row
+            return read(replace(self, values=Column(column.plain, unit=column.unit)))
+
     def numbers(self) -> Float:
         """Finite numbers, in the unit of the file.
 
@@ -85,6 +127,8 @@ class SourceColumn:
         InputError
             For text, a missing value, NaN or infinity.
         """
+        if isinstance(self.values, EncodedColumn):
+            return self._by_label(SourceColumn.numbers)
         values = self._plain()
         if values.dtype.kind in "iuf":
             out = values.astype(np.float64)
@@ -124,6 +168,8 @@ class SourceColumn:
         InputError
             For anything else.
         """
+        if isinstance(self.values, EncodedColumn):
+            return self._by_label(SourceColumn.integers)
         values = self.numbers()
         whole = values == np.rint(values)
         if not whole.all():
@@ -139,6 +185,9 @@ class SourceColumn:
         codes : ndarray of int, shape (N,)
         names : tuple of str
         """
+        if isinstance(self.values, EncodedColumn):
+            own, unique = replace(self, values=self.values.labels).labels()
+            return own[self.values.codes], unique
         values = self._plain()
         if values.dtype.kind == "O":
             values = np.array([_text(v) for v in values])
@@ -151,7 +200,7 @@ class SourceColumn:
         """Epochs as decimal years.
 
         Numbers are years, or Modified Julian Dates where the column's unit is the day; texts are
-        ISO dates.
+        such numbers or ISO dates.
 
         Returns
         -------
@@ -162,14 +211,17 @@ class SourceColumn:
         InputError
             For what is no date, or lies outside 1800 to 2200.
         """
+        if isinstance(self.values, EncodedColumn):
+            return self._by_label(SourceColumn.years)
         if isinstance(self.values, Time):
             self._refuse_masked_times()
             out = np.asarray(self.values.decimalyear, float)
         else:
             values = self._plain()
             if values.dtype.kind == "M":
-                # a time scale without leap seconds: dates stay as written
-                out = Time(values.astype("datetime64[ns]"), scale="tt").decimalyear
+                # a time scale without leap seconds: dates stay as written; few dates, many stars
+                found, codes = np.unique(values.astype("datetime64[ns]"), return_inverse=True)
+                out = np.asarray(Time(found, scale="tt").decimalyear, float)[codes]
             elif values.dtype.kind in "SUO" and not _all_numbers(values):
                 out = self._dates(values)
             else:
@@ -199,7 +251,8 @@ class SourceColumn:
             if not inside.all():
                 bad = int(np.argmin(inside))
                 raise self.fail(bad, f"{values[bad]:g} is no Modified Julian Date")
-            return np.asarray(Time(values, format="mjd", scale="tt").decimalyear, float)
+            found, codes = np.unique(values, return_inverse=True)
+            return np.asarray(Time(found, format="mjd", scale="tt").decimalyear, float)[codes]
         raise InputError(
             f"unit {unit} is not one of dates", where=self.where, do="give 'yr', or 'd' for MJD"
         )
@@ -209,13 +262,20 @@ class SourceColumn:
         years = []
         for k, text in enumerate(found):
             try:
-                years.append(float(Time(text, scale="tt").decimalyear))
-            except (ValueError, TypeError):
+                years.append(self._year(text))
+            except (ValueError, TypeError, InputError):
                 index = int(np.argmax(codes == k))
                 raise self.fail(
                     index, f"{text[:40]!r} is no date", "write ISO dates or decimal years"
                 ) from None
         return np.array(years)[codes]
+
+    def _year(self, text: str) -> float:
+        """Year of a date, or of a number that stands among dates."""
+        if _all_numbers([text]):
+            number = Column([float(text)], unit=getattr(self.values, "unit", None))
+            return float(replace(self, values=number)._numeric_years()[0])
+        return float(Time(text, scale="tt").decimalyear)
 
 
 def _text(value: Any) -> str:
@@ -227,7 +287,7 @@ def _text(value: Any) -> str:
     return str(value).strip()
 
 
-def _all_numbers(texts: NDArray[Any]) -> bool:
+def _all_numbers(texts: Iterable[Any]) -> bool:
     try:
         for text in texts:
             float(text)

@@ -16,6 +16,8 @@ __all__ = ["Truth", "simulate_matches"]
 
 Float = NDArray[np.float64]
 
+_AT_ONCE, _STEP = 65_536, 8192
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -111,8 +113,8 @@ def simulate_matches(
     false = rng.uniform(size=n) < fraction
     error[false] = _false_offsets(int(false.sum()), outlier_scale, outliers, rng)
 
-    true = model.predict(theta, x, y, epoch=epoch, exposure=exposure, chip=np.array(numbers)[chip])
-    matches = MatchTable(
+    true = _positions(model, theta, x, y, epoch, exposure, np.array(numbers)[chip])
+    matches = MatchTable.of_distinct_rows(  # positions drawn from a continuum do not repeat
         x=x,
         y=y,
         u=true[:, 0] + error[:, 0],
@@ -129,6 +131,30 @@ def simulate_matches(
         sources=("simulation",),
     )
     return matches, Truth(model, theta, fraction, jitter, outlier_scale, false)
+
+
+def _positions(
+    model: DistortionModel,
+    theta: Float,
+    x: Float,
+    y: Float,
+    epoch: Float | None,
+    exposure: NDArray[np.int64],
+    chip: NDArray[np.int64],
+) -> Float:
+    """Where stars (N,) are seen, (N, 2)."""
+    n = len(x)
+    # in steps that stay in the cache, 15 times faster at a million stars; small tables in one, for
+    # the order in which BLAS adds depends on the length, and a seed is to give what it always gave
+    step = n if n <= _AT_ONCE else _STEP
+    out = np.empty((n, 2))
+    for a in range(0, n, step):
+        rows = slice(a, a + step)
+        date = None if epoch is None else epoch[rows]
+        out[rows] = model.predict(
+            theta, x[rows], y[rows], epoch=date, exposure=exposure[rows], chip=chip[rows]
+        )
+    return out
 
 
 def _false_offsets(n: int, scale: float, kind: str, rng: np.random.Generator) -> Float:

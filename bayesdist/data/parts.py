@@ -1,0 +1,319 @@
+"""Parquet files of matches as parts of one whole: what each holds, and what they share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from astropy.table import Column
+from numpy.typing import NDArray
+
+from bayesdist.data.columns import (
+    match_columns,
+    needed_columns,
+    plane_unit,
+    position_unit,
+    sky_columns,
+)
+from bayesdist.data.duplicates import first_repetition, rounds_for
+from bayesdist.data.parquet_files import ParquetPart
+from bayesdist.data.tangent import direction_of, direction_sum
+from bayesdist.data.values import SourceColumn
+from bayesdist.errors import InputError
+
+__all__ = ["MatchPart", "Whole", "match_part", "scan", "tangent_point_of"]
+
+Int = NDArray[np.int64]
+
+_BLOCK = 2**18  # rows looked at together in a scan
+_LABELS = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
+_DEFAULTS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
+_UNCOMPARED = ("sigma_u", "sigma_v", "mag")  # of no matter to whether a row stands twice
+
+
+@dataclass(frozen=True, eq=False)
+class MatchPart:
+    """A Parquet file of matches, and how it is read.
+
+    Parameters
+    ----------
+    part : ParquetPart
+    found : mapping of str to str
+        Column of each quantity.
+    unit : str
+        Of u and v.
+    exposure_name : str or None
+        Name of the one exposure, where there is no column of them.
+    pixel_origin : int
+    tangent_point : tuple of float or None
+    """
+
+    part: ParquetPart
+    found: Mapping[str, str]
+    unit: str
+    exposure_name: str | None
+    pixel_origin: int
+    tangent_point: tuple[float, float] | None
+
+    @property
+    def source(self) -> str:
+        """Name of the file."""
+        return str(self.part.path)
+
+    @property
+    def on_sky(self) -> bool:
+        """Whether the reference positions are ra and dec."""
+        return "ra" in self.found
+
+    def blocks(
+        self,
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        size: int,
+        without: Sequence[str] = (),
+    ) -> Iterator[dict[str, Any]]:
+        """Arguments of MatchTable for rows `start` to `stop`, at most `size` rows at a time.
+
+        Parameters
+        ----------
+        start, stop, size
+            As `ParquetPart.blocks`.
+        without : sequence of str
+            Quantities to leave out.
+
+        Yields
+        ------
+        dict
+            As `match_columns` gives it, with codes into labels of the block's own.
+
+        Raises
+        ------
+        InputError
+            For what is wrong with a row, naming its row group.
+        """
+        found = {key: name for key, name in self.found.items() if key not in without}
+        encoded = {found[key] for key in _LABELS if key in found}
+        encoded |= {found["epoch"]} & self.part.texts if "epoch" in found else set()
+        columns = list(dict.fromkeys(found.values()))
+        for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
+            out = match_columns(
+                block,
+                found,
+                source=self.source,
+                unit=self.unit,
+                pixel_origin=self.pixel_origin,
+                tangent_point=self.tangent_point,
+                place=self.part.place(block.first),
+            )
+            for key, labels in _LABELS.items():
+                if key not in found:
+                    own = self.exposure_name if key == "exposure" else None
+                    out[labels] = (_DEFAULTS[key] if own is None else own,)
+            yield out
+
+    def direction(self) -> tuple[int, int, int]:
+        """Sum of the directions of all its reference positions."""
+        total = np.zeros(3, object)
+        columns = [self.found["ra"], self.found["dec"]]
+        for block in self.part.blocks(columns, size=_BLOCK):
+            place = self.part.place(block.first)
+            total += direction_sum(*sky_columns(block, self.found, source=self.source, place=place))
+        x, y, z = total.tolist()
+        return x, y, z
+
+
+def match_part(
+    part: ParquetPart,
+    columns: Mapping[str, str] | None,
+    *,
+    unit: str | None,
+    read_sigma: bool,
+    pixel_origin: int,
+    tangent_point: tuple[float, float] | None,
+    exposure_name: str | None,
+) -> MatchPart:
+    """What a file holds, by the names and units of its columns alone.
+
+    Parameters
+    ----------
+    part : ParquetPart
+    columns, unit, read_sigma, pixel_origin, tangent_point, exposure_name
+        As `matches_from_table`.
+
+    Returns
+    -------
+    MatchPart
+
+    Raises
+    ------
+    InputError
+        For missing columns and units.
+    """
+    source = str(part.path)
+    found = needed_columns(part.colnames, columns, source=source, read_sigma=read_sigma)
+    if "sigma_u" in found or "sigma_v" in found:
+        for key in ("sigma_u", "sigma_v"):
+            if key not in found:
+                raise InputError(
+                    f"column {key!r} is missing beside its partner",
+                    where=source,
+                    do="give both errors or neither",
+                )
+    if "ra" in found:
+        own = plane_unit(unit, source=source)
+    else:
+        u, v = (
+            SourceColumn(Column([], unit=part.units.get(found[key])), source, found[key])
+            for key in ("u", "v")
+        )
+        own = position_unit((u, v), unit)
+    return MatchPart(part, found, own, exposure_name, pixel_origin, tangent_point)
+
+
+@dataclass(frozen=True, eq=False)
+class Whole:
+    """What all parts share.
+
+    Parameters
+    ----------
+    unit : str
+    exposure_names, filter_names : tuple of str
+    chip_numbers : tuple of int
+    sources : tuple of str
+    n_rows : int
+    tangent_point : tuple of float or None
+    """
+
+    unit: str
+    exposure_names: tuple[str, ...]
+    chip_numbers: tuple[int, ...]
+    filter_names: tuple[str, ...]
+    sources: tuple[str, ...]
+    n_rows: int
+    tangent_point: tuple[float, float] | None
+
+    def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
+        """Codes of a block's exposures, chips or filters among those of the whole.
+
+        Raises
+        ------
+        InputError
+            For a label that was not there when the parts were scanned.
+        """
+        known = self._numbers[key]
+        try:
+            code_of_label = np.array([known[label] for label in block[_LABELS[key]]], np.int64)
+        except KeyError:
+            raise InputError(
+                "has changed since it was opened", where=source, do="start again"
+            ) from None
+        return _recoded(key, block, code_of_label)
+
+    @cached_property
+    def _numbers(self) -> dict[str, dict[Any, int]]:
+        """Code of each label."""
+        return {
+            key: {label: k for k, label in enumerate(getattr(self, names))}
+            for key, names in _LABELS.items()
+        }
+
+
+def _recoded(key: str, block: Mapping[str, Any], code_of_label: Int) -> Int:
+    codes = block.get(key)
+    if codes is None:
+        codes = np.zeros(len(block["x"]), np.int64)
+    return code_of_label[codes]
+
+
+def tangent_point_of(parts: Sequence[MatchPart]) -> tuple[float, float]:
+    """Mean direction of all reference positions."""
+    total = np.zeros(3, object)
+    for one in parts:
+        total += one.direction()
+    x, y, z = total.tolist()
+    return direction_of((x, y, z))
+
+
+@dataclass(eq=False)
+class _Scan:
+    """The parts batch by batch, as `first_repetition` goes through them.
+
+    The first time all columns are read, so that whatever is wrong with a row comes out, and labels
+    are numbered as they appear.
+    """
+
+    parts: Sequence[MatchPart]
+    numbers: dict[str, dict[Any, int]] = field(default_factory=lambda: {k: {} for k in _LABELS})
+    checked: bool = False
+
+    def __call__(self) -> Iterator[list[NDArray[Any]]]:
+        without = _UNCOMPARED if self.checked else ()
+        for one in self.parts:
+            for block in one.blocks(size=_BLOCK, without=without):
+                keys = [block[name] for name in ("x", "y", "u", "v")]
+                for key, known in self.numbers.items():
+                    code_of_label = np.array(
+                        [known.setdefault(label, len(known)) for label in block[_LABELS[key]]]
+                    )
+                    if key in block or one.exposure_name is not None:
+                        keys.append(_recoded(key, block, code_of_label))
+                if "epoch" in block:
+                    keys.append(block["epoch"])
+                yield keys
+        self.checked = True
+
+
+def scan(parts: Sequence[MatchPart]) -> Whole:
+    """Go through all rows: labels are collected, and whatever is wrong is found.
+
+    Parameters
+    ----------
+    parts : sequence of MatchPart
+        With the same quantities and unit, and with a tangent point if they need one.
+
+    Returns
+    -------
+    Whole
+
+    Raises
+    ------
+    InputError
+        For what is wrong with a row, for a row that stands twice, for a damaged file.
+    """
+    n_rows = sum(one.part.n_rows for one in parts)
+    if n_rows == 0:
+        more = f" and {len(parts) - 1} more" if len(parts) > 1 else ""
+        raise InputError(
+            "holds no rows", where=parts[0].source + more, do="give a table with matched stars"
+        )
+    rows = _Scan(parts)
+    pair = first_repetition(rows, rounds_for(n_rows))
+    if pair is not None:
+        first, second = (_named(parts, row) for row in pair)
+        raise InputError(
+            f"repeats {first}: the same x, y, u, v, exposure and chip",
+            where=second,
+            do="drop one of them",
+        )
+    return Whole(
+        unit=parts[0].unit,
+        exposure_names=tuple(rows.numbers["exposure"]),
+        chip_numbers=tuple(sorted(rows.numbers["chip"])),
+        filter_names=tuple(rows.numbers["filter"]),
+        sources=tuple(one.source for one in parts),
+        n_rows=n_rows,
+        tangent_point=parts[0].tangent_point,
+    )
+
+
+def _named(parts: Sequence[MatchPart], row: int) -> str:
+    """File, row group and row of a row counted over all parts."""
+    for one in parts:
+        if row < one.part.n_rows:
+            break
+        row -= one.part.n_rows
+    return f"{one.source}, {one.part.place(0)(row)}"

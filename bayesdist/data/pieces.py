@@ -1,0 +1,64 @@
+"""Pieces of a table of matches: what is read, sent to a worker and worked on at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from bayesdist.errors import InputError
+
+if TYPE_CHECKING:
+    from bayesdist.data.matches import MatchTable
+
+__all__ = ["PIECE", "Piece", "TablePiece", "even_edges", "every_kth"]
+
+PIECE = 2**20  # rows of a piece at most: as many as a row group of Parquet has by default
+
+
+class Piece(Protocol):
+    """Some consecutive rows of a table of matches; can be pickled."""
+
+    def __len__(self) -> int:
+        """Rows."""
+
+    def read(self) -> MatchTable:
+        """The rows; their codes refer to the names of the whole table."""
+
+
+@dataclass(frozen=True, eq=False)
+class TablePiece:
+    """A piece of a table in memory.
+
+    Parameters
+    ----------
+    table : MatchTable
+    """
+
+    table: MatchTable
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def read(self) -> MatchTable:
+        """The rows."""
+        return self.table
+
+
+def even_edges(n: int, most: int) -> list[int]:
+    """Where parts of about equal size, of at most `most` rows, begin and end: 0, ..., n."""
+    return np.linspace(0, n, -(-n // most) + 1).astype(int).tolist()
+
+
+def every_kth(n_rows: int, n: int) -> int:
+    """Step between the rows of a sample of at most `n` out of `n_rows` rows.
+
+    Raises
+    ------
+    InputError
+        For a sample of less than one row.
+    """
+    if n < 1:
+        raise InputError(f"a sample of {n} rows is asked for", do="ask for at least one")
+    return max(1, -(-n_rows // n))
