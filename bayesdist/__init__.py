@@ -17,15 +17,19 @@ _HOMES = {
     "bayesdist.errors": ("BayesdistError", "InputError"),
     "bayesdist.data": (
         "MatchTable",
+        "PartitionedMatches",
         "ReferenceCatalog",
         "match_table",
+        "open_matches",
         "read_catalog",
         "read_hst1pass",
         "read_matches",
         "read_matchup",
+        "write_partitioned",
     ),
     "bayesdist.model": ("Chip", "DistortionModel", "PolynomialBasis", "TimeDependence"),
     "bayesdist.infer": (
+        "Compute",
         "LinearFit",
         "OutlierMixture",
         "Posterior",
@@ -33,10 +37,17 @@ _HOMES = {
         "fit_by_magnitude",
         "fit_linear",
         "load_posterior",
+        "memberships",
+        "residuals",
         "sample",
         "save_posterior",
     ),
-    "bayesdist.simulate": ("simulate_matches", "simulate_wise", "wise_solution"),
+    "bayesdist.simulate": (
+        "simulate_matches",
+        "simulate_wise",
+        "simulate_wise_partitioned",
+        "wise_solution",
+    ),
     "bayesdist.assess": (
         "ErrorBudget",
         "Margin",
@@ -79,6 +90,7 @@ if TYPE_CHECKING:
     from bayesdist.assess import check_requirements as check_requirements
     from bayesdist.assess import error_budget as error_budget
     from bayesdist.assess import uncertainty_map as uncertainty_map
+    from bayesdist.data import open_matches as open_matches
     from bayesdist.data import read_matches as read_matches
     from bayesdist.infer import fit_linear as fit_linear
     from bayesdist.infer import load_posterior as load_posterior

@@ -34,7 +34,11 @@ LEVEL = {name: level for level, names in enumerate(FLOORS) for name in names}
 # library: the only module or folder (relative to bayesdist/) that may import it
 DOORS = {
     "emcee": "infer/sampler.py",
-    "numba": "infer/kernel.py",
+    "numba": "infer/kernel/",
+    "llvmlite": "infer/kernel/",
+    "dask": "infer/cluster.py",
+    "distributed": "infer/cluster.py",
+    "pyarrow": "data/",
     "xarray": "infer/labelled/",
     "arviz": "infer/labelled/",
     "matplotlib": "report/",

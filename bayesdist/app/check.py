@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
-
-import numpy as np
 
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
@@ -14,16 +13,15 @@ from bayesdist.app.screen import number
 from bayesdist.app.session import Session
 from bayesdist.app.stages import rehearse
 from bayesdist.app.stages.assess import warnings_of
-from bayesdist.infer import GaussianPriors, OutlierMixture
-from bayesdist.infer.sampler import FIRST_CHECK
-from bayesdist.infer.stars import prepare
-from bayesdist.infer.target import Target
+from bayesdist.infer import Limits
+from bayesdist.infer.plan import expected_passes
 
 __all__ = ["check"]
 
-WALKERS = 64  # of all ensembles, where the proposal is good
-PASSES = 2 * FIRST_CHECK * WALKERS
-EXPANSIONS = 75  # second-order expansions of the search for the proposal: 25 nodes of about 3 steps
+# measured on two cores of a server at orders 4 and 5; other machines differ by factors
+STAR_S = 3e-9  # of the likelihood, for each star and pass
+EXPANSION_S = 1.5e-8  # of an expansion to second order, for each star
+EXPANSIONS = 40  # in the search for the proposal
 OVERHEAD_S = 6e-5  # of emcee and the proposal, for each walker and step
 FIXED_S = 1.0  # diagnostics and files
 
@@ -49,36 +47,47 @@ def check(path: str | Path) -> str:
     config, text = load_config(path)
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
-    session = Session(run)
+    with closing(Session(run)) as session:
+        return "\n".join(_lines(session))
+
+
+def _lines(session: Session) -> Iterator[str]:
     rehearse(session)
     matches, model = session.raw_matches, session.model
     fit, errors = session.linear
+    session.fit = fit  # what a run would read from its files
     if errors is not None:
-        matches = matches.with_sigma(*errors.at(matches.mag))
-    target = Target(prepare(model, matches), OutlierMixture(), GaussianPriors.none(model))
-    psi = np.concatenate([fit.mean, target.hyper.point({"j": 0.1, "f": 0.05, "s_out": 1.0})])
-    target.log_density(psi[None])  # compiles, or loads what was compiled
-    started = perf_counter()
-    n = max(1, min(200, 2_000_000 // len(matches)))
-    target.log_density(np.repeat(psi[None], n, axis=0))
-    per_pass = (perf_counter() - started) / n
-    started = perf_counter()
-    target.expand(psi)
-    search = EXPANSIONS * (perf_counter() - started)
-    total = search + PASSES * (per_pass + OVERHEAD_S) + FIXED_S
-    lines = [
+        session.magnitude_errors = errors
+    sigma = session.shards.survey.reference_sigma
+    yield (
         f"matches      {len(matches)} of {matches.n_rows} rows, "
-        f"{len(matches.exposure_names)} exposure(s), u and v in {matches.unit}",
-        f"errors       median {number(target.hyper.scale)} {matches.unit}"
-        + (" (by magnitude)" if errors is not None else ""),
-        f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters",
-        f"rank         {model.n_params} of {model.n_params}, nothing is degenerate",
-        f"condition    {number(fit.condition)} (normal matrix, unit diagonal)",
+        f"{len(matches.exposure_names)} exposure(s), u and v in {matches.unit}"
+    )
+    yield (
+        f"errors       median {number(sigma)} {matches.unit}"
+        + (" (by magnitude)" if errors is not None else "")
+    )
+    yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
+    yield f"rank         {model.n_params} of {model.n_params}, nothing is degenerate"
+    yield f"condition    {number(fit.condition)} (normal matrix, unit diagonal)"
+    yield (
         f"linear fit   rms {number(fit.rms_u)}, {number(fit.rms_v)} {fit.unit}; "
-        f"chi2/dof {number(fit.chi2 / max(fit.dof, 1))}; {int((~fit.used).sum())} rows rejected",
-        f"cost         {number(1e3 * per_pass, 3)} ms a pass, about {PASSES} passes: "
-        f"{number(total, 2)} s to the posterior if it is well behaved",
-    ]
-    session.fit, session.matches = fit, matches  # what a run would read from its files
-    lines += [f"WARNING      {text}" for text in warnings_of(session)]
-    return "\n".join(lines)
+        f"chi2/dof {number(fit.chi2 / max(fit.dof, 1))}; {fit.n_rejected} rows rejected"
+    )
+    yield _cost(session)
+    for text in warnings_of(session):
+        yield f"WARNING      {text}"
+
+
+def _cost(session: Session) -> str:
+    """Expected passes and seconds, from the numbers of stars and parameters."""
+    sampler, n = session.config.sampler, len(session.shards)
+    limits = Limits(sampler.target_ess, sampler.target_rhat)
+    n_params = session.model.n_params + len(session.config.mixture().hyper)
+    passes = expected_passes(n_params, n, limits, sampler.ensembles)
+    per_pass = STAR_S * n
+    total = EXPANSIONS * EXPANSION_S * n + passes * (per_pass + OVERHEAD_S) + FIXED_S
+    return (
+        f"cost         about {passes} passes over {n} stars, {number(1e3 * per_pass, 2)} ms each: "
+        f"{number(total, 2)} s to the posterior if it is well behaved"
+    )

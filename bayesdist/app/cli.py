@@ -6,6 +6,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 from bayesdist.app.screen import start_logging
@@ -157,7 +158,7 @@ def _run(options: argparse.Namespace) -> None:
         seed=options.seed,
         command=options.line,
     )
-    print(results_text(Session(RunDirectory.open(path))))
+    print(results_text(Session(RunDirectory(path))))  # its input was checked when it began
 
 
 def _stage(options: argparse.Namespace) -> None:
@@ -181,10 +182,10 @@ def _validate(options: argparse.Namespace) -> int:
     from bayesdist.app.stages.assess import margin_rows, margins_of, write_margins
 
     requirements = load_requirements(options.requirements)
-    session = Session(RunDirectory.open(options.run))
-    require(session, "validate", ("fit", "sample"))
-    margins = margins_of(session, requirements, session.posterior)
-    write_margins(session, margins)
+    with closing(Session(RunDirectory.open(options.run))) as session:
+        require(session, "validate", ("fit", "sample"))
+        margins = margins_of(session, requirements, session.posterior)
+        write_margins(session, margins)
     print(margins_text(margin_rows(margins)))
     for m in margins:
         if m.verdict != "met":

@@ -20,7 +20,7 @@ from pydantic import (
 from bayesdist.app.config_errors import as_config_error
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.errors import ConfigError, InputError
-from bayesdist.infer import OutlierMixture
+from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
 
 __all__ = ["Config", "load_config", "load_requirements", "load_text", "parse_config"]
@@ -103,6 +103,8 @@ class Outliers(Section):
 class Sampler(Section):
     """When to stop, and from which seed."""
 
+    method: Literal["exact", "certified"] = "exact"
+    second_stage: Literal["auto", "always", "never"] = "auto"
     seed: Annotated[int, Field(ge=0)] = 1
     ensembles: Annotated[int, Field(ge=2)] = 4
     walkers: PositiveInt | None = None
@@ -112,10 +114,28 @@ class Sampler(Section):
     checkpoint_every: PositiveInt = 200
 
 
-class Compute(Section):
+class ComputeBlock(Section):
     """Where the work is done."""
 
-    engine: Literal["threads"] = "threads"
+    engine: Literal["threads", "dask"] = "threads"
+    scheduler: str | None = None
+    workers: PositiveInt | None = None
+    memory_mb: PositiveFloat = 1000.0
+
+    @model_validator(mode="after")
+    def _only_of_a_cluster(self) -> ComputeBlock:
+        for key in ("scheduler", "workers"):
+            if self.engine != "dask" and getattr(self, key) is not None:
+                raise ValueError(
+                    f"compute.{key} is given, but compute.engine is {self.engine!r}; set the "
+                    f"engine to 'dask', or leave {key} out"
+                )
+        if self.scheduler is not None and self.workers is not None:
+            raise ValueError(
+                "compute.workers is given, but the cluster of compute.scheduler has its own; "
+                "leave one of the two out"
+            )
+        return self
 
 
 class Assess(Section):
@@ -194,7 +214,7 @@ class Config(Section):
     fit: Fit = Fit()
     outliers: Outliers = Outliers()
     sampler: Sampler = Sampler()
-    compute: Compute = Compute()
+    compute: ComputeBlock = ComputeBlock()
     assess: Assess = Assess()
     budget: list[BudgetBlock] = []
     requirement: list[RequirementBlock] = []
@@ -237,6 +257,10 @@ class Config(Section):
             jitter=None if o.jitter == "fit" else o.jitter,
             fraction_prior=o.fraction_prior,
         )
+
+    def resources(self) -> Compute:
+        """Where the work is done."""
+        return Compute(**self.compute.model_dump())
 
     def user_terms(self) -> tuple[UserTerm, ...]:
         """The user's terms of the error budget."""

@@ -8,12 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import parse_config
-from bayesdist.data import MatchTable, atomic_path, read_matches
+from bayesdist.app.matches import load_matches
+from bayesdist.data import MatchTable, atomic_path
 from bayesdist.errors import InputError
+from bayesdist.infer import Matches
 
 __all__ = ["init"]
 
 SIGMA = 0.05  # for tables that say nothing about their errors
+
+_GUESSED_UNIT = 'unit = "pix"                    # GUESSED: the table does not say\n'
 
 _TEMPLATE = """\
 # A calibration of geometric distortion; see docs/configuration.md for every key.
@@ -52,6 +56,10 @@ seed = 1
 target_ess = 400
 target_rhat = 1.01
 
+# [compute]
+# engine = "threads"            # threads | dask
+# memory_mb = 1000              # for the stars; those beyond it are kept in a scratch file
+
 [assess]
 grid = [33, {grid_y}]                 # points on x and y
 # epoch = 2006.5
@@ -76,7 +84,7 @@ sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
 """
 
 
-def init(path: str | Path, matches: str | Path, *, force: bool = False) -> MatchTable:
+def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Matches:
     """Write a commented configuration for a file of matches.
 
     Parameters
@@ -90,7 +98,7 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
 
     Returns
     -------
-    MatchTable
+    MatchTable or PartitionedMatches
         As the configuration reads it.
 
     Raises
@@ -101,7 +109,8 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
     if path.exists() and not force:
         raise InputError("this file exists", where=str(path), do="replace it by --force")
     table, unit_line, sigma = _read(matches)
-    nx, ny = (_guess_size(v) for v in (table.x, table.y))
+    x, y = _reach(table)
+    nx, ny = _guess_size(x), _guess_size(y)
     relative = os.path.relpath(Path(matches), path.resolve().parent)
     n = len(table)
     text = _TEMPLATE.format(
@@ -111,7 +120,7 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
         name=Path(matches).stem.replace('"', ""),
         nx=nx,
         ny=ny,
-        size_note=f"guessed from x up to {table.x.max():.1f}, y up to {table.y.max():.1f}",
+        size_note=f"guessed from x up to {x:.1f}, y up to {y:.1f}",
         order=4 if n >= 300 else 3 if n >= 100 else 2,
         cx=(nx + 1) / 2,
         cy=(ny + 1) / 2,
@@ -125,30 +134,42 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
     return table
 
 
-def _read(matches: str | Path) -> tuple[MatchTable, str, str]:
-    """The table, the line about its unit, and how its errors are to be had."""
+def _read(matches: str | Path) -> tuple[Matches, str, str]:
+    """The matches, the line about their unit, and how their errors are to be had."""
     unit, line = None, ""
-    try:
-        table = read_matches(matches, sigma=SIGMA)
-    except InputError as error:
-        if error.cause != "has no unit":
-            raise
-        unit, line = "pix", 'unit = "pix"                    # GUESSED: the table does not say\n'
-        table = read_matches(matches, sigma=SIGMA, unit=unit)
-    try:
-        return read_matches(matches, unit=unit), line, '"columns"'
-    except InputError as error:
-        if error.cause != "holds no errors of the positions":
-            raise
-    if table.mag is not None:
+    sigma: float | str = "columns"
+    while True:
+        try:
+            table = load_matches(matches, sigma=sigma, unit=unit)
+        except InputError as error:
+            if error.cause == "has no unit" and unit is None:
+                unit, line = "pix", _GUESSED_UNIT
+            elif error.cause == "holds no errors of the positions" and sigma == "columns":
+                sigma = SIGMA
+            else:
+                raise
+        else:
+            break
+    if sigma == "columns":
+        return table, line, '"columns"'
+    if table.has_mag:
         return table, line, '"by_magnitude"        # the table carries no errors'
     guess = f"{SIGMA}                    # GUESSED: the table carries neither errors nor magnitudes"
     return table, line, guess
 
 
-def _guess_size(values: np.ndarray) -> int:
+def _reach(matches: Matches) -> tuple[float, float]:
+    """Largest x and y."""
+    if isinstance(matches, MatchTable):
+        return float(matches.x.max()), float(matches.y.max())
+    corners = [(t.x.max(), t.y.max()) for t in (piece.read() for piece in matches.pieces())]
+    x, y = np.max(corners, axis=0)
+    return float(x), float(y)
+
+
+def _guess_size(largest: float) -> int:
     """Detector size: the next multiple of 2 above the data, or a power of 2 that is near."""
-    largest = float(values.max()) - 0.5
+    largest -= 0.5
     for power in (256, 512, 1024, 2048, 4096, 8192):
         if 0.97 * power <= largest <= power:
             return power

@@ -55,8 +55,7 @@ def _posterior_text(p: Posterior) -> str:
         "posterior of a distortion",
         f"model      order {m.order}, {len(m.chips)} chip(s), frames '{m.frames}', "
         f"{len(m.exposures)} exposure(s), {m.n_params} parameters, u and v in {m.unit}",
-        f"outliers   {p.mixture.model}; {int((p.outlier_probability > 0.5).sum())} of "
-        f"{len(p.outlier_probability)} stars flagged",
+        f"outliers   {p.mixture.model}; {p.n_flagged} of {p.n_stars} stars flagged",
         f"sampler    {s.method}, {s.ensembles} ensembles of {s.walkers} walkers, {s.steps} steps, "
         f"acceptance {number(s.acceptance, 3)}",
         f"state      {state}",

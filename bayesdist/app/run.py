@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from pathlib import Path
 
 from bayesdist.app.config import load_config
@@ -66,17 +67,17 @@ def run(
         seed=seed,
         command=command,
     )
-    session = Session(directory)
-    _begin(session)
-    with log_file(directory / "bayesdist.log"):
-        redo = False
-        for stage in STAGES:
-            if directory.done(stage) and not redo:
-                log.info("%s: done before", stage)
-                continue
-            redo = True  # what comes after a stage that is made anew is made anew
-            _run_stage(session, stage)
-    _judge(session, strict)
+    with closing(Session(directory)) as session:
+        _begin(session)
+        with log_file(directory / "bayesdist.log"):
+            redo = False
+            for stage in STAGES:
+                if directory.done(stage) and not redo:
+                    log.info("%s: done before", stage)
+                    continue
+                redo = True  # what comes after a stage that is made anew is made anew
+                _run_stage(session, stage)
+        _judge(session, strict)
     return directory.path
 
 
@@ -88,13 +89,13 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     BayesdistError
     """
     directory = RunDirectory.open(path)
-    session = Session(directory)
-    require(session, stage, NEEDS[stage])
-    _begin(session)
-    with log_file(directory / "bayesdist.log"):
-        _run_stage(session, stage)
-    if stage == "sample":
-        _judge(session, strict)
+    with closing(Session(directory)) as session:
+        require(session, stage, NEEDS[stage])
+        _begin(session)
+        with log_file(directory / "bayesdist.log"):
+            _run_stage(session, stage)
+        if stage == "sample":
+            _judge(session, strict)
     return directory
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from bayesdist import __version__
 from bayesdist.app.config import Config, load_config, load_text
+from bayesdist.app.star_files import FOLDER, part_files
 from bayesdist.data import atomic_path, input_files, is_leftover, remove_leftovers, sha256_of
 from bayesdist.errors import InputError
 
@@ -120,6 +121,7 @@ class RunDirectory:
         run = cls(path)
         if run.path.exists() and not run.path.is_dir():
             raise InputError("is a file, not a folder", where=str(path), do="choose another folder")
+        run._refuse_inside_input(config, base)
         inputs = run._hashes(config, base)
         if (run / "run.json").exists() and not force:
             if not resume:
@@ -228,6 +230,17 @@ class RunDirectory:
             do="make one with 'bayesdist run CONFIG.toml -o RUN'",
         )
 
+    def _refuse_inside_input(self, config: Config, base: Path) -> None:
+        """Refuse a run whose own Parquet files would become part of its input."""
+        named = _named(config, base)
+        for path in named if isinstance(named, list) else [named]:
+            if path.is_dir() and self.path.resolve().is_relative_to(path.resolve()):
+                raise InputError(
+                    "the run would lie inside the folder of its input",
+                    where=str(self.path),
+                    do="choose a folder outside of it",
+                )
+
     def _foreign(self, text: str) -> list[str]:
         """What forbids a run to begin in a folder that holds none, sorted.
 
@@ -249,16 +262,18 @@ class RunDirectory:
             summary = {}
         products = [self / Path(p["path"]).name for p in summary.get("products", [])]
         figures = [self / "figures" / Path(name).name for name in summary.get("figures", [])]
-        return own + products + figures
+        return own + products + figures + part_files(self / FOLDER)
 
     def clear(self) -> None:
         """Remove what a run wrote, and nothing else."""
         for path in self._own():
             path.unlink(missing_ok=True)
-        try:
-            (self / "figures").rmdir()
-        except OSError:  # there is none, or it holds other files
-            pass
+        for folder in ("figures", FOLDER):
+            remove_leftovers(self / folder)
+            try:
+                (self / folder).rmdir()
+            except OSError:  # there is none, or it holds other files
+                pass
 
     @staticmethod
     def _hashes(config: Config, base: Path) -> dict[str, str]:

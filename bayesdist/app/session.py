@@ -12,16 +12,31 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.config import Config
+from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.assess import Misfit, misfit_of
-from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path, read_matches
+from bayesdist.assess import (
+    SAMPLE,
+    BinnedSums,
+    Misfit,
+    StarSample,
+    StarSums,
+    misfit_of,
+    partitions_for,
+    star_sample,
+    star_sums,
+)
+from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN
+from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
+    Matches,
     Posterior,
+    Shards,
     build_model,
     fit_by_magnitude,
     fit_linear,
+    load,
     load_fit,
     load_posterior,
 )
@@ -54,10 +69,10 @@ class Session:
         return self.run.config
 
     @cached_property
-    def raw_matches(self) -> MatchTable:
+    def raw_matches(self) -> Matches:
         """Matches as read."""
         data = self.config.data
-        return read_matches(
+        return load_matches(
             self.run.matches,
             format=data.format,
             columns=data.columns,
@@ -77,12 +92,32 @@ class Session:
         return MagnitudeErrors(**{name: np.asarray(table[name]) for name in ERROR_COLUMNS})
 
     @cached_property
-    def matches(self) -> MatchTable:
+    def matches(self) -> Matches:
         """Matches with their errors."""
-        errors = self.magnitude_errors
+        raw, errors = self.raw_matches, self.magnitude_errors
         if errors is None:
-            return self.raw_matches
-        return self.raw_matches.with_sigma(*errors.at(self.raw_matches.mag))
+            return raw
+        if isinstance(raw, MatchTable):
+            return raw.with_sigma(*errors.at(raw.mag))
+        return raw.with_errors_by_magnitude(errors)
+
+    @cached_property
+    def shards(self) -> Shards:
+        """All stars as the passes go over them: they are read once."""
+        return load(self.model, self.matches, self.config.resources())
+
+    def errors_changed(self) -> None:
+        """Forget what rests on the errors of the stars."""
+        shards = self.__dict__.get("shards")
+        if shards is not None:
+            shards.close()
+        for name in ("matches", "magnitude_errors", "shards", "sums", "stars", "misfit"):
+            self.__dict__.pop(name, None)
+
+    def close(self) -> None:
+        """Let go of the data, and of whoever holds them."""
+        if "shards" in self.__dict__:
+            self.__dict__.pop("shards").close()
 
     @cached_property
     def model(self) -> DistortionModel:
@@ -116,9 +151,10 @@ class Session:
             "priors": self.priors,
         }
         if self.config.data.sigma == "by_magnitude":
+            options["compute"] = self.config.resources()
             solution, _, errors = fit_by_magnitude(self.raw_matches, self.model, **options)
             return solution, errors
-        return fit_linear(self.raw_matches, self.model, **options), None
+        return fit_linear(self.shards, self.model, **options), None
 
     @cached_property
     def fit(self) -> LinearFit:
@@ -136,27 +172,40 @@ class Session:
         scale = self.config.detector.scale_mas
         return None if scale is None else scale / 1000
 
+    @cached_property
+    def _partitions(self) -> dict[str, tuple[int, int]]:
+        """Bins of the first chip: of the three tests for structure, and of the diagram."""
+        on_chip = self.shards.survey.chips[0].n / len(self.shards)
+        n = round(self.fit.n_used * on_chip)
+        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MOST_BINS))
+        return partitions_for(n) | {"shown": (side, side)}
+
+    @cached_property
+    def sums(self) -> StarSums:
+        """Residuals of the least-squares fit, summed over all stars."""
+        partitions = tuple(dict.fromkeys(self._partitions.values()))
+        return self.shards.sum(star_sums, self.fit.mean, self.fit.clip, partitions)
+
     @property
-    def fitted(self) -> np.ndarray:
-        """Which stars of the first chip the least-squares fit used."""
-        fit, matches = self.fit, self.matches
-        if len(fit.model.chips) == 1:
-            return fit.used
-        numbers = np.asarray(matches.chip_numbers)[matches.chip]
-        return fit.used & (numbers == fit.model.chips[0].number)
+    def shown_sums(self) -> BinnedSums:
+        """Those of them that the diagram of mean residuals shows."""
+        return self.sums.binned[self._partitions["shown"]]
 
     @cached_property
     def misfit(self) -> Misfit:
         """Structure that the least-squares fit leaves in the residuals of the first chip."""
-        fit, matches, good = self.fit, self.matches, self.fitted
+        fit, bins = self.fit, self._partitions
         return misfit_of(
-            matches.x[good],
-            matches.y[good],
-            fit.residual[good],
-            size=fit.model.chips[0].size,
+            {name: self.sums.binned[bins[name]] for name in bins if name != "shown"},
             n_params=2 * fit.model.n_terms,
             unit=fit.unit,
         )
+
+    @cached_property
+    def stars(self) -> StarSample:
+        """Some stars, or all of them, and what fit and posterior say of each."""
+        matches = self.matches
+        return star_sample(matches.sample(SAMPLE), len(matches), self.fit, self.posterior)
 
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""
@@ -167,8 +216,14 @@ class Session:
         """Epoch of the assessment; the middle of the data where none is given."""
         if self.config.assess.epoch is not None or self.model.time is None:
             return self.config.assess.epoch
-        assert self.raw_matches.epoch is not None
-        return float(np.median(self.raw_matches.epoch))
+        return self._median_epoch
+
+    @cached_property
+    def _median_epoch(self) -> float:
+        raw = self.raw_matches
+        table = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
+        assert table.epoch is not None
+        return float(np.median(table.epoch))
 
 
 def write_table(table: Table, path: Path) -> None:

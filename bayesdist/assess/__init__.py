@@ -5,10 +5,18 @@ from bayesdist.assess.budget import BudgetTerm, ErrorBudget, error_budget
 from bayesdist.assess.fields import ErrorFields, error_fields
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
-from bayesdist.assess.misfit import Misfit, misfit_of
+from bayesdist.assess.misfit import Misfit, misfit_of, partitions_for
 from bayesdist.assess.requirements import Margin, Requirement, check_requirements
-from bayesdist.assess.residuals import BinnedResiduals, binned_residuals, residual_statistics
+from bayesdist.assess.residuals import (
+    BinnedResiduals,
+    BinnedSums,
+    binned_residuals,
+    binned_sums,
+    residual_statistics,
+)
 from bayesdist.assess.solution import Solution
+from bayesdist.assess.star_sample import SAMPLE, StarSample, star_sample
+from bayesdist.assess.star_sums import ExposureSums, StarSums, flagged_by_exposure, star_sums
 from bayesdist.assess.statistics import STATISTICS, field_statistic
 from bayesdist.assess.terms import TERM_KINDS, UserTerm
 from bayesdist.assess.units import UNITS, convert, pixel_scale_of
@@ -16,32 +24,42 @@ from bayesdist.assess.vectors import VectorMap, distortion_vectors
 
 __all__ = [
     "DEFAULT_GRID",
+    "SAMPLE",
     "STATISTICS",
     "TERM_KINDS",
     "UNITS",
     "AreaMap",
     "BinnedResiduals",
+    "BinnedSums",
     "BudgetTerm",
     "ErrorBudget",
     "ErrorFields",
+    "ExposureSums",
     "Margin",
     "Misfit",
     "Requirement",
     "Solution",
+    "StarSample",
+    "StarSums",
     "UncertaintyMap",
     "UserTerm",
     "VectorMap",
     "area_map",
     "binned_residuals",
+    "binned_sums",
     "check_requirements",
     "convert",
     "distortion_vectors",
     "error_budget",
     "error_fields",
     "field_statistic",
+    "flagged_by_exposure",
     "grid_pixels",
     "misfit_of",
+    "partitions_for",
     "pixel_scale_of",
     "residual_statistics",
+    "star_sample",
+    "star_sums",
     "uncertainty_map",
 ]

@@ -6,17 +6,15 @@ nothing of it, and no requirement can be called met.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
-from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
+from bayesdist.assess.residuals import BinnedResiduals, BinnedSums
 
-__all__ = ["Misfit", "misfit_of"]
-
-Float = NDArray[np.float64]
+__all__ = ["MOST_BINS", "STARS_PER_BIN", "Misfit", "misfit_of", "partitions_for"]
 
 STARS_PER_BIN = 25
 MOST_BINS = 32  # along each side
@@ -59,24 +57,31 @@ class Misfit:
         )
 
 
-def misfit_of(
-    x: ArrayLike,
-    y: ArrayLike,
-    residual: ArrayLike,
-    *,
-    size: tuple[float, float],
-    n_params: int,
-    unit: str,
-) -> Misfit:
+def partitions_for(n: int) -> dict[str, tuple[int, int]]:
+    """The partitions of the detector that `misfit_of` looks at.
+
+    Parameters
+    ----------
+    n : int
+        Stars.
+
+    Returns
+    -------
+    dict of str to tuple of int
+        Bins on x and on y, by name.
+    """
+    side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 3, MOST_BINS))
+    strips = int(np.clip(n / STARS_PER_BIN, 3, 2 * MOST_BINS))
+    return {"cells": (side, side), "columns": (strips, 1), "rows": (1, strips)}
+
+
+def misfit_of(sums: Mapping[str, BinnedSums], *, n_params: int, unit: str) -> Misfit:
     """Test residuals for structure over the detector.
 
     Parameters
     ----------
-    x, y : array_like, shape (N,)
-        FITS 1-based pixels of the stars that were not rejected.
-    residual : array_like, shape (N, 2)
-        Data minus model.
-    size : tuple of float
+    sums : mapping of str to BinnedSums
+        Of the residuals of the stars that were not rejected, in each of `partitions_for` so many.
     n_params : int
         Polynomial coefficients of both axes, which the fit has taken out of the residuals.
     unit : str
@@ -86,16 +91,9 @@ def misfit_of(
     -------
     Misfit
     """
-    residual = np.asarray(residual, float)
-    n = len(residual)
-    side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 3, MOST_BINS))
-    strips = int(np.clip(n / STARS_PER_BIN, 3, 2 * MOST_BINS))
-    found = []
-    for name, bins in (("cells", (side, side)), ("columns", (strips, 1)), ("rows", (1, strips))):
-        cells = binned_residuals(x, y, residual[:, 0], residual[:, 1], bins=bins, size=size)
-        found.append((*_test(cells, n_params), name))
+    found = [(*_test(one.residuals(), n_params), name) for name, one in sums.items()]
     p, structure, name = min(found)
-    return Misfit(min(1.0, 3 * p), name, structure, unit)
+    return Misfit(min(1.0, len(found) * p), name, structure, unit)
 
 
 def _test(cells: BinnedResiduals, n_params: int) -> tuple[float, float]:

@@ -1,19 +1,23 @@
 """Rows that stand twice in a table, whether it is held in memory or streams by.
 
 Rows are hashed to one integer each, so that ten million of them need one sort, not one for each
-key; only rows whose hashes meet are compared in full.  A table that streams by is gone through
-once for every `HELD` rows, and each time the hashes of one residue class are held.
+key; only rows whose hashes meet are compared in full.  Of a table that streams by, the hashes are
+sorted into buckets of about `HELD` in a scratch file, and then looked at bucket by bucket: the cost
+grows linearly with the rows and the memory not at all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["HELD", "first_duplicate", "first_repetition", "rounds_for"]
+from bayesdist.errors import InputError
+
+__all__ = ["HELD", "buckets_for", "first_duplicate", "first_repetition"]
 
 UInt = NDArray[np.uint64]
 Keys = Sequence[NDArray[Any]]
@@ -43,12 +47,12 @@ def first_duplicate(keys: Keys) -> tuple[int, int] | None:
     return first_repetition(lambda: (keys,), 1)
 
 
-def rounds_for(n_rows: int) -> int:
-    """How many times a table of `n_rows` rows is to be gone through."""
+def buckets_for(n_rows: int) -> int:
+    """Into how many buckets the hashes of `n_rows` rows are to be sorted."""
     return max(1, -(-n_rows // HELD))
 
 
-def first_repetition(batches: Batches, rounds: int) -> tuple[int, int] | None:
+def first_repetition(batches: Batches, buckets: int) -> tuple[int, int] | None:
     """A pair of rows that agree in all keys, of a table that is gone through batch by batch.
 
     Parameters
@@ -56,8 +60,8 @@ def first_repetition(batches: Batches, rounds: int) -> tuple[int, int] | None:
     batches : callable
         Gives the table anew at each call: an iterable of batches of rows, each a sequence of keys
         as `first_duplicate` takes them.
-    rounds : int
-        1 / `rounds` of the hashes are held at a time.
+    buckets : int
+        1 / `buckets` of the hashes are held at a time.
 
     Returns
     -------
@@ -65,11 +69,16 @@ def first_repetition(batches: Batches, rounds: int) -> tuple[int, int] | None:
         Row numbers, counted over all batches, of a row and of its first repetition; None where no
         row repeats.  It is the earliest such pair, unless more than 100 000 different rows repeat:
         then it is the earliest of the first of them that come to light.
+
+    Raises
+    ------
+    InputError
+        When the scratch folder is full.
     """
     waiting: list[UInt] = []
-    for k in range(rounds):
-        waiting.append(_repeated(_hashes_of_round(batches, k, rounds)))
-        if k < rounds - 1 and sum(len(w) for w in waiting) <= _COMPARED:
+    for k, hashes in enumerate(_bucketed(batches, buckets)):
+        waiting.append(_repeated(hashes))
+        if k < buckets - 1 and sum(len(w) for w in waiting) <= _COMPARED:
             continue
         repeated, waiting = np.concatenate(waiting), []
         for a in range(0, len(repeated), _COMPARED):
@@ -101,16 +110,47 @@ def _hashed(keys: Keys) -> UInt:
     return out
 
 
-def _hashes_of_round(batches: Batches, k: int, rounds: int) -> UInt:
-    """The hashes of one residue class."""
-    found = []
-    for keys in batches():
-        hashed = _hashed(keys)
-        if rounds > 1:
-            # of the upper half: the lower bits of a product see the lower bits of its factors only
-            hashed = hashed[(hashed >> np.uint64(32)) % np.uint64(rounds) == k]
-        found.append(hashed)
-    return np.concatenate(found) if found else np.zeros(0, np.uint64)
+def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
+    """The hashes of each bucket; the table is gone through once."""
+    if buckets == 1:
+        found = [_hashed(keys) for keys in batches()]
+        yield np.concatenate(found) if found else np.zeros(0, np.uint64)
+        return
+    edges: list[NDArray[np.int64]] = []  # of the buckets of each batch, in the file
+    with tempfile.TemporaryFile(prefix="bayesdist-") as file:
+        try:
+            for hashed in _joined(_hashed(keys) for keys in batches()):
+                # by the upper half: the lower bits of a product see those of its factors only
+                bucket = (hashed >> np.uint64(32)) % np.uint64(buckets)
+                counts = np.bincount(bucket.astype(np.int64), minlength=buckets)
+                edges.append(file.tell() + 8 * np.concatenate([[0], np.cumsum(counts)]))
+                file.write(hashed[np.argsort(bucket, kind="stable")].data)
+            file.flush()
+        except OSError as error:
+            raise InputError(
+                f"the search for repeated rows does not fit into the scratch folder "
+                f"({error.strerror})",
+                where=tempfile.gettempdir(),
+                do="set TMPDIR to a folder with 8 bytes of room for each row",
+            ) from error
+        for k in range(buckets):
+            parts = []
+            for begin, end in ((e[k], e[k + 1]) for e in edges):
+                file.seek(int(begin))
+                parts.append(np.frombuffer(file.read(int(end - begin)), np.uint64))
+            yield np.concatenate(parts)
+
+
+def _joined(pieces: Iterable[UInt]) -> Iterator[UInt]:
+    """The same hashes in pieces of a size that keeps the list of places in the file short."""
+    waiting: list[UInt] = []
+    for piece in pieces:
+        waiting.append(piece)
+        if sum(len(w) for w in waiting) >= HELD // 4:
+            yield np.concatenate(waiting)
+            waiting = []
+    if waiting:
+        yield np.concatenate(waiting)
 
 
 def _repeated(hashed: UInt) -> UInt:

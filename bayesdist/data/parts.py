@@ -18,7 +18,7 @@ from bayesdist.data.columns import (
     position_unit,
     sky_columns,
 )
-from bayesdist.data.duplicates import first_repetition, rounds_for
+from bayesdist.data.duplicates import buckets_for, first_repetition
 from bayesdist.data.parquet_files import ParquetPart
 from bayesdist.data.tangent import direction_of, direction_sum
 from bayesdist.data.values import SourceColumn
@@ -291,7 +291,7 @@ def scan(parts: Sequence[MatchPart]) -> Whole:
             "holds no rows", where=parts[0].source + more, do="give a table with matched stars"
         )
     rows = _Scan(parts)
-    pair = first_repetition(rows, rounds_for(n_rows))
+    pair = first_repetition(rows, buckets_for(n_rows))
     if pair is not None:
         first, second = (_named(parts, row) for row in pair)
         raise InputError(

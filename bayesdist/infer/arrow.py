@@ -198,6 +198,14 @@ class ArrowFactor:
         low = np.einsum("nrq,...nr->...nq", self.chol_blocks, low)
         return self.matrix.join(b @ self.chol_border, low)
 
+    def variances(self) -> Float:
+        """The diagonal of H^-1, shape (size,), without the rest of it."""
+        root = self._inverse_border
+        top = (root**2).sum(axis=0)
+        spread = self.gain @ root.T
+        low = (self._inverse_blocks**2).sum(axis=1) + (spread**2).sum(axis=2)
+        return self.matrix.join(top, low)
+
     def covariance(self) -> Float:
         """H^-1 as a dense matrix (size, size)."""
         root = self.colour(np.eye(self.matrix.size))

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.arrow import Arrow
-from bayesdist.model import DistortionModel
+from bayesdist.infer.survey import Survey
+from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import frame_names
 
 __all__ = ["NullSpace", "check_coverage", "null_space"]
@@ -81,7 +81,7 @@ def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
     )
 
 
-def require_full_rank(matrix: Arrow, model: DistortionModel, matches: MatchTable) -> NullSpace:
+def require_full_rank(matrix: Arrow, model: DistortionModel, groups: Groups) -> NullSpace:
     """The null space, which must be empty.
 
     Raises
@@ -95,20 +95,17 @@ def require_full_rank(matrix: Arrow, model: DistortionModel, matches: MatchTable
     first = space.directions[0]
     listed = ", ".join(first[:-1]) + f" and {first[-1]}" if len(first) > 1 else first[0]
     verb = "are degenerate" if len(first) > 1 else "is not determined by the data"
-    reason, do = _reason(first, model, matches)
+    reason, do = _reason(first, model, groups)
     raise DegenerateError(
         f"{listed} {verb} (rank {space.rank} of {space.n_params}){reason}", where="model", do=do
     )
 
 
-def _reason(
-    direction: tuple[str, ...], model: DistortionModel, matches: MatchTable
-) -> tuple[str, str]:
+def _reason(direction: tuple[str, ...], model: DistortionModel, groups: Groups) -> tuple[str, str]:
     kinds = {p.name: p for p in model.parameters}
     parts = [kinds[name] for name in direction]
     if any(p.kind == "tdd" for p in parts):
-        epochs = np.unique(matches.epoch) if matches.epoch is not None else np.zeros(1)
-        if len(epochs) == 1:
+        if len(np.unique(groups.epoch)) == 1:
             return (
                 ": all exposures share one epoch",
                 "drop model.tdd or add exposures at other epochs",
@@ -130,7 +127,7 @@ def _reason(
     )
 
 
-def check_coverage(model: DistortionModel, matches: MatchTable) -> None:
+def check_coverage(model: DistortionModel, survey: Survey) -> None:
     """Refuse data that cannot carry the model, with the plain reason.
 
     Raises
@@ -139,50 +136,45 @@ def check_coverage(model: DistortionModel, matches: MatchTable) -> None:
         Fewer numbers than parameters, too few stars in an exposure, stars on a line, or stars in
         one corner of a chip.
     """
-    n = len(matches)
+    n = survey.n
     if 2 * n < model.n_params:
         raise DegenerateError(
             f"{n} stars give {2 * n} numbers, fewer than the {model.n_params} parameters",
-            where=", ".join(matches.sources),
+            where=survey.where,
             do="lower model.order or give more stars",
         )
     q = len(frame_names(model.frames))
     if q:
-        counts = np.bincount(matches.exposure, minlength=len(model.exposures))
-        for name, count in zip(model.exposures, counts, strict=True):
+        for name, count in zip(model.exposures, survey.exposures, strict=True):
             if 2 * count < q:
                 raise DegenerateError(
                     f"exposure {name!r} has {count} stars, too few for frame '{model.frames}'",
-                    where=", ".join(matches.sources),
+                    where=survey.where,
                     do="drop the exposure or choose a simpler model.frames",
                 )
-    numbers = np.asarray(matches.chip_numbers)[matches.chip]
-    for chip in model.chips:
-        on_chip = numbers == chip.number if len(model.chips) > 1 else np.ones(n, bool)
-        x, y = matches.x[on_chip], matches.y[on_chip]
-        where = f"chip {chip.name}" if len(model.chips) > 1 else ", ".join(matches.sources)
-        if not len(x):
+    for chip, found in zip(model.chips, survey.chips, strict=True):
+        where = f"chip {chip.name}" if len(model.chips) > 1 else survey.where
+        if not found.n:
             raise DegenerateError("no star lies on this chip", where=where, do="drop the chip")
-        outside = (x < 0.5) | (x > chip.size[0] + 0.5) | (y < 0.5) | (y > chip.size[1] + 0.5)
-        if outside.any():
-            k = int(np.flatnonzero(on_chip)[np.flatnonzero(outside)[0]])
+        if found.outside:
             raise DegenerateError(
-                f"row {matches.row[k] + 1} lies at pixel ({matches.x[k]:.2f}, {matches.y[k]:.2f}), "
-                f"outside the {chip.size[0]:g} x {chip.size[1]:g} detector",
+                found.outside,
                 where=where,
                 do="correct detector.size, the columns or data.pixel_origin",
             )
-        points = np.column_stack([x / chip.size[0], y / chip.size[1]])
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if len(x) < 3 or spread[-1] < 1e-6 * spread[0]:
+        a, b, aa, ab, bb = found.sums / found.n
+        spread = np.linalg.eigvalsh([[aa - a * a, ab - a * b], [ab - a * b, bb - b * b]])
+        # variances: they lose half of the digits
+        if found.n < 3 or spread[0] < 1e-12 * spread[1]:
             raise DegenerateError(
                 "all stars lie on a line", where=where, do="check columns x and y"
             )
         try:
-            covered = ConvexHull(points).volume
+            covered = ConvexHull(found.corners / chip.size).volume
         except QhullError:  # nearly collinear: no area to speak of
             covered = 0.0
         if covered < LEAST_COVERAGE:
+            x, y = found.corners.T
             raise DegenerateError(
                 f"the stars lie within x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to "
                 f"{y.max():.0f} and span {100 * covered:.0f} % of the detector, so that the rest "

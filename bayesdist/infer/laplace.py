@@ -17,7 +17,7 @@ from bayesdist.infer.coordinates import from_cube_root, inside, to_cube_root
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.target import Target
 
-__all__ = ["Conditional", "conditional_mode", "starting_point"]
+__all__ = ["Conditional", "conditional_mode", "expected_mode", "starting_point"]
 
 Float = NDArray[np.float64]
 
@@ -37,12 +37,23 @@ class Conditional:
         Of minus the Hessian at the mode.
     log_marginal : float
         Laplace estimate of the log posterior density of log j, up to a constant.
+    tangent : ndarray, shape (D',), optional
+        Derivative of the mode by log j: where the search at a neighbour begins.
+    slope, curvature : float
+        First derivative by log j of the log posterior along the modes, and minus the second.
     """
 
     log_j: float | None
     mode: Float
     factor: ArrowFactor
     log_marginal: float
+    tangent: Float | None = None
+    slope: float = 0.0
+    curvature: float = 0.0
+
+    def ahead(self, step: float) -> Float:
+        """Where the mode lies, to first order, when log j is larger by `step`."""
+        return self.mode if self.tangent is None else self.mode + step * self.tangent
 
 
 def split_hyper(target: Target) -> tuple[bool, tuple[str, ...]]:
@@ -78,13 +89,11 @@ def starting_point(target: Target, fit: LinearFit) -> tuple[Float, float | None]
     """
     has_j, rest = split_hyper(target)
     scale = target.hyper.scale
-    n_used = int(fit.used.sum())
-    n_rejected = len(fit.used) - n_used
     excess = max(fit.chi2 / max(fit.dof, 1) - 1.0, 0.0)
-    f = np.clip(n_rejected / len(fit.used), 0.5 / len(fit.used), 0.9)
+    f = np.clip(fit.n_rejected / fit.n_rows, 0.5 / fit.n_rows, 0.9)
     s_out = 5 * scale
-    if n_rejected > 2:
-        s_out = max(s_out, float(np.sqrt(np.mean(fit.residual[~fit.used] ** 2))))
+    if fit.n_rejected > 2:
+        s_out = max(s_out, fit.rms_rejected)
     natural = {"f": f, "s_out": s_out}
     h = np.array([np.log(v / (1 - v)) if k == "f" else np.log(v) for k, v in natural.items()])
     h = h[[list(natural).index(k) for k in rest]] if rest else np.zeros(0)
@@ -121,11 +130,11 @@ def conditional_mode(
     DegenerateError
         When no maximum is found, or the curvature there is not positive.
     """
-    value, gradient, full, safe = _expand(target, y, log_j)
+    here = _expand(target, y, log_j)
     for _ in range(max_steps):
-        factor = _positive(full, safe, y)
-        step = factor.solve(gradient)
-        decrement = 0.5 * float(gradient @ step)
+        factor = _positive(target, here.matrix, y, log_j)
+        step = factor.solve(here.gradient)
+        decrement = 0.5 * float(here.gradient @ step)
         if decrement < tolerance:
             y = y + step if _valid(target, y + step) else y
             break
@@ -133,9 +142,9 @@ def conditional_mode(
         for _ in range(40):
             trial = y + length * step
             if _valid(target, trial):
-                gain = _value(target, trial, log_j) - value
-                if gain > 1e-4 * length * decrement:
-                    y, moved = trial, True
+                there = _expand(target, trial, log_j)
+                if there.value - here.value > 1e-4 * length * decrement:
+                    y, here, moved = trial, there, True
                     break
             length /= 2
         if not moved:
@@ -146,24 +155,57 @@ def conditional_mode(
                 where="posterior",
                 do="check the match, the errors and the outlier model",
             )
-        value, gradient, full, safe = _expand(target, y, log_j)
     else:
         raise DegenerateError(
             f"no posterior mode was found in {max_steps} Newton steps",
             where="posterior",
             do="check the match, the errors and the outlier model",
         )
-    return Conditional(log_j, y, factor, value - 0.5 * factor.logdet)
+    log_marginal = here.value - 0.5 * factor.logdet
+    if log_j is None:
+        return Conditional(None, y, factor, log_marginal)
+    tangent = -factor.solve(here.coupling)
+    curvature = here.curvature + float(here.coupling @ tangent)
+    slope = here.slope - float(here.coupling @ (y - here.y))
+    return Conditional(log_j, y, factor, log_marginal, tangent, slope, curvature)
 
 
-def _positive(full: Arrow, safe: Arrow, y: Float) -> ArrowFactor:
+def expected_mode(target: Target, node: Conditional, step: float) -> Float:
+    """Where to begin the search at a log j that is larger by `step` than a node's.
+
+    The tangent may lead out of the support, to a fraction above one or below none: then it is the
+    node's own mode.
+    """
+    y = node.ahead(step)
+    return y if _valid(target, y) else node.mode
+
+
+@dataclass(frozen=True, eq=False)
+class _Expansion:
+    """Second-order expansion in the coordinates y at fixed log j, and what couples it to log j.
+
+    `slope` and `curvature` are the first derivative by log j and minus the second; `coupling` (D',)
+    is minus the mixed one.
+    """
+
+    y: Float
+    value: float
+    gradient: Float
+    matrix: Arrow
+    slope: float
+    curvature: float
+    coupling: Float
+
+
+def _positive(target: Target, full: Arrow, y: Float, log_j: float | None) -> ArrowFactor:
     """Factor of the Hessian, made positive where it is not.
 
     The distortion part falls back to the EM weights.  The hyperparameters' Schur complement gets
     eigenvalues of at least one, in units of half their own value: where outliers cannot be told
     from the core, the posterior is flat in f and s_out, or even curved upwards.
     """
-    for matrix in (full, safe):
+    for em in (False, True):
+        matrix = _expand(target, y, log_j, em=True).matrix if em else full
         try:
             inner = matrix.without_tail().factor()
         except np.linalg.LinAlgError:
@@ -201,27 +243,24 @@ def _log_jacobian(target: Target, y: Float) -> float:
     return float(np.log(np.abs(from_cube_root(rest, y[..., target.n_theta :])[1])).sum())
 
 
-def _value(target: Target, y: Float, log_j: float | None) -> float:
-    psi = to_psi(target, y, log_j)
-    return float(target.log_density(psi[None])[0]) + _log_jacobian(target, y)
-
-
-def _expand(target: Target, y: Float, log_j: float | None) -> tuple[float, Float, Arrow, Arrow]:
+def _expand(target: Target, y: Float, log_j: float | None, *, em: bool = False) -> _Expansion:
     """`Target.expand` in the coordinates y, at fixed log j."""
     has_j, rest = split_hyper(target)
     n, skip = target.n_theta, int(has_j)
-    _, gradient, full, safe = target.expand(to_psi(target, y, log_j))
+    value, gradient, matrix = target.expand(to_psi(target, y, log_j), em=em)
     _, h1, h2, g1, g2 = from_cube_root(rest, y[n:])
     by_h = gradient[n + skip :]
     out = np.concatenate([gradient[:n], by_h * h1 + g1])
     bend = -by_h * h2 - g2
-    # the value comes from the kernel, so that line searches compare like with like
-    return (
-        _value(target, y, log_j),
-        out,
-        _change_tail(full, skip, h1, bend),
-        _change_tail(safe, skip, h1, np.maximum(bend, 0.0)),
-    )
+    inner = _change_tail(matrix, skip, h1, np.maximum(bend, 0.0) if em else bend)
+    slope, curvature, coupling = 0.0, 0.0, np.zeros(len(y))
+    if has_j:
+        g = matrix.n_global
+        row = np.concatenate([matrix.border[g, :g], matrix.border[g, g + 1 :] * h1])
+        coupling = inner.join(row, matrix.edge[:, g])
+        slope, curvature = float(gradient[n]), float(matrix.border[g, g])
+    value += _log_jacobian(target, y)
+    return _Expansion(y, value, out, inner, slope, curvature, coupling)
 
 
 def _change_tail(matrix: Arrow, skip: int, h1: Float, bend: Float) -> Arrow:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,20 +17,53 @@ from numpy.typing import NDArray
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.arrow import Arrow, ArrowFactor
 from bayesdist.infer.identify import check_coverage, require_full_rank
-from bayesdist.infer.normal import NormalEquations, accumulate
+from bayesdist.infer.normal import NormalEquations, least_squares
 from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.stars import Stars, prepare
+from bayesdist.infer.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import nearest_frame
 
-__all__ = ["LinearFit", "build_model", "fit_by_magnitude", "fit_linear"]
+if TYPE_CHECKING:
+    from bayesdist.infer.posterior import Posterior
+
+__all__ = ["Clip", "LinearFit", "build_model", "fit_by_magnitude", "fit_linear", "residuals"]
 
 Float = NDArray[np.float64]
 
 RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
+MEDIAN_STARS = 1_000_000  # stars that a median is taken of
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """The rule by which the first pass leaves stars out: limits on its residuals.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (D,)
+        Parameters of the first pass.
+    chi2_limit, abs_limit : float
+        In the unit of u, v; stars beyond either are left out.
+    """
+
+    theta: Float
+    chi2_limit: float
+    abs_limit: float
+
+    def keeps(self, model: DistortionModel, matches: MatchTable) -> NDArray[np.bool_]:
+        """Which stars (N,) of a table stay."""
+        stars, order = prepare(model, matches)
+        return in_table_order(self.keeps_of(stars), order).astype(bool)
+
+    def keeps_of(self, stars: Stars) -> NDArray[np.bool_]:
+        """Which of some stars (N,) stay, in their own order."""
+        residual = stars.residuals(self.theta)
+        chi2 = residual[:, 0] ** 2 / stars.var_u + residual[:, 1] ** 2 / stars.var_v
+        r2 = (residual**2).sum(axis=1)
+        return np.asarray((chi2 <= self.chi2_limit) & (r2 <= self.abs_limit**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +77,18 @@ class LinearFit:
         Estimated parameters.
     cov : ndarray, shape (D, D)
         Formal covariance; with extra corner weights the sandwich form, which stays a covariance.
-    residual : ndarray, shape (N, 2)
-        Data minus model of every row of the table, in the unit of u, v.
-    used : ndarray of bool, shape (N,)
-        Rows of the second pass.
+    clip : Clip
+        What was left out of the second pass.
+    n_rows, n_used : int
+        All stars, and those of the second pass.
+    rms_u, rms_v : float
+        Rms residuals of the stars used, in the unit of u, v.
+    rms_rejected : float
+        Rms residual, of both axes, of the stars left out; 0 where there are none.
     rejected : dict of str to int
-        Rows left out of the second pass, by reason.
+        Stars left out of the second pass, by reason.
     chi2 : float
-        Of the rows used, with the quoted errors.
+        Of the stars used, with the quoted errors.
     dof : int
     condition : float
         Of the normal matrix scaled to unit diagonal.
@@ -60,8 +97,12 @@ class LinearFit:
     model: DistortionModel
     mean: Float
     cov: Float
-    residual: Float
-    used: NDArray[np.bool_]
+    clip: Clip
+    n_rows: int
+    n_used: int
+    rms_u: float
+    rms_v: float
+    rms_rejected: float
     rejected: dict[str, int]
     chi2: float
     dof: int
@@ -78,14 +119,13 @@ class LinearFit:
         return np.sqrt(np.diag(self.cov))
 
     @property
-    def rms_u(self) -> float:
-        """Rms residual in u of the rows used."""
-        return float(np.sqrt(np.mean(self.residual[self.used, 0] ** 2)))
+    def n_rejected(self) -> int:
+        """Stars left out of the second pass."""
+        return self.n_rows - self.n_used
 
-    @property
-    def rms_v(self) -> float:
-        """Rms residual in v of the rows used."""
-        return float(np.sqrt(np.mean(self.residual[self.used, 1] ** 2)))
+    def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
+        """Which stars (N,) of a table the second pass uses."""
+        return self.clip.keeps(self.model, matches)
 
     @cached_property
     def _root(self) -> Float:
@@ -108,7 +148,7 @@ class LinearFit:
 
 
 def build_model(
-    matches: MatchTable,
+    matches: Matches,
     *,
     order: int,
     size: tuple[float, float] | None = None,
@@ -122,7 +162,7 @@ def build_model(
 
     Parameters
     ----------
-    matches : MatchTable
+    matches : MatchTable or PartitionedMatches
     order : int
         Polynomial order, 1 to 9.
     size : tuple of float, optional
@@ -160,12 +200,13 @@ def build_model(
             where="chip",
             do="give one [[chip]] block for each, or select one chip",
         )
-    if time is not None and matches.epoch is None:
+    if time is not None and not matches.has_epoch:
         raise InputError(
             "time-dependent terms need an epoch for every star",
             where="data.columns",
             do="map column 'epoch' or drop model.tdd",
         )
+    some = matches.sample(MEDIAN_STARS)
     return DistortionModel(
         order=order,
         chips=chips,
@@ -173,35 +214,38 @@ def build_model(
         time=time,
         frames=frames,
         exposures=matches.exposure_names,
-        origin=(float(np.median(matches.u)), float(np.median(matches.v))),
+        origin=(float(np.median(some.u)), float(np.median(some.v))),
     )
 
 
 def fit_linear(
-    matches: MatchTable,
+    matches: Matches | Shards,
     model: DistortionModel,
     *,
     clip_chi2: float = 25.0,
     clip_abs: float | None = 2.0,
     radial_weight: float = 1.0,
     priors: GaussianPriors | None = None,
+    compute: Compute | None = None,
 ) -> LinearFit:
     """Two-pass weighted least squares.
 
     Parameters
     ----------
-    matches : MatchTable
+    matches : MatchTable, PartitionedMatches or Shards
         With errors.
     model : DistortionModel
     clip_chi2 : float
-        Rows with a first-pass chi-square (both axes) above this are left out of the second pass.
+        Stars with a first-pass chi-square (both axes) above this are left out of the second pass.
         Where the errors are too small as a whole, the limit is scaled by the median chi-square.
     clip_abs : float or None
-        Rows with a first-pass residual above this many pixels are left out too.
+        Stars with a first-pass residual above this many pixels are left out too.
     radial_weight : float
         Factor on the inverse variance in the corners, rising as the square of the radius.
     priors : GaussianPriors, optional
         Gaussian priors on named parameters.
+    compute : Compute, optional
+        Where the work is done; one process with threads by default.
 
     Returns
     -------
@@ -212,78 +256,117 @@ def fit_linear(
     DegenerateError
         When the data do not determine the model: see `check_coverage` and `require_full_rank`.
     """
-    check_coverage(model, matches)
-    priors = priors or GaussianPriors.none(model)
-    stars = prepare(model, matches)
-    extra = _corner_weight(stars, radial_weight)
-    inverse = np.column_stack([1.0 / stars.var_u, 1.0 / stars.var_v])
+    with opened(model, matches, compute) as shards:
+        return _fitted(
+            shards,
+            model,
+            clip_chi2=clip_chi2,
+            clip_abs=clip_abs,
+            radial_weight=radial_weight,
+            priors=priors or GaussianPriors.none(model),
+        )
 
-    zero = np.zeros((len(stars.groups), 2, model.n_terms))
-    first = accumulate(stars, zero, inverse * extra[:, None])
-    theta = _start(first, stars, priors)
-    _refuse_absorbed_drift(first, theta, stars, priors, matches)
-    theta = _gauss_newton(first, theta, stars, priors, matches)
 
-    residual = stars.residuals(theta)
-    chi2 = (residual**2 * inverse).sum(axis=1)
-    spread = max(1.0, float(np.median(chi2)) / MEDIAN_CHI2_2)
-    too_unlikely = chi2 > clip_chi2 * spread
-    too_far = np.zeros(len(stars), bool)
-    if clip_abs is not None:
-        limit = clip_abs * model.pixel_size(theta)
-        too_far = np.hypot(residual[:, 0], residual[:, 1]) > limit
-    used = ~(too_unlikely | too_far)
-    if used.sum() * 2 < model.n_params or used.mean() < 0.05:
+def _fitted(
+    shards: Shards,
+    model: DistortionModel,
+    *,
+    clip_chi2: float,
+    clip_abs: float | None,
+    radial_weight: float,
+    priors: GaussianPriors,
+) -> LinearFit:
+    check_coverage(model, shards.survey)
+    first = shards.sum(least_squares, None, None, np.inf, np.inf, radial_weight)
+    theta = _start(first, model, priors)
+    _refuse_absorbed_drift(first, theta, model, priors)
+    theta = _gauss_newton(first, theta, model, priors)
+
+    every = max(1, len(shards) // MEDIAN_STARS)
+    typical = float(np.median(np.concatenate(shards.sum(_some_chi2, theta, every))))
+    clip = Clip(
+        theta,
+        chi2_limit=clip_chi2 * max(1.0, typical / MEDIAN_CHI2_2),
+        abs_limit=np.inf if clip_abs is None else clip_abs * model.pixel_size(theta),
+    )
+    rule = (clip.theta, clip.chi2_limit, clip.abs_limit, radial_weight)
+    second = shards.sum(least_squares, clip.theta, *rule)
+    n_used, n_far = int(second.scalars[0]), int(second.scalars[1])
+    n_rejected = len(shards) - n_used
+    if n_used * 2 < model.n_params or n_used < 0.05 * len(shards):
         raise DegenerateError(
-            f"{int((~used).sum())} of {len(used)} rows are beyond the rejection limits",
+            f"{n_rejected} of {len(shards)} rows are beyond the rejection limits",
             where="fit",
             do="check the match, the errors, and fit.clip_chi2 and fit.clip_abs",
         )
 
-    weights = inverse * (extra * used)[:, None]
-    about = model.effective(theta, stars.groups)
-    second = accumulate(stars, about, weights)
-    theta = _gauss_newton(second, theta, stars, priors, matches)
-    about = model.effective(theta, stars.groups)
-    matrix, _ = second.moved(about).assemble(model, theta, stars.groups)
+    theta = _gauss_newton(second, theta, model, priors)
+    about = model.effective(theta, second.groups)
+    matrix, _ = second.moved(about).assemble(model, theta)
     matrix = matrix + priors.matrix(model)
-    space = require_full_rank(matrix, model, matches)
+    space = require_full_rank(matrix, model, second.groups)
     factor = matrix.factor()
     cov = factor.covariance()
+    # at the solution: the statistics, and the squared weights that a sandwich needs
+    final = shards.sum(least_squares, theta, *rule, 2)
     if radial_weight != 1.0:
-        cov = _sandwich(factor, cov, stars, about, theta, weights * extra[:, None], priors)
-
-    residual = stars.residuals(theta)
-    chi2 = (residual**2 * inverse).sum(axis=1)
+        meat, _ = final.assemble(model, theta)
+        cov = cov @ (meat + priors.matrix(model)).dense() @ cov
+    _, _, chi2, uu, vv, beyond, *_ = final.scalars
     return LinearFit(
         model=model,
         mean=theta,
         cov=cov,
-        residual=stars.in_table_order(residual),
-        used=stars.in_table_order(used).astype(bool),
-        rejected={
-            "chi-square": int((too_unlikely & ~too_far).sum()),
-            "absolute residual": int(too_far.sum()),
-        },
-        chi2=float(chi2[used].sum()),
-        dof=int(2 * used.sum()) - model.n_params + priors.n_informative,
+        clip=clip,
+        n_rows=len(shards),
+        n_used=n_used,
+        rms_u=float(np.sqrt(uu / n_used)),
+        rms_v=float(np.sqrt(vv / n_used)),
+        rms_rejected=float(np.sqrt(beyond / (2 * max(n_rejected, 1)))),
+        rejected={"chi-square": n_rejected - n_far, "absolute residual": n_far},
+        chi2=float(chi2),
+        dof=2 * n_used - model.n_params + priors.n_informative,
         condition=space.condition,
     )
 
 
+def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
+    """Chi-square of every so manieth star."""
+    residual = stars.residuals(theta)[::every]
+    var = np.stack([stars.var_u[::every], stars.var_v[::every]], axis=1)
+    return ((residual**2 / var).sum(axis=1),)
+
+
+def residuals(solution: LinearFit | Posterior, matches: MatchTable) -> Float:
+    """Data minus the model at a solution's mean.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    matches : MatchTable
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        In the unit of u and v.
+    """
+    stars, order = prepare(solution.model, matches)
+    return in_table_order(stars.residuals(solution.mean), order)
+
+
 def fit_by_magnitude(
-    matches: MatchTable,
+    matches: Matches,
     model: DistortionModel,
     *,
     max_iterations: int = 10,
     priors: GaussianPriors | None = None,
     **options: Any,
-) -> tuple[LinearFit, MatchTable, MagnitudeErrors]:
+) -> tuple[LinearFit, Matches, MagnitudeErrors]:
     """Fit and errors by magnitude, in turn, until both stand still.
 
     Parameters
     ----------
-    matches : MatchTable
+    matches : MatchTable or PartitionedMatches
         With magnitudes; errors, if there are any, are replaced.
     model : DistortionModel
     max_iterations : int
@@ -294,7 +377,7 @@ def fit_by_magnitude(
     Returns
     -------
     fit : LinearFit
-    matches : MatchTable
+    matches : MatchTable or PartitionedMatches
         With the errors of the last iteration.
     errors : MagnitudeErrors
         The bins and their values.
@@ -304,21 +387,19 @@ def fit_by_magnitude(
     InputError
         When the table has no magnitudes, or the errors do not settle.
     """
-    if matches.mag is None:
+    if not matches.has_mag:
         raise InputError(
             "errors by magnitude need magnitudes",
             where="data.columns",
             do="map column 'mag' or give data.sigma another value",
         )
-    ones = np.ones(len(matches))
-    fit = fit_linear(matches.with_sigma(ones, ones), model, priors=priors, **options)
+    fit = fit_linear(matches.with_sigma(1.0, 1.0), model, priors=priors, **options)
+    some = matches.sample(MEDIAN_STARS).with_sigma(1.0, 1.0)
     before: Float | None = None
     for _ in range(max_iterations):
-        errors = estimate(
-            matches.mag, fit.residual[:, 0], fit.residual[:, 1], n_params=model.n_params
-        )
-        sigma_u, sigma_v = errors.at(matches.mag)
-        table = matches.with_sigma(sigma_u, sigma_v)
+        assert some.mag is not None
+        errors = estimate(some.mag, *residuals(fit, some).T, n_params=model.n_params)
+        table = _with_errors(matches, errors)
         fit = fit_linear(table, model, priors=priors, **options)
         now = np.concatenate([errors.sigma_u, errors.sigma_v])
         if before is not None and np.abs(now / before - 1).max() < 0.01:
@@ -331,14 +412,17 @@ def fit_by_magnitude(
     )
 
 
-def _corner_weight(stars: Stars, factor: float) -> Float:
-    radius2 = (stars.X**2 + stars.Y**2) / 2  # 1 in the corners
-    return 1.0 + (factor - 1.0) * radius2
+def _with_errors(matches: Matches, errors: MagnitudeErrors) -> Matches:
+    """The same stars with errors by magnitude."""
+    if isinstance(matches, MatchTable):
+        assert matches.mag is not None  # or there would be no errors by magnitude
+        return matches.with_sigma(*errors.at(matches.mag))
+    return matches.with_errors_by_magnitude(errors)
 
 
-def _start(first: NormalEquations, stars: Stars, priors: GaussianPriors) -> Float:
+def _start(first: NormalEquations, model: DistortionModel, priors: GaussianPriors) -> Float:
     """Frames from linear maps of the exposures, then polynomials with the frames held."""
-    model, groups = stars.model, stars.groups
+    groups = first.groups
     theta = np.zeros(model.n_params)
     if model.n_frame:
         affine = np.array([_affine(w, r) for w, r in zip(first.weight, first.right, strict=True)])
@@ -353,7 +437,7 @@ def _start(first: NormalEquations, stars: Stars, priors: GaussianPriors) -> Floa
                     theta[model.frame_slice(e)] = nearest_frame(model.frames, M, d)
                     break
     held = first.moved(model.effective(theta, groups))
-    matrix, right = held.assemble(model, theta, groups)
+    matrix, right = held.assemble(model, theta)
     prior = priors.matrix(model)
     n = model.n_global
     theta[:n] = np.linalg.lstsq(
@@ -365,16 +449,14 @@ def _start(first: NormalEquations, stars: Stars, priors: GaussianPriors) -> Floa
 def _refuse_absorbed_drift(
     equations: NormalEquations,
     theta: Float,
-    stars: Stars,
+    model: DistortionModel,
     priors: GaussianPriors,
-    matches: MatchTable,
 ) -> None:
     """Refuse frames that absorb the drift of the linear terms.
 
     With a curved polynomial such a degeneracy is not exact, and the fit would follow its valley to
     numbers that mean nothing.  On the linear part of the model it is exact, and shows.
     """
-    model = stars.model
     if model.time is None or not model.n_frame:
         return
     flat = np.zeros_like(theta)
@@ -382,8 +464,8 @@ def _refuse_absorbed_drift(
         for axis in (0, 1):
             part = model.coefficient_slice(chip.number, axis)
             flat[part][:3] = theta[part][:3]
-    matrix, _ = equations.assemble(model, flat, stars.groups)
-    require_full_rank(matrix + priors.matrix(model), model, matches)
+    matrix, _ = equations.assemble(model, flat)
+    require_full_rank(matrix + priors.matrix(model), model, equations.groups)
 
 
 def _affine(weight: Float, right: Float) -> Float:
@@ -399,21 +481,20 @@ def _affine(weight: Float, right: Float) -> Float:
 def _gauss_newton(
     equations: NormalEquations,
     theta: Float,
-    stars: Stars,
+    model: DistortionModel,
     priors: GaussianPriors,
-    matches: MatchTable,
 ) -> Float:
     """Solve, moving the equations instead of passing over the data again."""
-    model, groups = stars.model, stars.groups
+    groups = equations.groups
     prior = priors.matrix(model)
     about = model.effective(theta, groups)
     for _ in range(50):
-        matrix, right = equations.moved(about).assemble(model, theta, groups)
+        matrix, right = equations.moved(about).assemble(model, theta)
         matrix = matrix + prior
         try:
             step = matrix.factor().solve(right + priors.pull(theta))
         except np.linalg.LinAlgError:
-            require_full_rank(matrix, model, matches)
+            require_full_rank(matrix, model, groups)
             raise
         theta = theta + step
         before, about = about, model.effective(theta, groups)
@@ -425,19 +506,3 @@ def _gauss_newton(
         where="model.frames",
         do="check that the exposures overlap and are not mirrored, or choose 'affine'",
     )
-
-
-def _sandwich(
-    factor: ArrowFactor,
-    bread: Float,
-    stars: Stars,
-    about: Float,
-    theta: Float,
-    squared: Float,
-    priors: GaussianPriors,
-) -> Float:
-    """Covariance of an estimate whose weights are not the inverse variances."""
-    moments = accumulate(stars, about, squared)
-    middle, _ = moments.assemble(stars.model, theta, stars.groups)
-    meat: Arrow = middle + priors.matrix(stars.model)
-    return bread @ meat.dense() @ bread

@@ -23,13 +23,15 @@ from numpy.typing import NDArray
 from scipy.special import expit, gammaln, log_expit, logit
 
 from bayesdist.errors import InputError
+from bayesdist.infer import kernel
+from bayesdist.infer.kernel import Constants
 
-__all__ = ["HYPER_NAMES", "Hyper", "OutlierMixture", "StarTerms"]
+__all__ = ["HYPER_NAMES", "Hyper", "OutlierMixture"]
 
 Float = NDArray[np.float64]
 
 HYPER_NAMES = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
-LOG_2PI = float(np.log(2 * np.pi))
+KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": kernel.UNIFORM}
 T_DOF = 4.0
 OUTLIER_SHAPE = 1.0
 OUTLIER_MODE = 5.0
@@ -108,40 +110,6 @@ class OutlierMixture:
 
 
 @dataclass(frozen=True)
-class StarTerms:
-    """First and second derivatives of each star's log-likelihood, by residuals and hyperparameters.
-
-    Hyperparameters stand in the order of `OutlierMixture.hyper`, in sampled coordinates.
-
-    Parameters
-    ----------
-    loglik : ndarray, shape (n,)
-    outlier : ndarray, shape (n,)
-        Probability that the star is an outlier.
-    pull : ndarray, shape (n, 2)
-        Minus the gradient by the residual: what a weighted residual is in least squares.
-    weight : ndarray, shape (n, 3)
-        Minus the Hessian by the residual (uu, uv, vv).
-    safe_weight : ndarray, shape (n, 3)
-        The same without the term of wavering membership: never negative (the EM weight).
-    gradient : ndarray, shape (n, h)
-    cross : ndarray, shape (n, h, 2)
-        Mixed derivative by hyperparameter and residual.
-    curvature : ndarray, shape (h, h)
-        Minus the Hessian by the hyperparameters, summed over stars.
-    """
-
-    loglik: Float
-    outlier: Float
-    pull: Float
-    weight: Float
-    safe_weight: Float
-    gradient: Float
-    cross: Float
-    curvature: Float
-
-
-@dataclass(frozen=True)
 class Hyper:
     """An `OutlierMixture` with the scale of the data: likelihood terms and priors.
 
@@ -174,97 +142,23 @@ class Hyper:
         pick = {"j": np.log, "f": logit, "s_out": np.log}
         return np.array([pick[k](values[k]) for k in self.mixture.hyper], float)
 
-    def constants(self, h: Float) -> tuple[Float, Float, Float, Float]:
-        """j^2, log f, log(1 - f) and log p_out's constant part's variance, each of shape (...).
-
-        The last one is s_out^2 for Gaussian outliers and the area of the circle for uniform ones.
-        """
-        lead = h.shape[:-1]
+    def constants(self, h: Float) -> Constants:
+        """What the likelihood needs of points (n, n_hyper)."""
+        n = len(h)
         fixed = self.mixture.jitter
-        j2 = np.full(lead, 0.0 if fixed is None else fixed**2)
-        lf, l1f, out = np.full(lead, -np.inf), np.zeros(lead), np.ones(lead)
+        j2 = np.full(n, 0.0 if fixed is None else fixed**2)
+        log_f, log_1_f, out = np.full(n, -np.inf), np.zeros(n), np.ones(n)
         if self.mixture.model == "uniform":
             assert self.mixture.match_radius is not None
-            out = np.full(lead, np.pi * self.mixture.match_radius**2)
+            out = np.full(n, np.pi * self.mixture.match_radius**2)
         for k, name in enumerate(self.mixture.hyper):
             if name == "j":
-                j2 = np.exp(2 * h[..., k])
+                j2 = np.exp(2 * h[:, k])
             elif name == "f":
-                lf, l1f = log_expit(h[..., k]), log_expit(-h[..., k])
+                log_f, log_1_f = log_expit(h[:, k]), log_expit(-h[:, k])
             else:
-                out = np.exp(2 * h[..., k])
-        return j2, lf, l1f, out
-
-    # -- likelihood -------------------------------------------------------------------------------
-
-    def terms(self, h: Float, residual: Float, var_u: Float, var_v: Float) -> StarTerms:
-        """Derivatives of the log-likelihood of each star.
-
-        Parameters
-        ----------
-        h : ndarray, shape (n_hyper,)
-        residual : ndarray, shape (n, 2)
-        var_u, var_v : ndarray, shape (n,)
-            Squared quoted errors.
-
-        Returns
-        -------
-        StarTerms
-        """
-        j2, lf, l1f, out = (float(c) for c in self.constants(h))
-        ru, rv = residual[:, 0], residual[:, 1]
-        au, av = var_u + j2, var_v + j2
-        log_in = l1f - 0.5 * (ru**2 / au + rv**2 / av + np.log(au * av)) - LOG_2PI
-        gaussian = self.mixture.model == "gaussian"
-        if self.mixture.model == "none":
-            p = np.zeros(len(ru))
-            loglik = log_in
-        else:
-            r2 = ru**2 + rv**2
-            log_out = lf - np.log(out) - (0.5 * r2 / out + LOG_2PI if gaussian else 0.0)
-            log_out = np.broadcast_to(log_out, log_in.shape)
-            p = expit(log_out - log_in)
-            loglik = np.logaddexp(log_in, log_out)
-        q = 1.0 - p
-        wout = 1.0 / out if gaussian else 0.0
-
-        # gradients of the two branches by (ru, rv, hyper...), and their expected Hessians
-        names = self.mixture.hyper
-        n, h_ = len(ru), len(names)
-        A, B = np.zeros((n, 2 + h_)), np.zeros((n, 2 + h_))
-        A[:, 0], A[:, 1] = -ru / au, -rv / av
-        B[:, 0], B[:, 1] = -ru * wout, -rv * wout
-        cross = np.zeros((n, h_, 2))
-        # diagonal of the branches' own Hessian, averaged over membership
-        second = np.zeros((n, h_))
-        for k, name in enumerate(names):
-            if name == "j":
-                eu, ev = ru**2 / au, rv**2 / av
-                A[:, 2 + k] = j2 * ((eu - 1) / au + (ev - 1) / av)
-                second[:, k] = q * (
-                    2 * A[:, 2 + k] + 2 * j2**2 * ((1 - 2 * eu) / au**2 + (1 - 2 * ev) / av**2)
-                )
-                cross[:, k, 0] = q * 2 * j2 * ru / au**2
-                cross[:, k, 1] = q * 2 * j2 * rv / av**2
-            elif name == "f":
-                f = np.exp(lf)
-                A[:, 2 + k], B[:, 2 + k] = -f, 1.0 - f
-                second[:, k] = -f * (1.0 - f)
-            else:
-                e = (ru**2 + rv**2) / out
-                B[:, 2 + k] = e - 2.0
-                second[:, k] = p * -2.0 * e
-                cross[:, k, 0] = p * 2.0 * ru / out
-                cross[:, k, 1] = p * 2.0 * rv / out
-        gradient = q[:, None] * A + p[:, None] * B
-        D = (A - B) * np.sqrt(p * q)[:, None]
-        safe = np.stack([q / au + p * wout, np.zeros(n), q / av + p * wout], axis=1)
-        weight = safe - np.stack([D[:, 0] ** 2, D[:, 0] * D[:, 1], D[:, 1] ** 2], axis=1)
-        cross += D[:, 2:, None] * D[:, None, :2]
-        curvature = -(np.diag(second.sum(axis=0)) + D[:, 2:].T @ D[:, 2:])
-        return StarTerms(
-            loglik, p, -gradient[:, :2], weight, safe, gradient[:, 2:], cross, curvature
-        )
+                out = np.exp(2 * h[:, k])
+        return Constants(j2, log_f, log_1_f, out, KINDS[self.mixture.model], self.scale**2)
 
     # -- priors -----------------------------------------------------------------------------------
 

@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer import kernel
 from bayesdist.infer.arrow import Arrow
+from bayesdist.infer.kernel import Constants
 from bayesdist.infer.stars import Stars
-from bayesdist.model import DistortionModel, Groups
+from bayesdist.model import DistortionModel, Groups, merge_groups
 
-__all__ = ["NormalEquations", "accumulate"]
+__all__ = ["NormalEquations", "least_squares", "mixture"]
 
 Float = NDArray[np.float64]
 
@@ -36,10 +38,10 @@ class NormalEquations:
         Effective coefficients at which r is taken.
     chi2 : float
         sum of r^T W r.
-    n_rows : int
-        Rows with weight.
     cross : ndarray, shape (G, h, 2, K)
-        Mixed second derivatives with h further parameters; h = 0 in least squares.
+        Mixed second derivatives with h further parameters.
+    scalars : ndarray
+        Further sums over the stars, which the pass that made the equations names.
     groups : Groups
     """
 
@@ -47,22 +49,44 @@ class NormalEquations:
     right: Float
     about: Float
     chi2: float
-    n_rows: int
     cross: Float
+    scalars: Float
     groups: Groups
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
-        """Sum over both pieces of data; the pieces share their groups and `about`."""
-        if not (np.array_equal(self.about, other.about) and self.groups.same(other.groups)):
-            raise ValueError("normal equations of other groups or coefficients do not add")
+        """Sum over both pieces of data, which may hold other groups.
+
+        Raises
+        ------
+        ValueError
+            When residuals of one group were taken at different coefficients.
+        """
+        if self.groups.same(other.groups):
+            here = np.arange(len(self.groups))
+            groups, of_self, of_other = self.groups, here, here
+        else:
+            groups, of_self, of_other = merge_groups(self.groups, other.groups)
+        pair = ((self, of_self), (other, of_other))
+
+        def total(name: str) -> Float:
+            out = np.zeros((len(groups), *getattr(self, name).shape[1:]))
+            for part, index in pair:
+                out[index] += getattr(part, name)
+            return out
+
+        about = np.empty((len(groups), *self.about.shape[1:]))
+        for part, index in pair:
+            about[index] = part.about
+        if not all(np.array_equal(about[index], part.about) for part, index in pair):
+            raise ValueError("normal equations about different coefficients do not add")
         return NormalEquations(
-            self.weight + other.weight,
-            self.right + other.right,
-            self.about,
+            total("weight"),
+            total("right"),
+            about,
             self.chi2 + other.chi2,
-            self.n_rows + other.n_rows,
-            self.cross + other.cross,
-            self.groups,
+            total("cross"),
+            self.scalars + other.scalars,
+            groups,
         )
 
     def moved(self, about: Float) -> NormalEquations:
@@ -72,13 +96,17 @@ class NormalEquations:
         chi2 = self.chi2 - 2 * float((self.right * step).sum()) + float((pull * step).sum())
         return replace(self, right=self.right - pull, about=about, chi2=chi2)
 
+    def with_cross(self, which: list[int]) -> NormalEquations:
+        """With some of the further parameters only."""
+        return replace(self, cross=self.cross[:, which])
+
     def _apply(self, E: Float) -> Float:
         uu, uv, vv = self.weight[:, 0], self.weight[:, 1], self.weight[:, 2]
         u = np.einsum("gkl,gl->gk", uu, E[:, 0]) + np.einsum("gkl,gl->gk", uv, E[:, 1])
         v = np.einsum("gkl,gl->gk", uv, E[:, 0]) + np.einsum("gkl,gl->gk", vv, E[:, 1])
         return np.stack([u, v], axis=1)
 
-    def assemble(self, model: DistortionModel, theta: Float, groups: Groups) -> tuple[Arrow, Float]:
+    def assemble(self, model: DistortionModel, theta: Float) -> tuple[Arrow, Float]:
         """Normal matrix and right-hand side in the model's parameters.
 
         Parameters
@@ -86,7 +114,6 @@ class NormalEquations:
         model : DistortionModel
         theta : ndarray, shape (n_params,)
             Where the frames are linearised; `about` are its effective coefficients.
-        groups : Groups
 
         Returns
         -------
@@ -101,7 +128,7 @@ class NormalEquations:
         blocks = np.zeros((n_blocks, q, q))
         right = np.zeros(model.n_params)
         tail = slice(G, G + h)
-        for g, (columns, d) in enumerate(model.effective_jacobian(theta, groups)):
+        for g, (columns, d) in enumerate(model.effective_jacobian(theta, self.groups)):
             uu, uv, vv = self.weight[g]
             wd_u = uu @ d[0] + uv @ d[1]
             wd_v = uv @ d[0] + vv @ d[1]
@@ -121,52 +148,72 @@ class NormalEquations:
         return Arrow(border, edge, blocks, n_tail=h), right
 
 
-def accumulate(
+def least_squares(
     stars: Stars,
-    about: Float,
-    weights: Float,
-    gradient: Float | None = None,
-    cross: Float | None = None,
+    about: Float | None,
+    test: Float | None = None,
+    chi2_limit: float = np.inf,
+    abs_limit: float = np.inf,
+    corner: float = 1.0,
+    power: int = 1,
 ) -> NormalEquations:
-    """One pass over the stars.
+    """Normal equations of weighted least squares with rejection: one pass over the stars.
 
     Parameters
     ----------
     stars : Stars
-    about : ndarray, shape (G, 2, K)
-        Effective coefficients.
-    weights : ndarray, shape (N, 2) or (N, 3)
-        Weights of u and v; with three columns uu, uv, vv.
-    gradient : ndarray, shape (N, 2), optional
-        W r of each star, where it is not the weight times the residual at `about`.
-    cross : ndarray, shape (N, h, 2), optional
+    about : ndarray, shape (n_params,), or None
+        Where residuals are taken; None takes the data themselves.
+    test : ndarray, shape (n_params,), or None
+        Where the residuals are taken that decide on rejection.
+    chi2_limit, abs_limit, corner, power
+        See `kernel.least_squares_moments`, which also names the `scalars`.
 
     Returns
     -------
     NormalEquations
     """
-    G, K = len(stars.groups), stars.model.n_terms
-    h = 0 if cross is None else cross.shape[1]
-    weight, right = np.zeros((G, 3, K, K)), np.zeros((G, 2, K))
-    mixed, chi2 = np.zeros((G, h, 2, K)), 0.0
-    full = weights.shape[1] == 3
-    for g, rows, phi in stars.chunks():
-        w = weights[rows]
-        wu, wv = w[:, 0], w[:, -1]
-        if gradient is None:
-            ru = stars.u[rows] - phi @ about[g, 0]
-            rv = stars.v[rows] - phi @ about[g, 1]
-            wr = np.stack([wu * ru, wv * rv], axis=1)
-            chi2 += float(wr[:, 0] @ ru + wr[:, 1] @ rv)
-        else:
-            wr = gradient[rows]
-        right[g] += wr.T @ phi
-        weight[g, 0] += phi.T @ (wu[:, None] * phi)
-        if full:
-            weight[g, 1] += phi.T @ (w[:, 1, None] * phi)
-        weight[g, 2] += phi.T @ (wv[:, None] * phi)
-        if cross is not None:
-            mixed[g] += (cross[rows].reshape(len(phi), 2 * h).T @ phi).reshape(h, 2, K)
+    moments = kernel.least_squares_moments(
+        stars.pieces,
+        stars.columns,
+        stars.powers(about),
+        stars.powers(test),
+        stars.model.order,
+        chi2_limit=chi2_limit,
+        abs_limit=abs_limit,
+        corner=corner,
+        power=power,
+    )
+    if about is None:
+        E = np.zeros((len(stars.groups), 2, stars.model.n_terms))
+    else:
+        E = stars.model.effective(about, stars.groups)
+    chi2, no_cross = float(moments.scalars[6]), moments.cross[:, :0]
     return NormalEquations(
-        weight, right, about.copy(), chi2, int((weights[:, 0] > 0).sum()), mixed, stars.groups
+        moments.weight, moments.right, E, chi2, no_cross, moments.scalars, stars.groups
+    )
+
+
+def mixture(stars: Stars, theta: Float, constants: Constants, em: bool = False) -> NormalEquations:
+    """Gradient and Hessian of the mixture's log-likelihood: one pass over the stars.
+
+    Parameters
+    ----------
+    stars : Stars
+    theta : ndarray, shape (n_params,)
+    constants : Constants
+    em : bool
+        See `kernel.mixture_moments`, which also names the `scalars`.
+
+    Returns
+    -------
+    NormalEquations
+        `right` is the gradient by the effective coefficients.
+    """
+    moments = kernel.mixture_moments(
+        stars.pieces, stars.columns, stars.powers(theta), stars.model.order, constants, em=em
+    )
+    E = stars.model.effective(theta, stars.groups)
+    return NormalEquations(
+        moments.weight, moments.right, E, 0.0, moments.cross, moments.scalars, stars.groups
     )

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.certificate import Certificate
 from bayesdist.infer.labelled.convergence import Convergence
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
@@ -35,6 +36,8 @@ class SamplerInfo:
     wall_s : float
         Seconds of this session.
     seed : int
+    exact : bool
+        False where draws are those of a surrogate.
     """
 
     method: str
@@ -46,6 +49,7 @@ class SamplerInfo:
     acceptance: float
     wall_s: float
     seed: int
+    exact: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +67,16 @@ class Posterior:
         Of 'f', 'j', 's_out' those that were sampled, in natural form.
     log_prob : ndarray, shape (chains, draws)
         Log posterior density, up to a constant.
-    outlier_probability : ndarray, shape (N,)
-        Of each row of the table.
+    n_stars, n_flagged : int
+        All stars, and those that are more likely false matches than not.
+    n_false : float
+        Expected number of false matches: the sum of the probabilities.
+    reference_sigma : float
+        Median quoted error, in which the priors of the mixture are scaled.
     convergence : Convergence
     sampler : SamplerInfo
+    certificate : Certificate, optional
+        Of the surrogate, where one was made.
     """
 
     model: DistortionModel
@@ -74,9 +84,20 @@ class Posterior:
     theta: Float
     hyper: dict[str, Float]
     log_prob: Float
-    outlier_probability: Float
+    n_stars: int
+    n_flagged: int
+    n_false: float
+    reference_sigma: float
     convergence: Convergence
     sampler: SamplerInfo
+    certificate: Certificate | None = None
+
+    @property
+    def approximation(self) -> str:
+        """What every output has to say of draws that are not exact; empty where they are."""
+        if self.sampler.exact or self.certificate is None:
+            return ""
+        return self.certificate.statement
 
     @cached_property
     def flat(self) -> Float:

@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicSpline
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.arrow import Arrow
@@ -22,6 +23,7 @@ from bayesdist.infer.coordinates import from_cube_root, inside, to_cube_root
 from bayesdist.infer.laplace import (
     Conditional,
     conditional_mode,
+    expected_mode,
     split_hyper,
     starting_point,
     to_psi,
@@ -29,13 +31,28 @@ from bayesdist.infer.laplace import (
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.target import Target
 
-__all__ = ["GridProposal", "build_proposal"]
+__all__ = ["GridProposal", "Proposal", "Random", "build_proposal"]
 
 Float = NDArray[np.float64]
+Random = np.random.Generator | np.random.RandomState
 
 N_NODES = 25
 DROP = 18.0  # how far (in log density) the grid reaches below the top: beyond lies 1e-8
-MESH = 801
+MESH = 4001
+
+
+class Proposal(Protocol):
+    """A density near the posterior, to be drawn from and evaluated."""
+
+    @property
+    def best(self) -> Conditional:
+        """The Laplace approximation at the most probable jitter."""
+
+    def draw(self, n: int, rng: Random) -> Float:
+        """Points (n, D) in sampled coordinates; NaN where a draw falls outside the support."""
+
+    def log_density(self, psi: Float) -> Float:
+        """Log density (n,) of points (n, D), up to a constant."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,21 +90,29 @@ class GridProposal:
     def _marginal(self) -> _PiecewiseExponential:
         values = np.array([node.log_marginal for node in self.nodes])
         mesh = np.linspace(self._grid[0], self._grid[-1], MESH)
-        smooth = PchipInterpolator(self._grid, values)(mesh)
+        smooth = CubicSpline(self._grid, values)(mesh)
         right = min(smooth[-1] - smooth[-2], -1e-3) / (mesh[1] - mesh[0])
         # at small j the likelihood forgets j: density of log j ~ p(j) j ~ exp(log j)
         return _PiecewiseExponential(mesh, smooth, left_slope=1.0, right_slope=right)
 
-    def _centres(self, log_j: Float) -> tuple[Float, NDArray[np.int64]]:
-        """Conditional mean (n, D') by linear interpolation, and the nearest node (n,)."""
-        nearest = np.searchsorted(self._middles, log_j)
-        t = np.clip(log_j, self._grid[0], self._grid[-1])
-        k = np.clip(np.searchsorted(self._grid, t) - 1, 0, max(len(self.nodes) - 2, 0))
-        a, b = self._grid[k], self._grid[k + 1]
-        w = ((t - a) / (b - a))[:, None]
-        return (1 - w) * self._modes[k] + w * self._modes[k + 1], nearest
+    @cached_property
+    def _between(self) -> CubicSpline:
+        """Conditional mean and logarithm of the standard deviations, (2, D') at each log j."""
+        log_sd = np.array([0.5 * np.log(node.factor.variances()) for node in self.nodes])
+        return CubicSpline(self._grid, np.stack([self._modes, log_sd], axis=1))
 
-    def draw(self, n: int, rng: np.random.Generator | np.random.RandomState) -> Float:
+    def _at(self, log_j: Float) -> tuple[Float, Float, NDArray[np.int64]]:
+        """Conditional mean (n, D'), and the nearest node (n,) with the factors (n, D').
+
+        By these its standard deviations are to be multiplied: correlations hardly change from node
+        to node.
+        """
+        nearest = np.searchsorted(self._middles, log_j)
+        here = self._between(np.clip(log_j, self._grid[0], self._grid[-1]))
+        there = self._between(self._grid)[nearest]
+        return here[:, 0], here[:, 1] - there[:, 1], nearest
+
+    def draw(self, n: int, rng: Random) -> Float:
         """Points (n, D) in sampled coordinates; NaN where a draw falls outside the support."""
         z = rng.standard_normal(size=(n, len(self.nodes[0].mode)))
         if len(self.nodes) == 1:
@@ -95,10 +120,10 @@ class GridProposal:
             y = self.nodes[0].mode + self.nodes[0].factor.colour(z)
         else:
             log_j = self._marginal.quantile(rng.uniform(size=n))
-            y, nearest = self._centres(log_j)
+            y, log_scale, nearest = self._at(log_j)
             for k in np.unique(nearest):
                 rows = nearest == k
-                y[rows] += self.nodes[k].factor.colour(z[rows])
+                y[rows] += np.exp(log_scale[rows]) * self.nodes[k].factor.colour(z[rows])
         _, rest = split_hyper(self.target)
         ok = inside(rest, y[:, self.target.n_theta :])
         out = np.full((n, self.target.n_theta + len(self.target.mixture.hyper)), np.nan)
@@ -116,10 +141,12 @@ class GridProposal:
             out -= np.log(np.abs(from_cube_root(rest, z_rest)[1])).sum(axis=1)
         if has_j:
             out += self._marginal.log_density(psi[:, n])
-            centre, nearest = self._centres(psi[:, n])
+            centre, log_scale, nearest = self._at(psi[:, n])
+            shift = (y - centre) * np.exp(-log_scale)
+            out -= log_scale.sum(axis=1)
         else:
-            centre, nearest = self.nodes[0].mode, np.zeros(len(psi), np.int64)
-        shift = y - centre
+            nearest = np.zeros(len(psi), np.int64)
+            shift = y - self.nodes[0].mode
         for k in np.unique(nearest):
             rows = nearest == k
             factor = self.nodes[k].factor
@@ -180,6 +207,7 @@ def build_proposal(target: Target, fit: LinearFit) -> GridProposal:
     first = conditional_mode(target, y, log_j)
     if log_j is None:
         return GridProposal(target, (first,))
+    first, log_j = _climb(target, first, log_j)
     nodes = {log_j: first}
     _walk(target, nodes, direction=1.0)
     _walk(target, nodes, direction=-1.0)
@@ -189,14 +217,30 @@ def build_proposal(target: Target, fit: LinearFit) -> GridProposal:
     return GridProposal(target, tuple(nodes[k] for k in sorted(nodes)))
 
 
+def _climb(target: Target, node: Conditional, log_j: float) -> tuple[Conditional, float]:
+    """Up along the modes to where log j is about most probable."""
+    for _ in range(30):
+        # where the curvature is not that of a peak, steps of a size that leaves the plateau
+        curvature = max(node.curvature, abs(node.slope), 1e-3)
+        step = float(np.clip(node.slope / curvature, -1.0, 1.0))
+        if step**2 * curvature < 0.1:
+            break
+        start, log_j = expected_mode(target, node, step), log_j + step
+        node = conditional_mode(target, start, log_j, tolerance=1e-4)
+    return node, log_j
+
+
 def _walk(target: Target, nodes: dict[float, Conditional], direction: float) -> None:
     """Step along log j until the marginal has dropped, or is the pure tail of the prior."""
-    step = 0.3
+    edge = max(nodes) if direction > 0 else min(nodes)
+    step = 1.0 / np.sqrt(np.clip(nodes[edge].curvature, 1.0, 1e12))
     for _ in range(200):
         edge = max(nodes) if direction > 0 else min(nodes)
         here = nodes[edge]
-        there = conditional_mode(target, here.mode, edge + direction * step, tolerance=1e-4)
-        nodes[edge + direction * step] = there
+        stride = direction * step
+        start = expected_mode(target, here, stride)
+        there = conditional_mode(target, start, edge + stride, tolerance=1e-4)
+        nodes[edge + stride] = there
         top = max(node.log_marginal for node in nodes.values())
         change = there.log_marginal - here.log_marginal
         if there.log_marginal < top - DROP:
@@ -205,7 +249,9 @@ def _walk(target: Target, nodes: dict[float, Conditional], direction: float) -> 
         if forgotten and np.exp(edge) < 0.3 * target.hyper.scale:
             return
         # steps that change the density by about 2: neither creeping nor leaping
-        step = float(np.clip(step * (2.0 / max(abs(change), 0.25)) ** 0.7, 0.02, 1.0))
+        step = float(
+            np.clip(step * np.clip((2.0 / max(abs(change), 0.25)) ** 0.7, 0.2, 4.0), 1e-7, 1.0)
+        )
     raise DegenerateError(
         "the posterior of the jitter has no end",
         where="outliers",
@@ -230,7 +276,9 @@ def _refine(target: Target, nodes: dict[float, Conditional]) -> None:
     width = np.diff(grid)
     k = int(np.argmax(width**2 * np.maximum(density[1:], density[:-1]) + 1e-3 * width))
     middle = float((grid[k] + grid[k + 1]) / 2)
-    start = (nodes[grid[k]].mode + nodes[grid[k + 1]].mode) / 2
+    low, high = nodes[grid[k]], nodes[grid[k + 1]]
+    ends = expected_mode(target, low, width[k] / 4), expected_mode(target, high, -width[k] / 4)
+    start = (ends[0] + ends[1]) / 2  # cubic Hermite
     nodes[middle] = conditional_mode(target, start, middle, tolerance=1e-4)
 
 
@@ -241,7 +289,7 @@ class _PiecewiseExponential:
         self.mesh = mesh
         self.slopes = np.concatenate([[left_slope], np.diff(values) / np.diff(mesh), [right_slope]])
         top = values.max()
-        heights = np.exp(values - top)
+        heights = np.maximum(np.exp(values - top), 1e-300)
         width = np.diff(mesh)
         rise = self.slopes[1:-1] * width
         flat = np.abs(rise) < 1e-9

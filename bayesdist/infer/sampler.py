@@ -1,4 +1,4 @@
-"""Exact sampling: four independent emcee ensembles in whitened coordinates.
+"""Exact sampling: independent emcee ensembles, in psi or in whitened coordinates.
 
 Three moves, all built on `emcee.moves.MHMove` or taken from emcee:
 
@@ -6,134 +6,99 @@ Three moves, all built on `emcee.moves.MHMove` or taken from emcee:
 - preconditioned Crank-Nicolson: q = sqrt(1 - b^2) x + b xi, corrected for its reference measure;
 - differential evolution (`emcee.moves.DEMove`), which needs no good proposal.
 
+Independence alone needs no walker to know what is proposed to it.  Then all proposals of a block
+are evaluated in one sweep over the data and numbered; emcee walks over the numbers, and what it
+asks of a number -- its log density, the ratio of proposal densities -- is looked up.
+
 `emcee.moves.DESnookerMove` is never used: in emcee 3.1.6 its acceptance factor is wrong.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import emcee
-import h5py
 import numpy as np
 from emcee.moves import DEMove, MHMove
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
-from bayesdist.infer.arrow import ArrowFactor
-from bayesdist.infer.proposal import GridProposal
+from bayesdist.infer.blocks import Block, Walkers, block_path, read_block, write_block
+from bayesdist.infer.lookahead import Page, draw_page
+from bayesdist.infer.plan import FIRST_CHECK, Plan, Stretch
+from bayesdist.infer.proposal import Proposal
 from bayesdist.infer.target import Target
+from bayesdist.infer.whitening import Whitening
 
-__all__ = ["Block", "Ensembles", "Plan", "Whitening", "boundaries", "plan_moves"]
+__all__ = ["FIRST_CHECK", "Ensembles", "Plan", "Whitening"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
-START_DRAWS = 4  # proposals for each walker's start: some fall outside the support
-FIRST_CHECK = 50  # steps after which convergence is first judged
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How to sample, chosen from the quality of the proposal before the first step.
-
-    Parameters
-    ----------
-    method : str
-        What the report calls it.
-    weights : tuple of float
-        Shares of independence, Crank-Nicolson and differential evolution.
-    walkers : int
-        Walkers of one ensemble.
-    warmup : int
-        Steps that are dropped at least; of moves that go slowly, the first half is dropped.
-    step : float
-        b of the Crank-Nicolson move.
-    thin : int
-        Every so many steps are kept: moves that go slowly would only fill the memory.
-    """
-
-    method: str
-    weights: tuple[float, float, float]
-    walkers: int
-    warmup: int
-    step: float
-    thin: int = 1
+START_PAGES = 20  # further pages of proposals in which walkers look for a start
 
 
-def plan_moves(efficiency: float, k: float, n_params: int, walkers: int | None = None) -> Plan:
-    """Choose the moves from the importance efficiency and the Pareto k of the proposal.
+class _Replay:
+    """Proposals by number: first where the walkers stand, then those of each step in turn."""
 
-    Acceptance plays no part: it looks fine on proposals that miss a tail.
+    def __init__(self, start: Walkers, page: Page, ensemble: int) -> None:
+        log_prob, log_q = page.log_prob[ensemble], page.log_q[ensemble]
+        outside = np.isnan(log_prob)
+        self.psi = np.concatenate([start.coords, page.psi[ensemble]])
+        self.log_prob = np.concatenate([start.log_prob, np.where(outside, -np.inf, log_prob)])
+        self.log_q = np.concatenate([start.log_q, np.where(outside, 0.0, log_q)])
+        self.used = len(start.coords)
+
+    def propose(self, numbers: Float, random: np.random.RandomState) -> tuple[Float, Float]:
+        """The next proposals, and the log ratio of the densities with which they are proposed."""
+        old = self._index(numbers)
+        new = np.arange(self.used, self.used + len(old))
+        self.used += len(old)
+        return new[:, None].astype(float), self.log_q[old] - self.log_q[new]
+
+    def log_density(self, numbers: Float) -> Float:
+        """Log posterior density of proposals."""
+        return self.log_prob[self._index(numbers)]
+
+    @staticmethod
+    def _index(numbers: Float) -> Int:
+        return numbers[:, 0].astype(np.int64)
+
+
+def replay(start: Walkers, page: Page, ensemble: int) -> Block:
+    """Metropolis-Hastings over proposals that have been evaluated.
 
     Parameters
     ----------
-    efficiency, k : float
-    n_params : int
-    walkers : int, optional
-        Overrides the number of walkers.
+    start : Walkers
+    page : Page
+        Proposals (ensembles, steps * walkers, D), step after step.
+    ensemble : int
 
     Returns
     -------
-    Plan
+    Block
     """
-    step = min(0.5, 2.0 / np.sqrt(n_params))
-    if efficiency > 0.5 and k < 0.7:
-        return Plan("independence", (0.95, 0.05, 0.0), walkers or 16, 10, step)
-    if efficiency > 0.05 and k < 0.7:
-        return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, 100, step, 5)
-    # emcee's red-blue moves want two walkers for each parameter
-    least = 2 * (n_params + 1)
-    return Plan("DE + pCN + independence", (0.2, 0.3, 0.5), max(walkers or 0, least), 500, step, 10)
+    known, W = _Replay(start, page, ensemble), len(start.coords)
+    sampler = emcee.EnsembleSampler(
+        W, 1, known.log_density, moves=MHMove(known.propose), vectorize=True
+    )
+    state = emcee.State(np.arange(W, dtype=float)[:, None], log_prob=start.log_prob.copy())
+    state.random_state = start.random
+    steps = page.psi.shape[1] // W
+    sampler.run_mcmc(state, steps, skip_initial_state_check=True)
+    index = sampler.get_chain()[..., 0].astype(np.int64)
+    log_q = known.log_q[index[-1]]
+    log_prob = known.log_prob[index]
+    end = Walkers(known.psi[index[-1]], log_prob[-1], log_q, sampler.random_state)
+    accepted = sampler.backend.accepted.astype(float)
+    return Block(known.psi[index], log_prob, accepted, page.log_weights[ensemble].copy(), end)
 
 
-@dataclass(frozen=True, eq=False)
-class Whitening:
-    """Coordinates in which the posterior is close to a standard Gaussian.
-
-    Parameters
-    ----------
-    centre : ndarray, shape (D,)
-    factor : ArrowFactor
-        Of the curvature of the distortion parameters.
-    scale : ndarray, shape (h,)
-        Standard deviations of the hyperparameters.
-    """
-
-    centre: Float
-    factor: ArrowFactor
-    scale: Float
-
-    @classmethod
-    def of(cls, target: Target, proposal: GridProposal, draws: Float) -> Whitening:
-        """From the proposal's best node and hyperparameters of some draws (n, D)."""
-        n = target.n_theta
-        factor = proposal.best.factor.matrix.without_tail().factor()
-        hyper = draws[:, n:]
-        centre = np.concatenate([proposal.best.mode[:n], np.nanmean(hyper, axis=0)])
-        return cls(centre, factor, np.nanstd(hyper, axis=0))
-
-    @property
-    def n_theta(self) -> int:
-        """Number of distortion parameters."""
-        return self.factor.matrix.size
-
-    def to_psi(self, w: Float) -> Float:
-        """Sampled coordinates (n, D) from whitened ones."""
-        n = self.n_theta
-        parts = [self.factor.colour(w[:, :n]), w[:, n:] * self.scale]
-        return self.centre + np.concatenate(parts, axis=1)
-
-    def to_white(self, psi: Float) -> Float:
-        """Whitened coordinates (n, D) from sampled ones."""
-        n, shift = self.n_theta, psi - self.centre
-        return np.concatenate([self.factor.whiten(shift[:, :n]), shift[:, n:] / self.scale], axis=1)
-
-
-def _independence(proposal: GridProposal, whitening: Whitening) -> MHMove:
+def _independence(proposal: Proposal, whitening: Whitening) -> MHMove:
     def propose(coords: Float, random: np.random.RandomState) -> tuple[Float, Float]:
         psi = proposal.draw(len(coords), random)
         lost = ~np.all(np.isfinite(psi), axis=1)  # outside the support: target density zero
@@ -158,38 +123,6 @@ def _crank_nicolson(step: float) -> MHMove:
     return MHMove(propose)
 
 
-def boundaries(every: int, max_steps: int, thin: int = 1) -> Iterator[int]:
-    """Steps at which blocks end: 50, 100, 200, ... then every `every` steps up to `max_steps`.
-
-    All are multiples of `thin`, so that every row that is kept stands for as many steps.
-    """
-    last, end = max_steps - max_steps % thin, 0
-    while end < last:
-        step = min(max(end, FIRST_CHECK), every)
-        end = min(end + step + -step % thin, last)
-        yield end
-
-
-@dataclass(frozen=True, eq=False)
-class Block:
-    """Some steps of one ensemble.
-
-    Parameters
-    ----------
-    psi : ndarray, shape (steps kept, walkers, D)
-    log_prob : ndarray, shape (steps kept, walkers)
-    accepted : ndarray, shape (walkers,)
-        Number of accepted moves of each walker among the steps kept.
-    state : emcee.State
-        After the last step, with the state of the random numbers.
-    """
-
-    psi: Float
-    log_prob: Float
-    accepted: Float
-    state: emcee.State
-
-
 @dataclass(frozen=True, eq=False)
 class Ensembles:
     """Independent ensembles that advance block by block and leave a file for each block.
@@ -197,8 +130,11 @@ class Ensembles:
     Parameters
     ----------
     target : Target
-    proposal : GridProposal
+    proposal : Proposal
+    pilot : Page
+        The first proposals of each ensemble.
     whitening : Whitening
+        Coordinates of moves that depend on the state.
     plan : Plan
     seeds : tuple of int
         One for each ensemble.
@@ -209,12 +145,98 @@ class Ensembles:
     """
 
     target: Target
-    proposal: GridProposal
+    proposal: Proposal
+    pilot: Page
     whitening: Whitening
     plan: Plan
     seeds: tuple[int, ...]
     folder: Path | None = None
     fingerprint: str = ""
+
+    # -- where the walkers start ------------------------------------------------------------------
+
+    def starts(self) -> tuple[list[Walkers], NDArray[np.bool_], int]:
+        """First states of the ensembles, from the pilot.
+
+        Where the pilot is too short for so many walkers, further proposals are evaluated.
+
+        Returns
+        -------
+        states : list of Walkers
+        taken : ndarray of bool, shape (ensembles, n)
+            Which pilot proposals they took.
+        n_further : int
+            Further proposals that were evaluated.
+        """
+        pages, W = [self.pilot], self.plan.walkers
+        while (fewest := min(len(_usable(pages, e)) for e in range(len(self.seeds)))) < W:
+            if len(pages) > START_PAGES:
+                raise InputError("the proposal has no mass inside the support", where="sampler")
+            key = (0, len(pages))
+            pages.append(draw_page(self.target, self.proposal, self.seeds, key, W - fewest))
+        n = self.pilot.psi.shape[1]
+        states, taken = [], np.zeros((len(self.seeds), n), bool)
+        for e, seed in enumerate(self.seeds):
+            rows = _usable(pages, e)[:W]
+            psi, log_prob, log_q = (
+                np.concatenate([getattr(p, name)[e] for p in pages])[rows]
+                for name in ("psi", "log_prob", "log_q")
+            )
+            random = tuple(np.random.RandomState(seed).get_state(legacy=True))
+            coords = psi if self.plan.independent else self.whitening.to_white(psi)
+            taken[e, rows[rows < n]] = True
+            states.append(Walkers(coords, log_prob, log_q, random))
+        return states, taken, sum(page.n_evaluated for page in pages[1:])
+
+    # -- steps ------------------------------------------------------------------------------------
+
+    def advance(self, states: Sequence[Walkers], stretch: Stretch, rest: Page) -> list[Block]:
+        """One block of every ensemble, read from its file or run.
+
+        Parameters
+        ----------
+        states : sequence of Walkers
+            At step `stretch.begin`.
+        stretch : Stretch
+        rest : Page
+            Pilot proposals that were not taken as starts, for the first steps.
+
+        Returns
+        -------
+        list of Block
+        """
+        paths: list[Path | None] = [None] * len(self.seeds)
+        if self.folder is not None:
+            paths = [block_path(self.folder, e, stretch.end) for e in range(len(self.seeds))]
+        mark = f"{self.fingerprint} {self.plan.method} {stretch.begin}"
+        known = [read_block(p, mark) if p is not None and p.exists() else None for p in paths]
+        # always for all ensembles, so that the very same numbers come out when some are known
+        page = None
+        if self.plan.independent and any(block is None for block in known):
+            page = self._page(stretch, rest)
+        out = []
+        for e, (block, path) in enumerate(zip(known, paths, strict=True)):
+            if block is None:
+                steps = stretch.end - stretch.begin
+                block = self._walk(states[e], steps) if page is None else replay(states[e], page, e)
+                if path is not None:
+                    write_block(path, mark, block)
+            out.append(block)
+        return out
+
+    def psi(self, block: Block) -> Float:
+        """Sampled coordinates (steps kept, walkers, D) of a block."""
+        if self.plan.independent:
+            return block.coords
+        flat = block.coords.reshape(-1, block.coords.shape[-1])
+        return self.whitening.to_psi(flat).reshape(block.coords.shape)
+
+    def _page(self, stretch: Stretch, rest: Page) -> Page:
+        W = self.plan.walkers
+        if stretch.begin * W < rest.psi.shape[1]:
+            return rest[slice(stretch.begin * W, stretch.end * W)]
+        drawn, used = (stretch.full - stretch.begin) * W, (stretch.end - stretch.begin) * W
+        return draw_page(self.target, self.proposal, self.seeds, (stretch.begin,), drawn, used)
 
     @cached_property
     def _sampler(self) -> emcee.EnsembleSampler:
@@ -232,83 +254,20 @@ class Ensembles:
             vectorize=True,
         )
 
-    def start(self, ensemble: int) -> emcee.State:
-        """First state of an ensemble: draws of the proposal."""
-        random = np.random.RandomState(self.seeds[ensemble])
-        psi = self.proposal.draw(START_DRAWS * self.plan.walkers, random)
-        psi = psi[np.isfinite(psi).all(axis=1)]
-        psi = psi[np.isfinite(self.target.log_density(psi))][: self.plan.walkers]
-        if len(psi) < self.plan.walkers:
-            raise InputError("the proposal has no mass inside the support", where="sampler")
-        state = emcee.State(self.whitening.to_white(psi))
-        state.random_state = random.get_state()
-        return state
-
-    def block(self, ensemble: int, state: emcee.State, begin: int, end: int) -> Block:
-        """Steps `begin` to `end` of one ensemble, read from its file or run.
-
-        Parameters
-        ----------
-        ensemble, begin, end : int
-        state : emcee.State
-            At step `begin`.
-
-        Returns
-        -------
-        Block
-        """
-        path = None
-        if self.folder is not None:
-            path = self.folder / f"chain-{ensemble + 1}-{end:06d}.h5"
-            if path.exists():
-                return self._block(*_read_block(path, f"{self.fingerprint} {begin}"))
+    def _walk(self, start: Walkers, steps: int) -> Block:
         sampler = self._sampler
         sampler.reset()
+        state = emcee.State(start.coords, log_prob=start.log_prob, copy=True)
+        state.random_state = start.random
         thin = self.plan.thin
-        sampler.run_mcmc(state, (end - begin) // thin, thin_by=thin, skip_initial_state_check=True)
-        white, log_prob = sampler.get_chain(), sampler.get_log_prob()
+        sampler.run_mcmc(state, steps // thin, thin_by=thin, skip_initial_state_check=True)
+        coords, log_prob = sampler.get_chain(), sampler.get_log_prob()
+        nothing = np.full(self.plan.walkers, np.nan)
+        end = Walkers(coords[-1], log_prob[-1], nothing, sampler.random_state)
         accepted = sampler.backend.accepted.astype(float)
-        random = sampler.random_state
-        if path is not None:
-            mark = f"{self.fingerprint} {begin}"
-            _write_block(path, mark, white, log_prob, accepted, random)
-        return self._block(white, log_prob, accepted, random)
-
-    def _block(self, white: Float, log_prob: Float, accepted: Float, random: tuple) -> Block:
-        state = emcee.State(white[-1], log_prob=log_prob[-1])
-        state.random_state = random
-        psi = self.whitening.to_psi(white.reshape(-1, white.shape[-1])).reshape(white.shape)
-        return Block(psi, log_prob, accepted, state)
+        return Block(coords, log_prob, accepted, np.empty(0), end)
 
 
-def _write_block(
-    path: Path, mark: str, white: Float, log_prob: Float, accepted: Float, random: tuple
-) -> None:
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        file["chain"], file["log_prob"], file["accepted"] = white, log_prob, accepted
-        _, file["random_keys"], position, has_gauss, gauss = random
-        file.attrs["belongs_to"] = mark
-        file.attrs["random_position"] = position
-        file.attrs["random_has_gauss"] = has_gauss
-        file.attrs["random_gauss"] = gauss
-
-
-def _read_block(path: Path, mark: str) -> tuple[Float, Float, Float, tuple]:
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs["belongs_to"] != mark:
-                raise KeyError("belongs_to")
-            random = (
-                "MT19937",
-                file["random_keys"][...],
-                int(file.attrs["random_position"]),
-                int(file.attrs["random_has_gauss"]),
-                float(file.attrs["random_gauss"]),
-            )
-            return file["chain"][...], file["log_prob"][...], file["accepted"][...], random
-    except (OSError, KeyError) as error:
-        raise InputError(
-            "the checkpoint cannot be read, or belongs to another run",
-            where=str(path),
-            do="delete it and resume: its steps are run again",
-        ) from error
+def _usable(pages: Sequence[Page], ensemble: int) -> Int:
+    """Proposals of an ensemble with a density above zero, numbered through the pages."""
+    return np.flatnonzero(np.isfinite(np.concatenate([p.log_prob[ensemble] for p in pages])))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
@@ -15,40 +14,34 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from bayesdist.data.files import atomic_path
-from bayesdist.data.matches import MatchTable
-from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.labelled.convergence import (
-    Convergence,
-    Limits,
-    diagnose,
-    importance_efficiency,
-    pareto_k,
-)
+from bayesdist.errors import InputError
+from bayesdist.infer.certificate import Certificate
+from bayesdist.infer.certified import run_certified
+from bayesdist.infer.chains import Chains, Settings, run_chains
+from bayesdist.infer.labelled.convergence import Limits
 from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.membership import count_outliers
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.proposal import GridProposal, build_proposal
-from bayesdist.infer.sampler import START_DRAWS, Ensembles, Whitening, boundaries, plan_moves
-from bayesdist.infer.stars import prepare
+from bayesdist.infer.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars import Stars
 from bayesdist.infer.target import Target
 
 __all__ = ["sample"]
 
 Float = NDArray[np.float64]
 
+METHODS = ("exact", "certified")
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may give other bits
-LEAST_ROWS = 10  # rows of a chain that diagnostics make sense of
-PILOT = 512  # proposals that judge the proposal
-PILOT_STARS = 200_000_000  # star evaluations that the pilot may cost
-MEMBERSHIP_DRAWS = 64  # draws over which the outlier probability of a star is averaged
 
 
 # matrices here are small: more BLAS threads only get in each other's way
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def sample(
     fit: LinearFit,
-    matches: MatchTable,
+    matches: Matches | Shards,
     *,
     outliers: OutlierMixture | None = None,
     priors: GaussianPriors | None = None,
@@ -59,8 +52,11 @@ def sample(
     target_rhat: float = 1.01,
     max_steps: int = 20_000,
     checkpoint_every: int = 200,
+    method: str = "exact",
+    second_stage: str = "auto",
     folder: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    compute: Compute | None = None,
 ) -> Posterior:
     """Sample the posterior of the distortion and of the outlier mixture.
 
@@ -68,8 +64,8 @@ def sample(
     ----------
     fit : LinearFit
         Of the same matches; it seeds the search for the mode.
-    matches : MatchTable
-        All rows: none is clipped.
+    matches : MatchTable, PartitionedMatches or Shards
+        All stars: none is clipped.
     outliers : OutlierMixture, optional
         Gaussian outliers by default.
     priors : GaussianPriors, optional
@@ -85,11 +81,18 @@ def sample(
         Largest total of steps of each ensemble, also over resumed runs.
     checkpoint_every : int
         Most steps between two checkpoints.
+    method : str
+        'exact', or 'certified': by way of a surrogate that costs few passes.
+    second_stage : str
+        With 'certified': whether exact evaluations accept or refuse the surrogate's draws
+        ('always', 'never'), or do so where that is affordable ('auto'); see `certified`.
     folder : path, optional
         Where checkpoints are kept.  Blocks found there are read instead of run, so that a killed
         run goes on bit for bit.
     progress : callable, optional
         Called with (steps made, `max_steps`).
+    compute : Compute, optional
+        Where the work is done; one process with threads by default.
 
     Returns
     -------
@@ -107,122 +110,93 @@ def sample(
         raise InputError(
             f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
         )
+    if method not in METHODS:
+        raise InputError(
+            f"there is no method {method!r}",
+            where="sampler.method",
+            do=f"choose {' or '.join(METHODS)}",
+        )
     if max_steps < 1 or checkpoint_every < 1:
         raise InputError("steps must be positive", where="sampler")
     started = time.monotonic()
-    mixture = outliers or OutlierMixture()
-    target = Target(prepare(fit.model, matches), mixture, priors or GaussianPriors.none(fit.model))
-    limits = Limits(target_ess, target_rhat)
-    folder = None if folder is None else Path(folder)
-    seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
-
-    known = _fingerprint(target, seed, ensembles, walkers, checkpoint_every)
-    proposal = _proposal(target, fit, folder, known)
-    n_pilot = int(np.clip(PILOT_STARS // len(matches), 64, PILOT))
-    pilot = proposal.draw(n_pilot, np.random.default_rng(int(seeds[-1])))
-    ok = np.isfinite(pilot).all(axis=1)
-    if ok.sum() < 2:
-        raise DegenerateError(
-            "the Laplace approximation has no mass inside the support",
-            where="posterior",
-            do="check the match, the errors and the outlier model",
+    with opened(fit.model, matches, compute) as shards:
+        mixture, priors = outliers or OutlierMixture(), priors or GaussianPriors.none(fit.model)
+        target = Target(shards, mixture, priors)
+        folder = None if folder is None else Path(folder)
+        known = _fingerprint(target, seed, ensembles, walkers, checkpoint_every, method)
+        proposal = _proposal(target, fit, folder, known)
+        seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
+        settings = Settings(
+            seeds=tuple(int(s) for s in seeds[:-1]),
+            n_stars=len(shards),
+            walkers=walkers,
+            limits=Limits(target_ess, target_rhat),
+            max_steps=max_steps,
+            checkpoint_every=checkpoint_every,
+            folder=folder,
+            fingerprint=known,
+            progress=progress,
         )
-    log_weights = target.log_density(pilot[ok]) - proposal.log_density(pilot[ok])
-    n_outside = int((~ok).sum())
-    efficiency = importance_efficiency(log_weights, n_outside)
-    plan = plan_moves(efficiency, pareto_k(log_weights), len(target.names), walkers)
-    if max_steps < 10 * plan.thin:
-        plan = replace(plan, thin=1)  # too few steps to leave any out
-    whitening = Whitening.of(target, proposal, pilot[ok])
-    starts = tuple(int(s) for s in seeds[:-1])
-    runs = Ensembles(target, proposal, whitening, plan, starts, folder, known)
-
-    states = [runs.start(e) for e in range(ensembles)]
-    psi: list[list[Float]] = [[] for _ in range(ensembles)]
-    log_prob: list[list[Float]] = [[] for _ in range(ensembles)]
-    accepted = 0.0
-    begin, verdict = 0, None
-    for end in boundaries(checkpoint_every, max_steps, plan.thin):
-        for e in range(ensembles):
-            block = runs.block(e, states[e], begin, end)
-            psi[e].append(block.psi)
-            log_prob[e].append(block.log_prob)
-            states[e] = block.state
-            accepted += float(block.accepted.sum())
-        begin = end
-        if progress is not None:
-            progress(end, max_steps)
-        made = sum(len(block) for block in psi[0])
-        warmup = min(plan.warmup // plan.thin, made // 2)
-        if plan.weights[0] < 0.9:
-            warmup = made // 2
-        if made - warmup < LEAST_ROWS and end + plan.thin <= max_steps:
-            continue
-        kept = slice(warmup, None)
-        chains = np.array([np.concatenate(p) for p in psi])[:, kept]
-        verdict = diagnose(
-            chains,
-            target.names,
-            log_weights,
-            limits,
-            coupled=plan.weights[2] > 0,
-            n_outside=n_outside,
+        certificate, exact = None, True
+        if method == "exact":
+            chains = run_chains(target, proposal, settings)
+        else:
+            chains, certificate, exact = run_certified(target, proposal, settings, second_stage)
+        info = SamplerInfo(
+            method=f"emcee {chains.plan.method}" if exact else chains.plan.method,
+            ensembles=ensembles,
+            walkers=chains.plan.walkers,
+            steps=chains.steps,
+            warmup=chains.warmup,
+            passes=chains.passes,
+            acceptance=chains.acceptance,
+            wall_s=time.monotonic() - started,
+            seed=seed,
+            exact=exact,
         )
-        if verdict.converged:
-            break
-    assert verdict is not None
-    n_moves = ensembles * plan.walkers * begin
-    info = SamplerInfo(
-        method=f"emcee {plan.method}",
-        ensembles=ensembles,
-        walkers=plan.walkers,
-        steps=begin,
-        warmup=warmup * plan.thin,
-        passes=n_pilot + (START_DRAWS + 1) * ensembles * plan.walkers + n_moves,
-        acceptance=accepted / (ensembles * plan.walkers * made),
-        wall_s=time.monotonic() - started,
-        seed=seed,
-    )
-    heights = np.array([np.concatenate(p) for p in log_prob])[:, kept]
-    return _posterior(target, chains, heights, verdict, info, int(seeds[-1]))
+        return _posterior(target, chains, info, certificate)
 
 
 def _posterior(
-    target: Target,
-    chains: Float,
-    log_prob: Float,
-    verdict: Convergence,
-    info: SamplerInfo,
-    seed: int,
+    target: Target, chains: Chains, info: SamplerInfo, certificate: Certificate | None
 ) -> Posterior:
-    E, T, W, D = chains.shape
-    draws = np.swapaxes(chains, 1, 2).reshape(E, W * T, D)
+    E, T, W, D = chains.psi.shape
+    draws = np.swapaxes(chains.psi, 1, 2).reshape(E, W * T, D)
     flat = draws.reshape(-1, D)
     n = target.n_theta
-    some = np.random.default_rng(seed).choice(len(flat), min(MEMBERSHIP_DRAWS, len(flat)), False)
+    flagged, expected = count_outliers(target.shards, target.hyper, flat[:, :n], flat[:, n:])
     return Posterior(
-        model=target.stars.model,
+        model=target.model,
         mixture=target.mixture,
         theta=draws[..., :n].copy(),
         hyper=target.hyper.values(draws[..., n:]),
-        log_prob=np.swapaxes(log_prob, 1, 2).reshape(E, W * T),
-        outlier_probability=target.outlier_probability(flat[np.sort(some)]),
-        convergence=verdict,
+        log_prob=np.swapaxes(chains.log_prob, 1, 2).reshape(E, W * T),
+        n_stars=len(target.shards),
+        n_flagged=flagged,
+        n_false=expected,
+        reference_sigma=target.hyper.scale,
+        convergence=chains.verdict,
         sampler=info,
+        certificate=certificate,
     )
 
 
-def _fingerprint(target: Target, *settings: int | None) -> str:
+def _fingerprint(target: Target, *settings: object) -> str:
     """What must not change between a run and its resumption."""
     digest = hashlib.sha256()
-    stars = target.stars
-    columns = (stars.X, stars.Y, stars.u, stars.v, stars.var_u, stars.var_v, stars.starts)
-    for column in (*columns, stars.groups.chip, stars.groups.exposure, stars.groups.epoch):
-        digest.update(np.ascontiguousarray(column).tobytes())
+    digest.update("".join(target.shards.sum(_digest)).encode())
     digest.update(repr([(name, metadata.version(name)) for name in ENGINES]).encode())
     digest.update(target.priors.centre.tobytes() + target.priors.precision.tobytes())
-    digest.update(repr((stars.model.to_dict(), target.mixture, settings)).encode())
+    digest.update(repr((target.model.to_dict(), target.mixture, settings)).encode())
     return digest.hexdigest()
+
+
+def _digest(stars: Stars) -> tuple[str]:
+    digest = hashlib.sha256()
+    groups = stars.groups
+    for column in (*stars.columns, stars.starts, groups.chip, groups.exposure, groups.epoch):
+        digest.update(np.ascontiguousarray(column).data)
+    return (digest.hexdigest(),)
 
 
 def _proposal(

@@ -1,24 +1,25 @@
-"""The data as the passes want them: sorted by group, scaled to [-1, 1], in contiguous columns."""
+"""Some of the data as the passes want them: sorted by group, scaled to [-1, 1], in columns."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.infer import kernel
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Stars", "prepare"]
+__all__ = ["Stars", "in_table_order", "prepare"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-CHUNK = 8192  # rows of a design matrix held at a time: fits the cache at order 9
+NOBODY = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +30,7 @@ class Stars:
     ----------
     model : DistortionModel
     groups : Groups
-        Index in the order of the *table*.
-    order : ndarray of int, shape (N,)
-        Table row of each star here.
+        Those that have stars here; without members, which `starts` tells.
     starts : ndarray of int, shape (G + 1,)
         Where each group begins.
     X, Y : ndarray, shape (N,)
@@ -39,12 +38,11 @@ class Stars:
     u, v : ndarray, shape (N,)
         Reference position.
     var_u, var_v : ndarray, shape (N,)
-        Squared errors.
+        Squared errors; one array where they are equal.
     """
 
     model: DistortionModel
     groups: Groups
-    order: Int
     starts: Int
     X: Float
     Y: Float
@@ -56,42 +54,51 @@ class Stars:
     def __len__(self) -> int:
         return len(self.X)
 
-    def chunks(self) -> Iterator[tuple[int, slice, Float]]:
-        """Group, rows and design matrix (n, K) of one piece after the other."""
-        for g in range(len(self.groups)):
-            basis = self.model.basis(self.model.chips[self.groups.chip[g]].number)
-            for a in range(self.starts[g], self.starts[g + 1], CHUNK):
-                rows = slice(a, min(a + CHUNK, int(self.starts[g + 1])))
-                yield g, rows, basis.evaluate_scaled(self.X[rows], self.Y[rows])
+    @property
+    def columns(self) -> tuple[Float, ...]:
+        """X, Y, u, v, var_u, var_v."""
+        return self.X, self.Y, self.u, self.v, self.var_u, self.var_v
 
-    def predict(self, theta: Float) -> Float:
-        """Model positions (N, 2) of one parameter vector, in the order of this object."""
-        E = self.model.effective(theta, self.groups)
-        out = np.empty((len(self), 2))
-        for g, rows, phi in self.chunks():
-            out[rows] = phi @ E[g].T
-        return out
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all columns."""
+        shared = self.var_u is self.var_v
+        return 8 * len(self) * (5 if shared else 6)
+
+    @cached_property
+    def blocks(self) -> Int:
+        """Pieces (n, 3) that stay in the cache."""
+        return kernel.pieces_of(self.starts, kernel.BLOCK)
+
+    @cached_property
+    def pieces(self) -> Int:
+        """Pieces (n, 3) whose sums are kept apart."""
+        return kernel.pieces_of(self.starts, kernel.PIECE)
+
+    def powers(self, theta: Float | None) -> Float:
+        """Effective coefficients (..., G, 2, K) of the scaled powers; None stands for zero."""
+        if theta is None:
+            return np.zeros((len(self.groups), 2, self.model.n_terms))
+        # all chips share the order, hence the map to powers
+        basis = self.model.basis(self.model.chips[0].number)
+        return basis.to_scaled_powers(self.model.effective(theta, self.groups))
 
     def residuals(self, theta: Float) -> Float:
         """Data minus model (N, 2), in the order of this object."""
-        out = self.predict(theta)
-        np.subtract(self.u, out[:, 0], out=out[:, 0])
-        np.subtract(self.v, out[:, 1], out=out[:, 1])
-        return out
+        return kernel.residuals(self.blocks, self.columns, self.powers(theta), self.model.order)
 
-    def in_table_order(self, values: Float) -> Float:
-        """Per-star values in the order of the table."""
-        out = np.empty_like(values)
-        out[self.order] = values
-        return out
-
-    @cached_property
-    def reference_sigma(self) -> float:
-        """Median quoted error of one axis: the scale of the priors."""
-        return float(np.sqrt(np.median(np.concatenate([self.var_u, self.var_v]))))
+    def pixels(self) -> tuple[Float, Float]:
+        """Detector positions x, y (N,), FITS 1-based."""
+        x, y = np.empty(len(self)), np.empty(len(self))
+        for g, chip in enumerate(self.groups.chip):
+            rows = slice(self.starts[g], self.starts[g + 1])
+            size = self.model.chips[chip].size
+            x[rows] = (self.X[rows] * size[0] + size[0] + 1) / 2
+            y[rows] = (self.Y[rows] * size[1] + size[1] + 1) / 2
+        return x, y
 
 
-def prepare(model: DistortionModel, matches: MatchTable) -> Stars:
+def prepare(model: DistortionModel, matches: MatchTable) -> tuple[Stars, Int]:
     """Sort a table of matches for the passes.
 
     Parameters
@@ -102,7 +109,9 @@ def prepare(model: DistortionModel, matches: MatchTable) -> Stars:
 
     Returns
     -------
-    Stars
+    stars : Stars
+    order : ndarray of int, shape (N,)
+        Table row of each star.
 
     Raises
     ------
@@ -120,7 +129,9 @@ def prepare(model: DistortionModel, matches: MatchTable) -> Stars:
     groups = model.groups(
         len(matches), epoch=matches.epoch, exposure=matches.exposure, chip=numbers
     )
-    order = np.argsort(groups.index, kind="stable")
+    order: Int | slice = slice(None)  # one group: the usual case, without copies
+    if len(groups) > 1:
+        order = np.argsort(groups.index, kind="stable")
     counts = np.bincount(groups.index, minlength=len(groups))
     starts = np.concatenate([[0], np.cumsum(counts)])
     x, y = matches.x[order], matches.y[order]
@@ -129,15 +140,24 @@ def prepare(model: DistortionModel, matches: MatchTable) -> Stars:
         rows = slice(starts[g], starts[g + 1])
         basis = model.basis(model.chips[groups.chip[g]].number)
         X[rows], Y[rows] = basis.scaled(x[rows], y[rows])
-    return Stars(
+    var_u = matches.sigma_u[order] ** 2
+    equal = np.array_equal(matches.sigma_u, matches.sigma_v)
+    stars = Stars(
         model=model,
-        groups=groups,
-        order=order,
+        groups=replace(groups, index=NOBODY),
         starts=starts,
         X=X,
         Y=Y,
         u=matches.u[order],
         v=matches.v[order],
-        var_u=matches.sigma_u[order] ** 2,
-        var_v=matches.sigma_v[order] ** 2,
+        var_u=var_u,
+        var_v=var_u if equal else matches.sigma_v[order] ** 2,
     )
+    return stars, np.arange(len(x))[order]
+
+
+def in_table_order(values: NDArray[Any], order: Int) -> NDArray[Any]:
+    """Values of each star, brought back to the order of the table along the first axis."""
+    out = np.empty_like(values)
+    out[order] = values
+    return out

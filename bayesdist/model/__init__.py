@@ -3,7 +3,7 @@
 from bayesdist.model.basis import PolynomialBasis, polynomial_terms
 from bayesdist.model.distortion import Chip, DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
-from bayesdist.model.grouping import Groups
+from bayesdist.model.grouping import Groups, merge_groups
 from bayesdist.model.timedep import AXES, TimeDependence
 
 __all__ = [
@@ -14,5 +14,6 @@ __all__ = [
     "Groups",
     "PolynomialBasis",
     "TimeDependence",
+    "merge_groups",
     "polynomial_terms",
 ]

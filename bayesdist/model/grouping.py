@@ -7,12 +7,12 @@ these groups.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Groups", "group_by"]
+__all__ = ["Groups", "group_by", "merge_groups"]
 
 Int = NDArray[np.int64]
 Float = NDArray[np.float64]
@@ -80,3 +80,26 @@ def group_by(chip: Int, exposure: Int, epoch: Float) -> Groups:
         exposure=unique["exposure"].copy(),
         epoch=unique["epoch"].copy(),
     )
+
+
+def merge_groups(a: Groups, b: Groups) -> tuple[Groups, Int, Int]:
+    """The groups of either, in the order in which `group_by` gives them.
+
+    Parameters
+    ----------
+    a, b : Groups
+
+    Returns
+    -------
+    groups : Groups
+        Without members.
+    of_a, of_b : ndarray of int
+        Where the groups of `a` and of `b` stand in it.
+    """
+    union = group_by(
+        np.concatenate([a.chip, b.chip]),
+        np.concatenate([a.exposure, b.exposure]),
+        np.concatenate([a.epoch, b.epoch]),
+    )
+    index = union.index
+    return replace(union, index=np.zeros(0, np.int64)), index[: len(a)], index[len(a) :]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from textwrap import wrap
 
 from astropy.io import fits
 
@@ -31,9 +32,12 @@ def convergence_cards(solution: object) -> list[str]:
     convergence = getattr(solution, "convergence", None)
     if convergence is None:
         return []
+    label = getattr(solution, "approximation", "")
+    notes = [text_card("COMMENT", line) for line in wrap(label, 70)]
     if convergence.converged:
-        return [text_card("BDCONV", "YES", "has the sampler converged?")]
+        return [text_card("BDCONV", "YES", "has the sampler converged?"), *notes]
     return [
+        *notes,
         text_card("BDCONV", "NO", "has the sampler converged?"),
         text_card("COMMENT", "NOT CONVERGED: provisional, not to be released."),
     ]

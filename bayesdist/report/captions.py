@@ -57,6 +57,10 @@ def _length(value: float, inputs: ReportInput) -> str:
     return with_mas(value, inputs.unit, inputs.scale_mas)
 
 
+def _sampled(inputs: ReportInput) -> str:
+    return f" Drawn from {inputs.sample}." if inputs.sample else ""
+
+
 def _by_magnitude(inputs: ReportInput) -> Caption:
     text = "Residuals grow towards faint stars; colour counts stars."
     if inputs.magnitude_errors is not None:
@@ -64,6 +68,7 @@ def _by_magnitude(inputs: ReportInput) -> Caption:
             " The lines are ±1 σ as assigned to each magnitude:"
             " about two thirds of the stars lie between them."
         )
+    text += _sampled(inputs)
     return Caption(
         "Residuals against magnitude",
         text,
@@ -84,6 +89,7 @@ def _histogram(inputs: ReportInput) -> Caption:
         )
         if inputs.posterior.mixture.model != "none":
             text += " The dashed part is false matches."
+    text += _sampled(inputs)
     return Caption(
         "Residual histograms",
         text,

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.report.numerals import count
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -15,11 +18,13 @@ if TYPE_CHECKING:
         AreaMap,
         BinnedResiduals,
         ErrorBudget,
+        ExposureSums,
         Margin,
+        StarSample,
         UncertaintyMap,
         VectorMap,
     )
-    from bayesdist.data import MagnitudeErrors, MatchTable
+    from bayesdist.data import MagnitudeErrors
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.model import Chip
 
@@ -76,7 +81,10 @@ class ReportInput:
         Of the run.
     config : mapping
         The resolved configuration.
-    matches : MatchTable
+    stars : StarSample
+        All stars or, of very many, some: the only ones that are drawn one by one.
+    exposures : ExposureSums
+        Of all stars, at the least-squares fit.
     fit : LinearFit
     posterior : Posterior or None
         None where nothing was sampled: the report then says that errors are formal ones only.
@@ -99,13 +107,16 @@ class ReportInput:
         Sentences that belong on top.
     magnitude_errors : MagnitudeErrors or None
         Errors by magnitude, where the stars carried none.
+    flagged : ndarray of int, shape (E,), or None
+        Stars of each exposure that are more likely false matches than not.
     provenance : mapping
         Versions, seed, hashes of the input, timings, command; mappings may be nested.
     """
 
     name: str
     config: Mapping[str, Any]
-    matches: MatchTable
+    stars: StarSample
+    exposures: ExposureSums
     fit: LinearFit
     posterior: Posterior | None
     formal_map: UncertaintyMap
@@ -120,12 +131,20 @@ class ReportInput:
     products: tuple[Product, ...] = ()
     warnings: tuple[str, ...] = ()
     magnitude_errors: MagnitudeErrors | None = None
+    flagged: NDArray[np.int64] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def unit(self) -> str:
         """Unit of u and v."""
         return self.fit.model.unit
+
+    @property
+    def sample(self) -> str:
+        """'a sample of 200 000 of 11 213 542 stars'; empty where all stars are shown."""
+        if not self.stars.partial:
+            return ""
+        return f"a sample of {count(len(self.stars))} of {count(self.stars.n_total)} stars"
 
     @property
     def provisional(self) -> bool:

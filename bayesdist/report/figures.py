@@ -19,7 +19,6 @@ from bayesdist.report.corners import corner_coefficients, corner_outliers
 from bayesdist.report.margins import margins_against_limits
 from bayesdist.report.residuals import (
     MixtureCurve,
-    posterior_residuals,
     residual_histogram,
     residuals_by_magnitude,
 )
@@ -28,7 +27,7 @@ from bayesdist.report.traces import traces
 from bayesdist.report.uncertainty import formal_uncertainty, uncertainty_radius
 from bayesdist.report.vectors import residual_vectors, vector_flow
 
-__all__ = ["DPI", "all_figures", "png_bytes", "save_figures"]
+__all__ = ["DPI", "all_figures", "drawn", "save_images"]
 
 DPI = 150
 
@@ -47,14 +46,13 @@ def all_figures(inputs: ReportInput) -> dict[str, Figure]:
         without magnitudes no plot against them, without a budget or requirements none of these.
     """
     out: dict[str, Figure] = {}
-    residual = posterior_residuals(inputs.matches, inputs.solution)
-    if inputs.matches.mag is not None and np.isfinite(inputs.matches.mag).any():
+    stars = inputs.stars
+    drawn = {"unit": inputs.unit, "sampled": stars.partial}
+    if stars.table.mag is not None and np.isfinite(stars.table.mag).any():
         out["residuals_by_magnitude"] = residuals_by_magnitude(
-            inputs.matches.mag, residual, unit=inputs.unit, errors=inputs.magnitude_errors
+            stars.table.mag, stars.residual, errors=inputs.magnitude_errors, **drawn
         )
-    out["residual_histogram"] = residual_histogram(
-        residual, mixture_curves(inputs), unit=inputs.unit
-    )
+    out["residual_histogram"] = residual_histogram(stars.residual, mixture_curves(inputs), **drawn)
     out["residual_vectors"] = residual_vectors(
         inputs.binned, unit=inputs.unit, size=inputs.chip.size
     )
@@ -81,7 +79,7 @@ def mixture_curves(inputs: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
 
     Without quoted errors the rms of the fit stands in for them.
     """
-    f, matches = inputs.fit, inputs.matches
+    f, matches = inputs.fit, inputs.stars.table
     sigmas = [
         np.full(len(matches), rms) if sigma is None else np.asarray(sigma, float)
         for sigma, rms in ((matches.sigma_u, f.rms_u), (matches.sigma_v, f.rms_v))
@@ -99,7 +97,12 @@ def mixture_curves(inputs: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
     return u, v
 
 
-def png_bytes(figure: Figure) -> bytes:
+def drawn(figures: Mapping[str, Figure]) -> dict[str, bytes]:
+    """Figures as PNG files, by name: drawn once, for the folder and for the report."""
+    return {name: _png_bytes(figure) for name, figure in figures.items()}
+
+
+def _png_bytes(figure: Figure) -> bytes:
     """A figure as the bytes of a PNG file, cut to what is drawn."""
     buffer = io.BytesIO()
     with figure_style():  # mathematical text and ticks read the settings only when drawn
@@ -107,12 +110,13 @@ def png_bytes(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write figures as PNG files.
+def save_images(images: Mapping[str, bytes], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Write the PNG files of a report.
 
     Parameters
     ----------
-    figures : mapping of str to matplotlib.figure.Figure
+    images : mapping of str to bytes
+        As of `drawn`.
     folder : path-like
         Made where it does not exist.
 
@@ -135,9 +139,9 @@ def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) 
             do="choose one that you may write to",
         ) from error
     paths = []
-    for name, figure in figures.items():
+    for name, png in images.items():
         path = folder / f"{name}.png"
         with atomic_path(path) as temporary:
-            temporary.write_bytes(png_bytes(figure))
+            temporary.write_bytes(png)
         paths.append(path)
     return tuple(paths)

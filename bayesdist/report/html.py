@@ -9,14 +9,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jinja2
-from matplotlib.figure import Figure
 
 from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
 from bayesdist.report import tables
 from bayesdist.report.captions import SECTIONS, Caption, caption
 from bayesdist.report.context import ReportInput
-from bayesdist.report.figures import DPI, png_bytes
+from bayesdist.report.figures import DPI
 from bayesdist.report.numerals import number
 from bayesdist.report.status import status_checks, verdict
 
@@ -31,14 +30,14 @@ class _Picture:
     words: Caption
 
 
-def render_report(inputs: ReportInput, figures: Mapping[str, Figure]) -> str:
+def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
     """The report as text.
 
     Parameters
     ----------
     inputs : ReportInput
-    figures : mapping of str to matplotlib.figure.Figure
-        As of `all_figures`.
+    images : mapping of str to bytes
+        PNG files by name, as of `drawn`.
 
     Returns
     -------
@@ -51,7 +50,7 @@ def render_report(inputs: ReportInput, figures: Mapping[str, Figure]) -> str:
         For a figure whose name has no place in the report.
     """
     placed = [name for names in SECTIONS.values() for name in names]
-    for name in figures:
+    for name in images:
         if name not in placed:
             raise InputError(
                 f"figure {name!r} has no place in the report",
@@ -70,7 +69,7 @@ def render_report(inputs: ReportInput, figures: Mapping[str, Figure]) -> str:
         verdict=verdict(inputs),
         status=status_checks(inputs),
         pictures={
-            section: [_picture(n, figures[n], inputs) for n in names if n in figures]
+            section: [_picture(n, images[n], inputs) for n in names if n in images]
             for section, names in SECTIONS.items()
         },
         tables={
@@ -93,15 +92,14 @@ def _present(table: tables.TextTable | None) -> tuple[tables.TextTable, ...]:
     return () if table is None else (table,)
 
 
-def _picture(name: str, figure: Figure, inputs: ReportInput) -> _Picture:
-    png = png_bytes(figure)
+def _picture(name: str, png: bytes, inputs: ReportInput) -> _Picture:
     (pixels,) = struct.unpack(">I", png[16:20])  # width, in the first chunk of every PNG file
     data = base64.b64encode(png).decode("ascii")
     return _Picture(name, data, pixels / DPI, caption(name, inputs))
 
 
 def write_report(
-    path: str | os.PathLike[str], inputs: ReportInput, figures: Mapping[str, Figure]
+    path: str | os.PathLike[str], inputs: ReportInput, images: Mapping[str, bytes]
 ) -> None:
     """Write the report.
 
@@ -109,14 +107,14 @@ def write_report(
     ----------
     path : path-like
     inputs : ReportInput
-    figures : mapping of str to matplotlib.figure.Figure
-        As of `all_figures`.
+    images : mapping of str to bytes
+        PNG files by name, as of `drawn`.
 
     Raises
     ------
     InputError
         When the file cannot be written, or as `render_report`.
     """
-    text = render_report(inputs, figures)
+    text = render_report(inputs, images)
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -19,50 +19,17 @@ from bayesdist.report.scales import display_scale
 from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:
-    from bayesdist.data import MagnitudeErrors, MatchTable
-    from bayesdist.infer import LinearFit, Posterior
+    from bayesdist.data import MagnitudeErrors
 
 __all__ = [
     "MixtureCurve",
-    "posterior_residuals",
     "residual_histogram",
     "residuals_by_magnitude",
 ]
 
 Float = NDArray[np.float64]
 
-_CHUNK = 200_000  # stars predicted at a time: tens of megabytes of basis values
 _SIGMA_BINS = 200
-
-
-def posterior_residuals(matches: MatchTable, solution: LinearFit | Posterior) -> Float:
-    """Data minus the model at a solution's mean, for every star.
-
-    Parameters
-    ----------
-    matches : MatchTable
-    solution : LinearFit or Posterior
-
-    Returns
-    -------
-    ndarray, shape (N, 2)
-        In the unit of u and v.
-    """
-    exposure = np.asarray(matches.exposure_names)[matches.exposure]
-    chip = np.asarray(matches.chip_numbers)[matches.chip]
-    out = np.empty((len(matches), 2))
-    for start in range(0, len(matches), _CHUNK):
-        s = slice(start, start + _CHUNK)
-        model = solution.model.predict(
-            solution.mean,
-            matches.x[s],
-            matches.y[s],
-            epoch=None if matches.epoch is None else matches.epoch[s],
-            exposure=exposure[s],
-            chip=chip[s],
-        )
-        out[s] = np.stack([matches.u[s], matches.v[s]], axis=-1) - model
-    return out
 
 
 @dataclass(frozen=True)
@@ -133,7 +100,11 @@ class MixtureCurve:
 
 
 def residual_histogram(
-    residual: Float, curves: tuple[MixtureCurve, MixtureCurve], *, unit: str
+    residual: Float,
+    curves: tuple[MixtureCurve, MixtureCurve],
+    *,
+    unit: str,
+    sampled: bool = False,
 ) -> Figure:
     """Histograms of the two axes: the core, and everything on a logarithmic scale of counts.
 
@@ -142,8 +113,10 @@ def residual_histogram(
     residual : ndarray, shape (N, 2)
         In the unit of u and v.
     curves : tuple of MixtureCurve
-        What is expected of u and of v.
+        What is expected of u and of v, for the same stars.
     unit : str
+    sampled : bool
+        Whether these are some stars of more, which the labels then say.
 
     Returns
     -------
@@ -153,6 +126,7 @@ def residual_histogram(
     widest = max(float(np.sqrt(np.max(c.sigma**2 + c.jitter**2))) for c in curves)
     core = min(6.0 * width, 4.0 * widest)
     tail = max(float(np.abs(residual).max()), 1.2 * core) * 1.02
+    everything = "whole sample" if sampled else "all stars"
     with figure_style():
         fig = new_figure(WIDTH, 4.9)
         axes = fig.subplots(2, 2, sharey="row")
@@ -163,11 +137,11 @@ def residual_histogram(
                 _histogram(ax, residual[:, column], curve, reach, bins, scale.factor)
                 ax.set_xlabel(f"residual in {axis} [{scale.unit}]")
             axes[0, column].set_title(f"{axis}: core")
-            axes[1, column].set_title(f"{axis}: all stars, logarithmic")
+            axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
             axes[1, column].set_yscale("log")
         axes[1, 0].set_ylim(bottom=0.5)
         for ax in axes[:, 0]:
-            ax.set_ylabel("stars per bin")
+            ax.set_ylabel("stars of the sample per bin" if sampled else "stars per bin")
         handles, labels = axes[0, 0].get_legend_handles_labels()
         fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
     return fig
@@ -195,7 +169,12 @@ def _histogram(
 
 
 def residuals_by_magnitude(
-    mag: Float, residual: Float, *, unit: str, errors: MagnitudeErrors | None = None
+    mag: Float,
+    residual: Float,
+    *,
+    unit: str,
+    errors: MagnitudeErrors | None = None,
+    sampled: bool = False,
 ) -> Figure:
     """Density of the residuals against magnitude, with the errors assigned to each magnitude.
 
@@ -207,11 +186,14 @@ def residuals_by_magnitude(
     unit : str
         Of the residuals.
     errors : MagnitudeErrors, optional
+    sampled : bool
+        Whether these are some stars of more, which the labels then say.
 
     Returns
     -------
     matplotlib.figure.Figure
     """
+    stars = "sampled stars" if sampled else "stars"
     known = np.isfinite(mag)
     mag, residual = mag[known], residual[known]
     reach = _magnitude_reach(residual, errors)
@@ -244,10 +226,10 @@ def residuals_by_magnitude(
             ax.axhline(0.0, color=INK, lw=0.5)
             ax.set_xlim(low - pad, high + pad)
             ax.set_ylim(-reach * scale.factor, reach * scale.factor)
-            ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} stars lie outside")
+            ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {stars} lie outside")
             ax.set_xlabel("magnitude [mag]")
         axes[0].set_ylabel(f"residual [{scale.unit}]")
-        fig.colorbar(hexagons, ax=axes, label="stars per hexagon", fraction=0.04, pad=0.01)
+        fig.colorbar(hexagons, ax=axes, label=f"{stars} per hexagon", fraction=0.04, pad=0.01)
     return fig
 
 

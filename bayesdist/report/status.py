@@ -121,7 +121,7 @@ def _sampling_checks(inputs: ReportInput) -> tuple[Check, ...]:
 def _fit_checks(inputs: ReportInput) -> tuple[Check, ...]:
     fit = inputs.fit
     ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
-    left_out = 1.0 - float(np.mean(fit.used))
+    left_out = fit.n_rejected / fit.n_rows
     low, high = _CHI2
     return (
         Check(

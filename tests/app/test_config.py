@@ -6,6 +6,7 @@ import pytest
 
 from bayesdist.app.config import load_config, load_requirements, parse_config
 from bayesdist.errors import ConfigError, InputError
+from bayesdist.infer import Compute
 from tests.app.support import config_text, write_config
 
 # design.md, section 8, for one chip and without the choice of an engine
@@ -120,6 +121,10 @@ def test_values_that_the_design_names_are_the_defaults():
     assert config.assess.grid == (33, 17) and config.assess.epoch is None
     assert config.requirements() == () and config.user_terms() == () and config.chips() == ()
     assert config.products.sip is None and config.products.idctab is None
+    assert config.sampler.method == "exact"
+    assert config.resources() == Compute("threads", 1000.0)
+    cluster = parsed(config_text(compute={"engine": "dask", "scheduler": "tcp://10.0.0.1:8786"}))
+    assert cluster.resources() == Compute("dask", scheduler="tcp://10.0.0.1:8786")
 
 
 @pytest.mark.parametrize(
@@ -191,7 +196,17 @@ def test_a_key_like_no_other_lists_the_known_ones():
         ("outliers", {"model": "uniform"}, ["outliers.match_radius"]),
         ("outliers", {"jitter": -1}, ["outliers.jitter", "'fit'"]),
         ("outliers", {"fraction_prior": [0, 1]}, ["outliers.fraction_prior[1]"]),
-        ("compute", {"engine": "dsak"}, ["compute.engine", "'threads'"]),
+        ("compute", {"engine": "dsak"}, ["compute.engine", "'threads' or 'dask'"]),
+        ("compute", {"scheduler": "tcp://a:1"}, ["compute.scheduler", "'threads'", "'dask'"]),
+        ("compute", {"workers": 2}, ["compute.workers", "set the engine to 'dask'"]),
+        ("compute", {"engine": "dask", "workers": 0}, ["compute.workers", "greater than 0"]),
+        (
+            "compute",
+            {"engine": "dask", "scheduler": "tcp://a:1", "workers": 2},
+            ["compute.workers", "compute.scheduler", "leave one"],
+        ),
+        ("compute", {"memory_mb": 0}, ["compute.memory_mb", "greater than 0"]),
+        ("sampler", {"method": "nuts"}, ["sampler.method", "'exact' or 'certified'"]),
         ("budget", [{"name": "b", "kind": "systemtic", "sigma_u": 1, "sigma_v": 1}], ["[1].kind"]),
         ("budget", [{"name": "b", "kind": "random", "sigma_u": -1, "sigma_v": 1}], ["sigma_u"]),
         ("prior", [{"parameter": "u_1_0", "mean": 1, "sigma": 0}], ["prior[1].sigma"]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import binom
 
-from bayesdist.assess import misfit_of
+from bayesdist.assess import binned_sums, misfit_of, partitions_for
 
 SIZE = (1000.0, 800.0)
 
@@ -15,13 +15,19 @@ def _stars(n, rng):
     return x, y, 0.05 * rng.standard_normal((n, 2)) * np.exp(0.5 * rng.normal(size=(n, 1)))
 
 
+def _misfit(x, y, r):
+    partitions = partitions_for(len(x))
+    sums = {k: binned_sums(x, y, *r.T, bins=b, size=SIZE) for k, b in partitions.items()}
+    return misfit_of(sums, n_params=0, unit="pix")
+
+
 def test_noise_is_no_structure():
     """200 data sets of noise: no more than chance falls below one per cent."""
     rng = np.random.default_rng(1)
     p = []
     for _ in range(200):
         x, y, r = _stars(3000, rng)
-        p.append(misfit_of(x, y, r, size=SIZE, n_params=0, unit="pix").p_value)
+        p.append(_misfit(x, y, r).p_value)
     p = np.array(p)
     assert (p < 0.01).sum() <= binom.ppf(0.999, 200, 0.01)
     assert p.min() > 1e-4
@@ -31,7 +37,7 @@ def test_a_step_in_a_column_is_found_with_its_size():
     rng = np.random.default_rng(2)
     x, y, r = _stars(6000, rng)
     r[:, 0] += np.where(np.abs(x - 700) < 20, 0.08, 0.0)
-    found = misfit_of(x, y, r, size=SIZE, n_params=0, unit="pix")
+    found = _misfit(x, y, r)
     assert found.significant and found.partition == "columns"
     assert abs(found.structure - 0.08 * np.sqrt(0.04)) < 0.004  # 4 % of the columns
     assert "columns" in found.sentence and "pix" in found.sentence
@@ -41,5 +47,5 @@ def test_a_wave_over_the_field_is_found_in_cells():
     rng = np.random.default_rng(3)
     x, y, r = _stars(6000, rng)
     r[:, 1] += 0.03 * np.sin(x / 60) * np.sin(y / 60)
-    found = misfit_of(x, y, r, size=SIZE, n_params=0, unit="pix")
+    found = _misfit(x, y, r)
     assert found.significant and found.partition == "cells"

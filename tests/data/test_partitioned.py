@@ -432,7 +432,7 @@ def test_empty_parts(rng, tmp_path):
 
 
 def test_a_repeated_row_names_both_places(good, tmp_path, monkeypatch):
-    """In another file, and whatever the errors say; in as many rounds as the memory asks for."""
+    """In another file, and whatever the errors say; in as many buckets as the memory asks for."""
     write(tmp_path / "p0.parquet", good, group=GROUP)
     again = {k: v[:20_000] for k, v in good.items()}
     rng = np.random.default_rng(5)
@@ -460,8 +460,8 @@ def test_signed_zeros_are_equal_on_disk_too(tmp_path):
         open_matches(write(tmp_path / "a.parquet", columns), sigma=1.0)
 
 
-@pytest.mark.parametrize("rounds", [1, 2, 5])
-def test_the_earliest_repetition_is_found_in_any_number_of_rounds(rng, rounds):
+@pytest.mark.parametrize("buckets", [1, 2, 5])
+def test_the_earliest_repetition_is_found_in_any_number_of_buckets(rng, buckets):
     keys = [rng.integers(0, 40, 3000).astype(float) for _ in range(3)]
     rows = list(zip(*(k.tolist() for k in keys), strict=True))
     second = next(i for i, row in enumerate(rows) if row in rows[:i])
@@ -470,7 +470,7 @@ def test_the_earliest_repetition_is_found_in_any_number_of_rounds(rng, rounds):
         return ([k[a : a + 77] for k in keys] for a in range(0, 3000, 77))
 
     expected = (rows.index(rows[second]), second)
-    assert duplicates_module.first_repetition(batches, rounds) == expected
+    assert duplicates_module.first_repetition(batches, buckets) == expected
     assert duplicates_module.first_duplicate(keys) == expected
 
 
@@ -488,8 +488,8 @@ def test_rows_whose_hashes_meet_by_chance_are_no_repetition(rng, monkeypatch, di
 def test_more_repetitions_than_are_compared_at_a_time(rng, monkeypatch):
     monkeypatch.setattr(duplicates_module, "_COMPARED", 10)
     keys = [np.tile(rng.uniform(size=300), 2)]
-    for rounds in (1, 4):
-        first, second = duplicates_module.first_repetition(lambda: (keys,), rounds)
+    for buckets in (1, 4):
+        first, second = duplicates_module.first_repetition(lambda: (keys,), buckets)
         assert second == first + 300
 
 

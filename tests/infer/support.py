@@ -8,8 +8,18 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer import GaussianPriors, LinearFit, OutlierMixture, fit_linear
-from bayesdist.infer.stars import prepare
+from bayesdist.infer import (
+    Convergence,
+    GaussianPriors,
+    Limits,
+    LinearFit,
+    OutlierMixture,
+    Posterior,
+    SamplerInfo,
+    fit_linear,
+    load,
+)
+from bayesdist.infer.stars import Stars, prepare
 from bayesdist.infer.target import Target
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches
@@ -90,8 +100,48 @@ def target_of(
     priors: GaussianPriors | None = None,
     **fit_options,
 ) -> tuple[Target, LinearFit]:
-    fit = fit_linear(matches, model, priors=priors, **fit_options)
-    return Target(prepare(model, matches), mixture, priors or GaussianPriors.none(model)), fit
+    shards = load(model, matches)
+    fit = fit_linear(shards, model, priors=priors, **fit_options)
+    return Target(shards, mixture, priors or GaussianPriors.none(model)), fit
+
+
+def stars_of(model: DistortionModel, matches: MatchTable) -> Stars:
+    return prepare(model, matches)[0]
+
+
+def columns_of(matches: MatchTable) -> dict[str, np.ndarray]:
+    """What `DistortionModel.predict` and `jacobian` want beside the pixels."""
+    return {
+        "epoch": matches.epoch,
+        "exposure": matches.exposure,
+        "chip": np.asarray(matches.chip_numbers)[matches.chip],
+    }
+
+
+def residual_of(model: DistortionModel, theta, matches: MatchTable) -> np.ndarray:
+    """Data minus `DistortionModel.predict`, star by star: no groups, no powers, no kernel."""
+    uv = model.predict(theta, matches.x, matches.y, **columns_of(matches))
+    return np.column_stack([matches.u, matches.v]) - uv
+
+
+def posterior_at(target: Target, psi: np.ndarray) -> Posterior:
+    """A posterior whose draws are the points psi (n, D): one chain, nothing said of convergence."""
+    n, nothing = target.n_theta, np.zeros(psi.shape[1])
+    return Posterior(
+        model=target.model,
+        mixture=target.mixture,
+        theta=psi[None, :, :n],
+        hyper={k: v[None] for k, v in target.hyper.values(psi[:, n:]).items()},
+        log_prob=target.log_density(psi)[None],
+        n_stars=len(target.shards),
+        n_flagged=0,
+        n_false=0.0,
+        reference_sigma=target.hyper.scale,
+        convergence=Convergence(
+            target.names, *[nothing] * 5, 0.0, 1.0, False, ("made by hand",), Limits()
+        ),
+        sampler=SamplerInfo("by hand", 1, 1, len(psi), 0, 0, 1.0, 0.0, 0),
+    )
 
 
 def numerical_gradient(function, point: np.ndarray, step) -> np.ndarray:

@@ -66,7 +66,7 @@ def test_orders_have_438_parameters():
 @pytest.mark.parametrize("order", ORDERS)
 def test_sampled_sd_is_the_formal_sigma(order):
     _, fit, matches = problem(order)
-    posterior = sample(fit, matches, outliers=CERTAIN, seed=order)
+    posterior = sample(fit, matches, outliers=CERTAIN, seed=order, walkers=16)
     assert posterior.convergence.converged, posterior.convergence.reasons
     info = posterior.sampler
     assert info.acceptance > 0.9

@@ -17,6 +17,8 @@ from bayesdist.infer import (
     fit_linear,
     load_fit,
     load_posterior,
+    memberships,
+    outlier_probability,
     sample,
     save_fit,
     save_posterior,
@@ -65,8 +67,10 @@ def test_posterior_round_trip(written):
     again = load_posterior(path)
     assert again.model == posterior.model and again.mixture == posterior.mixture
     assert again.sampler == posterior.sampler
-    for name in ("theta", "log_prob", "outlier_probability", "mean", "cov"):
+    for name in ("theta", "log_prob", "mean", "cov"):
         np.testing.assert_array_equal(getattr(again, name), getattr(posterior, name))
+    for name in ("n_stars", "n_flagged", "n_false", "reference_sigma"):
+        assert getattr(again, name) == getattr(posterior, name)
     assert again.hyper.keys() == posterior.hyper.keys()
     for name, values in posterior.hyper.items():
         np.testing.assert_array_equal(again.hyper[name], values)
@@ -114,9 +118,11 @@ def test_xarray_opens_it(written):
         np.testing.assert_array_equal(constants["sigma_u"], matches.sigma_u)
         numbers = np.asarray(matches.chip_numbers)[matches.chip]
         np.testing.assert_array_equal(constants["chip"], numbers)
+        p = outlier_probability(posterior, matches)
+        np.testing.assert_array_equal(constants["outlier_probability"], p)
         assert constants.attrs["unit"] == "pix"
         assert json.loads(tree.attrs["provenance"]) == {"seed": 8, "inputs": ["a.ecsv"]}
-        assert tree.attrs["schema"] == 1
+        assert tree.attrs["schema"] == 2
         assert list(tree["posterior"]["unit"].values) == list(posterior.model.units)
 
 
@@ -138,18 +144,33 @@ def test_log_likelihood_of_the_stars_adds_up(written):
     np.testing.assert_allclose(difference, 0, atol=1e-6)
 
 
-def test_large_runs_keep_a_summary_of_each_star(written, monkeypatch, tmp_path):
+def test_what_is_said_of_each_star_is_the_mean_over_some_draws(written):
+    """Where draws times stars are too many for the file, this is what takes their place."""
     posterior, matches, path = written
-    monkeypatch.setattr(posterior_file, "LARGEST", 1000)
-    save_posterior(posterior, matches, tmp_path / "big.nc")
-    with xr.open_datatree(tmp_path / "big.nc", engine="h5netcdf") as tree:
-        summary = tree["log_likelihood_summary"].load()
-        assert "log_likelihood" not in tree.children
+    found = memberships(posterior, matches)
     full = az.from_netcdf(path).log_likelihood["uv"].values.reshape(-1, len(matches))
-    some = np.linspace(0, len(full) - 1, int(summary.attrs["draws"])).astype(int)
-    np.testing.assert_allclose(summary["mean"], full[some].mean(axis=0), rtol=1e-9)
-    np.testing.assert_allclose(summary["variance"], full[some].var(axis=0), rtol=1e-5, atol=1e-8)
-    az.from_netcdf(tmp_path / "big.nc")
+    some = np.linspace(0, len(full) - 1, found.draws).astype(int)
+    np.testing.assert_allclose(found.log_likelihood, full[some].mean(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(
+        found.log_likelihood_variance, full[some].var(axis=0), rtol=1e-5, atol=1e-8
+    )
+
+
+def test_large_runs_leave_out_star_times_draw_and_then_the_stars(written, monkeypatch, tmp_path):
+    posterior, matches, _ = written
+    monkeypatch.setattr(posterior_file, "LARGEST", posterior.log_prob.size * len(matches) * 8 - 1)
+    save_posterior(posterior, matches, tmp_path / "big.nc")
+    draws = {"posterior", "sample_stats", "diagnostics"}
+    with xr.open_datatree(tmp_path / "big.nc", engine="h5netcdf") as tree:
+        assert set(tree.children) == draws | {"observed_data", "constant_data"}
+    monkeypatch.setattr(posterior_file, "MOST_STARS", len(matches) - 1)
+    save_posterior(posterior, matches, tmp_path / "larger.nc")
+    save_posterior(posterior, None, tmp_path / "none.nc")
+    for name in ("larger.nc", "none.nc"):
+        with xr.open_datatree(tmp_path / name, engine="h5netcdf") as tree:
+            assert set(tree.children) == draws
+        az.from_netcdf(tmp_path / name)
+        np.testing.assert_array_equal(load_posterior(tmp_path / name).theta, posterior.theta)
 
 
 def test_an_older_file_stays_when_writing_fails(written, tmp_path):
@@ -205,16 +226,34 @@ def test_a_fit_is_no_posterior_and_a_missing_file_is_missing(campaign, tmp_path)
         load_fit(tmp_path / "missing.nc")
 
 
-def test_fit_round_trip(campaign, tmp_path):
-    *_, fit = campaign
+NUMBERS = (
+    *("n_rows", "n_used", "n_rejected", "rms_u", "rms_v", "rms_rejected"),
+    *("chi2", "dof", "condition"),
+)
+
+
+@pytest.mark.parametrize("options", [{}, {"clip_abs": None}], ids=["clipped", "no absolute limit"])
+def test_fit_round_trip(campaign, tmp_path, options):
+    still, matches, _ = campaign
+    fit = fit_linear(matches, still, **options)
     save_fit(fit, tmp_path / "fit.nc")
     again = load_fit(tmp_path / "fit.nc")
     assert again.model == fit.model
-    for name in ("mean", "cov", "residual", "used"):
+    for name in ("mean", "cov"):
         np.testing.assert_array_equal(getattr(again, name), getattr(fit, name))
         assert getattr(again, name).dtype == getattr(fit, name).dtype
-    for name in ("rejected", "chi2", "dof", "condition", "rms_u", "rms_v"):
-        assert getattr(again, name) == getattr(fit, name)
+    for name in NUMBERS:
+        assert getattr(again, name) == getattr(fit, name), name
+        assert type(getattr(again, name)) is type(getattr(fit, name)), name
+    assert again.rejected == fit.rejected
+    # the rule that tells which stars were used comes back whole, infinite limits included
+    np.testing.assert_array_equal(again.clip.theta, fit.clip.theta)
+    assert (again.clip.chi2_limit, again.clip.abs_limit) == (
+        fit.clip.chi2_limit,
+        fit.clip.abs_limit,
+    )
+    np.testing.assert_array_equal(again.uses(matches), fit.uses(matches))
+    assert again.uses(matches).sum() == fit.n_used < len(matches)
     with xr.open_dataset(tmp_path / "fit.nc", engine="h5netcdf") as data:
         one = data["cov"].sel(parameter="A.u_1_0", parameter_2="A.u_1_0").item()
         k = fit.model.names.index("A.u_1_0")

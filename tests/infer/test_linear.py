@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, build_model, fit_linear
+from bayesdist.infer import GaussianPriors, build_model, fit_linear, residuals
 from bayesdist.model import FRAME_KINDS, DistortionModel, TimeDependence
 
 from .support import (
@@ -60,12 +60,14 @@ def test_without_frames_it_is_lstsq(order):
     A = legendre_design(order, matches.x, matches.y)
     mean = by_lstsq(order, matches)[0].reshape(2, -1)
     residual = np.column_stack([matches.u, matches.v]) - A @ mean.T
-    np.testing.assert_allclose(fit.residual, residual, atol=1e-9)
+    np.testing.assert_allclose(residuals(fit, matches), residual, atol=1e-9)
     quoted = np.column_stack([matches.sigma_u, matches.sigma_v])
     assert fit.chi2 == pytest.approx(((residual / quoted) ** 2).sum(), rel=1e-9)
     assert fit.dof == 800 - model.n_params
-    assert fit.used.all() and sum(fit.rejected.values()) == 0
-    assert fit.rms_u == pytest.approx(np.sqrt(np.mean(residual[:, 0] ** 2)), rel=1e-9)
+    assert fit.uses(matches).all() and sum(fit.rejected.values()) == 0
+    assert (fit.n_rows, fit.n_used, fit.n_rejected) == (400, 400, 0) and fit.rms_rejected == 0
+    rms = np.sqrt(np.mean(residual**2, axis=0))
+    assert (fit.rms_u, fit.rms_v) == pytest.approx(tuple(rms), rel=1e-9)
 
 
 def test_condition_is_that_of_the_unit_diagonal_normal_matrix():
@@ -153,12 +155,19 @@ def test_two_passes_reject_by_reason_and_refit_the_rest():
     u[[30, 40]] += 5.0
     bad = table(matches.x, matches.y, u, v)
     fit = fit_linear(bad, model, clip_chi2=25.0, clip_abs=2.0)
-    np.testing.assert_array_equal(np.flatnonzero(~fit.used), [10, 20, 30, 40])
+    used = fit.uses(bad)
+    np.testing.assert_array_equal(np.flatnonzero(~used), [10, 20, 30, 40])
     assert fit.rejected == {"chi-square": 1, "absolute residual": 3}
-    assert_same(fit, *by_lstsq(2, bad, fit.used))
+    assert (fit.n_rows, fit.n_used, fit.n_rejected) == (500, 496, 4)
+    assert_same(fit, *by_lstsq(2, bad, used))
     assert fit.dof == 2 * 496 - 12
     # rows left out have residuals too
-    assert fit.residual[20, 1] == pytest.approx(-30, abs=0.3)
+    residual = residuals(fit, bad)
+    assert residual[20, 1] == pytest.approx(-30, abs=0.3)
+    assert fit.rms_rejected == pytest.approx(np.sqrt(np.mean(residual[~used] ** 2)), rel=1e-9)
+    rms = np.sqrt(np.mean(residual[used] ** 2, axis=0))
+    assert (fit.rms_u, fit.rms_v) == pytest.approx(tuple(rms), rel=1e-9)
+    assert fit.chi2 == pytest.approx((residual[used] ** 2).sum() / 0.05**2, rel=1e-9)
 
 
 def test_the_absolute_limit_counts_in_pixels_whatever_the_unit():
@@ -170,14 +179,15 @@ def test_the_absolute_limit_counts_in_pixels_whatever_the_unit():
         matches.x, matches.y, (matches.u + bad) * scale, matches.v * scale, sigma=50.0, unit="mas"
     )
     fit = fit_linear(mas, DistortionModel(2, (CHIP,), unit="mas"), clip_chi2=np.inf, clip_abs=2.0)
-    np.testing.assert_array_equal(np.flatnonzero(~fit.used), [3])
+    np.testing.assert_array_equal(np.flatnonzero(~fit.uses(mas)), [3])
 
 
 def test_errors_that_are_too_small_as_a_whole_do_not_reject_everything():
     model, matches, _ = simulated(7, 500, order=2, sigma=0.05)
-    fit = fit_linear(matches.with_sigma(0.002, 0.002), model)
+    small = matches.with_sigma(0.002, 0.002)
+    fit = fit_linear(small, model)
     # a chi-square above 25 with two degrees of freedom has probability 4e-6
-    assert fit.used.all()
+    assert fit.uses(small).all() and fit.n_rejected == 0
     assert fit.chi2 / fit.dof == pytest.approx(25**2, rel=0.2)
 
 
@@ -205,6 +215,67 @@ def test_corner_weights_give_the_sandwich_covariance():
     zero = np.zeros_like(one)
     mean = np.concatenate([gain @ matches.u, gain @ matches.v])
     assert_same(fit, mean, np.block([[one, zero], [zero, one]]))
+
+
+def test_corner_weights_with_frames_and_priors_give_the_sandwich_covariance():
+    """H^-1 M H^-1 with the model's full Jacobian: H has the weights, M their squares.
+
+    A prior is an observation with its own error, whose weight is the inverse variance.
+    """
+    rng = np.random.default_rng(24)
+    model, matches, _ = simulated(
+        24, 300, frames="affine", n_exposures=3, sigma=uneven_sigma(rng, 300), fraction=0.03
+    )
+    priors = GaussianPriors.of(model, {"u_2_0": (0.5, 0.002), "e3.shift_u": (0.0, 5.0)})
+    fit = fit_linear(matches, model, radial_weight=4.0, priors=priors)
+    used = fit.uses(matches)
+    assert 0 < (~used).sum() < 30
+    J = model.jacobian(fit.mean, matches.x, matches.y, exposure=matches.exposure)[used]
+    w = (np.column_stack([matches.sigma_u, matches.sigma_v]) ** -2.0)[used]
+    extra = corner_weights(matches, 4.0)[used, None]
+    prior = np.diag(priors.precision)
+    H = np.einsum("nap,na,naq->pq", J, extra * w, J) + prior
+    M = np.einsum("nap,na,naq->pq", J, extra**2 * w, J) + prior
+    cov = np.linalg.solve(H, np.linalg.solve(H, M).T)
+    sigma = np.sqrt(np.diag(cov))
+    unit = np.outer(sigma, sigma)
+    np.testing.assert_allclose(fit.cov / unit, cov / unit, rtol=0, atol=1e-8)
+    # and the gradient vanishes at the solution
+    pull = np.einsum("nap,na->p", J, extra * w * residuals(fit, matches)[used])
+    pull += priors.pull(fit.mean)
+    assert np.sqrt(pull @ np.linalg.solve(H, pull)) < 1e-4
+    # statistics are those of the quoted errors, without the extra weight
+    chi2 = (w * residuals(fit, matches)[used] ** 2).sum()
+    assert fit.chi2 == pytest.approx(chi2, rel=1e-9)
+    assert fit.dof == 2 * used.sum() + 2 - model.n_params
+
+
+def test_who_is_used_is_decided_by_the_first_pass():
+    """The rule, worked out by hand on the first pass; it says the same of any part of the table."""
+    rng = np.random.default_rng(25)
+    model, matches, _ = simulated(
+        25, 600, frames="shift", n_exposures=2, sigma=uneven_sigma(rng, 600), fraction=0.1
+    )
+    fit = fit_linear(matches, model, clip_chi2=20.0, clip_abs=1.5)
+    first = fit_linear(matches, model, **UNCLIPPED)
+    # the first pass clips nothing
+    np.testing.assert_allclose(fit.clip.theta / first.sigma, first.mean / first.sigma, atol=1e-3)
+    quoted = np.column_stack([matches.sigma_u, matches.sigma_v])
+    r = residuals(first, matches)
+    chi2 = ((r / quoted) ** 2).sum(axis=1)
+    # the limit is scaled by the median chi-square where the errors are too small as a whole
+    limit = 20.0 * max(1.0, np.median(chi2) / (2 * np.log(2)))
+    assert fit.clip.chi2_limit == pytest.approx(limit, rel=1e-6) and fit.clip.abs_limit == 1.5
+    used = (chi2 <= limit) & (np.hypot(*r.T) <= 1.5)
+    np.testing.assert_array_equal(fit.uses(matches), used)
+    assert fit.n_used == used.sum() and 0 < fit.n_rejected < 100
+    far = np.hypot(*r.T) > 1.5
+    assert fit.rejected == {
+        "chi-square": (~used & ~far).sum(),
+        "absolute residual": far.sum(),
+    }
+    some = rng.permutation(600)[:100]
+    np.testing.assert_array_equal(fit.uses(matches.select(some)), used[some])
 
 
 def test_corner_weights_in_repeated_experiments():
@@ -251,7 +322,7 @@ def test_frames_are_found_from_large_rotations(frames, degrees):
     fit = fit_linear(matches, model)
     d = fit.mean - theta
     assert stats.chi2(model.n_params).sf(d @ np.linalg.solve(fit.cov, d)) > 1e-3
-    assert fit.used.mean() > 0.99
+    assert fit.n_used > 0.99 * fit.n_rows
 
 
 def test_time_dependence_with_a_break_and_two_chips_is_recovered():
@@ -312,7 +383,7 @@ def test_priors_on_frames_are_pseudo_observations():
     priors = GaussianPriors.of(model, named)
     fit = fit_linear(matches, model, priors=priors, **UNCLIPPED)
     J = model.jacobian(fit.mean, matches.x, matches.y, exposure=matches.exposure)
-    pull = np.einsum("nap,na->p", J, fit.residual) / 0.05**2
+    pull = np.einsum("nap,na->p", J, residuals(fit, matches)) / 0.05**2
     precision = np.einsum("nap,naq->pq", J, J) / 0.05**2
     for name, (centre, sigma) in named.items():
         k = model.names.index(name)

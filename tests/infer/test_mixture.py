@@ -8,8 +8,9 @@ from scipy import integrate, stats
 from scipy.special import expit
 
 from bayesdist.errors import InputError
-from bayesdist.infer import OutlierMixture
+from bayesdist.infer import OutlierMixture, kernel
 
+from .oracle import StarTerms, star_terms
 from .support import numerical_gradient
 
 SCALE = 0.05
@@ -72,46 +73,80 @@ def test_points_and_values_are_inverse(hyper):
         assert value == pytest.approx(expected, rel=1e-12)
 
 
+def terms_of(mixture: OutlierMixture, values, residual, var_u, var_v) -> StarTerms:
+    """The reference in numpy, at natural values of what is sampled."""
+    values = {"j": mixture.jitter} | values
+    return star_terms(
+        mixture.model, residual, var_u, var_v, radius=mixture.match_radius or 1.0, **values
+    )
+
+
+def by_kernel(hyper, values, residual, sigma) -> tuple[np.ndarray, np.ndarray]:
+    """Outlier probability and log-likelihood of each star by the compiled pass.
+
+    The model is zero: the residuals are the data.
+    """
+    n = len(residual)
+    columns = (np.zeros(n), np.zeros(n), *residual.T, *(sigma**2).T)
+    p, loglik, _ = kernel.memberships(
+        kernel.pieces_of(np.array([0, n]), kernel.BLOCK),
+        tuple(np.ascontiguousarray(c) for c in columns),
+        np.zeros((1, 1, 2, 3)),
+        1,
+        hyper.constants(hyper.point(values)[None]),
+    )
+    return p, loglik
+
+
 def test_log_likelihood_is_the_formula(hyper):
     residual, sigma = some_stars()
     values = {k: NATURAL[k] for k in hyper.mixture.hyper}
-    terms = hyper.terms(hyper.point(values), residual, *(sigma**2).T)
     expected = direct(hyper.mixture, values, residual, sigma)
-    np.testing.assert_allclose(terms.loglik, expected, rtol=1e-12, atol=1e-12)
+    _, loglik = by_kernel(hyper, values, residual, sigma)
+    np.testing.assert_allclose(loglik, expected, rtol=1e-12, atol=1e-12)
+    reference = terms_of(hyper.mixture, values, residual, *(sigma**2).T)
+    np.testing.assert_allclose(reference.loglik, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_outlier_probability_is_bayes_theorem():
     residual, sigma = some_stars()
-    h = MIXTURES["gaussian"].bind(SCALE)
-    p = h.terms(h.point(NATURAL), residual, *(sigma**2).T).outlier
+    hyper = MIXTURES["gaussian"].bind(SCALE)
     bad = 0.04 * stats.norm(scale=0.6).pdf(residual).prod(axis=1)
     good = 0.96 * stats.norm(scale=np.hypot(sigma, 0.03)).pdf(residual).prod(axis=1)
+    p, _ = by_kernel(hyper, NATURAL, residual, sigma)
     np.testing.assert_allclose(p, bad / (bad + good), rtol=1e-10)
     assert p.min() < 0.01 and p.max() > 0.99
+    reference = terms_of(hyper.mixture, NATURAL, residual, *(sigma**2).T)
+    np.testing.assert_allclose(reference.outlier, bad / (bad + good), rtol=1e-10)
 
 
-def test_derivatives_by_differences(hyper):
+HYPER_ORDER = ("j", "f", "s_out")
+
+
+def test_derivatives_of_the_reference_by_differences(hyper):
+    """Of the log-likelihood of single stars; what the compiled sums are held against."""
     residual, sigma = some_stars(12)
     variances = (sigma**2).T
-    h0 = hyper.point({k: NATURAL[k] for k in hyper.mixture.hyper})
-    n_h = len(h0)
-    terms = hyper.terms(h0, residual, *variances)
+    names = hyper.mixture.hyper
+    which = [HYPER_ORDER.index(k) for k in names]
+    h0 = hyper.point({k: NATURAL[k] for k in names})
+
+    def at(h, residual, var_u, var_v):
+        return terms_of(hyper.mixture, hyper.values(h), residual, var_u, var_v)
 
     def per_star(k, point):
         """log p and its gradient of star k at (r_u, r_v, h...)."""
-        out = hyper.terms(
-            point[2:], point[None, :2], variances[0][k : k + 1], variances[1][k : k + 1]
-        )
-        return out.loglik[0], np.concatenate([-out.pull[0], out.gradient[0]])
+        out = at(point[2:], point[None, :2], variances[0][k : k + 1], variances[1][k : k + 1])
+        return out.loglik[0], np.concatenate([-out.pull[0], out.gradient[0][which]])
 
-    curvature = np.zeros((n_h, n_h))
+    terms = at(h0, residual, *variances)
     for k in range(12):
         point = np.concatenate([residual[k], h0])
-        step = np.concatenate([1e-3 * sigma[k], np.full(n_h, 1e-3)])
+        step = np.concatenate([1e-3 * sigma[k], np.full(len(h0), 1e-3)])
         gradient = numerical_gradient(lambda p, k=k: per_star(k, p)[0], point, step)
         scale = 1e-7 / step * 1e-3  # differences of numbers of order 1 to 100
         np.testing.assert_allclose(-terms.pull[k], gradient[:2], rtol=1e-6, atol=scale[0])
-        np.testing.assert_allclose(terms.gradient[k], gradient[2:], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(terms.gradient[k][which], gradient[2:], rtol=1e-6, atol=1e-7)
         hessian = numerical_gradient(lambda p, k=k: per_star(k, p)[1], point, step)
         uu, uv, vv = terms.weight[k]
         np.testing.assert_allclose(
@@ -120,24 +155,55 @@ def test_derivatives_by_differences(hyper):
             rtol=1e-6,
             atol=1e-6 / SCALE**2 * 1e-3,
         )
-        np.testing.assert_allclose(terms.cross[k], hessian[2:, :2], rtol=1e-6, atol=1e-5)
-        curvature -= hessian[2:, 2:]
-    np.testing.assert_allclose(terms.curvature, curvature, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(terms.cross[k][which], hessian[2:, :2], rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(
+            terms.curvature[k][which][:, which], -hessian[2:, 2:], rtol=1e-6, atol=1e-6
+        )
     assert (terms.safe_weight >= 0).all()
 
 
 def test_extreme_residuals_stay_finite(hyper):
     """1e6 sigma: a false match across the whole detector."""
     residual = np.array([[0.05e6, 0.0], [0.0, -0.05e6], [0.0, 0.0]])
-    variances = np.full(3, 0.05**2)
+    sigma = np.full((3, 2), 0.05)
     values = {k: NATURAL[k] for k in hyper.mixture.hyper}
-    terms = hyper.terms(hyper.point(values), residual, variances, variances)
-    for name in ("loglik", "outlier", "pull", "weight", "safe_weight", "gradient", "cross"):
-        assert np.isfinite(getattr(terms, name)).all(), name
-    assert np.isfinite(terms.curvature).all()
     with np.errstate(divide="ignore"):
-        expected = direct(hyper.mixture, values, residual, np.full((3, 2), 0.05))
-    np.testing.assert_allclose(terms.loglik, expected, rtol=1e-12)
+        expected = direct(hyper.mixture, values, residual, sigma)
+    p, loglik = by_kernel(hyper, values, residual, sigma)
+    np.testing.assert_allclose(loglik, expected, rtol=1e-12)
+    far = 0.0 if hyper.mixture.model == "none" else 1.0
+    np.testing.assert_allclose(p[:2], far, atol=1e-12)
+    moments = kernel.mixture_moments(
+        np.array([[0, 0, 3]]),
+        (np.zeros(3), np.zeros(3), *np.ascontiguousarray(residual.T), *(sigma.T.copy() ** 2)),
+        np.zeros((1, 2, 3)),
+        1,
+        hyper.constants(hyper.point(values)[None]),
+    )
+    for name in ("weight", "right", "cross", "scalars"):
+        assert np.isfinite(getattr(moments, name)).all(), name
+
+
+def test_constants_are_those_of_the_values(hyper):
+    """Each point by itself, and what is fixed stands in every row."""
+    rng = np.random.default_rng(5)
+    h = rng.uniform(-6, 1, (4, len(hyper.names)))
+    constants, mixture = hyper.constants(h), hyper.mixture
+    values = hyper.values(h)
+    j = values.get("j", np.full(4, mixture.jitter))
+    f = values.get("f", np.zeros(4))
+    np.testing.assert_allclose(constants.j2, j**2, rtol=1e-14)
+    np.testing.assert_allclose(np.exp(constants.log_f), f, rtol=1e-14)
+    np.testing.assert_allclose(np.exp(constants.log_1_f), 1 - f, rtol=1e-14)
+    if mixture.model == "gaussian":
+        np.testing.assert_allclose(constants.out, values["s_out"] ** 2, rtol=1e-14)
+    elif mixture.model == "uniform":
+        np.testing.assert_allclose(constants.out, np.pi * 1.5**2)
+    assert constants.unit2 == SCALE**2
+    some = constants.of(slice(1, 3))
+    again = hyper.constants(h[1:3])
+    for one, two in zip(some, again, strict=True):
+        np.testing.assert_array_equal(one, two)
 
 
 # -- priors ---------------------------------------------------------------------------------------

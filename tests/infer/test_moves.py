@@ -7,15 +7,25 @@ independent sample.
 
 from __future__ import annotations
 
-import emcee
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.infer import OutlierMixture
+from bayesdist.infer import Limits, OutlierMixture
+from bayesdist.infer.plan import (
+    boundaries,
+    expected_passes,
+    ladder,
+    pilot_steps,
+    plan_moves,
+    walkers_for,
+)
 from bayesdist.infer.proposal import GridProposal, build_proposal
-from bayesdist.infer.sampler import Ensembles, Plan, Whitening, boundaries, plan_moves
+from bayesdist.infer.whitening import Whitening
 
+from .fakes import advanced, ensembles_of
 from .oracle import JitterOracle
 from .support import UNCLIPPED, simulated, target_of
 
@@ -48,13 +58,11 @@ def known(request):
 def run(known, weights, seed):
     target, proposal, oracle = known
     rng = np.random.default_rng(seed)
-    whitening = Whitening.of(target, proposal, oracle.draw(500, rng))
-    plan = Plan("test", weights, WALKERS, 0, 0.5)
-    runs = Ensembles(target, proposal, whitening, plan, (1,))
+    draws = oracle.draw(500, rng)
     first = oracle.draw(WALKERS, rng)
-    state = emcee.State(whitening.to_white(first))
-    state.random_state = np.random.RandomState(seed).get_state()
-    return first, runs.block(0, state, 0, STEPS), oracle
+    runs = ensembles_of(target, proposal, draws, weights, WALKERS, (seed,))
+    (block,) = advanced(runs, first[None], STEPS)
+    return first, block, runs.psi(block), oracle
 
 
 def standardised(psi, oracle):
@@ -65,11 +73,11 @@ def standardised(psi, oracle):
 
 @pytest.mark.parametrize("weights", MOVES.values(), ids=MOVES)
 def test_moves_leave_a_skewed_posterior_invariant(known, weights):
-    first, block, oracle = run(known, weights, seed=3)
-    theta, log_j = standardised(block.psi[-1], oracle)
+    first, block, psi, oracle = run(known, weights, seed=3)
+    theta, log_j = standardised(psi[-1], oracle)
 
     target = known[0]
-    np.testing.assert_allclose(block.log_prob[-1], target.log_density(block.psi[-1]), atol=1e-7)
+    np.testing.assert_allclose(block.log_prob[-1], target.log_density(psi[-1]), atol=1e-7)
 
     # the walkers have moved on: the test sees the move, not the start
     rate = block.accepted.mean() / STEPS
@@ -126,15 +134,54 @@ def test_boundaries_are_those_documented():
     assert list(boundaries(200, 1000)) == [50, 100, 200, 400, 600, 800, 1000]
 
 
+@pytest.mark.parametrize("n_stars", [100, 5_000, 1_000_000, 10**10])
+@pytest.mark.parametrize(
+    ("every", "most"), [(200, 20_000), (1000, 3000), (30, 100), (4, 77), (7, 3)]
+)
+def test_ladder(every, most, n_stars):
+    pilot = 15
+    rungs = list(ladder(pilot, every, most, n_stars))
+    assert rungs[0].begin == 0 and rungs[-1].end == most
+    for one, following in pairwise(rungs):
+        assert one.end == one.full == following.begin
+    for rung in rungs:
+        assert 0 < rung.end - rung.begin <= every
+        assert rung.end <= rung.full
+        assert rung.full <= pilot or rung.begin >= pilot  # pilot and later pages are never mixed
+        # what is added is in proportion to what there is
+        assert rung.begin < pilot or rung.full - rung.begin <= 0.25 * rung.begin + 1
+    longer = list(ladder(pilot, every, 2 * most, n_stars))
+    assert [(r.begin, r.full) for r in rungs] == [(r.begin, r.full) for r in longer[: len(rungs)]]
+
+
+def test_sizes_follow_the_price_of_a_pass():
+    stars = [10, 1_000, 5_000, 50_000, 1_000_000, 10**10]
+    walkers = [walkers_for(n) for n in stars]
+    assert walkers == sorted(walkers, reverse=True)
+    assert walkers[0] >= 64 and walkers[-1] == 8
+    for ensembles in (2, 4, 8):
+        for w in (*walkers, 1, 1000):
+            # enough proposals to tell how good they are, and steps to make something of them
+            assert ensembles * w * (pilot_steps(ensembles, w) + 1) >= 512
+            assert pilot_steps(ensembles, w) >= 15
+    # hundreds of passes where they are dear
+    for n_params in (20, 45, 400):
+        assert 512 <= expected_passes(n_params, 10**7, Limits()) < 1500
+
+
 def test_plan_falls_back_as_the_proposal_gets_worse():
-    good = plan_moves(0.95, 0.2, 45)
-    fair = plan_moves(0.3, 0.6, 45)
-    poor = plan_moves(0.01, 1.2, 45)
-    assert good.weights[0] > fair.weights[0] > poor.weights[0] > 0
+    good = plan_moves(0.95, 0.2, 45, 5000)
+    fair = plan_moves(0.3, 0.6, 45, 5000)
+    poor = plan_moves(0.01, 1.2, 45, 5000)
+    assert good.independent and good.weights[0] > fair.weights[0] > poor.weights[0] > 0
     assert good.weights[2] == fair.weights[2] == 0 < poor.weights[2]
+    assert poor.coupled and not fair.coupled
     # emcee's red-blue moves refuse fewer walkers than twice the parameters
     assert poor.walkers >= 2 * 45
     # a tail that the proposal misses shows in k while the efficiency looks fine
-    assert plan_moves(0.9, 1.5, 45) == plan_moves(0.01, 1.5, 45)
+    assert plan_moves(0.9, 1.5, 45, 5000) == plan_moves(0.01, 1.5, 45, 5000)
+    # ... but few proposals do not tell
+    assert plan_moves(0.9, 1.5, 45, 5000, n_proposals=512).independent
+    assert not plan_moves(0.4, 1.5, 45, 5000, n_proposals=512).independent
     for plan in (good, fair, poor):
         assert sum(plan.weights) == pytest.approx(1)

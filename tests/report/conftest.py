@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bayesdist.report import ReportInput, all_figures
+from bayesdist.report import ReportInput, all_figures, drawn
 from bayesdist.report.html import render_report
 
 from .runs import report_input
@@ -26,11 +26,16 @@ def figures(converged):
 
 
 @pytest.fixture(scope="session")
-def page(converged, figures) -> str:
-    return render_report(converged, figures)
+def images(figures):
+    return drawn(figures)
 
 
 @pytest.fixture(scope="session")
-def bad_page(not_converged, figures) -> str:
+def page(converged, images) -> str:
+    return render_report(converged, images)
+
+
+@pytest.fixture(scope="session")
+def bad_page(not_converged, images) -> str:
     # the pictures are those of the other run: only the words are looked at
-    return render_report(not_converged, figures)
+    return render_report(not_converged, images)

@@ -17,18 +17,21 @@ from bayesdist.assess import (
     Requirement,
     UserTerm,
     area_map,
-    binned_residuals,
     check_requirements,
     distortion_vectors,
     error_budget,
+    flagged_by_exposure,
+    star_sample,
+    star_sums,
     uncertainty_map,
 )
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.labelled.convergence import Convergence, Limits
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.shards import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.report import Check, Product, ReportInput
 
@@ -111,7 +114,7 @@ def sampled(
         hyper["f"] = rng.beta(F * 6000, (1 - F) * 6000, shape)
     if outliers == "gaussian":
         hyper["s_out"] = rng.lognormal(np.log(S_OUT), 0.04, shape) * scale
-    r2 = (fit.residual**2).sum(axis=1)
+    r2 = (residuals(fit, table) ** 2).sum(axis=1)
     s2, o2 = table.sigma_u**2 + (scale * JITTER) ** 2, (scale * S_OUT) ** 2
     odds = F / (1 - F) * s2 / o2 * np.exp(np.minimum(0.5 * r2 * (1 / s2 - 1 / o2), 700.0))
     sampled_as = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
@@ -140,7 +143,10 @@ def sampled(
         theta=theta,
         hyper=hyper,
         log_prob=np.zeros(shape),
-        outlier_probability=odds / (1 + odds),
+        n_stars=len(table),
+        n_flagged=int((odds > 1).sum()),
+        n_false=float((odds / (1 + odds)).sum()),
+        reference_sigma=float(np.median(table.sigma_u)),
         convergence=convergence,
         sampler=sampler,
     )
@@ -184,8 +190,9 @@ def report_input(
     unit: str = "pix",
     size: tuple[float, float] = SIZE,
     scale: float = 1.0,
+    shown: int = 1_000_000,
 ) -> ReportInput:
-    """Everything of a run, as the report takes it."""
+    """Everything of a run, as the report takes it; at most `shown` stars are drawn."""
     rng = np.random.default_rng(11)
     table = simulated(unit=unit, size=size, scale=scale)
     fit = fit_linear(table, wise_model(unit, size))
@@ -193,6 +200,10 @@ def report_input(
     if sampler:
         posterior = sampled(fit, table, converged=converged, outliers=outliers, scale=scale)
     solution = posterior or fit
+    shards = load(fit.model, table)
+    sums = shards.sum(star_sums, fit.mean, fit.clip, ((16, 16),))
+    stars = star_sample(table.sample(shown), len(table), fit, posterior)
+    mag, residual = (a[stars.used] for a in (stars.table.mag, stars.fit_residual))
     place = {"epoch": 2010.3}
     return ReportInput(
         name="wise-w2",
@@ -202,7 +213,8 @@ def report_input(
             "model": {"order": 4, "frames": "shift"},
             "fit": {"clip_chi2": 25.0, "clip_abs": 2.0},
         },
-        matches=table,
+        stars=stars,
+        exposures=sums.exposures,
         fit=fit,
         posterior=posterior,
         formal_map=uncertainty_map(fit, **place),
@@ -210,14 +222,7 @@ def report_input(
         displacement=distortion_vectors(solution, part="no_constant", **place),
         non_linear=distortion_vectors(solution, part="non_linear", **place),
         area=area_map(solution, **place),
-        binned=binned_residuals(
-            table.x,
-            table.y,
-            *fit.residual.T,
-            bins=(16, 16),
-            size=size,
-            weights=fit.used.astype(float),
-        ),
+        binned=sums.binned[16, 16].residuals(),
         coefficients=coefficient_table(fit, posterior),
         budget=error_budget(
             solution, terms=TERMS, n_draws=500, rng=rng, pixel_scale=2757.0, **place
@@ -236,7 +241,8 @@ def report_input(
             ),
             Product("maps.fits", "uncertainty maps"),
         ),
-        magnitude_errors=estimate(table.mag[fit.used], *fit.residual[fit.used].T),
+        magnitude_errors=estimate(mag, *residual.T),
+        flagged=None if posterior is None else flagged_by_exposure(shards, posterior),
         provenance={
             "command": "bayesdist run wise.toml -o run",
             "seed": 1,

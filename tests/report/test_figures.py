@@ -16,15 +16,16 @@ from bayesdist.assess import VectorMap
 from bayesdist.errors import InputError
 from bayesdist.report import (
     all_figures,
+    drawn,
     formal_uncertainty,
     residual_histogram,
     residuals_by_magnitude,
-    save_figures,
+    save_images,
     uncertainty_radius,
     vector_flow,
 )
 from bayesdist.report.corners import correlated_parameters
-from bayesdist.report.residuals import MixtureCurve, posterior_residuals
+from bayesdist.report.residuals import MixtureCurve
 from bayesdist.report.style import nice_below
 from bayesdist.report.traces import slowest_parameters
 from bayesdist.report.vectors import square_cells
@@ -205,7 +206,7 @@ def test_a_map_without_variation_or_vectors_is_drawn(converged):
 def test_the_callers_matplotlib_is_left_alone(converged, tmp_path):
     with matplotlib.rc_context({"font.size": 23.0, "axes.linewidth": 3.0}):
         before = dict(matplotlib.rcParams)
-        save_figures(all_figures(converged), tmp_path)
+        save_images(drawn(all_figures(converged)), tmp_path)
         assert dict(matplotlib.rcParams) == before
     assert pyplot.get_fignums() == []
 
@@ -229,12 +230,33 @@ def test_a_million_stars_are_drawn_as_counts():
 def test_every_star_of_a_histogram_is_counted(converged):
     fig = all_figures(converged)["residual_histogram"]
     bars = fig.axes[2].patches[0]  # all stars of u
-    assert bars.get_data().values.sum() == len(converged.matches)
+    assert bars.get_data().values.sum() == converged.stars.n_total == 6000
 
 
-def test_residuals_at_the_fit_are_the_fits_own(converged):
-    residual = posterior_residuals(converged.matches, converged.fit)
-    np.testing.assert_allclose(residual, converged.fit.residual, atol=1e-9)
+def test_residuals_are_the_data_minus_the_model(converged):
+    """By the model's own prediction, which takes another way than the passes over the data."""
+    t = converged.stars.table
+    where = {"exposure": t.exposure, "epoch": t.epoch}
+    for solution, found in (
+        (converged.fit, converged.stars.fit_residual),
+        (converged.posterior, converged.stars.residual),
+    ):
+        model = solution.model.predict(solution.mean, t.x, t.y, **where)
+        np.testing.assert_allclose(found, np.column_stack([t.u, t.v]) - model, atol=1e-9)
+
+
+def test_figures_of_some_stars_say_so_and_show_no_others():
+    run = report_input(shown=1500)
+    assert run.stars.partial and len(run.stars) == 1500
+    figs = all_figures(run)
+    histogram = figs["residual_histogram"]
+    bars, curve = histogram.axes[2].patches[0].get_data(), histogram.axes[2].lines[0]
+    assert bars.values.sum() == 1500
+    # bars and curve count the same stars
+    assert curve.get_ydata().sum() == pytest.approx(1500, rel=0.01)
+    for name in ("residual_histogram", "residuals_by_magnitude"):
+        labels = [ax.get_ylabel() + ax.get_title() for ax in figs[name].axes]
+        assert any("sample" in label for label in labels), name
 
 
 def test_the_most_correlated_pair_is_chosen_for_the_corner_plot(converged):
@@ -275,8 +297,8 @@ def test_round_numbers_below(value, expected):
     assert nice_below(value) == expected
 
 
-def test_a_folder_that_cannot_be_made_is_named(figures, tmp_path):
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     with pytest.raises(InputError, match="file"):
-        save_figures(figures, blocked / "figures")
+        save_images({}, blocked / "figures")

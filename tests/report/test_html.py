@@ -91,7 +91,7 @@ def test_pictures_are_whole_and_described(page, figures):
         assert caption.strip().endswith(".") and len(caption) > 60
 
 
-def test_no_nan_is_ever_printed(converged, figures):
+def test_no_nan_is_ever_printed(converged, images):
     fit, c = converged.fit, converged.posterior.convergence
     table = coefficient_table(fit, converged.posterior)
     table["sd"][3] = table["rhat"][4] = np.nan
@@ -108,7 +108,7 @@ def test_no_nan_is_ever_printed(converged, figures):
         provenance={"timings": {"fit": float("nan")}, "seed": None, "note": np.float64("nan")},
         products=(Product("a.fits", "a", (Check("closure", float("nan"), "at most 1", "warn"),)),),
     )
-    assert not re.search(r"\b(nan|None|inf)\b", words(render_report(holes, figures)), re.IGNORECASE)
+    assert not re.search(r"\b(nan|None|inf)\b", words(render_report(holes, images)), re.IGNORECASE)
 
 
 def test_a_page_of_a_good_run_says_nothing_of_provisional(page):
@@ -192,12 +192,16 @@ def test_names_cannot_break_the_page(converged, figures):
         converged,
         name=evil,
         config={"data": {"matches": evil}},
-        matches=replace(
-            converged.matches,
-            sources=(evil,),
-            exposure_names=("<b>", "&amp;", "frame2", "frame3"),
-            rejected={"<i>reason": 3},
+        stars=replace(
+            converged.stars,
+            table=replace(
+                converged.stars.table,
+                sources=(evil,),
+                exposure_names=("<b>", "&amp;", "frame2", "frame3"),
+                rejected={"<i>reason": 3},
+            ),
         ),
+        flagged=None,
         fit=converged.fit,
         posterior=None,
         posterior_map=None,
@@ -210,6 +214,26 @@ def test_names_cannot_break_the_page(converged, figures):
     tree = lxml_html.fromstring(out)
     assert tree.xpath("//h1")[0].text_content() == evil
     assert "&amp;" in [t.text_content() for t in tree.xpath("//section[@id='data']//tbody//th")]
+
+
+def test_a_page_of_some_stars_says_of_how_many(converged):
+    """What is drawn from a sample is marked; what is counted, is counted over all stars."""
+    page = render_report(report_input(shown=1500), {})
+    text = words(page)
+    assert "a sample of 1\u202f500 of 6\u202f000 stars" in text
+    whole = words(render_report(converged, {}))
+    assert "a sample of" not in whole
+
+    def row(page, head):
+        (cells,) = [
+            [c.text_content() for c in tr.xpath("./th|./td")]
+            for tr in lxml_html.fromstring(page).xpath("//tr")
+            if tr.xpath("./th|./td")[0].text_content().strip() == head
+        ]
+        return cells
+
+    for head in ("Matched stars", "Used by the least-squares fit", "frame0", "frame3"):
+        assert row(page, head) == row(render_report(converged, {}), head)
 
 
 def test_least_squares_alone_makes_a_page():
@@ -238,13 +262,13 @@ def test_legendre_and_monomial_tables_hold_the_same_polynomial(converged):
         np.testing.assert_allclose(basis.evaluate(x, y) @ a, powers @ b, atol=0.005)
 
 
-def test_the_file_appears_whole_or_not_at_all(converged, figures, tmp_path):
+def test_the_file_appears_whole_or_not_at_all(converged, images, tmp_path):
     path = tmp_path / "report.html"
-    write_report(path, converged, {"margins": figures["margins"]})
+    write_report(path, converged, {"margins": images["margins"]})
     first = path.read_text(encoding="utf-8")
     assert first.rstrip().endswith("</html>")
     with pytest.raises(InputError, match="no place"):
-        write_report(path, converged, {"unknown": figures["margins"]})
+        write_report(path, converged, {"unknown": images["margins"]})
     assert path.read_text(encoding="utf-8") == first
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(InputError, match="missing"):

@@ -48,7 +48,7 @@ def run_assess(session: Session) -> None:
     coefficients = coefficient_table(session.fit, solution)
     coefficients.meta["converged"] = solution.convergence.converged
     write_table(coefficients, run / "coefficients.ecsv")
-    warnings = warnings_of(session)
+    warnings = posterior_warnings(session)
     for text in warnings:
         log.warning("assess: WARNING: %s", text)
     budget = budget_of(session, solution)
@@ -127,6 +127,12 @@ def warnings_of(session: Session) -> list[str]:
             "small, which the jitter takes up, or the model does not fit"
         )
     return [text[0].upper() + text[1:] for text in out]
+
+
+def posterior_warnings(session: Session) -> list[str]:
+    """Those of the fit, and before them what must be said of the draws."""
+    label = session.posterior.approximation
+    return [label[0].upper() + label[1:], *warnings_of(session)] if label else warnings_of(session)
 
 
 def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:

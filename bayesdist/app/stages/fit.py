@@ -23,14 +23,17 @@ def run_fit(session: Session) -> None:
         table = Table({name: getattr(errors, name) for name in ERROR_COLUMNS})
         write_table(table, run / "magnitude_errors.ecsv")
     save_fit(fit, run / "fit.nc")
-    for stale in ("matches", "magnitude_errors", "fit"):  # this fit is what they go by from now on
+    # this fit is what all goes by from now on
+    if errors is not None:
+        session.errors_changed()
+    for stale in ("fit", "sums", "misfit", "stars"):
         session.__dict__.pop(stale, None)
     matches = session.raw_matches
     run.summarise(
         data={
             "n_rows": matches.n_rows,
-            "n_used": int(fit.used.sum()),
-            "n_rejected": matches.n_rows - int(fit.used.sum()),
+            "n_used": fit.n_used,
+            "n_rejected": matches.n_rows - fit.n_used,
             "rejected": {**matches.rejected, **fit.rejected},
             "n_exposures": len(matches.exposure_names),
             "sources": list(matches.sources),
@@ -49,8 +52,8 @@ def run_fit(session: Session) -> None:
     )
     log.info(
         "fit: %d stars, %d rejected, rms %.4g and %.4g %s, chi2/dof %.3f",
-        fit.used.size,
-        int((~fit.used).sum()),
+        fit.n_rows,
+        fit.n_rejected,
         fit.rms_u,
         fit.rms_v,
         fit.unit,

@@ -6,24 +6,21 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from bayesdist.app.rundir import as_json
 from bayesdist.app.session import Session
 from bayesdist.app.stages.assess import (
     budget_of,
     judged_requirements,
     margins_of,
-    warnings_of,
+    posterior_warnings,
 )
 from bayesdist.assess import (
     area_map,
-    binned_residuals,
     distortion_vectors,
+    flagged_by_exposure,
     uncertainty_map,
 )
 from bayesdist.assess.coefficients import coefficient_table
-from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN
 
 __all__ = ["run_report"]
 
@@ -39,7 +36,8 @@ def run_report(session: Session) -> None:
         Product,
         ReportInput,
         all_figures,
-        save_figures,
+        drawn,
+        save_images,
         write_report,
     )
 
@@ -47,9 +45,7 @@ def run_report(session: Session) -> None:
     fit, posterior, epoch = session.fit, session.posterior, session.epoch
     chip, grid = fit.model.chips[0], config.assess.grid
     vectors = {"grid": _vector_grid(chip.size), "epoch": epoch}
-    matches = session.matches
-    good = session.fitted
-    side = int(np.clip(np.sqrt(good.sum() / STARS_PER_BIN), 4, MOST_BINS))
+    several = len(fit.model.exposures) > 1
     record = run.record
     products = tuple(
         Product(
@@ -62,7 +58,8 @@ def run_report(session: Session) -> None:
     inputs = ReportInput(
         name=run.path.resolve().name,
         config=as_json(config.model_dump(exclude_none=True)),
-        matches=matches,
+        stars=session.stars,
+        exposures=session.sums.exposures,
         fit=fit,
         posterior=posterior,
         formal_map=uncertainty_map(fit, grid=grid, epoch=epoch),
@@ -70,21 +67,15 @@ def run_report(session: Session) -> None:
         displacement=distortion_vectors(posterior, part="no_constant", **vectors),
         non_linear=distortion_vectors(posterior, part="non_linear", **vectors),
         area=area_map(posterior, grid=grid, epoch=epoch),
-        binned=binned_residuals(
-            matches.x[good],
-            matches.y[good],
-            fit.residual[good, 0],
-            fit.residual[good, 1],
-            bins=side,
-            size=chip.size,
-        ),
+        binned=session.shown_sums.residuals(),
         coefficients=coefficient_table(fit, posterior),
         budget=budget_of(session, posterior),
         # the requirements that were judged last, be it by `assess` or by `validate`
         margins=margins_of(session, judged_requirements(run), posterior),
         products=products,
-        warnings=tuple(warnings_of(session)),
+        warnings=tuple(posterior_warnings(session)),
         magnitude_errors=session.magnitude_errors,
+        flagged=flagged_by_exposure(session.shards, posterior) if several else None,
         provenance={
             k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")
         },
@@ -94,8 +85,9 @@ def run_report(session: Session) -> None:
     for stale in set(run.summary.get("figures", [])) - set(names):
         (run / "figures" / stale).unlink(missing_ok=True)
     run.summarise(figures=names)
-    save_figures(figures, run / "figures")
-    write_report(run / "report.html", inputs, figures)
+    images = drawn(figures)
+    save_images(images, run / "figures")
+    write_report(run / "report.html", inputs, images)
     log.info("report: %s", run / "report.html")
 
 

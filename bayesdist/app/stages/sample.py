@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
 
 from bayesdist.app.session import Session
+from bayesdist.app.star_files import FOLDER, write_star_files
+from bayesdist.data import MatchTable
 from bayesdist.infer import (
     Posterior,
     sample,
@@ -21,7 +24,7 @@ def run_sample(session: Session) -> None:
     s = config.sampler
     posterior = sample(
         session.fit,
-        session.matches,
+        session.shards,
         outliers=config.mixture(),
         priors=session.priors,
         seed=s.seed,
@@ -33,16 +36,23 @@ def run_sample(session: Session) -> None:
         checkpoint_every=s.checkpoint_every,
         folder=run.path,
         progress=session.progress,
+        method=s.method,
+        second_stage=s.second_stage,
     )
     record = run.record
     provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
-    save_posterior(posterior, session.matches, run / "posterior.nc", provenance=provenance)
+    matches = session.matches
+    table = matches if isinstance(matches, MatchTable) else None
+    save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
+    session.__dict__.pop("stars", None)
     session.__dict__["posterior"] = posterior
+    write_star_files(matches, session.fit, posterior, run / FOLDER)
     c, i = posterior.convergence, posterior.sampler
     run.summarise(
         outliers=_outliers(posterior),
         sampler={
             "method": i.method,
+            "exact": i.exact,
             "converged": c.converged,
             "reasons": list(c.reasons),
             "rhat_max": c.rhat_max,
@@ -56,6 +66,7 @@ def run_sample(session: Session) -> None:
             "passes": i.passes,
             "acceptance": i.acceptance,
             "wall_s": i.wall_s,
+            **_certificate(posterior),
         },
     )
     if c.converged:
@@ -75,5 +86,11 @@ def _outliers(posterior: Posterior) -> dict[str, object]:
             out[name] = {"mean": posterior.mixture.jitter, "sd": 0.0}
         elif key == "f":
             out[name] = {"mean": 0.0, "sd": 0.0}
-    out["n_flagged"] = int((posterior.outlier_probability > 0.5).sum())
+    out["n_flagged"] = posterior.n_flagged
     return out
+
+
+def _certificate(posterior: Posterior) -> dict[str, object]:
+    """What vouches for draws that were not made from the posterior itself."""
+    c = posterior.certificate
+    return {} if c is None else {"certificate": asdict(c) | {"granted": c.granted}}

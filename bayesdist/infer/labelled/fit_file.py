@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-
 from bayesdist.infer.labelled import netcdf
-from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.linear import Clip, LinearFit
 from bayesdist.model import DistortionModel
 
 __all__ = ["load_fit", "save_fit"]
+
+NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
 
 
 def save_fit(fit: LinearFit, path: str | Path) -> None:
@@ -23,17 +23,16 @@ def save_fit(fit: LinearFit, path: str | Path) -> None:
         {
             "mean": ("parameter", fit.mean),
             "cov": (("parameter", "parameter_2"), fit.cov),
-            "residual": (("star", "axis"), fit.residual),
-            "used": ("star", fit.used.astype(np.int8)),
+            "clip": ("parameter", fit.clip.theta),
         },
-        coords={"parameter": names, "parameter_2": names, "axis": ["u", "v"]},
+        coords={"parameter": names, "parameter_2": names},
         attrs={
             "creator": "bayesdist",
             "model": json.dumps(fit.model.to_dict()),
             "rejected": json.dumps(fit.rejected),
-            "chi2": fit.chi2,
-            "dof": fit.dof,
-            "condition": fit.condition,
+            "clip_chi2_limit": fit.clip.chi2_limit,
+            "clip_abs_limit": fit.clip.abs_limit,
+            **{name: getattr(fit, name) for name in NUMBERS},
         },
     )
     netcdf.write(data, path)
@@ -57,10 +56,11 @@ def load_fit(path: str | Path) -> LinearFit:
             model=DistortionModel.from_dict(json.loads(data.attrs["model"])),
             mean=data["mean"].values,
             cov=data["cov"].values,
-            residual=data["residual"].values,
-            used=data["used"].values.astype(bool),
+            clip=Clip(
+                data["clip"].values,
+                float(data.attrs["clip_chi2_limit"]),
+                float(data.attrs["clip_abs_limit"]),
+            ),
             rejected=json.loads(data.attrs["rejected"]),
-            chi2=float(data.attrs["chi2"]),
-            dof=int(data.attrs["dof"]),
-            condition=float(data.attrs["condition"]),
+            **{name: data.attrs[name].item() for name in NUMBERS},
         )

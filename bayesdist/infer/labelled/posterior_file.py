@@ -1,7 +1,8 @@
 """posterior.nc: the posterior as a netCDF tree that ArviZ and xarray open.
 
-Groups: posterior, sample_stats, diagnostics, observed_data, constant_data, and log_likelihood --
-or, where that would be too large, log_likelihood_summary with the mean and variance for each star.
+Groups: posterior, sample_stats, diagnostics; of tables in memory also observed_data, constant_data
+and, where that is not too large, log_likelihood.  What the posterior says of each star of larger
+data stands beside it, in the parts of `stars/`.
 """
 
 from __future__ import annotations
@@ -13,28 +14,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.certificate import Certificate
 from bayesdist.infer.labelled import netcdf
 from bayesdist.infer.labelled.convergence import Convergence, Limits
+from bayesdist.infer.membership import outlier_probability, star_log_likelihood
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.stars import prepare
-from bayesdist.infer.target import Target
 from bayesdist.model import DistortionModel
 
 __all__ = ["load_posterior", "save_posterior"]
 
-SCHEMA = 1
+SCHEMA = 2
+NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
+MOST_STARS = 1_000_000  # whose data are repeated here
 LARGEST = 16_000_000  # bytes of log-likelihood that are kept star by star and draw by draw
-SUMMARY_DRAWS = 100
 
 
 def save_posterior(
     posterior: Posterior,
-    matches: MatchTable,
+    matches: MatchTable | None,
     path: str | Path,
     *,
     provenance: Mapping[str, object] | None = None,
@@ -44,8 +44,8 @@ def save_posterior(
     Parameters
     ----------
     posterior : Posterior
-    matches : MatchTable
-        The data it was made from.
+    matches : MatchTable or None
+        The data it was made from; None, or more than a million stars, leaves them out.
     path : path
         Replaced atomically.
     provenance : mapping, optional
@@ -66,7 +66,8 @@ def save_posterior(
             coords={"parameter": parameter, "unit": ("parameter", list(posterior.model.units))},
         ),
         "sample_stats": xr.Dataset(
-            {"lp": (("chain", "draw"), posterior.log_prob)}, attrs=asdict(posterior.sampler)
+            {"lp": (("chain", "draw"), posterior.log_prob)},
+            attrs=asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
         ),
         "diagnostics": xr.Dataset(
             {
@@ -83,10 +84,13 @@ def save_posterior(
                 "limit_rhat": c.limits.rhat,
             },
         ),
-        "observed_data": xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)}),
-        "constant_data": _constants(posterior, matches, xr),
-        **_log_likelihood(posterior, matches, xr),
     }
+    if matches is not None and len(matches) <= MOST_STARS:
+        groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
+        groups["constant_data"] = _constants(posterior, matches, xr)
+        if posterior.log_prob.size * len(matches) * 8 <= LARGEST:
+            values = star_log_likelihood(posterior, matches)
+            groups["log_likelihood"] = xr.Dataset({"uv": (("chain", "draw", "star"), values)})
     tree = xr.DataTree.from_dict({f"/{name}": data for name, data in groups.items()})
     tree.attrs = {
         "schema": SCHEMA,
@@ -94,7 +98,9 @@ def save_posterior(
         "model": json.dumps(posterior.model.to_dict()),
         "mixture": json.dumps(asdict(posterior.mixture)),
         "provenance": json.dumps(dict(provenance or {}), default=str),
+        "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
         "n_parameters": n_theta,
+        **{name: getattr(posterior, name) for name in NUMBERS},
     }
     netcdf.write(tree, path)
 
@@ -107,7 +113,7 @@ def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[n
         "sigma_v": matches.sigma_v,
         "exposure": np.asarray(matches.exposure),
         "chip": np.asarray(matches.chip_numbers)[matches.chip],
-        "outlier_probability": posterior.outlier_probability,
+        "outlier_probability": outlier_probability(posterior, matches),
         "row": matches.row,
     }
     for name in ("epoch", "mag"):
@@ -117,39 +123,6 @@ def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[n
         {name: ("star", values) for name, values in columns.items()},
         attrs={"unit": matches.unit, "exposure_names": json.dumps(matches.exposure_names)},
     )
-
-
-def _log_likelihood(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[no-untyped-def]
-    target = Target(
-        prepare(posterior.model, matches), posterior.mixture, GaussianPriors.none(posterior.model)
-    )
-    chains, draws = posterior.log_prob.shape
-    psi = _psi(posterior, target)
-    if chains * draws * len(matches) * 8 <= LARGEST:
-        values = target.star_log_likelihood(psi.reshape(chains * draws, -1))
-        values = values.reshape(chains, draws, len(matches))
-        return {"log_likelihood": xr.Dataset({"uv": (("chain", "draw", "star"), values)})}
-    some = np.linspace(0, chains * draws - 1, min(SUMMARY_DRAWS, chains * draws)).astype(int)
-    mean, square = np.zeros(len(matches)), np.zeros(len(matches))
-    for point in psi.reshape(chains * draws, -1)[some]:
-        value = target.star_log_likelihood(point[None])[0]
-        mean += value / len(some)
-        square += value**2 / len(some)
-    return {
-        "log_likelihood_summary": xr.Dataset(
-            {"mean": ("star", mean), "variance": ("star", np.maximum(square - mean**2, 0.0))},
-            attrs={"draws": len(some)},
-        )
-    }
-
-
-def _psi(posterior: Posterior, target: Target) -> NDArray[np.float64]:
-    natural = posterior.hyper
-    columns = [
-        np.log(natural[k]) - np.log1p(-natural[k]) if k == "f" else np.log(natural[k])
-        for k in posterior.mixture.hyper
-    ]
-    return np.concatenate([posterior.theta, *(c[..., None] for c in columns)], axis=-1)
 
 
 def load_posterior(path: str | Path) -> Posterior:
@@ -185,13 +158,17 @@ def load_posterior(path: str | Path) -> Posterior:
         mixture = json.loads(attrs["mixture"])
         mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
         info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
+        info["exact"] = bool(info["exact"])
         return Posterior(
             model=DistortionModel.from_dict(json.loads(attrs["model"])),
             mixture=OutlierMixture(**mixture),
             theta=draws["theta"].values,
             hyper={k: draws[k].values for k in ("j", "f", "s_out") if k in draws},
             log_prob=stats["lp"].values,
-            outlier_probability=tree["constant_data"].to_dataset()["outlier_probability"].values,
+            n_stars=int(attrs["n_stars"]),
+            n_flagged=int(attrs["n_flagged"]),
+            n_false=float(attrs["n_false"]),
+            reference_sigma=float(attrs["reference_sigma"]),
             convergence=Convergence(
                 names=tuple(str(n) for n in checks["sampled"].values),
                 rhat=checks["rhat"].values,
@@ -206,7 +183,12 @@ def load_posterior(path: str | Path) -> Posterior:
                 limits=Limits(float(checks.attrs["limit_ess"]), float(checks.attrs["limit_rhat"])),
             ),
             sampler=SamplerInfo(**info),
+            certificate=_certificate(json.loads(attrs["certificate"])),
         )
+
+
+def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
+    return None if fields is None else Certificate(**fields | {"reasons": tuple(fields["reasons"])})
 
 
 def _plain(value: object) -> object:

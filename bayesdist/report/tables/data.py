@@ -14,20 +14,21 @@ __all__ = ["data_tables"]
 
 def data_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
     """What was read, what was rejected, errors by magnitude, exposures."""
-    m, fit = inputs.matches, inputs.fit
+    m, fit = inputs.stars.table, inputs.fit
+    partial = ", of the sample" if inputs.stars.partial else ""
     pairs = {
         "Sources": ", ".join(m.sources),
         "Rows read": count(m.n_rows),
-        "Matched stars": count(len(m)),
-        "Used by the least-squares fit": count(int(np.sum(fit.used))),
+        "Matched stars": count(inputs.stars.n_total),
+        "Used by the least-squares fit": count(fit.n_used),
         "Unit of u, v": m.unit,
-        "Exposures": count(len(np.unique(m.exposure))),
+        "Exposures": count(np.count_nonzero(inputs.exposures.n)),
         "Filters": ", ".join(f for f in m.filter_names if f) or MISSING,
     }
     if m.epoch is not None:
-        pairs["Epochs [yr]"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
+        pairs[f"Epochs [yr]{partial}"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
     if m.mag is not None and np.isfinite(m.mag).any():
-        pairs["Magnitudes"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
+        pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
     pairs["Errors of the stars"] = (
         "by magnitude, see below"
         if inputs.magnitude_errors is not None
@@ -43,7 +44,8 @@ def data_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
         if inputs.posterior is not None
         else "",
     )
-    out = [listing("Input", pairs), rejected]
+    note = f"Figures and tables of single stars show {inputs.sample}." if partial else ""
+    out = [listing("Input", pairs, note), rejected]
     if inputs.magnitude_errors is not None:
         out.append(_magnitude_table(inputs))
     if len(m.exposure_names) > 1:
@@ -68,27 +70,18 @@ def _magnitude_table(inputs: ReportInput) -> TextTable:
 
 
 def _exposure_table(inputs: ReportInput) -> TextTable:
-    m, fit = inputs.matches, inputs.fit
+    names, fit, sums = inputs.stars.table.exposure_names, inputs.fit, inputs.exposures
     scale = display_scale(inputs.unit, [fit.rms_u, fit.rms_v])
-    p = None if inputs.posterior is None else inputs.posterior.outlier_probability
-    n_codes = len(m.exposure_names)
-    stars = np.bincount(m.exposure, minlength=n_codes)
-    used = np.bincount(m.exposure, weights=fit.used, minlength=n_codes)
-    with np.errstate(invalid="ignore", divide="ignore"):  # an exposure may have lost all its stars
-        rms = [
-            np.sqrt(np.bincount(m.exposure, weights=fit.used * r**2, minlength=n_codes) / used)
-            for r in fit.residual.T
-        ]
-    flagged = None if p is None else np.bincount(m.exposure, weights=p > 0.5, minlength=n_codes)
+    flagged = inputs.flagged
     rows = tuple(
         (
-            m.exposure_names[k],
-            count(stars[k]),
-            count(used[k]),
-            *(number(r[k] * scale.factor) for r in rms),
+            names[k],
+            count(sums.n[k]),
+            count(sums.n_used[k]),
+            *(number(r[k] * scale.factor) for r in sums.rms),
             MISSING if flagged is None else marked(inputs, count(flagged[k])),
         )
-        for k in np.flatnonzero(stars)
+        for k in np.flatnonzero(sums.n)
     )
     return TextTable(
         "Exposures",

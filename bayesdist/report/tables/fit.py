@@ -15,7 +15,7 @@ __all__ = ["fit_tables", "outlier_table"]
 
 def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
     """The linear fit in figures, and statistics of its residuals."""
-    fit, model = inputs.fit, inputs.fit.model
+    fit, model, stars = inputs.fit, inputs.fit.model, inputs.stars
     mas = inputs.scale_mas
     pairs = {
         "Polynomial order": str(model.order),
@@ -29,19 +29,24 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
         f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",
         "rms of u": with_mas(fit.rms_u, inputs.unit, mas),
         "rms of v": with_mas(fit.rms_v, inputs.unit, mas),
-        "Stars used, left out": f"{count(np.sum(fit.used))}, {count(np.sum(~fit.used))}",
+        "Stars used, left out": f"{count(fit.n_used)}, {count(fit.n_rejected)}",
         "Condition of the scaled normal matrix": number(fit.condition, 2),
     }
     scale = display_scale(inputs.unit, [fit.rms_u, fit.rms_v])
     names = ("mean", "sigma", "min", "max", "median", "p01", "p99")
     heads = ("Mean", "σ", "Min", "Max", "Median", "1 %", "99 %")
     rows = []
-    for axis, values in zip("uv", fit.residual[fit.used].T, strict=True):
+    for axis, values in zip("uv", stars.fit_residual[stars.used].T, strict=True):
         s = residual_statistics(values * scale.factor)
         rows.append((axis, *(rounded(s[k], s["sigma"] / 10) for k in names)))
     return (
         listing("Linear fit", pairs),
-        TextTable(f"Residuals of the stars used [{scale.unit}]", ("Axis", *heads), tuple(rows)),
+        TextTable(
+            f"Residuals of the stars used [{scale.unit}]",
+            ("Axis", *heads),
+            tuple(rows),
+            note=f"From {inputs.sample}." if inputs.sample else "",
+        ),
     )
 
 
@@ -66,10 +71,9 @@ def outlier_table(inputs: ReportInput) -> TextTable | None:
         sd = float(v.std())
         cells = (rounded(v.mean(), sd), number(sd, 2), interval(low, high, sd))
         rows.append((name, *(marked(inputs, c) for c in cells), scale.unit))
-    p = post.outlier_probability
-    flagged = marked(inputs, count(np.sum(p > 0.5)))
+    flagged = marked(inputs, count(post.n_flagged))
     rows.append(("Stars flagged (probability above 0.5)", flagged, MISSING, MISSING, "stars"))
-    expected = marked(inputs, number(float(np.sum(p)), 4))
+    expected = marked(inputs, number(post.n_false, 4))
     rows.append(("False matches expected (sum of the probabilities)", expected, "–", "–", "stars"))
     mixture = post.mixture
     note = f"Outlier component: {mixture.model}"

@@ -1,0 +1,45 @@
+"""Matches in memory where they are few, left on disk where they are many."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+from bayesdist.data import input_files, open_matches, read_matches
+from bayesdist.data.parquet_files import describe_part
+from bayesdist.infer import Matches
+
+__all__ = ["IN_MEMORY", "load_matches"]
+
+IN_MEMORY = 1_000_000  # rows of Parquet above which they stay on disk
+
+PathLike = str | os.PathLike[str]
+
+
+def load_matches(
+    path: PathLike | Sequence[PathLike], *, format: str = "auto", **options: Any
+) -> Matches:
+    """Matches of any known kind; large tables in Parquet stay on disk.
+
+    Parameters
+    ----------
+    path, format, **options
+        As `read_matches`.
+
+    Returns
+    -------
+    MatchTable or PartitionedMatches
+
+    Raises
+    ------
+    InputError
+        As `read_matches`.
+    """
+    if format in ("auto", "table"):
+        files = input_files(path)
+        if all(file.suffix.lower() == ".parquet" for file in files):
+            rows = sum(describe_part(file).n_rows for file in files)
+            if rows > IN_MEMORY:
+                return open_matches(path, **options)
+    return read_matches(path, format=format, **options)

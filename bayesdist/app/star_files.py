@@ -1,0 +1,70 @@
+"""What a run says of each star: a folder of Parquet files, one for each piece of the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bayesdist.data import MatchTable, remove_leftovers
+from bayesdist.data.result_files import write_columns
+from bayesdist.errors import InputError
+from bayesdist.infer import LinearFit, Matches, Posterior, memberships, residuals
+
+__all__ = ["FOLDER", "part_files", "write_star_files"]
+
+FOLDER = "stars"
+
+
+def part_files(folder: Path) -> list[Path]:
+    """Parts that are there, in order."""
+    return sorted(folder.glob("part-" + 5 * "[0-9]" + ".parquet"))
+
+
+def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, folder: Path) -> None:
+    """Write what fit and posterior say of each star, piece by piece.
+
+    Parameters
+    ----------
+    matches : MatchTable or PartitionedMatches
+        With errors.
+    fit : LinearFit
+    posterior : Posterior
+    folder : Path
+        Parts that are there already are replaced or removed.
+
+    Raises
+    ------
+    InputError
+        When the folder or a file cannot be written, or the data have become unreadable.
+    """
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"the folder cannot be made ({error.strerror})",
+            where=str(folder),
+            do="choose one that you may write to",
+        ) from error
+    remove_leftovers(folder)
+    for path in part_files(folder):
+        path.unlink()
+    for k, piece in enumerate(matches.pieces()):
+        _write_part(piece.read(), fit, posterior, folder / f"part-{k:05d}.parquet")
+
+
+def _write_part(table: MatchTable, fit: LinearFit, posterior: Posterior, path: Path) -> None:
+    said = memberships(posterior, table)
+    u, v = residuals(posterior, table).T
+    columns = {
+        "source": (table.source, table.sources),
+        "row": table.row,
+        "x": table.x,
+        "y": table.y,
+        "residual_u": u,
+        "residual_v": v,
+        "used": fit.uses(table),
+        "outlier_probability": said.outlier_probability,
+        "log_likelihood": said.log_likelihood,
+        "log_likelihood_variance": said.log_likelihood_variance,
+    }
+    unit = posterior.unit
+    write_columns(path, columns, {"x": "pix", "y": "pix", "residual_u": unit, "residual_v": unit})

@@ -1,0 +1,85 @@
+"""Some of the stars with what the solutions say of them: for figures that draw single stars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer import LinearFit, Posterior, outlier_probability, residuals
+
+__all__ = ["SAMPLE", "StarSample", "star_sample"]
+
+Float = NDArray[np.float64]
+
+SAMPLE = 200_000  # stars that show what all of them look like
+
+
+@dataclass(frozen=True, eq=False)
+class StarSample:
+    """Evenly spread stars of the data, or all of them.
+
+    Parameters
+    ----------
+    table : MatchTable
+        N stars.
+    fit_residual : ndarray, shape (N, 2)
+        Data minus the least-squares fit, in the unit of u and v.
+    used : ndarray of bool, shape (N,)
+        Whether the fit used the star.
+    n_total : int
+        Stars that there are in all.
+    posterior_residual : ndarray, shape (N, 2), or None
+        Data minus the model at the posterior mean; None where nothing was sampled.
+    outlier_probability : ndarray, shape (N,), or None
+    """
+
+    table: MatchTable
+    fit_residual: Float
+    used: NDArray[np.bool_]
+    n_total: int
+    posterior_residual: Float | None = None
+    outlier_probability: Float | None = None
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @property
+    def partial(self) -> bool:
+        """Whether there are more stars than these."""
+        return len(self.table) < self.n_total
+
+    @property
+    def residual(self) -> Float:
+        """Residuals at the posterior mean where there is one, else at the fit."""
+        return self.fit_residual if self.posterior_residual is None else self.posterior_residual
+
+
+def star_sample(
+    table: MatchTable, n_total: int, fit: LinearFit, posterior: Posterior | None = None
+) -> StarSample:
+    """What a fit and a posterior say of some stars.
+
+    Parameters
+    ----------
+    table : MatchTable
+        With errors: as of ``matches.sample(SAMPLE)``.
+    n_total : int
+        Stars that there are in all.
+    fit : LinearFit
+    posterior : Posterior, optional
+
+    Returns
+    -------
+    StarSample
+    """
+    return StarSample(
+        table=table,
+        fit_residual=residuals(fit, table),
+        used=fit.uses(table),
+        n_total=n_total,
+        posterior_residual=None if posterior is None else residuals(posterior, table),
+        outlier_probability=None if posterior is None else outlier_probability(posterior, table),
+    )

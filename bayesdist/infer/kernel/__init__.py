@@ -1,0 +1,37 @@
+"""The fused passes over the stars, compiled: the only place that knows numba.
+
+Polynomials are evaluated on the fly by Horner's rule from the effective coefficients, so that no
+design matrix is read from memory.  Sums are taken over fixed pieces of the data and therefore do
+not depend on the number of threads.
+"""
+
+from bayesdist.infer.kernel.cache import kept_by_content
+
+with kept_by_content():
+    from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
+    from bayesdist.infer.kernel.likelihood import log_likelihood
+    from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
+    from bayesdist.infer.kernel.moments import (
+        PIECE,
+        Moments,
+        least_squares_moments,
+        mixture_moments,
+    )
+    from bayesdist.infer.kernel.stars import memberships, residuals
+
+__all__ = [
+    "BLOCK",
+    "GAUSSIAN",
+    "NO_OUTLIERS",
+    "PIECE",
+    "UNIFORM",
+    "Constants",
+    "Moments",
+    "least_squares_moments",
+    "log_likelihood",
+    "memberships",
+    "mixture_moments",
+    "pieces_of",
+    "residuals",
+    "set_threads",
+]

@@ -1,0 +1,50 @@
+"""How the stars are cut into pieces, and when a second thread pays."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["BLOCK", "pieces_of", "set_threads", "threads_for"]
+
+Int = NDArray[np.int64]
+
+BLOCK = 256  # stars whose scratch arrays stay in the first-level cache
+THREADS_PAY = 200_000  # evaluations of a star below which one thread is faster
+
+
+def pieces_of(starts: Int, size: int) -> Int:
+    """Pieces (n, 3) of (group, first star, end), none larger than `size` or across two groups.
+
+    Parameters
+    ----------
+    starts : ndarray of int, shape (G + 1,)
+    size : int
+    """
+    first = [np.arange(a, b, size) for a, b in pairwise(starts)]
+    group = np.repeat(np.arange(len(first)), [len(f) for f in first])
+    begin = np.concatenate([*first, np.zeros(0, np.int64)]).astype(np.int64)
+    end = np.minimum(begin + size, np.asarray(starts)[group + 1])
+    return np.column_stack([group, begin, end]).astype(np.int64)
+
+
+@contextmanager
+def threads_for(evaluations: float) -> Iterator[None]:
+    """One thread where more would wait for each other longer than they work."""
+    threads = nb.get_num_threads()
+    nb.set_num_threads(threads if evaluations > THREADS_PAY else 1)
+    try:
+        yield
+    finally:
+        nb.set_num_threads(threads)
+
+
+def set_threads(n: int) -> None:
+    """Use at most `n` threads in this process from now on."""
+    nb.set_num_threads(max(1, min(n, nb.config.NUMBA_NUM_THREADS, os.cpu_count() or 1)))

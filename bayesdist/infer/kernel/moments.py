@@ -1,0 +1,341 @@
+"""Sums over the stars that second-order steps need: normal equations, gradient and Hessian.
+
+A normal matrix is a sum of w phi_k phi_l.  The product of two Legendre functions is a sum of
+others, of twice the order: so only the moments of w with those are summed over the stars, 66 for
+order 5 instead of 231 products, and the matrix follows by a fixed linear map (`product_table`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numba as nb
+import numpy as np
+from numpy.polynomial import legendre as series
+from numpy.typing import NDArray
+
+from bayesdist.infer.kernel.blocks import BLOCK, threads_for
+from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
+from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.infer.kernel.polynomial import FAST, horner, legendre
+
+__all__ = ["PIECE", "Moments", "least_squares_moments", "mixture_moments"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+PIECE = 4096  # stars whose sums are kept apart, for the sake of the threads
+EVALUATIONS = 10  # what the sums of one star cost, in likelihood evaluations
+
+N_LEAST, N_MIXTURE = 9, 10  # scalar sums of the two passes
+N_HYPER = 3  # log j, logit f, log s_out
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Sums over the stars of each group.
+
+    Parameters
+    ----------
+    weight : ndarray, shape (G, 3, K, K)
+        sum of w phi phi^T for the axis pairs uu, uv, vv.
+    right : ndarray, shape (G, 2, K)
+        sum of phi times minus the gradient by the model.
+    cross : ndarray, shape (G, 3, 2, K)
+        Mixed second derivatives with log j, logit f, log s_out; zero in least squares.
+    scalars : ndarray, shape (n,)
+        Sums over all groups: see the functions.
+    """
+
+    weight: Float
+    right: Float
+    cross: Float
+    scalars: Float
+
+
+def _powers(order: int) -> tuple[Int, Int]:
+    """Exponents i, j of all terms to a total order, by total order, then falling i."""
+    i, j = np.array([(t - j, j) for t in range(order + 1) for j in range(t + 1)]).T
+    return i, j
+
+
+@cache
+def product_table(order: int) -> Float:
+    """Legendre coefficients (K, K, M) of the products of two basis functions.
+
+    phi_k phi_l = sum_m T[k, l, m] P_i(X) P_j(Y), with (i, j) in the order of the moments: by total
+    order up to 2 `order`, then falling i.
+    """
+    top = 2 * order
+    one = np.zeros((order + 1, order + 1, top + 1))
+    for a in range(order + 1):
+        for b in range(order + 1):
+            coefficients = series.legmul([0] * a + [1], [0] * b + [1])
+            one[a, b, : len(coefficients)] = coefficients
+    i, j = _powers(order)
+    mi, mj = _powers(top)
+    return one[np.ix_(i, i, mi)] * one[np.ix_(j, j, mj)]
+
+
+# Only here may the compiler choose the order of a sum.  Where it could reorder more, it makes other
+# last bits when it compiles the same code again, as it does for numba's cache.
+@nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
+def _dot(a, b):
+    """Sum of the products of two blocks."""
+    total = 0.0
+    for s in range(BLOCK):
+        total += a[s] * b[s]
+    return total
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _add(columns, first, last, P, Q, top, work, out):
+    """Add the moments of some columns (n, BLOCK) with P_i Q_j, i + j <= top, to out (n, M)."""
+    for c in range(first, last):
+        for i in range(top + 1):
+            for s in range(BLOCK):
+                work[s] = columns[c, s] * P[i, s]
+            for j in range(top + 1 - i):
+                t = i + j
+                out[c, t * (t + 1) // 2 + j] += _dot(work, Q[j])
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+def _least_squares(pieces, X, Y, u, v, var_u, var_v, about, test, order, rules):
+    n_pieces, top = len(pieces), 2 * order
+    sums = np.zeros((n_pieces, 4, (top + 1) * (top + 2) // 2))
+    scalars = np.zeros((n_pieces, N_LEAST))
+    chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
+    for b in nb.prange(n_pieces):
+        g, first, end = pieces[b]
+        P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
+        pu, pv, tu, tv = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        work = np.empty(BLOCK)
+        columns, parts = np.empty((4, BLOCK)), np.empty((N_LEAST, BLOCK))
+        for a in range(first, end, BLOCK):
+            e = min(a + BLOCK, end)
+            n = e - a
+            Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
+            legendre(Xb, n, top, P)
+            legendre(Yb, n, top, Q)
+            horner(about[g, 0], order, Xb, Yb, n, pu, work)
+            horner(about[g, 1], order, Xb, Yb, n, pv, work)
+            horner(test[g, 0], order, Xb, Yb, n, tu, work)
+            horner(test[g, 1], order, Xb, Yb, n, tv, work)
+            columns[:] = 0.0
+            parts[:] = 0.0
+            for s in range(n):
+                iu, iv = 1.0 / su[s], 1.0 / sv[s]
+                du, dv = ub[s] - tu[s], vb[s] - tv[s]
+                far = du * du + dv * dv > r2_limit
+                unlikely = du * du * iu + dv * dv * iv > chi2_limit
+                used = 0.0 if far or unlikely else 1.0
+                extra = 1.0 + (corner - 1.0) * 0.5 * (Xb[s] * Xb[s] + Yb[s] * Yb[s])
+                factor = used * (extra * extra if power == 2 else extra)
+                ru, rv = ub[s] - pu[s], vb[s] - pv[s]
+                wu, wv = factor * iu, factor * iv
+                columns[0, s], columns[1, s] = wu, wv
+                columns[2, s], columns[3, s] = wu * ru, wv * rv
+                parts[0, s], parts[1, s] = used, 1.0 if far else 0.0
+                parts[2, s] = used * (ru * ru * iu + rv * rv * iv)
+                parts[3, s], parts[4, s] = used * ru * ru, used * rv * rv
+                parts[5, s] = (1.0 - used) * (ru * ru + rv * rv)
+                parts[6, s] = wu * ru * ru + wv * rv * rv
+                parts[7, s], parts[8, s] = used * ru, used * rv
+            for k in range(N_LEAST):
+                scalars[b, k] += _dot(parts[k], P[0])
+            _add(columns, 0, 2, P, Q, top, work, sums[b])
+            _add(columns, 2, 4, P, Q, order, work, sums[b])
+    return sums, scalars
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
+    n_pieces, top = len(pieces), 2 * order
+    sums = np.zeros((n_pieces, 11, (top + 1) * (top + 2) // 2))
+    scalars = np.zeros((n_pieces, N_MIXTURE))
+    wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
+    j2, core, outlier, half, never, f, w = (
+        row[0],
+        row[1],
+        row[2],
+        row[3],
+        row[4],
+        row[5],
+        row[6],
+    )
+    for b in nb.prange(n_pieces):
+        g, first, end = pieces[b]
+        P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
+        pu, pv, work = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        density = np.empty(BLOCK)
+        columns, parts = np.empty((11, BLOCK)), np.empty((N_MIXTURE, BLOCK))
+        for a in range(first, end, BLOCK):
+            e = min(a + BLOCK, end)
+            n = e - a
+            Xb, Yb, ub, vb, su, sv = X[a:e], Y[a:e], u[a:e], v[a:e], var_u[a:e], var_v[a:e]
+            horner(coef[g, 0], order, Xb, Yb, n, pu, work)
+            horner(coef[g, 1], order, Xb, Yb, n, pv, work)
+            legendre(Xb, n, top, P)
+            legendre(Yb, n, top, Q)
+            columns[:] = 0.0
+            parts[:] = 0.0
+            for s in range(n):
+                ru, rv = ub[s] - pu[s], vb[s] - pv[s]
+                iu, iv = 1.0 / (su[s] + j2), 1.0 / (sv[s] + j2)
+                eu, ev = ru * ru * iu, rv * rv * iv
+                r2 = ru * ru + rv * rv
+                q_in, q_out = 0.5 * (eu + ev), r2 * half + never
+                t = exp_negative(-abs(q_in - q_out))
+                is_core = q_in <= q_out
+                peak = core * math.sqrt(iu * iv)
+                d_in = peak if is_core else peak * t
+                d_out = outlier * t if is_core else outlier
+                density[s] = d_in + d_out
+                parts[0, s] = -q_in if is_core else -q_out
+                whole = 1.0 / (d_in + d_out)
+                p, q = d_out * whole, d_in * whole
+                pq = p * q
+                # derivatives of log core minus log outlier, by u, v, log j, logit f, log s_out
+                D_u, D_v = -ru * iu + ru * w, -rv * iv + rv * w
+                D_j = j2 * ((eu - 1.0) * iu + (ev - 1.0) * iv)
+                D_s = 2.0 - r2 * w
+                pq *= wavering
+                columns[0, s] = q * iu + p * w - pq * D_u * D_u
+                columns[1, s] = -pq * D_u * D_v
+                columns[2, s] = q * iv + p * w - pq * D_v * D_v
+                columns[3, s] = (q * iu + p * w) * ru
+                columns[4, s] = (q * iv + p * w) * rv
+                columns[5, s] = q * 2.0 * j2 * ru * iu * iu + pq * D_j * D_u
+                columns[6, s] = q * 2.0 * j2 * rv * iv * iv + pq * D_j * D_v
+                columns[7, s] = -pq * D_u
+                columns[8, s] = -pq * D_v
+                columns[9, s] = p * 2.0 * ru * w + pq * D_s * D_u
+                columns[10, s] = p * 2.0 * rv * w + pq * D_s * D_v
+                pq = p * q
+                second = 2.0 * D_j + 2.0 * j2 * j2 * (
+                    (1.0 - 2.0 * eu) * iu * iu + (1.0 - 2.0 * ev) * iv * iv
+                )
+                parts[1, s], parts[2, s], parts[3, s] = q * D_j, p, -p * D_s
+                parts[4, s] = -q * second - pq * D_j * D_j
+                parts[5, s], parts[6, s] = pq * D_j, -pq * D_j * D_s
+                parts[7, s], parts[8, s] = f * (1.0 - f) - pq, pq * D_s
+                parts[9, s] = 2.0 * p * r2 * w - pq * D_s * D_s
+            for k in range(N_MIXTURE):
+                scalars[b, k] += _dot(parts[k], P[0])
+            scalars[b, 0] += log_of_product(density, n, work) - n * log_unit
+            _add(columns, 0, 3, P, Q, top, work, sums[b])
+            _add(columns, 3, 5, P, Q, order, work, sums[b])
+            if not em:
+                _add(columns, 5, 11, P, Q, order, work, sums[b])
+    return sums, scalars
+
+
+def _by_group(sums: Float, pieces: Int) -> Float:
+    """Moments (G, columns, M) of each group from those of its pieces, which stand in a row."""
+    first = np.flatnonzero(np.diff(pieces[:, 0], prepend=-1))
+    return np.asarray(np.add.reduceat(sums, first, axis=0))
+
+
+def least_squares_moments(
+    pieces: Int,
+    columns: tuple[Float, ...],
+    about: Float,
+    test: Float,
+    order: int,
+    *,
+    chi2_limit: float,
+    abs_limit: float,
+    corner: float = 1.0,
+    power: int = 1,
+) -> Moments:
+    """Normal equations of weighted least squares with rejection.
+
+    Parameters
+    ----------
+    pieces : ndarray of int, shape (n, 3)
+        `pieces_of` size `PIECE`.
+    columns : tuple of ndarray, shape (N,)
+        X, Y, u, v, var_u, var_v.
+    about, test : ndarray, shape (G, 2, K)
+        Effective coefficients of the scaled powers: where residuals are taken, and where those are
+        taken that decide on rejection.
+    order : int
+    chi2_limit, abs_limit : float
+        Stars with more than either are left out.
+    corner : float
+        Factor on the inverse variance in the corners, rising as the square of the radius.
+    power : int
+        1, or 2 for the squared weights that a sandwich covariance needs.
+
+    Returns
+    -------
+    Moments
+        Its scalars: stars used; stars beyond `abs_limit`; chi-square of those used; their squared
+        residuals in u and in v; squared residuals of those left out; the weighted chi-square;
+        residuals in u and v of those used.
+    """
+    K = (order + 1) * (order + 2) // 2
+    rules = np.array([chi2_limit, min(abs_limit, 1e150) ** 2, corner, float(power)])
+    with threads_for(EVALUATIONS * len(columns[0])):
+        sums, scalars = _least_squares(
+            pieces, *columns, np.ascontiguousarray(about), np.ascontiguousarray(test), order, rules
+        )
+    total = _by_group(sums, pieces)
+    weight = np.zeros((len(about), 3, K, K))
+    weight[:, 0::2] = np.einsum("gcm,klm->gckl", total[:, :2], product_table(order), optimize=True)
+    right = total[:, 2:, :K].copy()
+    return Moments(weight, right, np.zeros((len(about), N_HYPER, 2, K)), scalars.sum(axis=0))
+
+
+def mixture_moments(
+    pieces: Int,
+    columns: tuple[Float, ...],
+    coef: Float,
+    order: int,
+    constants: Constants,
+    *,
+    em: bool = False,
+) -> Moments:
+    """Gradient and Hessian of the mixture's log-likelihood.
+
+    Parameters
+    ----------
+    pieces, columns, order
+        As in `least_squares_moments`.
+    coef : ndarray, shape (G, 2, K)
+        Effective coefficients of the scaled powers.
+    constants : Constants
+        Of one parameter vector.
+    em : bool
+        Weights of the expectation-maximisation step, which are never negative, in place of the
+        Hessian; `cross` is zero then.
+
+    Returns
+    -------
+    Moments
+        Its scalars: the log-likelihood; its derivatives by log j and, for logit f, the expected
+        number of outliers, then by log s_out; minus the Hessian by log j, logit f, log s_out: jj,
+        jf, js, ff, fs, ss.
+    """
+    K = (order + 1) * (order + 2) // 2
+    with threads_for(EVALUATIONS * len(columns[0])):
+        sums, scalars = _mixture(
+            pieces,
+            *columns,
+            np.ascontiguousarray(coef),
+            order,
+            packed(constants)[0],
+            constants.unit2,
+            em,
+        )
+    total = _by_group(sums, pieces)
+    weight = np.einsum("gcm,klm->gckl", total[:, :3], product_table(order), optimize=True)
+    return Moments(
+        weight,
+        total[:, 3:5, :K].copy(),
+        total[:, 5:, :K].reshape(len(coef), N_HYPER, 2, K).copy(),
+        scalars.sum(axis=0),
+    )

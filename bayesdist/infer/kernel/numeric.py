@@ -1,0 +1,69 @@
+"""Scalar functions that the compiler turns into vector instructions.
+
+numba calls `math.exp` once for each star, which costs more than the polynomial.  Here exp is a
+branch-free polynomial, and the logarithm of a product is split into exponents, which are integers
+in the bits of a double and are added, and mantissas, which are multiplied.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+__all__ = ["bits_of", "exp_negative", "from_bits"]
+
+
+@intrinsic
+def bits_of(typingctx: Any, x: Any) -> Any:
+    """The 64 bits of a double as an integer."""
+    return types.int64(types.float64), lambda context, builder, signature, args: builder.bitcast(
+        args[0], ir.IntType(64)
+    )
+
+
+@intrinsic
+def from_bits(typingctx: Any, x: Any) -> Any:
+    """The double with these 64 bits."""
+    return types.float64(types.int64), lambda context, builder, signature, args: builder.bitcast(
+        args[0], ir.DoubleType()
+    )
+
+
+LOWEST = -700.0  # exp of less is 1e-304: nothing beside the larger branch of a mixture
+ROUND = 6755399441055744.0  # 1.5 * 2^52: adding it leaves the nearest integer in the low bits
+LOG2_E = 1.4426950408889634
+# ln 2 in two parts, the first with trailing zeros, so that n times it is exact (Cody and Waite)
+LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+
+
+# By LLVM, not by numba: inside a loop that may reorder its sums, adding and subtracting ROUND must
+# stay what it is.  And always: a function that is called stands twice among the compiled code, and
+# which one is taken, hence the last bit of a sum, would depend on whether the cache was warm.
+@nb.njit(cache=True, forceinline=True, fastmath={"contract"})
+def exp_negative(x):
+    """exp(x) for x <= 0, within two units of the last digit; below -700 as at -700."""
+    x = x if x > LOWEST else LOWEST
+    shifted = x * LOG2_E + ROUND
+    n = shifted - ROUND
+    r = (x - n * LN2_HIGH) - n * LN2_LOW
+    # Taylor series on |r| <= ln(2) / 2, where the 14th term is below 1e-17
+    p = 1.0 / 6227020800.0
+    p = p * r + 1.0 / 479001600.0
+    p = p * r + 1.0 / 39916800.0
+    p = p * r + 1.0 / 3628800.0
+    p = p * r + 1.0 / 362880.0
+    p = p * r + 1.0 / 40320.0
+    p = p * r + 1.0 / 5040.0
+    p = p * r + 1.0 / 720.0
+    p = p * r + 1.0 / 120.0
+    p = p * r + 1.0 / 24.0
+    p = p * r + 1.0 / 6.0
+    p = p * r + 0.5
+    p = p * r + 1.0
+    p = p * r + 1.0
+    # 2^n by adding n to the exponent
+    return from_bits(bits_of(p) + (bits_of(shifted) << 52))

@@ -1,0 +1,204 @@
+"""Matches that stay on disk give what they give in memory, with no more than some of them held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from bayesdist.app import matches as app_matches
+from bayesdist.app.config import load_config
+from bayesdist.app.matches import load_matches
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.session import Session
+from bayesdist.data import MatchTable, PartitionedMatches, read_matches, write_partitioned
+from bayesdist.data.partitioned import PartPiece
+from bayesdist.infer import load_fit, load_posterior
+from bayesdist.model import TimeDependence
+from bayesdist.simulate import simulate_matches
+from tests.app.support import (
+    as_table,
+    begin_stagewise,
+    good,
+    model_of,
+    refused,
+    simulated,
+    summary_of,
+    truth_of,
+    write_config,
+)
+
+N = 6000
+
+
+@pytest.fixture
+def on_disk(monkeypatch):
+    """Tables of this size stay on disk, in pieces of 1700 rows."""
+    monkeypatch.setattr(app_matches, "IN_MEMORY", 1000)
+    monkeypatch.setattr("bayesdist.data.partitioned.PIECE", 1700)
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory):
+    """A folder of three parts, and a configuration that names it by its whole path."""
+    folder = tmp_path_factory.mktemp("job")
+    matches, _ = simulated(N, seed=4, mag=np.linspace(12.0, 18.0, N))
+    thirds = [matches.select(np.arange(k, N, 3)) for k in range(3)]
+    write_partitioned(thirds, folder / "stars", rows_per_group=500)
+    return write_config(folder / "config.toml", data={"matches": str(folder / "stars")})
+
+
+def _numbers(value, path=""):
+    if isinstance(value, dict):
+        for k, v in value.items():
+            yield from _numbers(v, f"{path}.{k}")
+    elif isinstance(value, list):
+        for k, v in enumerate(value):
+            yield from _numbers(v, f"{path}[{k}]")
+    else:
+        yield path, value
+
+
+def test_which_stay_on_disk(job, monkeypatch, tmp_path):
+    """Parquet of more rows than IN_MEMORY, as one file or several; nothing else."""
+    folder = job.parent / "stars"
+    files = sorted(folder.iterdir())
+    for limit, kind in ((N, MatchTable), (N - 1, PartitionedMatches)):
+        monkeypatch.setattr(app_matches, "IN_MEMORY", limit)
+        for path in (folder, str(folder / "*.parquet"), files):
+            assert type(load_matches(path)) is kind
+        assert type(load_matches(folder, format="table")) is kind
+    monkeypatch.setattr(app_matches, "IN_MEMORY", 1)
+    table = read_matches(files[0])
+    as_table(table).write(tmp_path / "stars.ecsv")
+    assert type(load_matches(tmp_path / "stars.ecsv")) is MatchTable
+
+
+def test_a_run_on_disk_is_the_run_in_memory(job, tmp_path, on_disk, monkeypatch):
+    stages = ("fit", "sample", "assess")
+    disk = begin_stagewise(tmp_path / "disk", job, *stages)
+    monkeypatch.setattr(app_matches, "IN_MEMORY", 10 * N)
+    memory = begin_stagewise(tmp_path / "memory", job, *stages)
+
+    one, other = load_fit(disk / "fit.nc"), load_fit(memory / "fit.nc")
+    # sums over pieces round otherwise: far less than a formal error
+    assert (np.abs(one.mean - other.mean) < 1e-6 * other.sigma).all()
+    assert (one.n_rows, one.n_used, one.rejected) == (other.n_rows, other.n_used, other.rejected)
+    a, b = load_posterior(disk), load_posterior(memory)
+    assert (np.abs(a.mean - b.mean) < 0.01 * b.sigma).all()
+    assert (a.n_stars, a.n_flagged) == (b.n_stars, b.n_flagged)
+    assert a.n_false == pytest.approx(b.n_false, rel=1e-3)
+    found, expected = (dict(_numbers(summary_of(run))) for run in (disk, memory))
+    assert found.keys() == expected.keys()
+    for key in found:
+        if key.startswith((".data", ".fit", ".misfit", ".warnings")):
+            value = expected[key]
+            exact = value is None or isinstance(value, str | bool)
+            assert found[key] == (value if exact else pytest.approx(value, rel=1e-6)), key
+
+    parts = [pq.read_table(path) for path in sorted((disk / "stars").iterdir())]
+    assert len(parts) >= 4 and max(map(len, parts)) <= 1700
+    (whole,) = [pq.read_table(path) for path in (memory / "stars").iterdir()]
+    for name in ("source", "row", "x", "y", "used"):
+        joined = [value for part in parts for value in part[name].to_pylist()]
+        assert joined == whole[name].to_pylist(), name
+
+
+def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch):
+    """The largest table that is ever made has the rows of one piece, or of the sample."""
+    sizes = []
+    complete = MatchTable._complete
+    monkeypatch.setattr(
+        MatchTable, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
+    )
+    for name in ("session", "stages.report"):
+        monkeypatch.setattr(f"bayesdist.app.{name}.SAMPLE", 900, raising=False)
+    monkeypatch.setattr("bayesdist.infer.linear.MEDIAN_STARS", 900)
+    good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")
+    good("check", job)
+    run = tmp_path / "run"
+    good("run", job, "-o", run)
+    assert 900 <= max(sizes) <= 1700
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert "a sample of 858 of 6\u202f000 stars" in page  # every seventh
+    assert "of 6000 stars flagged" in good("inspect", run).out
+
+
+def test_the_data_are_read_once_for_all_passes(job, tmp_path, on_disk):
+    """The scan, the median position, the passes, what is said of each star, and the sample."""
+    read = []
+    real = PartPiece.read
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PartPiece, "read", lambda self: (read.append(1), real(self))[1])
+        good("run", job, "-o", tmp_path / "run")
+    pieces = len(load_matches(job.parent / "stars").pieces())
+    assert len(read) == 4 * pieces
+
+
+def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path, on_disk, monkeypatch):
+    config, text = load_config(job)
+    sums = []
+    for limit in (1000, 10 * N):
+        monkeypatch.setattr(app_matches, "IN_MEMORY", limit)
+        run = RunDirectory.plan(tmp_path / "none", config, text, job.parent)
+        session = Session(run)
+        session.fit = session.linear[0]
+        sums.append(session.sums)
+        session.close()
+    one, other = sums
+    np.testing.assert_array_equal(one.exposures.n_used, other.exposures.n_used)
+    for name in ("uu", "vv"):
+        np.testing.assert_allclose(getattr(one.exposures, name), getattr(other.exposures, name))
+    assert one.binned.keys() == other.binned.keys()
+    for bins, found in one.binned.items():
+        expected = other.binned[bins].residuals()
+        np.testing.assert_array_equal(found.count, expected.count)
+        np.testing.assert_allclose(found.residuals().mean_u, expected.mean_u, atol=1e-12)
+        np.testing.assert_allclose(found.residuals().sem_v, expected.sem_v, rtol=1e-9)
+
+
+def test_errors_by_magnitude_on_disk(tmp_path, on_disk):
+    """From the residuals of a sample, given to all: a bright star is good to 0.01 px."""
+
+    def quoted(mag):
+        sigma = 0.01 * 10 ** (0.13 * (mag - 12.0))
+        return sigma, sigma
+
+    rng = np.random.default_rng(5)
+    matches, _ = simulated(
+        N, seed=10, mag=rng.uniform(12, 18, N), sigma=quoted, jitter=0.0, fraction=0.02
+    )
+    write_partitioned([matches], tmp_path / "stars", rows_per_group=500)
+    data = {"matches": str(tmp_path / "stars"), "sigma": "by_magnitude"}
+    config = write_config(tmp_path / "c.toml", data=data)
+    assert "(by magnitude)" in good("check", config).out
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    posterior = load_posterior(run)
+    assert posterior.n_stars == N and 0.01 < posterior.n_flagged / N < 0.03
+    assert not summary_of(run)["warnings"]
+
+
+def test_the_epoch_of_the_assessment_is_in_the_middle_of_the_data(tmp_path, on_disk):
+    names = ("a", "b", "c")
+    model = model_of(time=TimeDependence((("u", 1, 0),), (2004.5,)), exposures=names)
+    matches, _ = simulate_matches(
+        model, truth_of(model), 3000, rng=np.random.default_rng(6), sigma=0.02, outlier_scale=0.5,
+        epochs=(2004.0, 2007.0, 2008.0),
+    )  # fmt: skip
+    write_partitioned([matches], tmp_path / "stars", rows_per_group=500)
+    config = write_config(
+        tmp_path / "c.toml",
+        data={"matches": str(tmp_path / "stars")},
+        **{"model.tdd": {"epoch0": 2004.5, "terms": [["u", 1, 0]]}},
+    )
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    assert summary_of(run)["map"]["epoch"] == 2007.0
+
+
+def test_a_run_inside_the_folder_of_its_input_is_refused(job, tmp_path):
+    """Its own files would be read as input when it is resumed."""
+    matches, _ = simulated(400)
+    write_partitioned([matches], tmp_path / "stars")
+    config = write_config(tmp_path / "c.toml", data={"matches": "stars"})
+    words = ["stars/run", "inside the folder of its input"]
+    refused(tmp_path, "run", config, "-o", tmp_path / "stars" / "run", words=words)

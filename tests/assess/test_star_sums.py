@@ -1,0 +1,165 @@
+"""Sums over pieces of the data are those of the whole, and of what one would do with arrays."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from bayesdist.assess import (
+    binned_residuals,
+    binned_sums,
+    flagged_by_exposure,
+    star_sample,
+    star_sums,
+)
+from bayesdist.data import MatchTable
+from bayesdist.infer import (
+    OutlierMixture,
+    fit_linear,
+    load,
+    outlier_probability,
+    residuals,
+    sample,
+)
+from bayesdist.model import Chip, DistortionModel
+
+SIZE = (1016.0, 508.0)
+BINS = ((5, 4), (12, 1))
+
+
+def test_bins_of_pieces_add(rng):
+    n = 150_000  # more than are summed at a time
+    x, y = rng.uniform(-5.0, 1020.0, n), rng.uniform(0.5, 508.5, n)
+    r = rng.normal(0.3, 0.1, (2, n))
+    w = rng.integers(0, 3, n).astype(float)
+    for weights in (None, w):
+        whole = binned_residuals(x, y, *r, bins=(31, 15), size=SIZE, weights=weights)
+        parts = []
+        for rows in np.array_split(np.arange(n), (10, 70_000, 70_001)):
+            some = None if weights is None else weights[rows]
+            args = (x[rows], y[rows], *r[:, rows])
+            parts.append(binned_sums(*args, bins=(31, 15), size=SIZE, weights=some))
+        sums = (parts[0] + parts[1]) + (parts[2] + parts[3])
+        found = sums.residuals()
+        np.testing.assert_array_equal(found.count, whole.count)
+        assert found.n_outside == whole.n_outside > 0
+        used = np.ones(n, bool) if weights is None else w > 0
+        assert sums.n + found.n_outside == used.sum()
+        for name in ("mean_u", "mean_v", "sem_u", "sem_v"):
+            np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-10)
+
+
+def test_other_bins_do_not_add():
+    args = ([1.0], [1.0], [0.0], [0.0])
+    one = binned_sums(*args, bins=3, size=SIZE)
+    for other in (
+        binned_sums(*args, bins=(3, 4), size=SIZE),
+        binned_sums(*args, bins=3, size=(9.0, 9.0)),
+    ):
+        with pytest.raises(ValueError, match="do not add"):
+            one + other
+
+
+def test_edges_decide_to_the_last_bit():
+    """A star on the line between two bins, or one bit before it: as numpy's own histogram."""
+    for n, size in ((7, 1016.0), (31, 1000.0), (64, 4096.0), (3, 10.0)):
+        edges = np.linspace(0.5, size + 0.5, n + 1)
+        x = np.concatenate([edges, np.nextafter(edges[1:], 0), np.nextafter(edges[:-1], 1e9)])
+        zero = np.zeros_like(x)
+        sums = binned_sums(x, zero + 1.0, zero, zero, bins=(n, 1), size=(size, 1.0))
+        np.testing.assert_array_equal(sums.count[0], np.histogram(x, edges)[0])
+
+
+def test_equal_residuals_scatter_by_nothing():
+    b = binned_residuals([1.0, 2.0, 3.0], [1.0] * 3, [0.1] * 3, [-7e5] * 3, bins=1, size=(9, 9))
+    assert b.mean_v[0, 0] == -7e5
+    assert 0 <= b.sem_u[0, 0] < 1e-8 and 0 <= b.sem_v[0, 0] < 0.1
+
+
+@pytest.fixture(scope="module")
+def several():
+    """Two chips, three exposures with frames, some false matches; and its fit."""
+    rng = np.random.default_rng(7)
+    n, names = 3000, ("a", "b", "c")
+    chips = tuple(Chip(k, f"chip {k}", SIZE, (508.5, 254.5)) for k in (2, 1))
+    model = DistortionModel(2, chips, frames="shift", exposures=names)
+    theta = np.zeros(model.n_params)
+    for chip in chips:
+        for axis, term in enumerate(((1, 0), (0, 1))):
+            basis = model.basis(chip.number)
+            monomial = np.array([float(t == term) for t in basis.terms])
+            theta[model.coefficient_slice(chip.number, axis)] = basis.from_monomials(monomial)
+    x, y = rng.uniform(0.5, SIZE[0] + 0.5, n), rng.uniform(0.5, SIZE[1] + 0.5, n)
+    exposure, chip = rng.integers(0, 3, n), rng.integers(0, 2, n)
+    numbers = np.array([1, 2])[chip]
+    uv = model.predict(theta, x, y, exposure=exposure, chip=numbers)
+    spread = np.where(rng.random(n) < 0.05, 0.6, 0.05)
+    u, v = (uv + rng.normal(size=(n, 2)) * spread[:, None]).T
+    table = MatchTable(
+        x, y, u, v, sigma_u=np.full(n, 0.05), sigma_v=np.full(n, 0.06), exposure=exposure,
+        exposure_names=names, chip=chip, chip_numbers=(1, 2),
+    )  # fmt: skip
+    return table, fit_linear(table, model)
+
+
+def test_one_pass_gives_what_arrays_give(several, monkeypatch):
+    table, fit = several
+    residual, used = residuals(fit, table), fit.uses(table)
+    assert used.sum() == fit.n_used < len(table)
+    first = used & (np.asarray(table.chip_numbers)[table.chip] == fit.model.chips[0].number)
+    for piece in (10_000, 700):
+        monkeypatch.setattr("bayesdist.data.matches.PIECE", piece)
+        sums = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
+        for bins in BINS:
+            expected = binned_residuals(
+                table.x[first], table.y[first], *residual[first].T, bins=bins, size=SIZE
+            )
+            found = sums.binned[bins].residuals()
+            np.testing.assert_array_equal(found.count, expected.count)
+            for name in ("mean_u", "mean_v", "sem_u", "sem_v"):
+                np.testing.assert_allclose(
+                    getattr(found, name), getattr(expected, name), rtol=1e-8, atol=1e-13
+                )
+        for k in range(3):
+            here = table.exposure == k
+            assert sums.exposures.n[k] == here.sum()
+            assert sums.exposures.n_used[k] == (used & here).sum()
+            rms = np.sqrt((residual[used & here] ** 2).mean(axis=0))
+            np.testing.assert_allclose([r[k] for r in sums.exposures.rms], rms, rtol=1e-10)
+
+
+def test_the_sums_over_exposures_are_those_of_the_fit(several):
+    table, fit = several
+    e = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS).exposures
+    assert (e.n.sum(), e.n_used.sum()) == (fit.n_rows, fit.n_used)
+    rms = np.sqrt([e.uu.sum() / e.n_used.sum(), e.vv.sum() / e.n_used.sum()])
+    np.testing.assert_allclose(rms, [fit.rms_u, fit.rms_v], rtol=1e-9)
+
+
+def test_the_task_and_what_it_returns_travel(several):
+    """To workers and back."""
+    table, fit = several
+    task, clip = pickle.loads(pickle.dumps((star_sums, fit.clip)))
+    one = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
+    other = pickle.loads(pickle.dumps(load(fit.model, table).sum(task, fit.mean, clip, BINS)))
+    np.testing.assert_array_equal(one.exposures.uu, other.exposures.uu)
+    np.testing.assert_array_equal(one.binned[5, 4].second_2, other.binned[5, 4].second_2)
+
+
+def test_stars_flagged_are_those_that_are_flagged_one_by_one(several, monkeypatch):
+    table, fit = several
+    posterior = sample(fit, table, outliers=OutlierMixture(), target_ess=50, target_rhat=1.1)
+    flagged = outlier_probability(posterior, table) > 0.5
+    expected = [(flagged & (table.exposure == k)).sum() for k in range(3)]
+    monkeypatch.setattr("bayesdist.data.matches.PIECE", 700)
+    found = flagged_by_exposure(load(fit.model, table), posterior)
+    np.testing.assert_array_equal(found, expected)
+    assert found.sum() == posterior.n_flagged > 50
+    some = star_sample(table.sample(1000), len(table), fit, posterior)
+    assert some.partial and len(some) == 1000
+    np.testing.assert_array_equal(some.table.row, np.arange(0, 3000, 3))
+    np.testing.assert_array_equal(some.outlier_probability > 0.5, flagged[::3])
+    np.testing.assert_array_equal(some.used, fit.uses(table)[::3])
+    np.testing.assert_allclose(some.residual, residuals(posterior, table)[::3], atol=1e-12)

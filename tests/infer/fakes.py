@@ -1,0 +1,67 @@
+"""Densities with known moments that stand in for a posterior, and Gaussian proposals for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bayesdist.infer import OutlierMixture
+from bayesdist.infer.arrow import Arrow
+from bayesdist.infer.blocks import Walkers
+from bayesdist.infer.laplace import Conditional
+from bayesdist.infer.lookahead import Page
+from bayesdist.infer.plan import Plan, Stretch
+from bayesdist.infer.proposal import GridProposal
+from bayesdist.infer.sampler import Ensembles
+from bayesdist.infer.whitening import Whitening
+
+
+class FakeTarget:
+    """What the sampler asks of a target; counts what it is asked."""
+
+    mixture = OutlierMixture("none", jitter=0.0)
+    hyper = mixture.bind(1.0)
+
+    def __init__(self, log_density: Callable[[np.ndarray], np.ndarray], n_params: int) -> None:
+        self.function, self.n_theta = log_density, n_params
+        self.names = tuple(f"p{k}" for k in range(n_params))
+        self.calls, self.points = 0, 0
+
+    def log_density(self, psi: np.ndarray) -> np.ndarray:
+        self.calls, self.points = self.calls + 1, self.points + len(psi)
+        return self.function(psi)
+
+
+def gaussian_proposal(target: FakeTarget, mean, cov) -> GridProposal:
+    """One node, no hyperparameters."""
+    n = len(mean)
+    curvature = Arrow(np.linalg.inv(cov), np.zeros((0, n, 0)), np.zeros((0, 0, 0)))
+    return GridProposal(target, (Conditional(None, np.asarray(mean), curvature.factor(), 0.0),))
+
+
+def empty_page(ensembles: int, n_params: int) -> Page:
+    return Page(np.empty((ensembles, 0, n_params)), *np.empty((2, ensembles, 0)))
+
+
+def ensembles_of(target, proposal, draws, weights, walkers, seeds, step=0.5) -> Ensembles:
+    """Ensembles with the moves that are asked for, whatever the proposal is worth."""
+    return Ensembles(
+        target,
+        proposal,
+        empty_page(len(seeds), draws.shape[-1]),
+        Whitening.of(target, proposal, draws),
+        Plan("test", weights, walkers, step),
+        tuple(seeds),
+    )
+
+
+def advanced(runs: Ensembles, first: np.ndarray, steps: int):
+    """Blocks of all ensembles from walkers at psi (ensembles, walkers, D)."""
+    states = []
+    for seed, psi in zip(runs.seeds, first, strict=True):
+        coords = psi if runs.plan.independent else runs.whitening.to_white(psi)
+        log_prob, log_q = runs.target.log_density(psi), runs.proposal.log_density(psi)
+        random = np.random.RandomState(seed).get_state()
+        states.append(Walkers(coords, log_prob, log_q, random))
+    return runs.advance(states, Stretch(0, steps, steps), runs.pilot)
