@@ -1,11 +1,13 @@
-# Two targets do everything on a bare machine with Python 3.11 or newer:
+# Three targets do everything on a bare machine with Python 3.11 or newer:
 #   make demo    the environment, then `bayesdist demo`
 #   make test    the environment with the test extra, then the tests
+#   make bench   the same environment, then the benchmarks: build/bench/bench.json and bench.md;
+#                some 20 minutes on two cores that have nothing else to do
 PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
 
-.PHONY: demo test lint clean
+.PHONY: demo test bench lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bayesdist demo -o demo-run --force
@@ -15,6 +17,9 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
+
+bench: $(VENV)/.installed-test
+	$(BIN)/python -m tests.benchmarks --output build/bench --figures build/bench/figures
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check --fix .

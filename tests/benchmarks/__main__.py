@@ -1,0 +1,90 @@
+"""`python -m tests.benchmarks [--quick] [--only NAME ...] [--output DIR] [--figures DIR]`"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bayesdist.data.files import atomic_path
+from tests.benchmarks import likelihood, linear, samplers, scaling
+from tests.benchmarks.figure import draw_scaling
+from tests.benchmarks.machine import describe
+from tests.benchmarks.markdown import to_markdown
+from tests.benchmarks.timing import say
+
+__all__ = ["main"]
+
+PARTS = {"samplers": samplers, "kernel": likelihood, "linear": linear, "scaling": scaling}
+
+
+def _finite(value: Any) -> Any:
+    """The same without numbers that JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _write(bench: dict[str, Any], folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    clean = _finite(bench)
+    texts = {
+        "bench.json": json.dumps(clean, indent=1, allow_nan=False) + "\n",
+        "bench.md": to_markdown(clean),
+    }
+    for name, text in texts.items():
+        with atomic_path(folder / name) as path:
+            path.write_text(text, encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the parts that are asked for; the files are renewed after each.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Of the command line by default.
+
+    Returns
+    -------
+    int
+        Zero.
+    """
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="tiny problems: does it work?")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="NAME")
+    parser.add_argument("--output", type=Path, default=Path("build/bench"), metavar="DIR")
+    parser.add_argument("--figures", type=Path, metavar="DIR", help="draw scaling.png there")
+    options = parser.parse_args(arguments)
+    bench: dict[str, Any] = {
+        "schema": 1,
+        "quick": options.quick,
+        "machine": describe(),
+        "parts": {},
+    }
+    for name in PARTS:
+        if name not in options.only:
+            continue
+        module = PARTS[name]
+        start = time.perf_counter()
+        part = module.run(module.QUICK if options.quick else module.FULL)
+        part["wall_s"] = time.perf_counter() - start
+        if name == "scaling" and options.figures is not None:
+            draw_scaling(part, options.figures / "scaling.png")
+            part["figure"] = f"{options.figures.name}/scaling.png"
+        bench["parts"][name] = part
+        _write(bench, options.output)
+    say(f"written: {options.output / 'bench.json'}, {options.output / 'bench.md'}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,295 @@
+"""The report as Markdown: a pure function of the JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+__all__ = ["to_markdown"]
+
+
+def _number(value: Any, digits: int = 3) -> str:
+    """Three digits, thousands separated, a dash for what is not known."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "–"
+    if value == 0:
+        return "0"
+    size = math.floor(math.log10(abs(value)))
+    if size >= digits - 1:
+        return f"{round(value, digits - 1 - size):,.0f}"
+    if size < -4:
+        return f"{value:.{digits - 1}e}"
+    return f"{value:.{digits - 1 - size}f}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    body = ["| " + " | ".join(cells) + " |" for cells in rows]
+    rule = "|" + "|".join(["---"] + ["---:"] * (len(head) - 1)) + "|"
+    return ["| " + " | ".join(head) + " |", rule, *body, ""]
+
+
+def _machine(m: dict[str, Any]) -> list[str]:
+    flags = m["flags"] or {}
+    ram = None if m["ram_gib"] is None else f"{m['ram_gib']:g} GiB"
+    facts = {
+        "processor": f"{m['cpu']}, {m['cores']} cores",
+        "instruction sets": ", ".join(k for k, v in flags.items() if v) or "–",
+        "memory": ram or "–",
+        "system": f"{m['os']}, Python {m['python']}",
+        "libraries": ", ".join(f"{k} {v}" for k, v in m["libraries"].items() if v),
+        "date": m["date"],
+        "load before the start": _number(m["load"]),
+        "revision": m["revision"] or "–",
+    }
+    return ["| | |", "|---|---|", *(f"| {k} | {v} |" for k, v in facts.items()), ""]
+
+
+def _samplers(part: dict[str, Any]) -> list[str]:
+    out = [
+        "## Samplers",
+        "",
+        f"One posterior: order {part['order']}, one chip, {part['n_params']} parameters "
+        "(coefficients, log j, logit f, log s_out), 3 % false matches, jitter well measured; "
+        "float64, exact. ESS is the smaller of bulk and tail, smallest over the parameters. "
+        "*Sampling* is the rate once the sampler is warm; *all* counts the linear fit, the search "
+        "for the mode, pilot and warm-up as well (compilation never). For emcee's ensembles the "
+        "rate is walkers / (tau x seconds of a step): burn-in is not charged. NUTS and DEMove get "
+        "the posterior covariance for nothing. *Ratio* is bayesdist's rate over that row's, "
+        "sampling against sampling, and all against all.",
+        "",
+    ]
+    head = ("sampler", "N", "ESS/s sampling", "ESS/s all", "ESS per pass")
+    head += ("ratio", "ratio, all", "mean, sd against ours", "remarks")
+    rows = []
+    for r in part["rows"]:
+        agreement = r.get("agreement")
+        text = "–"
+        if agreement is not None:
+            low, high = agreement["sd_ratio"]
+            text = f"{agreement['shift']:.3f} sd; {low:.3f} to {high:.3f}"
+        rows.append(
+            (
+                r["sampler"],
+                f"{r['n_stars']:,}",
+                _number(r["rate"]),
+                _number(r.get("rate_total")),
+                _number(r["per_pass"]),
+                _number(r["ratio"]),
+                _number(r["ratio_total"]),
+                text,
+                "; ".join([r["setting"], *r["flags"]]),
+            )
+        )
+    out += _table(head, rows)
+    out += ["bayesdist in detail; the limit is one effective sample per pass at the kernel's own "]
+    out[-1] += "speed, measured beside it:"
+    out.append("")
+    head = ("N", "to ESS 400 [s]", "of that linear fit [s]", "longer run: ESS bulk, tail")
+    head += ("seconds", "passes", "ESS/pass, all", "ESS/pass, sampling", "us per pass")
+    head += ("share of limit", "share, all", "acceptance", "efficiency")
+    out += _table(
+        head,
+        [
+            (
+                f"{r['n_stars']:,}",
+                _number(r["to_400_s"]),
+                _number(r["fit_s"]),
+                f"{r['ess_bulk']:,.0f}, {r['ess_tail']:,.0f}",
+                _number(r["seconds"]),
+                f"{r['passes']:,}",
+                _number(r["per_pass"]),
+                _number(r["per_pass_sampling"]),
+                _number(1e6 * r["seconds_per_pass"]),
+                f"{100 * r['share_of_limit']:.0f} %",
+                f"{100 * r['share_of_limit_total']:.0f} %",
+                _number(r["acceptance"]),
+                _number(r["efficiency"]),
+            )
+            for r in part["rows"]
+            if r["sampler"] == "bayesdist"
+        ],
+    )
+    out += ["emcee's ensembles in detail:", ""]
+    head = ("sampler", "N", "walkers", "tau bulk, tail [steps]", "chain / tau", "ms per step")
+    head += ("density differs by",)
+    out += _table(
+        head,
+        [
+            (
+                r["sampler"],
+                f"{r['n_stars']:,}",
+                str(r["walkers"]),
+                f"{r['tau_bulk']:.0f}, {r['tau_tail']:.0f}",
+                f"{r['tau_lengths']:.0f}",
+                _number(1e3 * r["seconds_per_step"]),
+                _number(r.get("density_difference")),
+            )
+            for r in part["rows"]
+            if "walkers" in r
+        ],
+    )
+    out += ["NUTS in detail (a pass is a gradient):", ""]
+    head = ("basis", "N", "ESS bulk, tail", "sampling [s]", "warm-up [s]", "compilation [s]")
+    head += ("gradients", "ms per gradient", "acceptance")
+    out += _table(
+        head,
+        [
+            (
+                r["setting"],
+                f"{r['n_stars']:,}",
+                f"{r['ess_bulk']:,.0f}, {r['ess_tail']:,.0f}",
+                _number(r["seconds"]),
+                _number(r["warmup_s"]),
+                _number(r["compile_s"]),
+                f"{r['passes']:,}",
+                _number(1e3 * r["seconds"] / r["passes"]),
+                _number(r["acceptance"]),
+            )
+            for r in part["rows"]
+            if "basis" in r
+        ],
+    )
+    return out
+
+
+def _kernel(part: dict[str, Any]) -> list[str]:
+    roof, rows = part["roofline"], part["rows"]
+    counts = [k for k in (1, 2, 4, 8) if any(f"ns_{k}" in r for r in rows)]
+    out = [
+        "## Kernel",
+        "",
+        f"Nanoseconds for one star and evaluation of the log-likelihood, {rows[0]['batch']} "
+        "parameter vectors at once. numpy: one parameter vector, design matrix stored, BLAS as it "
+        "comes. Measured ceilings: "
+        f"{roof['fma_per_ns']:.1f} multiply-adds per ns and core in the cache, "
+        f"{roof['divide_root_ns']:.2f} ns for one division and one root, "
+        f"{roof['bytes_per_ns']:.1f} GB/s (triad). The roofline is the largest of: "
+        f"multiply-adds of two Horner polynomials and {part['mixture_ops']} operations of the "
+        "mixture, one division and one root, 48 bytes of a star shared by the batch.",
+        "",
+    ]
+    head = ["order", "N"]
+    for k in counts:
+        head += [f"{k} thread{'s' * (k > 1)}", "roofline", "reached"]
+    head += ["numpy", "numpy / 1 thread"]
+    body = []
+    for r in rows:
+        cells = [str(r["order"]), f"{r['n_stars']:,}"]
+        for k in counts:
+            mine, floor = r.get(f"ns_{k}"), r.get(f"floor_{k}")
+            share = "–" if mine is None else f"{100 * floor / mine:.0f} %"
+            cells += [_number(mine), _number(floor), share]
+        numpy_ns, one = r.get("ns_numpy"), r.get("ns_1")
+        times = None if numpy_ns is None or one is None else numpy_ns / one
+        body.append([*cells, _number(numpy_ns), _number(times)])
+    return out + _table(head, body)
+
+
+def _linear(part: dict[str, Any]) -> list[str]:
+    out = [
+        "## Linear fit",
+        "",
+        "Seconds. `fit_linear` makes two passes with rejection, formal covariance, rank and "
+        "coverage checks; *unclipped* keeps all rows. lstsq: one unweighted solution without "
+        "covariance. *Differ by*: largest difference of coefficients between the unclipped fit "
+        "and a weighted lstsq, in formal sigmas. astropy: `fit_wcs_from_points`, sip_degree = "
+        "order, on the same pairs; *from lstsq*: rms distance of its positions from those of "
+        "lstsq. There is no ratio where that exceeds the error of one star.",
+        "",
+    ]
+    head = ("order", "N", "fit_linear", "unclipped", "build design", "lstsq")
+    head += ("lstsq with design / fit_linear", "differ by", "astropy", "from lstsq [pix]")
+    head += ("astropy / fit_linear", "remarks")
+    body = []
+    for r in part["rows"]:
+        ours, theirs = r["fit_linear_s"], r["astropy_s"]
+        body.append(
+            (
+                str(r["order"]),
+                f"{r['n_stars']:,}",
+                _number(ours),
+                _number(r["fit_linear_unclipped_s"]),
+                _number(r["design_s"]),
+                _number(r["lstsq_s"]),
+                _number((r["design_s"] + r["lstsq_s"]) / ours),
+                _number(r["coefficients_differ"]),
+                _number(theirs),
+                _number(r.get("astropy_apart")),
+                _number(theirs / ours if r["astropy_close"] else None),
+                "; ".join(r["flags"]) or "–",
+            )
+        )
+    return out + _table(head, body)
+
+
+def _scaling(part: dict[str, Any]) -> list[str]:
+    out = [
+        "## Scaling",
+        "",
+        f"Order {part['order']}, 3 % false matches, to ESS 400, each in a process of its own; "
+        "matches are read from Parquet. Memory is the peak of the process, libraries included.",
+        "",
+    ]
+    head = ("N", "read [s]", "fit [s]", "sample [s]", "fit + sample [s]")
+    head += ("us per star", "passes", "ESS", "converged", "peak [MB]", "of that before reading")
+    out += _table(
+        head,
+        [
+            (
+                f"{r['n_stars']:,}",
+                _number(r["read_s"]),
+                _number(r["fit_s"]),
+                _number(r["sample_s"]),
+                _number(r["seconds"]),
+                _number(1e6 * r["seconds"] / r["n_stars"]),
+                f"{r['passes']:,}",
+                f"{r['ess']:,.0f}",
+                "yes" if r["converged"] else "no",
+                f"{r['peak_mb']:,.0f}",
+                f"{r['peak_before_mb']:,.0f}",
+            )
+            for r in part["rows"]
+        ],
+    )
+    for n in part["stopped"]:
+        out += [f"N = {n:,} was stopped after {part['limit_s']:g} s.", ""]
+    fitted = part["exponent"]
+    if fitted is not None:
+        text = (
+            f"Exponent of fit + sample from N = {fitted['from']:,} to {fitted['to']:,}: "
+            f"{fitted['value']:.3f} ± {fitted['error']:.3f}."
+        )
+        out += [text, ""]
+    if part.get("figure"):
+        out += [f"![Wall time and memory against the number of stars]({part['figure']})", ""]
+    return out
+
+
+_PARTS = {"samplers": _samplers, "kernel": _kernel, "linear": _linear, "scaling": _scaling}
+
+
+def to_markdown(bench: dict[str, Any]) -> str:
+    """The report.
+
+    Parameters
+    ----------
+    bench : dict
+        What stands in bench.json.
+
+    Returns
+    -------
+    str
+    """
+    out = ["# Benchmarks", ""]
+    out += [
+        "Written by `make bench`. Ratios compare what was measured in this one run, on the same "
+        "machine and cores."
+    ]
+    if bench["quick"]:
+        out[-1] += " **Quick run on tiny problems: the figures mean nothing.**"
+    out += ["", *_machine(bench["machine"])]
+    for name, part in bench["parts"].items():
+        out += _PARTS[name](part)
+        out += [f"({part['wall_s']:.0f} s)", ""]
+    return "\n".join(out).rstrip() + "\n"

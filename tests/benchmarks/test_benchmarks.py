@@ -1,0 +1,154 @@
+"""The benchmark program works, and what it compares is one posterior.  No figure is judged here."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tests.benchmarks import __main__ as program
+from tests.benchmarks.agreement import compare
+from tests.benchmarks.effective import autocorrelation, smallest_ess
+from tests.benchmarks.markdown import to_markdown
+from tests.benchmarks.plain import PlainDensity
+from tests.benchmarks.problem import simulated
+from tests.benchmarks.roofline import Roofline
+from tests.benchmarks.scaling import exponent
+
+AGREE = 5.0  # Monte-Carlo errors, the largest of nine parameters
+
+
+def _points(problem, n: int = 6) -> np.ndarray:
+    """Parameter vectors around the truth, some far out."""
+    rng = np.random.default_rng(2)
+    width = np.concatenate([problem.fit.sigma, [0.2, 0.2, 0.2]])
+    reach = np.geomspace(0.3, 30, n)[:, None] * np.r_[np.ones(problem.dim - 3), 0.2, 0.2, 0.2]
+    return problem.truth + reach * width * rng.standard_normal((n, problem.dim))
+
+
+@pytest.mark.parametrize("order", [1, 5])
+def test_numpy_density_is_the_library_s_but_for_a_constant(order):
+    problem = simulated(700, order)
+    points = _points(problem)
+    apart = np.array([PlainDensity(problem)(p) for p in points]) - problem.log_density(points)
+    np.testing.assert_allclose(apart, apart[0], rtol=0, atol=1e-7)
+
+
+def test_jax_density_is_the_library_s_but_for_a_constant():
+    pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+    import jax
+
+    from tests.benchmarks.nuts import log_density
+
+    problem = simulated(700, 3)
+    points = _points(problem)
+    function, data = log_density(problem)
+    fast = jax.jit(function)
+    theirs = np.array([float(fast(p, *data)) for p in points])
+    apart = theirs - problem.log_density(points)
+    np.testing.assert_allclose(apart, apart[0], rtol=0, atol=1e-7)
+
+
+def _autoregressive(coefficient: float, rows: int, walkers: int) -> np.ndarray:
+    """Chains (rows, walkers, 2) whose autocorrelation time is (1 + c) / (1 - c)."""
+    rng = np.random.default_rng(4)
+    out = np.empty((rows, walkers, 2))
+    out[0] = rng.standard_normal((walkers, 2))
+    for k in range(1, rows):
+        noise = np.sqrt(1 - coefficient**2) * rng.standard_normal((walkers, 2))
+        out[k] = coefficient * out[k - 1] + noise
+    return out
+
+
+def test_autocorrelation_time_of_a_known_process():
+    chain = _autoregressive(0.8, 4000, 20)
+    tau = autocorrelation(chain, 1, 1)
+    assert tau.bulk == pytest.approx(9.0, rel=0.1)
+    assert tau.tail < tau.bulk  # an indicator forgets sooner
+    assert tau.long_enough
+    # every fifth row of it: a row stands for five steps
+    assert autocorrelation(chain[::5], 5, 1).bulk == pytest.approx(9.0, rel=0.2)
+    bulk, _ = smallest_ess(np.swapaxes(chain, 0, 1))
+    assert bulk == pytest.approx(4000 * 20 / 9, rel=0.15)
+
+
+def test_agreement_is_in_monte_carlo_errors():
+    rng = np.random.default_rng(6)
+    a, b = rng.standard_normal((2, 10_000, 3))
+    same = compare(a, 1e4, b, 1e4)
+    assert same["shift_errors"] < 4 and same["sd_errors"] < 4
+    other = compare(a + 0.1, 1e4, 1.1 * b, 1e4)
+    assert other["shift"] == pytest.approx(0.1 / 1.1, abs=0.03)
+    assert other["shift_errors"] > 5 and other["sd_errors"] > 5
+    assert other["sd_ratio"][1] == pytest.approx(1 / 1.1, rel=0.03)
+
+
+def test_exponent_of_a_power_law():
+    rows = [{"n_stars": n, "seconds": 3e-6 * n**1.03} for n in (1e5, 1e6, 1e7)]
+    found = exponent(rows)
+    assert found["value"] == pytest.approx(1.03) and found["error"] < 1e-9
+    assert exponent(rows[:2]) is None
+
+
+def test_roofline_counts_the_terms_of_two_polynomials():
+    roof = Roofline(fma_per_ns=10.0, divide_root_ns=2.0, bytes_per_ns=20.0)
+    floor = roof.floor_ns(order=5, batch=1, threads=1)
+    assert floor["polynomials"] == pytest.approx(42 / 10)
+    assert floor["memory"] == pytest.approx(48 / 20)
+    assert roof.floor_ns(5, 16, 2)["division and root"] == pytest.approx(1.0)
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+    folder = tmp_path_factory.mktemp("bench")
+    figures = folder / "figures"
+    assert program.main(["--quick", "--output", str(folder), "--figures", str(figures)]) == 0
+    return folder
+
+
+def test_json_and_markdown_are_complete(quick):
+    bench = json.loads((quick / "bench.json").read_text(encoding="utf-8"))
+    assert set(bench["parts"]) == set(program.PARTS)
+    machine = bench["machine"]
+    assert machine["cpu"] and machine["cores"] >= 1 and machine["libraries"]["numba"]
+    text = (quick / "bench.md").read_text(encoding="utf-8")
+    assert text == to_markdown(bench)
+    for name in ("stock emcee", "DEMove", "NUTS, whitened", "bayesdist", "lstsq", "GB/s"):
+        assert name in text
+    samplers = bench["parts"]["samplers"]["rows"]
+    assert len(samplers) == 5
+    for row in samplers:
+        for key in ("rate", "per_pass", "ratio", "ratio_total"):
+            assert row[key] > 0 and math.isfinite(row[key]), (row["sampler"], key)
+    kernel = bench["parts"]["kernel"]["rows"]
+    assert {row["order"] for row in kernel} == {1, 3} and all(row["ns_numpy"] > 0 for row in kernel)
+    (linear,) = bench["parts"]["linear"]["rows"]
+    assert linear["coefficients_differ"] < 1e-6 and linear["astropy_s"] > 0
+    assert linear["astropy_close"]  # the same pairs on the sky: a matched degree finds the fit
+    scaling = bench["parts"]["scaling"]
+    assert [row["n_stars"] for row in scaling["rows"]] == [400, 1200]
+    assert all(
+        row["converged"] and row["peak_mb"] > row["peak_before_mb"] - 1 for row in scaling["rows"]
+    )
+    assert (quick / "figures" / "scaling.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_all_samplers_sample_one_posterior(quick):
+    bench = json.loads((quick / "bench.json").read_text(encoding="utf-8"))
+    others = [r for r in bench["parts"]["samplers"]["rows"] if r["sampler"] != "bayesdist"]
+    for row in others:
+        assert row["agreement"]["shift_errors"] < AGREE, row["sampler"]
+        assert row["agreement"]["sd_errors"] < AGREE, row["sampler"]
+    stock = next(r for r in others if r["sampler"] == "stock emcee")
+    assert stock["density_difference"] < 1e-6
+
+
+def test_only_the_parts_that_are_asked_for(tmp_path):
+    program.main(["--quick", "--only", "linear", "--output", str(tmp_path)])
+    bench = json.loads((tmp_path / "bench.json").read_text(encoding="utf-8"))
+    assert list(bench["parts"]) == ["linear"]
+    with pytest.raises(SystemExit):
+        program.main(["--only", "nothing"])
