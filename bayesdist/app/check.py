@@ -14,6 +14,7 @@ from bayesdist.app.session import Session
 from bayesdist.app.stages import rehearse
 from bayesdist.app.stages.assess import warnings_of
 from bayesdist.infer import Limits
+from bayesdist.infer.certified import AFFORDABLE, PILOTS
 from bayesdist.infer.plan import expected_passes
 
 __all__ = ["check"]
@@ -84,10 +85,16 @@ def _cost(session: Session) -> str:
     sampler, n = session.config.sampler, len(session.shards)
     limits = Limits(sampler.target_ess, sampler.target_rhat)
     n_params = session.model.n_params + len(session.config.mixture().hyper)
-    passes = expected_passes(n_params, n, limits, sampler.ensembles)
+    passes, how = expected_passes(n_params, n, limits, sampler.ensembles), ""
+    if sampler.method == "certified":
+        affordable = passes * n <= AFFORDABLE
+        exact = sampler.second_stage == "always" or (sampler.second_stage == "auto" and affordable)
+        passes = PILOTS + (passes if exact else 0)
+        how = "certified, with an exact second stage; " if exact else "certified, approximate; "
     per_pass = STAR_S * n
     total = EXPANSIONS * EXPANSION_S * n + passes * (per_pass + OVERHEAD_S) + FIXED_S
     return (
-        f"cost         about {passes} passes over {n} stars, {number(1e3 * per_pass, 2)} ms each: "
+        f"cost         {how}about {passes} passes over {n} stars, "
+        f"{number(1e3 * per_pass, 2)} ms each: "
         f"{number(total, 2)} s to the posterior if it is well behaved"
     )

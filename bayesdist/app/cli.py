@@ -186,10 +186,13 @@ def _validate(options: argparse.Namespace) -> int:
         require(session, "validate", ("fit", "sample"))
         margins = margins_of(session, requirements, session.posterior)
         write_margins(session, margins)
+        label = session.posterior.approximation
     print(margins_text(margin_rows(margins)))
     for m in margins:
         if m.verdict != "met":
             print(f"{m.requirement.name}: {m.verdict}: {m.reason}")
+    if label:
+        print(f"WARNING: {label}")
     return 0 if all(m.verdict == "met" for m in margins) else MISSED
 
 

@@ -117,8 +117,11 @@ def _run_stage(session: Session, stage: str) -> None:
 def _judge(session: Session, strict: bool) -> None:
     convergence = session.posterior.convergence
     if strict and not convergence.converged:
+        exact = session.posterior.sampler.exact
         raise NotConvergedError(
             f"the sampler has not converged ({'; '.join(convergence.reasons)})",
             where=str(session.run.path),
-            do="raise sampler.max_steps and resume, or simplify the model",
+            do="raise sampler.max_steps and resume, or simplify the model"
+            if exact
+            else "set sampler.second_stage = 'always' and run with --force",
         )

@@ -392,9 +392,11 @@ def _judge(
     if n_outside:
         reasons.append(f"{n_outside} pilots lie where the posterior is zero")
     if not pareto_k < MOST_K:
-        reasons.append(f"Pareto k {pareto_k:.2f} of the proposal is not below {MOST_K}")
+        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {MOST_K}")
     if not efficiency > LEAST_EFFICIENCY:
-        reasons.append(f"efficiency {efficiency:.2f} of the proposal is not above 0.5")
+        reasons.append(
+            f"efficiency {efficiency:.3f} of the proposal is not above {LEAST_EFFICIENCY}"
+        )
     if not sd <= MOST_REMAINDER:
         reasons.append(f"standard deviation {sd:.2g} of the remainder exceeds {MOST_REMAINDER}")
     if not bound <= MOST_SHIFT:

@@ -24,7 +24,7 @@ from bayesdist.infer.proposal import GridProposal, Random
 from bayesdist.infer.target import Target
 from bayesdist.infer.whitening import Whitening
 
-__all__ = ["SECOND_STAGES", "SurrogateProposal", "run_certified"]
+__all__ = ["AFFORDABLE", "PILOTS", "SECOND_STAGES", "SurrogateProposal", "run_certified"]
 
 Float = NDArray[np.float64]
 
@@ -155,6 +155,11 @@ def _approximate(
     inside = np.isfinite(page.log_prob.ravel())
     weights = page.log_prob.ravel()[inside] - proposal.log_density(flat[inside])
     verdict = diagnose(kept, target.names, weights, s.limits, coupled=False)
+    verdict = replace(
+        verdict,
+        pareto_k=certificate.pareto_k,
+        importance_efficiency=certificate.raw_efficiency,
+    )
     if not certificate.granted:
         reasons = (*verdict.reasons, certificate.statement)
         verdict = replace(verdict, converged=False, reasons=reasons)

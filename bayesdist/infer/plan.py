@@ -39,6 +39,7 @@ FEWEST_WALKERS, MOST_WALKERS = 8, 64
 
 EFFICIENT, USABLE = 0.5, 0.05  # importance efficiency
 LONGEST_TAIL = 0.7  # Pareto k
+NO_MEAN = 1.0  # Pareto k beyond which weights have no mean: the proposal has lost the posterior
 PROBATION = 2048  # proposals before which k scatters too much (by about 0.2 at 512) to condemn one
 
 
@@ -107,7 +108,8 @@ def plan_moves(
     dear = n_stars > DEAR  # every step counts, and there will be few of them
     if efficiency > EFFICIENT and (k < LONGEST_TAIL or n_proposals < PROBATION):
         return Plan("independence", (1.0, 0.0, 0.0), walkers or walkers_for(n_stars), step)
-    if efficiency > USABLE and k < LONGEST_TAIL:
+    # local moves make up for a tail that the proposal reaches too seldom
+    if efficiency > USABLE and (k < NO_MEAN or n_proposals < PROBATION):
         return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, step, 1 if dear else 5)
     # emcee's red-blue moves want two walkers for each parameter
     least = max(2 * (n_params + 1), 32)

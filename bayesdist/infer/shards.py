@@ -49,6 +49,12 @@ class Compute:
     workers: int | None = None
 
     def __post_init__(self) -> None:
+        if not 0 <= self.memory_mb < float("inf"):
+            raise InputError(
+                f"memory_mb is {self.memory_mb}",
+                where="compute.memory_mb",
+                do="give 0 or a positive number",
+            )
         if self.engine not in ("threads", "dask"):
             raise InputError(
                 f"there is no engine {self.engine!r}",
@@ -164,6 +170,15 @@ def load(
         As `prepare`; for a full scratch folder; when no cluster is there.
     """
     if not isinstance(matches, MatchTable | PartitionedMatches):
+        if not hasattr(matches, "survey"):
+            raise InputError(
+                f"{type(matches).__name__} holds no matches",
+                do="give what read_matches, open_matches or load returned",
+            )
+        if matches.model != model:
+            raise InputError(
+                "the shards were made for another model", do="load the matches for this one"
+            )
         return matches
     compute = compute or Compute()
     if compute.engine == "threads":

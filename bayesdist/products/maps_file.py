@@ -23,6 +23,7 @@ def write_maps(
     area: AreaMap | None = None,
     *,
     converged: bool = True,
+    note: str = "",
 ) -> None:
     """Write uncertainty maps of one chip.
 
@@ -38,10 +39,14 @@ def write_maps(
     area : AreaMap, optional
     converged : bool
         Whether the posterior may be relied on; noted in the primary header.
+    note : str
+        What else has to be said of the posterior there.
     """
     hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU()]
     hdus[0].header["CREATOR"] = "bayesdist"
     hdus[0].header["BDCONV"] = (converged, "has the sampler converged?")
+    if note:
+        hdus[0].header["COMMENT"] = note
     for m in maps:
         prefix = PREFIX[m.kind]
         for name, values, unit in (

@@ -104,13 +104,13 @@ def _sampling_checks(inputs: ReportInput) -> tuple[Check, ...]:
             _level(mcse <= _MCSE, "warn"),
         ),
         Check(
-            "Pareto k of the Laplace proposal",
+            "Pareto k of the proposal",
             number(c.pareto_k, 2),
             f"at most {_PARETO_K:g}",
             _level(c.pareto_k <= _PARETO_K, "warn"),
         ),
         Check(
-            "Importance efficiency of the Laplace proposal",
+            "Importance efficiency of the proposal",
             percent(c.importance_efficiency, 2),
             f"at least {percent(_EFFICIENCY, 2)}",
             _level(c.importance_efficiency >= _EFFICIENCY, "warn"),

@@ -155,8 +155,8 @@ def residual_vectors(
             draw_vectors(ax, gx[k], gy[k], du[k], dv[k], magnification=M, color=color)
         ax.plot(gx[filled], gy[filled], ".", ms=1.2, color="#A9B4C0", zorder=2)
         ax.set_title(
-            f"{int(significant.sum())} of {int(filled.sum())} cells are significant"
-            f" ({CHANCE * filled.sum():.0f} by chance)",
+            f"{int(significant.sum())} of {int(filled.sum())} cells significant,\n"
+            f"{CHANCE * filled.sum():.0f} by chance",
             pad=9,
         )
         vector_key(ax, nice_below(typical), magnification=M, unit=unit)

@@ -183,5 +183,9 @@ def test_plan_falls_back_as_the_proposal_gets_worse():
     # ... but few proposals do not tell
     assert plan_moves(0.9, 1.5, 45, 5000, n_proposals=512).independent
     assert not plan_moves(0.4, 1.5, 45, 5000, n_proposals=512).independent
+    # and a tail that is somewhat long is what local moves are for: the others cost a hundred times
+    # as many passes
+    for k, n_proposals in ((0.73, 4096), (1.5, 512)):
+        assert plan_moves(0.47, k, 45, 1_000_000, n_proposals=n_proposals).method == fair.method
     for plan in (good, fair, poor):
         assert sum(plan.weights) == pytest.approx(1)

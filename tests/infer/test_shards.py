@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -235,3 +237,19 @@ def test_preparing_changes_no_input(chips):
     fit_linear(matches, model, clip_abs=None)
     for name, values in before.items():
         np.testing.assert_array_equal(getattr(matches, name), values)
+
+
+def test_shards_of_another_model_are_refused():
+    model, matches, _ = simulated(51, 300)
+    other = replace(model, chips=(replace(model.chips[0], size=(2000.0, 1600.0)),))
+    shards = load(model, matches)
+    with pytest.raises(InputError, match="another model"):
+        fit_linear(shards, other)
+    with pytest.raises(InputError, match="holds no matches"):
+        fit_linear("stars.ecsv", model)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("memory", [-1.0, np.nan, np.inf])
+def test_a_budget_that_is_no_budget_is_refused(memory):
+    with pytest.raises(InputError, match=r"compute\.memory_mb"):
+        Compute(memory_mb=memory)

@@ -44,9 +44,10 @@ def run_assess(session: Session) -> None:
     solution, grid, epoch = session.posterior, config.assess.grid, session.epoch
     maps = [uncertainty_map(s, grid=grid, epoch=epoch) for s in (session.fit, solution)]
     area = area_map(solution, grid=grid, epoch=epoch)
-    write_maps(run / "maps.fits", maps, area, converged=solution.convergence.converged)
+    state = trust(session)
+    write_maps(run / "maps.fits", maps, area, note=solution.approximation, **state)
     coefficients = coefficient_table(session.fit, solution)
-    coefficients.meta["converged"] = solution.convergence.converged
+    coefficients.meta |= state | labelled(session)
     write_table(coefficients, run / "coefficients.ecsv")
     warnings = posterior_warnings(session)
     for text in warnings:
@@ -56,7 +57,7 @@ def run_assess(session: Session) -> None:
     for name in ("u", "v", "radial"):
         table[name].unit = solution.unit
     table.meta = {"epoch": epoch, "grid": list(grid), "statistic": "rms over the grid"}
-    table.meta["converged"] = solution.convergence.converged
+    table.meta |= state | labelled(session)
     write_table(table, run / "budget.ecsv")
     margins = margins_of(session, config.requirements(), solution)
     write_margins(session, margins)
@@ -129,6 +130,17 @@ def warnings_of(session: Session) -> list[str]:
     return [text[0].upper() + text[1:] for text in out]
 
 
+def trust(session: Session) -> dict[str, bool]:
+    """Whether the posterior may be relied on, for the head of a file."""
+    return {"converged": session.posterior.convergence.converged}
+
+
+def labelled(session: Session) -> dict[str, str]:
+    """What must be said of draws that are not exact, for the head of a file."""
+    label = session.posterior.approximation
+    return {"posterior": label} if label else {}
+
+
 def posterior_warnings(session: Session) -> list[str]:
     """Those of the fit, and before them what must be said of the draws."""
     label = session.posterior.approximation
@@ -168,7 +180,9 @@ def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
         flat["epoch"] = np.nan if flat["epoch"] is None else flat["epoch"]
         for name, value in flat.items():
             columns.setdefault(name, []).append(value)
-    write_table(Table(columns), session.run / "margins.ecsv")
+    table = Table(columns)
+    table.meta = trust(session) | labelled(session)
+    write_table(table, session.run / "margins.ecsv")
     session.run.summarise(margins=rows)
 
 

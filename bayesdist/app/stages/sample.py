@@ -69,7 +69,9 @@ def run_sample(session: Session) -> None:
             **_certificate(posterior),
         },
     )
-    if c.converged:
+    if posterior.approximation:
+        log.warning("sample: %s", posterior.approximation)
+    elif c.converged:
         log.info("sample: converged after %d steps, %d passes", i.steps, i.passes)
     else:
         log.warning("sample: NOT CONVERGED after %d steps: %s", i.steps, "; ".join(c.reasons))
@@ -93,4 +95,6 @@ def _outliers(posterior: Posterior) -> dict[str, object]:
 def _certificate(posterior: Posterior) -> dict[str, object]:
     """What vouches for draws that were not made from the posterior itself."""
     c = posterior.certificate
-    return {} if c is None else {"certificate": asdict(c) | {"granted": c.granted}}
+    if c is None:
+        return {}
+    return {"certificate": asdict(c) | {"granted": c.granted, "statement": c.statement}}
