@@ -14,7 +14,7 @@ from bayesdist.app.session import Session
 from bayesdist.app.stages import rehearse
 from bayesdist.app.stages.assess import warnings_of
 from bayesdist.infer import Limits
-from bayesdist.infer.certified import AFFORDABLE, PILOTS
+from bayesdist.infer.certified import PILOTS, has_second_stage
 from bayesdist.infer.plan import expected_passes
 
 __all__ = ["check"]
@@ -87,8 +87,7 @@ def _cost(session: Session) -> str:
     n_params = session.model.n_params + len(session.config.mixture().hyper)
     passes, how = expected_passes(n_params, n, limits, sampler.ensembles), ""
     if sampler.method == "certified":
-        affordable = passes * n <= AFFORDABLE
-        exact = sampler.second_stage == "always" or (sampler.second_stage == "auto" and affordable)
+        exact = has_second_stage(sampler.second_stage, passes, n)
         passes = PILOTS + (passes if exact else 0)
         how = "certified, with an exact second stage; " if exact else "certified, approximate; "
     per_pass = STAR_S * n

@@ -95,11 +95,7 @@ class Session:
     def matches(self) -> Matches:
         """Matches with their errors."""
         raw, errors = self.raw_matches, self.magnitude_errors
-        if errors is None:
-            return raw
-        if isinstance(raw, MatchTable):
-            return raw.with_sigma(*errors.at(raw.mag))
-        return raw.with_errors_by_magnitude(errors)
+        return raw if errors is None else raw.with_errors_by_magnitude(errors)
 
     @cached_property
     def shards(self) -> Shards:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from bayesdist.data import MatchTable, remove_leftovers
-from bayesdist.data.result_files import write_columns
+from bayesdist.data.parquet_write import write_columns
 from bayesdist.errors import InputError
-from bayesdist.infer import LinearFit, Matches, Posterior, memberships, residuals
+from bayesdist.infer import LinearFit, Matches, Posterior
+from bayesdist.infer.membership import memberships_of
+from bayesdist.infer.stars import in_table_order, prepare
 
 __all__ = ["FOLDER", "part_files", "write_star_files"]
 
@@ -52,8 +54,9 @@ def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, fol
 
 
 def _write_part(table: MatchTable, fit: LinearFit, posterior: Posterior, path: Path) -> None:
-    said = memberships(posterior, table)
-    u, v = residuals(posterior, table).T
+    stars, order = prepare(posterior.model, table)
+    said = memberships_of(posterior, stars).in_table_order(order)
+    u, v = in_table_order(stars.residuals(posterior.mean), order).T
     columns = {
         "source": (table.source, table.sources),
         "row": table.row,
@@ -61,7 +64,7 @@ def _write_part(table: MatchTable, fit: LinearFit, posterior: Posterior, path: P
         "y": table.y,
         "residual_u": u,
         "residual_v": v,
-        "used": fit.uses(table),
+        "used": in_table_order(fit.clip.keeps_of(stars), order),
         "outlier_probability": said.outlier_probability,
         "log_likelihood": said.log_likelihood,
         "log_likelihood_variance": said.log_likelihood_variance,

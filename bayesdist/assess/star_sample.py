@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer import LinearFit, Posterior, outlier_probability, residuals
+from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.membership import memberships_of
+from bayesdist.infer.stars import in_table_order, prepare
 
 __all__ = ["SAMPLE", "StarSample", "star_sample"]
 
@@ -75,11 +77,17 @@ def star_sample(
     -------
     StarSample
     """
+    stars, order = prepare(fit.model, table)
+    said = None if posterior is None else memberships_of(posterior, stars).in_table_order(order)
+
+    def residual(solution: LinearFit | Posterior) -> Float:
+        return in_table_order(stars.residuals(solution.mean), order)
+
     return StarSample(
         table=table,
-        fit_residual=residuals(fit, table),
-        used=fit.uses(table),
+        fit_residual=residual(fit),
+        used=in_table_order(fit.clip.keeps_of(stars), order),
         n_total=n_total,
-        posterior_residual=None if posterior is None else residuals(posterior, table),
-        outlier_probability=None if posterior is None else outlier_probability(posterior, table),
+        posterior_residual=None if posterior is None else residual(posterior),
+        outlier_probability=None if said is None else said.outlier_probability,
     )

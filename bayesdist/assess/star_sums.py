@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.residuals import BinnedSums, binned_sums
-from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.linear import Clip
-from bayesdist.infer.membership import sampled_points, some_draws
+from bayesdist.infer.membership import averaged_draws, star_averages
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.shards import Shards
 from bayesdist.infer.stars import Stars
@@ -113,15 +112,11 @@ def flagged_by_exposure(shards: Shards, posterior: Posterior) -> Int:
         Of all stars; one pass over them is made.
     posterior : Posterior
     """
-    theta, h = some_draws(*sampled_points(posterior), posterior.n_stars)
-    constants = posterior.mixture.bind(posterior.reference_sigma).constants(h)
-    return shards.sum(_flagged, theta, constants)
+    return shards.sum(_flagged, *averaged_draws(posterior))
 
 
 def _flagged(stars: Stars, theta: Float, constants: Constants) -> Int:
-    p = kernel.memberships(
-        stars.blocks, stars.columns, stars.powers(theta), stars.model.order, constants
-    )[0]
+    p = star_averages(stars, theta, constants)[0]
     exposure = _of_groups(stars, stars.groups.exposure)
     return np.bincount(exposure[p > 0.5], minlength=len(stars.model.exposures))
 

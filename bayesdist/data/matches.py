@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.duplicates import first_duplicate
+from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
 from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
 from bayesdist.data.units import check_unit
@@ -330,6 +331,30 @@ class MatchTable:
             sigma_u=np.broadcast_to(np.asarray(sigma_u, float), shape),
             sigma_v=np.broadcast_to(np.asarray(sigma_v, float), shape),
         )
+
+    def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> MatchTable:
+        """The same stars with errors by magnitude.
+
+        Parameters
+        ----------
+        errors : MagnitudeErrors
+
+        Returns
+        -------
+        MatchTable
+
+        Raises
+        ------
+        InputError
+            Without magnitudes.
+        """
+        if self.mag is None:
+            raise InputError(
+                "holds no magnitudes, and errors by magnitude need them",
+                where=", ".join(self.sources),
+                do="give a table with magnitudes",
+            )
+        return self.with_sigma(*errors.at(self.mag))
 
     @staticmethod
     def concatenate(tables: Sequence[MatchTable]) -> MatchTable:

@@ -31,7 +31,6 @@ Int = NDArray[np.int64]
 _BLOCK = 2**18  # rows looked at together in a scan
 _LABELS = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
 _DEFAULTS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
-_UNCOMPARED = ("sigma_u", "sigma_v", "mag")  # of no matter to whether a row stands twice
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,18 +241,16 @@ def tangent_point_of(parts: Sequence[MatchPart]) -> tuple[float, float]:
 class _Scan:
     """The parts batch by batch, as `first_repetition` goes through them.
 
-    The first time all columns are read, so that whatever is wrong with a row comes out, and labels
-    are numbered as they appear.
+    All columns are read, so that whatever is wrong with a row comes out, and labels are numbered as
+    they appear.
     """
 
     parts: Sequence[MatchPart]
     numbers: dict[str, dict[Any, int]] = field(default_factory=lambda: {k: {} for k in _LABELS})
-    checked: bool = False
 
     def __call__(self) -> Iterator[list[NDArray[Any]]]:
-        without = _UNCOMPARED if self.checked else ()
         for one in self.parts:
-            for block in one.blocks(size=_BLOCK, without=without):
+            for block in one.blocks(size=_BLOCK):
                 keys = [block[name] for name in ("x", "y", "u", "v")]
                 for key, known in self.numbers.items():
                     code_of_label = np.array(
@@ -264,7 +261,6 @@ class _Scan:
                 if "epoch" in block:
                     keys.append(block["epoch"])
                 yield keys
-        self.checked = True
 
 
 def scan(parts: Sequence[MatchPart]) -> Whole:

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bayesdist.data.files import atomic_path
 from bayesdist.data.matches import MatchTable
+from bayesdist.data.parquet_write import labelled, save_parquet
 from bayesdist.data.pieces import PIECE
 from bayesdist.errors import InputError
 
@@ -123,25 +123,12 @@ def _schema(table: MatchTable, *, like: pyarrow.Schema | None = None) -> pyarrow
 
 def _write(table: MatchTable, schema: pyarrow.Schema, path: Path, rows_per_group: int) -> None:
     import pyarrow
-    import pyarrow.parquet
 
     columns = []
     for one in schema:
         values = getattr(table, one.name)
         if pyarrow.types.is_dictionary(one.type):
-            labels = pyarrow.array(getattr(table, _LABELS[one.name][0]), one.type.value_type)
-            codes = pyarrow.array(values, one.type.index_type)
-            columns.append(pyarrow.DictionaryArray.from_arrays(codes, labels))
+            columns.append(labelled(values, getattr(table, _LABELS[one.name][0])))
         else:
             columns.append(pyarrow.array(values))
-    with atomic_path(path) as temporary:
-        pyarrow.parquet.write_table(
-            pyarrow.table(columns, schema=schema),
-            temporary,
-            row_group_size=rows_per_group,
-            # measured positions do not compress; labels are run-length encoded all the same
-            compression="none",
-            use_dictionary=[name for name in _LABELS if name in schema.names],
-            write_statistics=False,
-            write_page_checksum=True,
-        )
+    save_parquet(pyarrow.table(columns, schema=schema), path, rows_per_group=rows_per_group)

@@ -40,6 +40,7 @@ from numpy.typing import NDArray
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer.labelled.convergence import importance_efficiency
 from bayesdist.infer.labelled.convergence import pareto_k as tail_shape
+from bayesdist.infer.plan import EFFICIENT, LONGEST_TAIL
 from bayesdist.infer.proposal import Random
 
 __all__ = ["Certificate", "Surrogate", "certify", "draw_surrogate"]
@@ -51,8 +52,6 @@ LEAST_TRAINING = 20
 LEAST_HELD_OUT = 100  # fewer leave more than 3 % of the probability unseen
 MOST_REMAINDER = 0.1
 MOST_SHIFT = 0.1  # posterior standard deviations: the Monte-Carlo error of 100 draws
-LEAST_EFFICIENCY = 0.5  # of q itself: as for the plan of independence proposals
-MOST_K = 0.7
 MISSED = 3  # pilots, by the rule of three
 MISSED_FACTOR = 2.0  # by how much an unseen remainder may exceed the worst that was seen
 ROUNDING = 1e-6  # of log densities of 1e7 and more
@@ -391,12 +390,10 @@ def _judge(
         reasons.append(f"{n} pilots held out are fewer than {LEAST_HELD_OUT}")
     if n_outside:
         reasons.append(f"{n_outside} pilots lie where the posterior is zero")
-    if not pareto_k < MOST_K:
-        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {MOST_K}")
-    if not efficiency > LEAST_EFFICIENCY:
-        reasons.append(
-            f"efficiency {efficiency:.3f} of the proposal is not above {LEAST_EFFICIENCY}"
-        )
+    if not pareto_k < LONGEST_TAIL:
+        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {LONGEST_TAIL}")
+    if not efficiency > EFFICIENT:
+        reasons.append(f"efficiency {efficiency:.3f} of the proposal is not above {EFFICIENT}")
     if not sd <= MOST_REMAINDER:
         reasons.append(f"standard deviation {sd:.2g} of the remainder exceeds {MOST_REMAINDER}")
     if not bound <= MOST_SHIFT:

@@ -24,7 +24,7 @@ from bayesdist.infer.proposal import GridProposal, Random
 from bayesdist.infer.target import Target
 from bayesdist.infer.whitening import Whitening
 
-__all__ = ["AFFORDABLE", "PILOTS", "SECOND_STAGES", "SurrogateProposal", "run_certified"]
+__all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
 
 Float = NDArray[np.float64]
 
@@ -70,6 +70,21 @@ class SurrogateProposal:
     def log_density(self, psi: Float) -> Float:
         """Log density (n,) of points (n, D), up to a constant."""
         return self.first.log_density(psi) + self.surrogate.log_weight(self.whitening.to_white(psi))
+
+
+def has_second_stage(choice: str, passes: int, n_stars: int) -> bool:
+    """Whether exact evaluations follow the surrogate.
+
+    Parameters
+    ----------
+    choice : str
+        Of `SECOND_STAGES`.
+    passes : int
+        That they are expected to take.
+    n_stars : int
+    """
+    affordable = float(passes) * n_stars <= AFFORDABLE
+    return choice == "always" or (choice == "auto" and affordable)
 
 
 def run_certified(
@@ -120,8 +135,7 @@ def run_certified(
     better = SurrogateProposal(proposal, whitening, surrogate)
 
     passes = expected_passes(len(target.names), s.n_stars, s.limits, E)
-    affordable = float(passes) * s.n_stars <= AFFORDABLE
-    if second_stage == "always" or (second_stage == "auto" and affordable):
+    if has_second_stage(second_stage, passes, s.n_stars):
         # a surrogate that is no good is no better proposal either
         chains = run_chains(target, better if certificate.granted else proposal, s)
         method = f"delayed acceptance ({chains.plan.method} second stage)"

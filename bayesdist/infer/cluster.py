@@ -5,8 +5,7 @@ A pass is one map-reduce: a task for each shard, run where the shard is, whose r
 are added in the order of the shards, as threads add them, however many workers there are and
 whatever happens to them: a worker that is lost takes its shards along, and Dask makes them again
 elsewhere from the pieces.  What a kernel gives for one shard is the same up to rounding: code that
-was compiled for another processor, or just now rather than read from the cache, may differ in the
-last bits.
+was compiled for another processor may differ in the last bits.
 
 The only module that knows dask and distributed; it is imported when the engine is asked for.
 """
@@ -29,10 +28,10 @@ from bayesdist.data.partitioned import PartPiece
 from bayesdist.data.pieces import Piece
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
-from bayesdist.infer.shards import Compute, Matches, Task, shard_of, total
+from bayesdist.infer.shards import Compute, Matches, Shards, Task, shard_of, total
 from bayesdist.infer.stars import Stars
 from bayesdist.infer.survey import Survey
-from bayesdist.model import DistortionModel, Groups
+from bayesdist.model import DistortionModel
 
 try:
     import dask
@@ -59,7 +58,7 @@ TOGETHER = 256  # results that are fetched at a time
 _one_pass = threading.Lock()  # a pass uses all threads of its process
 
 
-class ClusterShards:
+class ClusterShards(Shards):
     """Shards on the workers of a Dask cluster.
 
     Parameters
@@ -82,7 +81,7 @@ class ClusterShards:
     """
 
     def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
-        self.model = model
+        super().__init__(model)
         self._shards: list[Future] = []
         self._loading: set[str] = set()  # workers that pieces are tied to
         self._client, cluster, self._threads = _connected(compute)
@@ -106,19 +105,11 @@ class ClusterShards:
                             pure=False,
                         )
                     )
-            self.survey: Survey = total(self._results(self._on_each(_survey)))
+            self.survey = total(self._results(self._on_each(_survey)))
             self._settle()
         except BaseException:
             self.close()
             raise
-
-    def __len__(self) -> int:
-        return self.survey.n
-
-    @property
-    def groups(self) -> Groups:
-        """Groups of the whole, without members."""
-        return self.survey.groups
 
     def sum(self, task: Task, *args: Any) -> Any:
         """Sum over the shards of ``task(stars, *args)``, in their order.

@@ -399,7 +399,7 @@ def fit_by_magnitude(
     for _ in range(max_iterations):
         assert some.mag is not None
         errors = estimate(some.mag, *residuals(fit, some).T, n_params=model.n_params)
-        table = _with_errors(matches, errors)
+        table = matches.with_errors_by_magnitude(errors)
         fit = fit_linear(table, model, priors=priors, **options)
         now = np.concatenate([errors.sigma_u, errors.sigma_v])
         if before is not None and np.abs(now / before - 1).max() < 0.01:
@@ -410,14 +410,6 @@ def fit_by_magnitude(
         where="data.sigma",
         do="give errors as columns or as one number",
     )
-
-
-def _with_errors(matches: Matches, errors: MagnitudeErrors) -> Matches:
-    """The same stars with errors by magnitude."""
-    if isinstance(matches, MatchTable):
-        assert matches.mag is not None  # or there would be no errors by magnitude
-        return matches.with_sigma(*errors.at(matches.mag))
-    return matches.with_errors_by_magnitude(errors)
 
 
 def _start(first: NormalEquations, model: DistortionModel, priors: GaussianPriors) -> Float:

@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
-from bayesdist.errors import InputError
+from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.proposal import Proposal
 from bayesdist.infer.target import Target
 
@@ -140,26 +138,10 @@ def pilot_page(
     """
     path = None if folder is None else folder / f"chain-0-{name}.h5"
     if path is not None and path.exists():
-        try:
-            with h5py.File(path, "r") as file:
-                known = file.attrs["fingerprint"]
-                values = [file[name][...] for name in ("log_prob", "log_q")]
-        except (OSError, KeyError) as error:
-            raise InputError(
-                "the checkpoint cannot be read",
-                where=str(path),
-                do="delete it and resume: its proposals are evaluated again",
-            ) from error
-        if known != fingerprint:
-            raise InputError(
-                "the checkpoints belong to other data or settings",
-                where=str(path.parent),
-                do="restore them, or start again with --force",
-            )
-        return Page(_drawn(proposal, seeds, key, n), *values)
+        do = "delete it and resume: its proposals are evaluated again"
+        known = read_arrays(path, fingerprint, ("log_prob", "log_q"), do=do)
+        return Page(_drawn(proposal, seeds, key, n), **known)
     page = draw_page(target, proposal, seeds, key, n)
     if path is not None:
-        with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-            file["log_prob"], file["log_q"] = page.log_prob, page.log_q
-            file.attrs["fingerprint"] = fingerprint
+        write_arrays(path, fingerprint, {"log_prob": page.log_prob, "log_q": page.log_q})
     return page

@@ -18,15 +18,19 @@ from bayesdist.infer.stars import Stars, in_table_order, prepare
 
 __all__ = [
     "Memberships",
+    "averaged_draws",
     "count_outliers",
     "memberships",
+    "memberships_of",
     "outlier_probability",
     "sampled_points",
     "some_draws",
+    "star_averages",
     "star_log_likelihood",
 ]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 MOST_DRAWS, LEAST_DRAWS = 64, 8
 EVALUATIONS = 200_000_000  # of a star, that the average may cost
@@ -51,6 +55,15 @@ class Memberships:
     log_likelihood: Float
     log_likelihood_variance: Float
     draws: int
+
+    def in_table_order(self, order: Int) -> Memberships:
+        """Brought back from the order of prepared stars to that of their table."""
+        return Memberships(
+            in_table_order(self.outlier_probability, order),
+            in_table_order(self.log_likelihood, order),
+            in_table_order(self.log_likelihood_variance, order),
+            self.draws,
+        )
 
 
 def sampled_points(posterior: Posterior) -> tuple[Float, Float]:
@@ -84,11 +97,20 @@ def memberships(posterior: Posterior, matches: MatchTable) -> Memberships:
         In the order of the table.
     """
     stars, order = prepare(posterior.model, matches)
-    theta, h = some_draws(*sampled_points(posterior), posterior.n_stars)
-    constants = posterior.mixture.bind(posterior.reference_sigma).constants(h)
-    values = in_table_order(_memberships(stars, theta, constants).T, order).T
-    p, mean, square = values
+    return memberships_of(posterior, stars).in_table_order(order)
+
+
+def memberships_of(posterior: Posterior, stars: Stars) -> Memberships:
+    """`memberships` of stars that are prepared for the posterior's model, in their own order."""
+    theta, constants = averaged_draws(posterior)
+    p, mean, square = star_averages(stars, theta, constants)
     return Memberships(p, mean, np.maximum(square - mean**2, 0.0), len(theta))
+
+
+def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
+    """The draws over which memberships are averaged: theta (n, D), and the mixture at each."""
+    theta, h = some_draws(*sampled_points(posterior), posterior.n_stars)
+    return theta, posterior.mixture.bind(posterior.reference_sigma).constants(h)
 
 
 def outlier_probability(posterior: Posterior, matches: MatchTable) -> Float:
@@ -104,7 +126,7 @@ def star_log_likelihood(posterior: Posterior, matches: MatchTable) -> Float:
     out = np.empty((len(theta), len(matches)))
     for k in range(len(theta)):
         rows = slice(k, k + 1)
-        values = _memberships(stars, theta[rows], constants.of(rows))[1]
+        values = star_averages(stars, theta[rows], constants.of(rows))[1]
         out[k] = in_table_order(values, order)
     return out.reshape(*posterior.log_prob.shape, len(matches))
 
@@ -124,12 +146,16 @@ def count_outliers(shards: Shards, hyper: Hyper, theta: Float, h: Float) -> tupl
     return int(flagged), float(expected)
 
 
-def _memberships(stars: Stars, theta: Float, constants: Constants) -> Float:
+def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
+    """Probability of being an outlier, log-likelihood and its square (3, N), averaged over draws.
+
+    A task for `Shards.sum` is made of it by what sums over the stars.
+    """
     return kernel.memberships(
         stars.blocks, stars.columns, stars.powers(theta), stars.model.order, constants
     )
 
 
 def _count(stars: Stars, theta: Float, constants: Constants) -> Float:
-    p = _memberships(stars, theta, constants)[0]
+    p = star_averages(stars, theta, constants)[0]
     return np.array([(p > 0.5).sum(), p.sum()])

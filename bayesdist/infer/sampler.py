@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from bayesdist.errors import InputError
 from bayesdist.infer.blocks import Block, Walkers, block_path, read_block, write_block
 from bayesdist.infer.lookahead import Page, draw_page
-from bayesdist.infer.plan import FIRST_CHECK, Plan, Stretch
+from bayesdist.infer.plan import Plan, Stretch
 from bayesdist.infer.proposal import Proposal
 from bayesdist.infer.target import Target
 from bayesdist.infer.whitening import Whitening
 
-__all__ = ["FIRST_CHECK", "Ensembles", "Plan", "Whitening"]
+__all__ = ["Ensembles", "replay"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

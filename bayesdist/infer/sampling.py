@@ -8,16 +8,15 @@ from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
 from bayesdist.infer.certificate import Certificate
 from bayesdist.infer.certified import run_certified
 from bayesdist.infer.chains import Chains, Settings, run_chains
+from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.labelled.convergence import Limits
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.membership import count_outliers
@@ -205,25 +204,9 @@ def _proposal(
     """The proposal, kept in a file so that a resumed run has the very same one."""
     path = None if folder is None else folder / "chain-0-proposal.h5"
     if path is not None and path.exists():
-        try:
-            with h5py.File(path, "r") as file:
-                known = file.attrs["fingerprint"]
-                arrays = {name: file[name][...] for name in file}
-        except (OSError, KeyError) as error:
-            raise InputError(
-                "the checkpoint cannot be read", where=str(path), do="start again with --force"
-            ) from error
-        if known != fingerprint:
-            raise InputError(
-                "the checkpoints belong to other data or settings",
-                where=str(path.parent),
-                do="restore them, or start again with --force",
-            )
+        arrays = read_arrays(path, fingerprint, do="start again with --force")
         return GridProposal.from_arrays(target, arrays)
     proposal = build_proposal(target, fit)
     if path is not None:
-        with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-            for name, values in proposal.to_arrays().items():
-                file[name] = values
-            file.attrs["fingerprint"] = fingerprint
+        write_arrays(path, fingerprint, proposal.to_arrays())
     return proposal

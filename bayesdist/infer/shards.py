@@ -6,10 +6,11 @@ which is that of the data, so that they depend neither on the threads nor on the
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from bayesdist.data import MatchTable, PartitionedMatches
 from bayesdist.data.pieces import Piece
@@ -63,27 +64,43 @@ class Compute:
             )
 
 
-class Shards(Protocol):
-    """The stars of a model, wherever they are."""
+class Shards(ABC):
+    """The stars of a model, wherever they are.
 
-    model: DistortionModel
+    Parameters
+    ----------
+    model : DistortionModel
+
+    Attributes
+    ----------
+    survey : Survey
+        Of all stars.
+    """
+
     survey: Survey
 
-    def sum(self, task: Task, *args: Any) -> Any:
-        """Sum over the shards of ``task(stars, *args)``, in their order."""
-
-    def close(self) -> None:
-        """Let go of the data."""
+    def __init__(self, model: DistortionModel) -> None:
+        self.model = model
 
     def __len__(self) -> int:
         """Number of stars."""
+        return self.survey.n
 
     @property
     def groups(self) -> Groups:
         """Groups of the whole, without members."""
+        return self.survey.groups
+
+    @abstractmethod
+    def sum(self, task: Task, *args: Any) -> Any:
+        """Sum over the shards of ``task(stars, *args)``, in their order."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of the data."""
 
 
-class LocalShards:
+class LocalShards(Shards):
     """Shards in this process.
 
     Parameters
@@ -94,7 +111,7 @@ class LocalShards:
     """
 
     def __init__(self, model: DistortionModel, matches: Matches, memory_mb: float) -> None:
-        self.model = model
+        super().__init__(model)
         self._store = Store(1e6 * memory_mb)
         surveys = []
         for piece in matches.pieces():
@@ -102,14 +119,6 @@ class LocalShards:
             self._store.add(stars)
             surveys.append(found)
         self.survey = total(surveys)
-
-    def __len__(self) -> int:
-        return self.survey.n
-
-    @property
-    def groups(self) -> Groups:
-        """Groups of the whole, without members."""
-        return self.survey.groups
 
     def sum(self, task: Task, *args: Any) -> Any:
         """Sum over the shards of ``task(stars, *args)``, in their order."""
@@ -169,17 +178,17 @@ def load(
     InputError
         As `prepare`; for a full scratch folder; when no cluster is there.
     """
-    if not isinstance(matches, MatchTable | PartitionedMatches):
-        if not hasattr(matches, "survey"):
-            raise InputError(
-                f"{type(matches).__name__} holds no matches",
-                do="give what read_matches, open_matches or load returned",
-            )
+    if isinstance(matches, Shards):
         if matches.model != model:
             raise InputError(
                 "the shards were made for another model", do="load the matches for this one"
             )
         return matches
+    if not isinstance(matches, MatchTable | PartitionedMatches):
+        raise InputError(
+            f"{type(matches).__name__} holds no matches",
+            do="give what read_matches, open_matches or load returned",
+        )
     compute = compute or Compute()
     if compute.engine == "threads":
         return LocalShards(model, matches, compute.memory_mb)

@@ -31,6 +31,7 @@ from bayesdist.data import open_matches, partitioned
 from bayesdist.infer import Compute, fit_linear, load, sample
 from bayesdist.infer import cluster as cluster_module
 from bayesdist.infer.cluster import ClusterShards
+from bayesdist.infer.shards import Shards
 from tests.infer.support import TWO_CHIPS, simulated
 
 PIECE = 500
@@ -242,7 +243,7 @@ def test_scheduler_knows_how_large_a_shard_is(there, cluster):
 
 
 @dataclass
-class Interrupted:
+class Interrupted(Shards):
     """Shards, of whose workers one is killed while a pass is under way."""
 
     shards: ClusterShards
@@ -251,11 +252,11 @@ class Interrupted:
     passes: int = 0
     killed: bool = False
 
-    def __getattr__(self, name):
-        return getattr(self.shards, name)
+    def __post_init__(self):
+        self.model, self.survey = self.shards.model, self.shards.survey
 
-    def __len__(self):
-        return len(self.shards)
+    def close(self):
+        self.shards.close()
 
     def sum(self, task, *args):
         self.passes += 1

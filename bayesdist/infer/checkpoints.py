@@ -1,0 +1,60 @@
+"""Arrays that a resumed run takes up again, in files that say to what they belong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.files import atomic_path
+from bayesdist.errors import InputError
+
+__all__ = ["read_arrays", "write_arrays"]
+
+Float = NDArray[np.float64]
+
+
+def read_arrays(
+    path: Path, fingerprint: str, names: Sequence[str] | None = None, *, do: str
+) -> dict[str, Float]:
+    """What `write_arrays` kept.
+
+    Parameters
+    ----------
+    path : Path
+    fingerprint : str
+        Of data and settings.
+    names : sequence of str, optional
+        Arrays that must be there; all that are by default.
+    do : str
+        Advice for a file that cannot be read.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, or belongs to other data or settings.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            known = file.attrs["fingerprint"]
+            arrays = {name: file[name][...] for name in names or file}
+    except (OSError, KeyError) as error:
+        raise InputError("the checkpoint cannot be read", where=str(path), do=do) from error
+    if known != fingerprint:
+        raise InputError(
+            "the checkpoints belong to other data or settings",
+            where=str(path.parent),
+            do="restore them, or start again with --force",
+        )
+    return arrays
+
+
+def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, Float]) -> None:
+    """Keep arrays by name; the file appears whole or not at all."""
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        for name, values in arrays.items():
+            file[name] = values
+        file.attrs["fingerprint"] = fingerprint
