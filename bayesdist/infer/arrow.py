@@ -78,7 +78,7 @@ class Arrow:
         border, local = self._indices
         out = np.empty((*border_part.shape[:-1], self.size))
         out[..., border] = border_part
-        out[..., local] = local_part.reshape(*border_part.shape[:-1], -1)
+        out[..., local] = local_part.reshape(*border_part.shape[:-1], len(local))
         return out
 
     def diagonal(self) -> Float:

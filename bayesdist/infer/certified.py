@@ -17,7 +17,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.certificate import Certificate, Surrogate, certify, draw_surrogate
 from bayesdist.infer.chains import Chains, Settings, run_chains
 from bayesdist.infer.labelled.convergence import diagnose
-from bayesdist.infer.laplace import Conditional
+from bayesdist.infer.laplace import Node
 from bayesdist.infer.lookahead import Page, pilot_page
 from bayesdist.infer.plan import Plan, expected_passes
 from bayesdist.infer.proposal import GridProposal, Random
@@ -55,7 +55,7 @@ class SurrogateProposal:
     surrogate: Surrogate
 
     @property
-    def best(self) -> Conditional:
+    def best(self) -> Node:
         """As of the first proposal."""
         return self.first.best
 

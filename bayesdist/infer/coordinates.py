@@ -9,10 +9,12 @@ proposals live in
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["from_cube_root", "inside", "to_cube_root"]
+__all__ = ["Split", "from_cube_root", "inside", "to_cube_root"]
 
 Float = NDArray[np.float64]
 
@@ -65,3 +67,59 @@ def from_cube_root(names: tuple[str, ...], z: Float) -> tuple[Float, Float, Floa
             h1[..., k], h2[..., k] = -1.5 / t, 1.5 / t**2
             g1[..., k], g2[..., k] = -1 / t, 1 / t**2
     return h, h1, h2, g1, g2
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which hyperparameters are held on a grid, and which move with the distortion.
+
+    Sampled coordinates psi (..., D) fall into y = (theta, cube-root hyperparameters), (..., D'),
+    and the grid's coordinates `at` (..., g): log j, log s_out.
+
+    Parameters
+    ----------
+    n_theta : int
+    hyper : tuple of str
+        Of 'j', 'f', 's_out', in this order: all that are sampled.
+    held : tuple of str
+        Those of them on the grid: 'j' at least, where it is sampled.
+    """
+
+    n_theta: int
+    hyper: tuple[str, ...]
+    held: tuple[str, ...]
+
+    @property
+    def rest(self) -> tuple[str, ...]:
+        """Hyperparameters that are not held."""
+        return tuple(name for name in self.hyper if name not in self.held)
+
+    @property
+    def columns(self) -> tuple[list[int], list[int]]:
+        """Where those held stand among the hyperparameters, and where the rest."""
+        held = [self.hyper.index(name) for name in self.held]
+        return held, [self.hyper.index(name) for name in self.rest]
+
+    def contains(self, y: Float) -> NDArray[np.bool_]:
+        """Which points (..., D') lie in the support."""
+        return np.isfinite(y).all(axis=-1) & inside(self.rest, y[..., self.n_theta :])
+
+    def to_psi(self, y: Float, at: Float) -> Float:
+        """Sampled coordinates (..., D)."""
+        n, (held, rest) = self.n_theta, self.columns
+        out = np.empty((*y.shape[:-1], n + len(self.hyper)))
+        out[..., :n] = y[..., :n]
+        out[..., [n + k for k in held]] = at
+        out[..., [n + k for k in rest]] = from_cube_root(self.rest, y[..., n:])[0]
+        return out
+
+    def from_psi(self, psi: Float) -> tuple[Float, Float]:
+        """y (..., D') and the grid's coordinates (..., g)."""
+        n, (held, rest) = self.n_theta, self.columns
+        z = to_cube_root(self.rest, psi[..., [n + k for k in rest]])
+        return np.concatenate([psi[..., :n], z], axis=-1), psi[..., [n + k for k in held]]
+
+    def log_jacobian(self, y: Float) -> Float:
+        """Log |d psi / d y| (...)."""
+        h1 = from_cube_root(self.rest, y[..., self.n_theta :])[1]
+        return np.asarray(np.log(np.abs(h1)).sum(axis=-1))

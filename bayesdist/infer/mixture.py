@@ -26,7 +26,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 
-__all__ = ["HYPER_NAMES", "Hyper", "OutlierMixture"]
+__all__ = ["HYPER_NAMES", "TAILS", "Hyper", "OutlierMixture"]
 
 Float = NDArray[np.float64]
 
@@ -35,6 +35,8 @@ KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": ker
 T_DOF = 4.0
 OUTLIER_SHAPE = 1.0
 OUTLIER_MODE = 5.0
+# where the data say nothing of log j or log s_out: the end, and the slope of the log prior there
+TAILS = {"j": ("left", 1.0), "s_out": ("right", -2.0 * OUTLIER_SHAPE)}
 
 
 @dataclass(frozen=True)

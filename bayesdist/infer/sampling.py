@@ -17,13 +17,14 @@ from bayesdist.infer.certificate import Certificate
 from bayesdist.infer.certified import run_certified
 from bayesdist.infer.chains import Chains, Settings, run_chains
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.grid import build_proposal
 from bayesdist.infer.labelled.convergence import Limits
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.membership import count_outliers
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.proposal import GridProposal, build_proposal
+from bayesdist.infer.proposal import GridProposal
 from bayesdist.infer.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars import Stars
 from bayesdist.infer.target import Target
@@ -205,7 +206,7 @@ def _proposal(
     path = None if folder is None else folder / "chain-0-proposal.h5"
     if path is not None and path.exists():
         arrays = read_arrays(path, fingerprint, do="start again with --force")
-        return GridProposal.from_arrays(target, arrays)
+        return GridProposal.from_arrays(target.n_theta, target.mixture.hyper, arrays)
     proposal = build_proposal(target, fit)
     if path is not None:
         write_arrays(path, fingerprint, proposal.to_arrays())

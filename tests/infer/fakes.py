@@ -9,7 +9,8 @@ import numpy as np
 from bayesdist.infer import OutlierMixture
 from bayesdist.infer.arrow import Arrow
 from bayesdist.infer.blocks import Walkers
-from bayesdist.infer.laplace import Conditional
+from bayesdist.infer.coordinates import Split
+from bayesdist.infer.laplace import Node
 from bayesdist.infer.lookahead import Page
 from bayesdist.infer.plan import Plan, Stretch
 from bayesdist.infer.proposal import GridProposal
@@ -33,11 +34,12 @@ class FakeTarget:
         return self.function(psi)
 
 
-def gaussian_proposal(target: FakeTarget, mean, cov) -> GridProposal:
+def gaussian_proposal(mean, cov) -> GridProposal:
     """One node, no hyperparameters."""
     n = len(mean)
     curvature = Arrow(np.linalg.inv(cov), np.zeros((0, n, 0)), np.zeros((0, 0, 0)))
-    return GridProposal(target, (Conditional(None, np.asarray(mean), curvature.factor(), 0.0),))
+    node = Node(np.zeros(0), np.asarray(mean), curvature.factor(), 0.0)
+    return GridProposal(Split(n, (), ()), (node,))
 
 
 def empty_page(ensembles: int, n_params: int) -> Page:

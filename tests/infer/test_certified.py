@@ -12,7 +12,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import OutlierMixture, fit_linear, load_posterior, sample, save_posterior
 from bayesdist.infer.certified import AFFORDABLE, run_certified
 from bayesdist.infer.chains import Settings
-from bayesdist.infer.proposal import build_proposal
+from bayesdist.infer.grid import build_proposal
 from bayesdist.products.cards import convergence_cards
 
 from .support import simulated, target_of

@@ -17,8 +17,9 @@ from emcee.moves import DEMove, MHMove
 from scipy import special, stats
 
 from bayesdist.infer import Limits, OutlierMixture, sampler
+from bayesdist.infer.grid import build_proposal
 from bayesdist.infer.labelled.convergence import diagnose
-from bayesdist.infer.proposal import GridProposal, build_proposal
+from bayesdist.infer.proposal import GridProposal
 
 from .fakes import FakeTarget, advanced, ensembles_of, gaussian_proposal
 from .oracle import JitterOracle
@@ -52,7 +53,7 @@ def correlated_gaussian() -> Known:
         return -0.5 * np.einsum("ni,ij,nj->n", x - mean, precision, x - mean)
 
     target = FakeTarget(log_density, n)
-    proposal = gaussian_proposal(target, mean + 0.3 * sd, 1.35 * cov)
+    proposal = gaussian_proposal(mean + 0.3 * sd, 1.35 * cov)
     return Known(target, proposal, mean, sd, np.arange(n))
 
 
@@ -69,7 +70,7 @@ def skewed() -> Known:
         return (-0.5 * x**2 + special.log_ndtr(alpha * x)).sum(axis=1)
 
     target = FakeTarget(log_density, n)
-    proposal = gaussian_proposal(target, mix @ (0.5 * own_mean), mix @ mix.T)
+    proposal = gaussian_proposal(mix @ (0.5 * own_mean), mix @ mix.T)
     sd = np.sqrt((mix**2) @ own_var)
     return Known(target, proposal, mix @ own_mean, sd, np.arange(n))
 
@@ -79,16 +80,16 @@ def jitter_at_its_bound() -> Known:
     model, matches, _ = simulated(51, 25, order=1)
     target, fit = target_of(model, matches, OutlierMixture("none"), **UNCLIPPED)
     arrays = build_proposal(target, fit).to_arrays()
-    coarse = {name: values[::4].copy() for name, values in arrays.items()}
+    coarse = {k: v.copy() if k == "held" else v[::4].copy() for k, v in arrays.items()}
     coarse["mode"] += 0.4 * fit.sigma
-    coarse["log_j"] += 0.3
+    coarse["at"] += 0.3
     oracle = JitterOracle.of(1, matches)
     t = oracle.log_j
     mean_t = oracle.expect(t)
     sd = np.sqrt(oracle.expect(oracle.variance) * np.diag(oracle.unit_cov))
     sd_t = np.sqrt(oracle.expect((t - mean_t) ** 2))
     mean = np.append(oracle.centre, mean_t)
-    proposal = GridProposal.from_arrays(target, coarse)
+    proposal = GridProposal.from_arrays(target.n_theta, ("j",), coarse)
     return Known(target, proposal, mean, np.append(sd, sd_t), np.arange(len(mean)))
 
 

@@ -9,6 +9,7 @@ from scipy import optimize, stats
 from bayesdist.infer import Limits, OutlierMixture, lookahead
 from bayesdist.infer.blocks import Walkers
 from bayesdist.infer.chains import Settings, run_chains
+from bayesdist.infer.grid import build_proposal
 from bayesdist.infer.importance import (
     draws_per_effective,
     quality_of,
@@ -17,7 +18,6 @@ from bayesdist.infer.importance import (
 )
 from bayesdist.infer.lookahead import Page, draw_page
 from bayesdist.infer.plan import expected_passes
-from bayesdist.infer.proposal import build_proposal
 from bayesdist.infer.sampler import replay
 
 from .fakes import FakeTarget, gaussian_proposal
@@ -35,7 +35,7 @@ def settings(n_stars=MANY, seed=1, **options) -> Settings:
 
 def nearly_gaussian(n: int = 12):
     target = FakeTarget(lambda x: -0.5 * (x**2).sum(axis=1) + 0.1 * np.cos(x[:, 0]), n)
-    return target, gaussian_proposal(target, np.zeros(n), np.eye(n))
+    return target, gaussian_proposal(np.zeros(n), np.eye(n))
 
 
 # -- replay ----------------------------------------------------------------------------------------
@@ -211,7 +211,7 @@ def banana(x):
 def test_a_second_mode_is_found_out_and_sampled():
     """The proposal sits on one mode; its tail touches the other, and k shows it."""
     target = FakeTarget(two_bumps(3.5, 3), 3)
-    found = run_chains(target, gaussian_proposal(target, np.zeros(3), np.eye(3)), settings(FEW))
+    found = run_chains(target, gaussian_proposal(np.zeros(3), np.eye(3)), settings(FEW))
     assert "DE" in found.plan.method
     assert found.verdict.converged, found.verdict.reasons
     first = found.psi[..., 0]
@@ -222,7 +222,7 @@ def test_a_second_mode_is_found_out_and_sampled():
 
 def test_tails_that_a_gaussian_misses():
     target = FakeTarget(student(3.0, 2), 2)
-    found = run_chains(target, gaussian_proposal(target, np.zeros(2), np.eye(2)), settings(FEW))
+    found = run_chains(target, gaussian_proposal(np.zeros(2), np.eye(2)), settings(FEW))
     assert found.plan.method != "independence"
     assert found.verdict.pareto_k > 0.7
     assert found.verdict.converged, found.verdict.reasons
@@ -237,7 +237,7 @@ def test_tails_that_a_gaussian_misses():
 def test_a_banana():
     target = FakeTarget(banana, 3)
     cov = np.diag([1.0, 0.3**2, 1.0])
-    found = run_chains(target, gaussian_proposal(target, np.zeros(3), cov), settings(FEW))
+    found = run_chains(target, gaussian_proposal(np.zeros(3), cov), settings(FEW))
     assert "DE" in found.plan.method  # Crank-Nicolson was tried, and got nowhere
     assert found.warmup > 500
     assert found.verdict.converged, found.verdict.reasons
@@ -248,7 +248,7 @@ def test_a_banana():
 def test_a_fair_proposal_is_mixed_with_crank_nicolson():
     """Too wide by half in eight dimensions: bounded weights, efficiency 0.3."""
     target = FakeTarget(lambda x: -0.5 * (x**2).sum(axis=1), 8)
-    proposal = gaussian_proposal(target, np.zeros(8), 1.9 * np.eye(8))
+    proposal = gaussian_proposal(np.zeros(8), 1.9 * np.eye(8))
     found = run_chains(target, proposal, settings(FEW))
     assert found.plan.method == "independence + pCN"
     assert found.verdict.converged, found.verdict.reasons
@@ -262,7 +262,7 @@ def test_what_never_mixes_is_not_converged(n_stars):
     """Two modes thirty sigma apart: no move ever leads from one to the other."""
     n = 4
     target = FakeTarget(two_bumps(30.0, n), n)
-    proposal = gaussian_proposal(target, np.array([15.0, 0.0, 0.0, 0.0]), 6.0 * np.eye(n))
+    proposal = gaussian_proposal(np.array([15.0, 0.0, 0.0, 0.0]), 6.0 * np.eye(n))
     found = run_chains(target, proposal, settings(n_stars, max_steps=400))
     assert not found.verdict.converged and found.verdict.reasons
     assert "DE" in found.plan.method
@@ -273,7 +273,7 @@ def test_what_never_mixes_is_not_converged(n_stars):
 def misleading():
     """A second mode so far out that 512 proposals hardly touch it, and some thousands do."""
     target = FakeTarget(two_bumps(3.5, 2), 2)
-    return target, gaussian_proposal(target, np.zeros(2), np.eye(2))
+    return target, gaussian_proposal(np.zeros(2), np.eye(2))
 
 
 def test_a_flaw_that_the_pilot_did_not_see():

@@ -14,6 +14,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.infer import Limits, OutlierMixture
+from bayesdist.infer.grid import build_proposal
 from bayesdist.infer.plan import (
     boundaries,
     expected_passes,
@@ -22,7 +23,7 @@ from bayesdist.infer.plan import (
     plan_moves,
     walkers_for,
 )
-from bayesdist.infer.proposal import GridProposal, build_proposal
+from bayesdist.infer.proposal import GridProposal
 from bayesdist.infer.whitening import Whitening
 
 from .fakes import advanced, ensembles_of
@@ -48,10 +49,10 @@ def known(request):
     # every fourth node, shifted by half a sigma: an imperfect proposal, or accepting everything
     # would be right
     arrays = build_proposal(target, fit).to_arrays()
-    coarse = {name: values[::4].copy() for name, values in arrays.items()}
+    coarse = {k: v.copy() if k == "held" else v[::4].copy() for k, v in arrays.items()}
     coarse["mode"] += 0.5 * fit.sigma
-    coarse["log_j"] += 0.3
-    proposal = GridProposal.from_arrays(target, coarse)
+    coarse["at"] += 0.3
+    proposal = GridProposal.from_arrays(target.n_theta, ("j",), coarse)
     return target, proposal, JitterOracle.of(1, matches)
 
 
