@@ -5,9 +5,9 @@
 One membership for each star, shared by both axes.  p_out is a round Gaussian of scale s_out, or
 uniform on the match circle.  Sampled are log j, logit f and log s_out; the priors are proper:
 
-    f      Beta(a, b) j      half-Student-t, four degrees of freedom, scale: the median quoted
-    error s_out  inverse gamma on s_out^2, shape 1, mode of log s_out at five times the median
-    quoted error
+    f      Beta(a, b)
+    j      half-Student-t, four degrees of freedom, scale: the median quoted error
+    s_out  inverse gamma on s_out^2, shape 1; log s_out is most probable at five such errors
 
 All three leave tails in the sampled coordinates that fall at least exponentially, so that the
 posterior stays proper where the data say nothing: j when the quoted errors are right, s_out when

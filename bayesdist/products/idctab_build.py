@@ -85,8 +85,10 @@ def idctab_from_solution(
     DegenerateError
         When the linear part of a chip is singular.
 
-    Notes ----- TDD_DATE is the reference date of the fit.  stwcs dates an exposure by year + day of
-    year / 365.25, which is within about a day of the decimal year.
+    Notes
+    -----
+    TDD_DATE is the reference date of the fit.  stwcs dates an exposure by year + day of year /
+    365.25, which is within about a day of the decimal year.
     """
     model = solution.model
     parity = parity_of(instrument, detector)

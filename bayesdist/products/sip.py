@@ -1,8 +1,8 @@
 """The SIP header: a distortion as FITS keywords (Shupe et al. 2005, ASP Conf. 347, 491).
 
-u = x - CRPIX1, v = y - CRPIX2          U = u + A(u, v), V = v + B(u, v)         (xi, eta) = CD (U,
-V)
-                                        u = U + AP(U, V), v = V + BP(U, V)
+    u = x - CRPIX1,    v = y - CRPIX2
+    U = u + A(u, v),   V = v + B(u, v),   (xi, eta) = CD (U, V)
+    u = U + AP(U, V),  v = V + BP(U, V)
 """
 
 from __future__ import annotations

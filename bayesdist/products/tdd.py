@@ -1,7 +1,8 @@
 """The time-dependent terms of ACS/WFC in the primary header of an IDCTAB, as stwcs reads them.
 
-CX11 += CXB dt,  CY11 += CTB dt,  CY10 += CYB dt       dt in years from TDD_DATE (scheme of
-2015)
+    CX11 += CXB dt,  CY11 += CTB dt,  CY10 += CYB dt
+
+with dt in years from TDD_DATE (scheme of 2015).
 """
 
 from __future__ import annotations
