@@ -1,5 +1,7 @@
 """The SIP header: a distortion as FITS keywords (Shupe et al. 2005, ASP Conf. 347, 491).
 
+With FITS pixels (x, y):
+
     u = x - CRPIX1,    v = y - CRPIX2
     U = u + A(u, v),   V = v + B(u, v),   (xi, eta) = CD (U, V)
     u = U + AP(U, V),  v = V + BP(U, V)
