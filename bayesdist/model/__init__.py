@@ -1,9 +1,10 @@
-"""The distortion as mathematics: bases, frames, time dependence, and the model that joins them."""
+"""The distortion as mathematics: bases, frames, time dependence, look-up tables, and the model."""
 
 from bayesdist.model.basis import PolynomialBasis, polynomial_terms
 from bayesdist.model.distortion import Chip, DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
 from bayesdist.model.grouping import Groups, merge_groups
+from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.model.timedep import AXES, TimeDependence
 
 __all__ = [
@@ -12,8 +13,10 @@ __all__ = [
     "Chip",
     "DistortionModel",
     "Groups",
+    "LookupTable",
     "PolynomialBasis",
     "TimeDependence",
+    "corrected",
     "merge_groups",
     "polynomial_terms",
 ]

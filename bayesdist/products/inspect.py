@@ -15,13 +15,17 @@ from bayesdist.products.idctab import FILTER_COLUMNS, IdcTab
 from bayesdist.products.idctab_lint import lint_idctab
 from bayesdist.products.indices import idctab_column, sip_keyword
 from bayesdist.products.lint import LEVELS, Finding
+from bayesdist.products.lookup_file import AXES, LookupFile
+from bayesdist.products.lookup_lint import lint_lookup_file
 from bayesdist.products.sip import SipHeader
 from bayesdist.products.sip_lint import lint_sip
 from bayesdist.products.sip_read import holds_sip, read_sip
 
-__all__ = ["UNDERSTOOD", "describe", "describe_idctab", "describe_sip"]
+__all__ = ["UNDERSTOOD", "describe", "describe_idctab", "describe_lookup_file", "describe_sip"]
 
-UNDERSTOOD = "an IDCTAB, or a FITS file or text file of cards with SIP keywords"
+UNDERSTOOD = (
+    "an IDCTAB, a D2IMFILE or NPOLFILE, or a FITS file or text file of cards with SIP keywords"
+)
 
 _SCHEMES = {
     "2015": "scheme of 2015: CX11 += CXB dt, CY11 += CTB dt, CY10 += CYB dt",
@@ -40,7 +44,7 @@ def describe(path: str | os.PathLike[str]) -> str:
     Parameters
     ----------
     path : path-like
-        An IDCTAB, or a FITS file or text header with SIP keywords.
+        An IDCTAB, a D2IMFILE or NPOLFILE, or a FITS file or text header with SIP keywords.
 
     Returns
     -------
@@ -60,6 +64,8 @@ def describe(path: str | os.PathLike[str]) -> str:
         damaged = error
     if len(blocks) > 1 and _is_idctab(blocks[1].header.values()):
         return describe_idctab(IdcTab(blocks, name))
+    if any(block.name in AXES for block in blocks[1:]):
+        return describe_lookup_file(LookupFile(blocks, name))
     if holds_sip(path):  # also of a header without its data, which is no whole FITS file
         return describe_sip(read_sip(path), name)
     if damaged is not None and _looks_like_fits(path):
@@ -215,6 +221,57 @@ def _term_lines(
         error = f"  +- {sigma[powers]:.3e}" if powers in sigma else ""
         out.append(f"  {sip_keyword(prefix, *powers):<7} {terms[powers]:21.13e}{error}")
     return out
+
+
+# -- look-up tables ------------------------------------------------------------------------------
+
+
+def describe_lookup_file(file: LookupFile) -> str:
+    """Text of a D2IMFILE or NPOLFILE.
+
+    Parameters
+    ----------
+    file : LookupFile
+
+    Returns
+    -------
+    str
+    """
+    header = file.header
+    kind, unit = {
+        "d2im": ("D2IMFILE", "pixels, before the polynomial"),
+        "npol": ("NPOLFILE", "undistorted pixels of SCALE, after the polynomial"),
+    }[file.kind]
+    lines = [
+        f"{file.name}: {kind} of {file.instrument or '(no INSTRUME)'}/"
+        f"{file.detector or '(no DETECTOR)'}, {len(file.chips)} chip(s)",
+    ]
+    lines += [f"  {k:<9} {header[k]}" for k in ("DESCRIP", "USEAFTER", "PEDIGREE") if k in header]
+    if file.filters:
+        lines.append(f"  filters   {' '.join(file.filters)}")
+    if "BDNPLERR" in header:
+        lines.append(f"  linear    error of the linear form {header['BDNPLERR']:.2g} mas at most")
+    lines.append(f"  unit      {unit}")
+    for chip in file.chips:
+        planes = [p for p in file.planes if p.chip == chip]
+        sigma = {p.name.removeprefix("SIGMA_"): p for p in file.sigma_planes if p.chip == chip}
+        ny, nx = planes[0].nodes.shape
+        (x, y), (dx, dy) = planes[0].first, planes[0].step
+        padded = ", padded" if "BDPAD" in planes[0].header else ""
+        lines += [
+            "",
+            f"  chip {chip}: {nx} x {ny} nodes{padded}, first at pixel ({x:g}, {y:g}), "
+            f"step {dx:g} x {dy:g}",
+            "          smallest   largest       rms" + ("   median sigma" if sigma else ""),
+        ]
+        for plane in planes:
+            values = plane.nodes
+            row = f"    {plane.name}  {values.min():10.4f}{values.max():10.4f}"
+            row += f"{np.sqrt(np.mean(values**2)):10.4f}"
+            if plane.name in sigma:
+                row += f"{np.median(sigma[plane.name].nodes):15.4f}"
+            lines.append(row)
+    return "\n".join([*lines, "", *_finding_text(lint_lookup_file(file))])
 
 
 def _finding_text(findings: tuple[Finding, ...]) -> list[str]:
