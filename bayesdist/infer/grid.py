@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.coordinates import Split
+from bayesdist.infer.importance import quality_of
 from bayesdist.infer.laplace import (
     Conditional,
     Node,
@@ -29,7 +28,11 @@ Line = dict[float, Conditional]  # nodes by their value on one axis
 N_NODES = 25
 N_SCALES, STRIDE = 17, 2  # of log s_out; then every other one of log j is enough
 DROP = 18.0  # how far (in log density) the grid reaches below the top: beyond lies 1e-8
+NOTHING = 40.0  # as far below the top as nodes are said to be that were not searched for
 NEAR = 1e-4  # Newton decrement at which a node's search stops
+FEW, CLOSE = 30.0, 2.0  # outliers, and their scale over that of the core, below which it may be open
+TRIAL = 128  # proposals that compare both grids
+GOOD, WORSE = 0.98, 0.8  # efficiency that needs no second axis; share of it that is a fair price
 VAGUE = 0.2  # standard deviation of log s_out beyond which one Gaussian is not enough
 # distance from the median quoted error at which the end of an axis may begin to be its prior's tail
 FAR = {"j": 0.3, "s_out": 30.0}
@@ -59,30 +62,68 @@ def build_proposal(target: Target, fit: LinearFit) -> GridProposal:
     first = conditional_mode(target, split, y, at)
     line = _line(target, split, _climb(target, split, first), 0, N_NODES) if split.held else {}
     best = max(line.values(), key=lambda node: node.log_marginal, default=first)
-    if not _is_vague(split, best):
-        nodes: list[Node] = [line[x] for x in sorted(line)] or [first]
-        return GridProposal(split, tuple(nodes))
-    wide = Split(split.n_theta, hyper, (*split.held, "s_out"))
+    nodes: list[Node] = [line[x] for x in sorted(line)] or [first]
+    narrow = GridProposal(split, tuple(nodes))
+    if not _is_vague(target, split, best):
+        return narrow
+    worth = _trial(target, narrow)
+    if worth > GOOD:
+        return narrow
+    try:
+        wide = _with_scales(target, narrow, line, best)
+    except DegenerateError:
+        return narrow
+    # a few draws do not show the tails, for which the second axis is there
+    return wide if _trial(target, wide) > WORSE * worth else narrow
+
+
+def _is_vague(target: Target, split: Split, node: Node) -> bool:
+    """Whether the data may leave the scale of the outliers open.
+
+    They do where their curvature says so, where the outliers are few, and where they are hardly
+    wider than the core: the mode that was found may then be one of several.
+    """
+    if "s_out" not in split.rest:
+        return False
+    k = split.n_theta + split.rest.index("s_out")
+    sd, z = np.sqrt(node.factor.variances()[k]), node.mode[k]
+    if 1.5 * sd > VAGUE * z:  # log s_out = -3/2 log z
+        return True
+    psi = split.to_psi(node.mode, node.at)
+    value = {name: float(x) for name, x in target.hyper.values(psi[split.n_theta :]).items()}
+    core = np.hypot(target.hyper.scale, value.get("j", target.mixture.jitter or 0.0))
+    return value["f"] * len(target.shards) < FEW or value["s_out"] < CLOSE * core
+
+
+def _trial(target: Target, proposal: GridProposal) -> float:
+    """Importance efficiency of a few draws."""
+    psi = proposal.draw(TRIAL, np.random.default_rng(0))
+    out = np.full(TRIAL, np.nan)
+    inside = np.isfinite(psi).all(axis=1)
+    if inside.any():
+        out[inside] = target.log_density(psi[inside]) - proposal.log_density(psi[inside])
+    return quality_of(out).efficiency
+
+
+def _with_scales(
+    target: Target, narrow: GridProposal, line: Line, best: Conditional
+) -> GridProposal:
+    """The grid with log s_out as a further axis."""
+    split = narrow.split
+    wide = Split(split.n_theta, split.hyper, (*split.held, "s_out"))
     y, at = wide.from_psi(split.to_psi(best.mode, best.at))
     middle = conditional_mode(target, wide, y, at)
     axis = len(split.held)
     along = _line(target, wide, middle, axis, N_SCALES if line else N_NODES)
     if not line:
         return GridProposal(wide, tuple(along[x] for x in sorted(along)))
-    columns = [_column(target, wide, along[x], _thinned(line, best)) for x in sorted(along)]
+    top = max(node.log_marginal for node in along.values())
+    log_j = _thinned(line, best)
+    columns = [_column(target, wide, along[x], log_j, top) for x in sorted(along)]
     return GridProposal(wide, tuple(node for row in zip(*columns, strict=True) for node in row))
 
 
-def _is_vague(split: Split, node: Node) -> bool:
-    """Whether the data leave the scale of the outliers open."""
-    if "s_out" not in split.rest:
-        return False
-    k = split.n_theta + split.rest.index("s_out")
-    sd, z = np.sqrt(node.factor.variances()[k]), node.mode[k]
-    return bool(1.5 * sd > VAGUE * z)  # log s_out = -3/2 log z
-
-
-def _thinned(line: Mapping[float, Conditional], best: Conditional) -> list[float]:
+def _thinned(line: Line, best: Conditional) -> list[float]:
     """About half the nodes of a line, the best one and the ends among them."""
     grid = sorted(line)
     k = grid.index(float(best.at[0]))
@@ -90,20 +131,38 @@ def _thinned(line: Mapping[float, Conditional], best: Conditional) -> list[float
 
 
 def _column(
-    target: Target, split: Split, middle: Conditional, log_j: list[float]
-) -> list[Conditional]:
-    """Nodes at some jitters and the s_out of one node, found from there outwards."""
+    target: Target, split: Split, middle: Conditional, log_j: list[float], top: float
+) -> list[Node]:
+    """Nodes at some jitters and the s_out of one node, found from there outwards.
+
+    Beyond where the posterior has ended nothing is searched: the last node is repeated there, with
+    a marginal density as good as none.
+    """
     start = float(middle.at[0])
-    found = {start: middle}
+    found: dict[float, Node] = {start: middle}
     above, below = [x for x in log_j if x > start], [x for x in log_j if x < start]
     for side in (above, below[::-1]):
-        here = middle
+        here: Conditional | None = middle
+        last: Node = middle
         for x in side:
-            step = np.array([x - here.at[0], 0.0])
-            y = expected_mode(split, here, step)
             at = np.array([x, middle.at[1]])
-            here = found[x] = conditional_mode(target, split, y, at, tolerance=NEAR)
+            if here is not None:
+                here = _reached(target, split, here, at)
+            if here is None or here.log_marginal < top - DROP:
+                here = None
+                found[x] = Node(at, last.mode, last.factor, top - NOTHING)
+            else:
+                found[x] = last = here
     return [found[x] for x in log_j]
+
+
+def _reached(target: Target, split: Split, here: Conditional, at: Float) -> Conditional | None:
+    """The node at a place next to another, or None where no mode is found."""
+    y = expected_mode(split, here, at - here.at)
+    try:
+        return conditional_mode(target, split, y, at, tolerance=NEAR)
+    except DegenerateError:
+        return None
 
 
 # -- along one axis -------------------------------------------------------------------------------

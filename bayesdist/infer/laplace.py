@@ -21,6 +21,8 @@ __all__ = ["Conditional", "Node", "conditional_mode", "expected_mode", "starting
 
 Float = NDArray[np.float64]
 
+ON_A_RIDGE = 1e-2  # decrement at which a search stops where the curvature had to be mended
+
 
 @dataclass(frozen=True, eq=False)
 class Node:
@@ -34,7 +36,7 @@ class Node:
         The grid's coordinates.
     mode : ndarray, shape (D',)
     factor : ArrowFactor
-        Of minus the Hessian at the mode.
+        Of minus the Hessian, as of the last pass of the search, and made positive where it is not.
     log_marginal : float
         Laplace estimate of the log posterior density of the grid's coordinates, up to a constant.
     """
@@ -104,7 +106,8 @@ def conditional_mode(
     at : ndarray, shape (g,)
         The grid's coordinates.
     tolerance : float
-        The Newton decrement (expected gain in log density) at which to stop.
+        The Newton decrement (expected gain in log density) at which to stop.  Where the curvature
+        is not positive, along a ridge, `ON_A_RIDGE` is enough: steps would be many and gain little.
     max_steps : int
 
     Returns
@@ -118,10 +121,10 @@ def conditional_mode(
     """
     here = _expand(target, split, y, at)
     for _ in range(max_steps):
-        factor = _positive(target, split, here, at)
+        factor, mended = _positive(target, split, here, at)
         step = factor.solve(here.gradient)
         decrement = 0.5 * float(here.gradient @ step)
-        if decrement < tolerance:
+        if decrement < (max(tolerance, ON_A_RIDGE) if mended else tolerance):
             y = y + step if split.contains(y + step) else y
             break
         length, moved = 1.0, False
@@ -188,8 +191,10 @@ class _Expansion:
     coupling: Float
 
 
-def _positive(target: Target, split: Split, here: _Expansion, at: Float) -> ArrowFactor:
-    """Factor of the Hessian, made positive where it is not.
+def _positive(
+    target: Target, split: Split, here: _Expansion, at: Float
+) -> tuple[ArrowFactor, bool]:
+    """Factor of the Hessian, made positive where it is not, and whether that was needed.
 
     The distortion part falls back to the EM weights.  The hyperparameters' Schur complement gets
     eigenvalues of at least one, in units of half their own value: where outliers cannot be told
@@ -203,7 +208,7 @@ def _positive(target: Target, split: Split, here: _Expansion, at: Float) -> Arro
             continue
         t, g = matrix.n_tail, matrix.n_global
         if not t:
-            return inner
+            return inner, em
         coupling = np.array(
             [inner.matrix.join(matrix.border[:g, g + k], matrix.edge[:, g + k]) for k in range(t)]
         )
@@ -212,11 +217,11 @@ def _positive(target: Target, split: Split, here: _Expansion, at: Float) -> Arro
         schur = (matrix.border[g:, g:] - explained) * np.outer(unit, unit)
         values, vectors = np.linalg.eigh((schur + schur.T) / 2)
         if values[0] >= 1.0:
-            return matrix.factor()
+            return matrix.factor(), em
         mended = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T / np.outer(unit, unit)
         border = matrix.border.copy()
         border[g:, g:] = mended + explained
-        return Arrow(border, matrix.edge, matrix.blocks, t).factor()
+        return Arrow(border, matrix.edge, matrix.blocks, t).factor(), True
     raise DegenerateError(
         "the stars with weight do not determine the model",
         where="posterior",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
 
 from bayesdist.infer.mixture import TAILS
 from bayesdist.infer.piecewise import PiecewiseExponential
@@ -19,9 +19,20 @@ Float = NDArray[np.float64]
 MESH = {1: 4001, 2: 401}  # points of each axis, by their number
 
 
-def cardinal(axis: Float) -> CubicSpline:
-    """Splines (len(axis),) that are one at their own node and zero at the others."""
-    return CubicSpline(axis, np.eye(len(axis)))
+def cardinal(axis: Float, *, local: bool) -> CubicSpline | CubicHermiteSpline:
+    """Splines (len(axis),) that are one at their own node and zero at the others.
+
+    Parameters
+    ----------
+    axis : ndarray, shape (n,)
+    local : bool
+        Slopes of the parabolas through three nodes each, so that a node is not felt beyond its
+        neighbours' neighbours; else natural splines, which are smoother.
+    """
+    unit = np.eye(len(axis))
+    if not local:
+        return CubicSpline(axis, unit)
+    return CubicHermiteSpline(axis, unit, np.gradient(unit, axis, axis=0, edge_order=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +61,11 @@ class Marginal:
         axes : sequence of ndarray
         values : ndarray, one dimension for each axis
         """
-        meshes = []
-        for k, axis in enumerate(axes):
-            meshes.append(np.linspace(axis[0], axis[-1], MESH[len(axes)]))
-            along = np.tensordot(cardinal(axis)(meshes[-1]), values, axes=(1, k))
-            values = np.moveaxis(along, 0, k)
+        # along one axis the nodes are where they are needed; a product has some far below the top
+        kind = CubicSpline if len(axes) == 1 else PchipInterpolator
+        meshes = [np.linspace(axis[0], axis[-1], MESH[len(axes)]) for axis in axes]
+        for k, (axis, mesh) in enumerate(zip(axes, meshes, strict=True)):
+            values = kind(axis, values, axis=k)(mesh)
         if not meshes:
             return cls(None)
         if len(meshes) == 1:

@@ -35,6 +35,8 @@ KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": ker
 T_DOF = 4.0
 OUTLIER_SHAPE = 1.0
 OUTLIER_MODE = 5.0
+# of a in Beta(a, b): at 1/3 and below the posterior of f^(1/3) may have no mode
+LEAST_SHAPE = 0.5
 # where the data say nothing of log j or log s_out: the end, and the slope of the log prior there
 TAILS = {"j": ("left", 1.0), "s_out": ("right", -2.0 * OUTLIER_SHAPE)}
 
@@ -82,6 +84,12 @@ class OutlierMixture:
         if self.jitter is not None and not 0 <= self.jitter < np.inf:
             raise InputError(
                 f"jitter is {self.jitter}", where="outliers.jitter", do="give 0 or more"
+            )
+        if self.fraction_prior[0] < LEAST_SHAPE:
+            raise InputError(
+                f"Beta{self.fraction_prior} puts too much weight on fractions of next to nothing",
+                where="outliers.fraction_prior",
+                do=f"give a first parameter of {LEAST_SHAPE} or more",
             )
         if not all(0 < p < np.inf for p in self.fraction_prior):
             raise InputError(

@@ -27,15 +27,13 @@ class PiecewiseExponential:
         self.mesh = mesh
         self.slopes = np.concatenate([[left_slope], np.diff(values) / np.diff(mesh), [right_slope]])
         self.top = values.max()
-        heights = np.maximum(np.exp(values - self.top), 1e-300)
-        width = np.diff(mesh)
-        rise = self.slopes[1:-1] * width
-        flat = np.abs(rise) < 1e-9
-        safe = np.where(flat, 1.0, rise)
-        inner = heights[:-1] * width * np.where(flat, 1.0, np.expm1(safe) / safe)
+        heights = np.exp(values - self.top)
+        # of each cell from its higher end, so that nothing overflows
+        fall = np.abs(np.diff(values))
+        inner = np.maximum(heights[1:], heights[:-1]) * np.diff(mesh) * _mean_of_fall(fall)
         mass = np.concatenate([[heights[0] / left_slope], inner, [-heights[-1] / right_slope]])
         self.cumulative = np.concatenate([[0.0], np.cumsum(mass)])
-        self.heights, self.total = heights, mass.sum()
+        self.total = mass.sum()
         self.values = values - self.log_mass
 
     @property
@@ -53,14 +51,26 @@ class PiecewiseExponential:
         """Where the distribution reaches probabilities."""
         m = np.clip(p, 1e-300, 1 - 1e-16) * self.total
         k = np.clip(np.searchsorted(self.cumulative, m, side="right") - 1, 0, len(self.slopes) - 1)
-        anchor = np.maximum(k - 1, 0)
-        slope, height = self.slopes[k], self.heights[anchor]
-        inside_mass = m - self.cumulative[k]
-        # left tail: mass up to x is h exp(s (x - x0)) / s
-        share = np.maximum(m * self.slopes[0] / self.heights[0], 1e-300)
-        left = self.mesh[0] + np.log(share) / self.slopes[0]
-        flat = np.abs(slope) < 1e-9
-        safe = np.where(flat, 1.0, slope)
-        grown = np.log1p(np.maximum(inside_mass * safe / height, -1 + 1e-16)) / safe
-        right = self.mesh[anchor] + np.where(flat, inside_mass / height, grown)
-        return np.where(k == 0, left, right)
+        share = (m - self.cumulative[k]) / (self.cumulative[k + 1] - self.cumulative[k])
+        share = np.clip(share, 1e-300, 1.0)
+        last = len(self.slopes) - 1
+        left, right = self.mesh[np.maximum(k - 1, 0)], self.mesh[np.minimum(k, last - 1)]
+        rise = self.slopes[k] * (right - left)  # of the cell; 0 for the tails
+        # from the higher end: share of the mass beyond x, and how far down the cell that is
+        beyond = np.where(rise > 0, 1 - share, share)
+        fall = np.abs(rise)
+        flat = fall < 1e-9
+        safe = np.where(flat, 1.0, fall)
+        down = np.where(flat, beyond, -np.log1p(beyond * np.expm1(-safe)) / safe)
+        inside = np.where(rise > 0, right - down * (right - left), left + down * (right - left))
+        with np.errstate(divide="ignore"):
+            below = self.mesh[0] + np.log(share) / self.slopes[0]
+            above = self.mesh[-1] + np.log1p(-np.minimum(share, 1 - 1e-16)) / self.slopes[-1]
+        return np.where(k == 0, below, np.where(k == last, above, inside))
+
+
+def _mean_of_fall(fall: Float) -> Float:
+    """Mean of exp(-fall t) over t from 0 to 1."""
+    flat = fall < 1e-9
+    safe = np.where(flat, 1.0, fall)
+    return np.where(flat, 1.0, -np.expm1(-safe) / safe)

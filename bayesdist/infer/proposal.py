@@ -113,9 +113,11 @@ class GridProposal:
         to node.
         """
         weights, nearest = np.ones((len(at), 1)), np.zeros(len(at), np.int64)
+        local = len(self._axes) > 1
         for axis, x in zip(self._axes, at.T, strict=True):
-            along = cardinal(axis)(np.clip(x, axis[0], axis[-1]))
-            weights = (weights[:, :, None] * along[:, None]).reshape(len(at), -1)
+            along = cardinal(axis, local=local)(np.clip(x, axis[0], axis[-1]))
+            size = weights.shape[1] * len(axis)
+            weights = (weights[:, :, None] * along[:, None]).reshape(len(at), size)
             middles = (axis[1:] + axis[:-1]) / 2
             nearest = nearest * len(axis) + np.searchsorted(middles, x)
         mean, log_sd = np.split(weights @ self._between, 2, axis=1)
@@ -149,8 +151,8 @@ class GridProposal:
             white = factor.whiten(shift[rows])
             out[rows] += 0.5 * factor.logdet - 0.5 * (white**2).sum(axis=1)
             tail = white[:, white.shape[1] - self._n_wide :]
-            wide = SHARE / WIDE * np.exp(0.5 * (1 - WIDE**-2) * np.minimum(tail**2, 1400.0))
-            out[rows] += np.log(1 - SHARE + wide).sum(axis=1)
+            wide = np.log(SHARE / WIDE) + 0.5 * (1 - WIDE**-2) * tail**2
+            out[rows] += np.logaddexp(np.log(1 - SHARE), wide).sum(axis=1)
         return out - 0.5 * y.shape[1] * np.log(2 * np.pi)
 
     # -- as arrays, for checkpoints ---------------------------------------------------------------

@@ -34,6 +34,7 @@ __all__ = ["sample"]
 Float = NDArray[np.float64]
 
 METHODS = ("exact", "certified")
+FORMAT = 2  # of the checkpoints
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may give other bits
 
 
@@ -187,7 +188,7 @@ def _fingerprint(target: Target, *settings: object) -> str:
     digest.update("".join(target.shards.sum(_digest)).encode())
     digest.update(repr([(name, metadata.version(name)) for name in ENGINES]).encode())
     digest.update(target.priors.centre.tobytes() + target.priors.precision.tobytes())
-    digest.update(repr((target.model.to_dict(), target.mixture, settings)).encode())
+    digest.update(repr((target.model.to_dict(), target.mixture, settings, FORMAT)).encode())
     return digest.hexdigest()
 
 

@@ -304,6 +304,7 @@ def test_prior_derivatives_by_differences(hyper):
         ({"jitter": -0.1}, r"outliers\.jitter"),
         ({"jitter": np.nan}, r"outliers\.jitter"),
         ({"fraction_prior": (0.0, 9.0)}, r"outliers\.fraction_prior"),
+        ({"fraction_prior": (0.3, 9.0)}, r"outliers\.fraction_prior"),
         ({"fraction_prior": (1.0, np.nan)}, r"outliers\.fraction_prior"),
     ],
     ids=str,

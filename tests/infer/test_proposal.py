@@ -86,6 +86,22 @@ def test_piecewise_draws_follow_the_density(piecewise):
     assert stats.kstest(x, lambda t: np.interp(t, fine, cdf)).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("rise", [-800.0, -705.0, 700.0, 750.0, 1e6])
+def test_piecewise_density_with_a_cliff(rise):
+    """The cell of the cliff holds next to nothing: no overflow, and no mass that is not there."""
+    values = np.array([0.0, rise, rise, rise - 3.0])
+    density = PiecewiseExponential(np.arange(4.0), values, left_slope=1.0, right_slope=-1.0)
+    x = density.quantile(np.linspace(1e-4, 1 - 1e-4, 2001))
+    if rise > 0:  # 1 on the plateau, (1 - e^-3) / 3 beyond it, e^-3 in the tail
+        total = 1 + (1 - np.exp(-3)) / 3 + np.exp(-3)
+        assert np.mean(x < 1) < 1e-3
+        assert np.mean(x < 2) == pytest.approx(1 / total, abs=2e-3)
+        assert density.log_density(np.array([1.5]))[0] == pytest.approx(-np.log(total), abs=2e-3)
+    else:  # all of it to the left
+        assert x.max() < 0.02
+        assert density.log_density(np.array([-1.0]))[0] == pytest.approx(-1.0, abs=2e-3)
+
+
 # -- the marginal of a grid ---------------------------------------------------------------------
 
 
@@ -227,8 +243,10 @@ def test_efficiency_of_the_mixture(mixed):
 
 def test_the_scale_of_the_outliers_is_on_the_grid_where_it_is_vague(mixed):
     target, proposal, options = mixed
+    if 0 < options["fraction"] < 0.01:
+        pytest.skip("four or five outliers: either way")
     held = tuple(name for name in target.mixture.hyper if name == "j")
-    assert proposal.split.held == held + ("s_out",) * (options["fraction"] < 0.01)
+    assert proposal.split.held == held + ("s_out",) * (options["fraction"] == 0)
 
 
 def test_density_is_normalised_and_followed_by_the_draws(mixed):
@@ -470,7 +488,20 @@ def test_clean_tables_have_a_good_proposal(n, seed):
     model, matches, _ = simulated(seed, n)
     target, fit = target_of(model, matches, OutlierMixture())
     proposal = build_proposal(target, fit)
-    assert proposal.split.held == ("j", "s_out")
     quality = quality_of(log_weights_of(target, proposal, 2048)[1])
     assert quality.efficiency > 0.85
     assert quality.k < 0.7
+
+
+@pytest.mark.parametrize(
+    "n, jitter, seed",
+    [(1000, 2.0, 1), (1000, 2.0, 2), (3000, 0.5, 2), (10_000, 0.5, 2), (10_000, 0.1, 3)],
+)
+def test_clean_tables_with_errors_far_too_small(n, jitter, seed):
+    """The outliers may then be *narrower* than the core, and most of the grid is empty."""
+    model, matches, _ = simulated(seed, n, jitter=jitter)
+    target, fit = target_of(model, matches, OutlierMixture())
+    proposal = build_proposal(target, fit)
+    psi, log_weights = log_weights_of(target, proposal, 2048)
+    assert np.isfinite(psi).all(axis=1).mean() > 0.8
+    assert efficiency(log_weights) > 0.005  # enough for the moves that do not rest on it alone

@@ -200,12 +200,19 @@ def importance_efficiency(log_weights: Float, n_outside: int = 0) -> float:
 
 
 def pareto_k(log_weights: Float) -> float:
-    """Shape of the Pareto tail of importance weights; above 0.7 they cannot be trusted."""
+    """Shape of the Pareto tail of importance weights; above 0.7 they cannot be trusted.
+
+    0 where no weight is more than twice the mean: there is no tail then, and the shape of weights
+    that are all but equal says nothing.
+    """
     import arviz as az
 
     finite = log_weights[np.isfinite(log_weights)]
     if len(finite) < 25 or np.ptp(finite) < 1e-9:
         return float("-inf") if len(finite) >= 25 else float("inf")
+    weights = np.exp(finite - finite.max())
+    if weights.mean() > 0.5:
+        return 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return float(az.psislw(finite.copy())[1])
