@@ -105,14 +105,32 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("inspect", _inspect, "what a product or a posterior holds, and what is wrong in it")
     sub.add_argument("file", metavar="FILE")
 
-    sub = add("simulate", _simulate, "matched stars of known truth, with a configuration")
-    sub.add_argument("what", choices=["wise"])
-    sub.add_argument("-o", "--output", required=True, metavar="DIR")
-    sub.add_argument("--seed", type=_seed, default=1, metavar="N")
+    sub = add("simulate", _simulate_wise, "data of known truth")
+    kinds = sub.add_subparsers(title="what to simulate", required=True, metavar="WHAT")
+
+    def kind(name: str, function, text: str) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
+        sub = kinds.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        sub.set_defaults(function=function)
+        sub.add_argument("-q", "--quiet", action="store_true", default=argparse.SUPPRESS)
+        sub.add_argument("-o", "--output", required=True, metavar="DIR")
+        sub.add_argument("--seed", type=_seed, default=1, metavar="N")
+        sub.add_argument("--force", action="store_true", help="replace files that are there")
+        return sub
+
+    sub = kind("wise", _simulate_wise, "matched stars of WISE and 2MASS, with a configuration")
     sub.add_argument("--band", default="W2")
     sub.add_argument("--stars", type=int, default=6000, metavar="N")
     sub.add_argument("--fraction", type=float, default=0.03, help="share of false matches")
-    sub.add_argument("--force", action="store_true", help="replace files that are there")
+
+    sub = kind("acs", _simulate_acs, "star lists, catalogue and log of the 47 Tuc campaign")
+    sub.add_argument("--exposures", type=int, default=110, metavar="N", help="in F606W")
+    sub.add_argument("--stars", type=int, default=53_900, metavar="N", help="of the catalogue")
+    sub.add_argument("--filters", default="F606W", metavar="F606W,F814W", help="one or several")
+    sub.add_argument("--other", type=int, default=15, metavar="N", help="exposures of each other")
+    sub.add_argument("--false", type=float, default=0.05, help="share of detections that are none")
+    sub.add_argument("--outlying", type=float, default=0.0, help="share of outlying exposures")
+    sub.add_argument("--cte", action="store_true", help="trailed charge moves the stars")
+    sub.add_argument("--smooth", action="store_true", help="without look-up tables")
 
     sub = add("init", _init, "a commented configuration for a file of matches")
     sub.add_argument("config", metavar="CONFIG.toml")
@@ -202,7 +220,13 @@ def _inspect(options: argparse.Namespace) -> None:
     print(inspect(options.file))
 
 
-def _simulate(options: argparse.Namespace) -> None:
+def _simulate_acs(options: argparse.Namespace) -> None:
+    from bayesdist.app.simulate import simulate_campaign
+
+    print(simulate_campaign(options))
+
+
+def _simulate_wise(options: argparse.Namespace) -> None:
     import numpy as np
 
     from bayesdist.app.demo import simulation_config, write_simulation

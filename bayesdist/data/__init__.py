@@ -6,18 +6,32 @@ memory is Parquet: `open_matches` leaves it on disk and gives `PartitionedMatche
 MatchTables; `write_partitioned` makes such files.
 """
 
+from bayesdist.data.aberration import velocity_aberration
+from bayesdist.data.campaign import CampaignMatches, ExposureReport, match_campaign
 from bayesdist.data.catalog import ReferenceCatalog, catalog_from_table, read_catalog
 from bayesdist.data.columns import matches_from_table
+from bayesdist.data.exposure_log import Exposure, ExposureLog
+from bayesdist.data.exposures import exposure_of_headers, read_exposures, write_exposures
 from bayesdist.data.files import atomic_path, is_leftover, remove_leftovers, sha256_of
 from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
 from bayesdist.data.linear_map import LinearMap
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching import Matching, match_table, match_to_catalog
+from bayesdist.data.motions import (
+    MotionErrorLine,
+    derive_motions,
+    motion_error_line,
+    select_motions,
+)
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
+from bayesdist.data.patterns import find_similarity, pattern_index
 from bayesdist.data.pieces import PIECE, Piece
+from bayesdist.data.preparing import neutralise_aberration, with_centroid_errors
 from bayesdist.data.readers import FORMATS, input_files, read_matches
+from bayesdist.data.starlists import StarCuts, StarList, read_star_lists, star_list_of_hst1pass
 from bayesdist.data.tangent import mean_direction, tangent_plane
+from bayesdist.data.tolerance import SearchRadius, search_radius
 from bayesdist.data.units import UNITS
 from bayesdist.data.writing import write_partitioned
 
@@ -25,29 +39,52 @@ __all__ = [
     "FORMATS",
     "PIECE",
     "UNITS",
+    "CampaignMatches",
+    "Exposure",
+    "ExposureLog",
+    "ExposureReport",
     "Hst1passList",
     "LinearMap",
     "MagnitudeErrors",
     "MatchTable",
     "Matching",
+    "MotionErrorLine",
     "PartitionedMatches",
     "Piece",
     "ReferenceCatalog",
+    "SearchRadius",
+    "StarCuts",
+    "StarList",
     "atomic_path",
     "catalog_from_table",
+    "derive_motions",
+    "exposure_of_headers",
+    "find_similarity",
     "input_files",
     "is_leftover",
+    "match_campaign",
     "match_table",
     "match_to_catalog",
     "matches_from_table",
     "mean_direction",
+    "motion_error_line",
+    "neutralise_aberration",
     "open_matches",
+    "pattern_index",
     "read_catalog",
+    "read_exposures",
     "read_hst1pass",
     "read_matches",
     "read_matchup",
+    "read_star_lists",
     "remove_leftovers",
+    "search_radius",
+    "select_motions",
     "sha256_of",
+    "star_list_of_hst1pass",
     "tangent_plane",
+    "velocity_aberration",
+    "with_centroid_errors",
+    "write_exposures",
     "write_partitioned",
 ]

@@ -22,6 +22,7 @@ from bayesdist.errors import InputError
 __all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 
@@ -49,11 +50,15 @@ class ReferenceCatalog:
         RA and Dec in degrees of the plane that u, v lie on.
     source : str
         File.
+    star : ndarray of int, optional
+        Code of each star, 0 or more, by which it is known in tables of matches; by default the row,
+        from 0.  It stays with the star in every selection.
 
     Raises
     ------
     InputError
-        For no stars, unequal lengths, values that are not finite, negative errors, or half a pair.
+        For no stars, unequal lengths, values that are not finite, negative errors or codes, or half
+        a pair.
     """
 
     u: Float
@@ -69,6 +74,7 @@ class ReferenceCatalog:
     unit: str = "pix"
     tangent_point: tuple[float, float] | None = None
     source: str = "catalogue"
+    star: Int = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         check_unit(self.unit, where=self.source)
@@ -103,6 +109,14 @@ class ReferenceCatalog:
                     where=f"{self.source}, row {bad + 1}, column {name!r}",
                     do="correct the row or drop it",
                 )
+        star = np.ascontiguousarray(np.arange(n) if self.star is None else self.star, np.int64)
+        object.__setattr__(self, "star", star)
+        if star.shape != (n,) or star.min() < 0:
+            raise InputError(
+                f"codes of the stars are not {n} numbers of 0 or more",
+                where=f"{self.source}, column 'star'",
+                do="number the stars, or leave the column out",
+            )
         if self.epoch is not None and np.ndim(self.epoch):
             object.__setattr__(self, "epoch", np.ascontiguousarray(self.epoch, np.float64))
         if self.epoch is not None and not (
@@ -126,7 +140,7 @@ class ReferenceCatalog:
         }
         if isinstance(self.epoch, np.ndarray):
             arrays["epoch"] = self.epoch[which]
-        return replace(self, **arrays)
+        return replace(self, **arrays, star=self.star[which])
 
     def at(self, epoch: float) -> ReferenceCatalog:
         """The catalogue as it is at another epoch.
@@ -186,6 +200,7 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "sigma_pm_v": ("sigma_pm_v", "vye", "pmdec_error"),
     "epoch": ("epoch", "t0", "ref_epoch"),
     "mag": ("mag", "magnitude", "phot_g_mean_mag", "g", "m"),
+    "star": ("star",),
 }
 
 
@@ -242,9 +257,9 @@ def catalog_from_table(
     table : astropy Table
     columns : mapping of str to str, optional
         Column of each quantity: u v ra dec sigma_u sigma_v pm_u pm_v sigma_pm_u sigma_pm_v epoch
-        mag. With ra and dec, positions are projected to the tangent plane in arcsec; pm_u is then
-        the motion to the east with its factor cos(dec), and all errors and motions turn with the
-        plane.
+        mag star.  With ra and dec, positions are projected to the tangent plane in arcsec; pm_u is
+        then the motion to the east with its factor cos(dec), and all errors and motions turn with
+        the plane.
     source : str, optional
         File, for errors.
     unit : str, optional
@@ -294,11 +309,23 @@ def catalog_from_table(
             out |= {key: values(key, " / yr" if "pm" in key else "") for key in pair}
     if "mag" in found:
         out["mag"] = column("mag").numbers()
+    if "star" in found:
+        out["star"] = _identities(column("star"))
     out["epoch"] = column("epoch").years() if "epoch" in found else epoch
     if on_sky:
         out |= _on_plane(out, tangent_point, source)
         base = "arcsec"
     return ReferenceCatalog(**out, unit=base, source=source)
+
+
+def _identities(column: SourceColumn) -> Int:
+    """Codes of the stars, of which none stands twice."""
+    star = column.integers()
+    unique, first = np.unique(star, return_index=True)
+    if len(unique) < len(star):
+        again = int(np.setdiff1d(np.arange(len(star)), first)[0])
+        raise column.fail(again, f"star {star[again]} stands twice")
+    return star
 
 
 def _on_plane(

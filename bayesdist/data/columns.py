@@ -46,6 +46,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "chip": ("chip", "ccdchip", "ccd_chip"),
     "filter": ("filter", "filt", "filter_name"),
     "mag": ("mag", "magnitude"),
+    "star": ("star",),
 }
 
 
@@ -221,10 +222,10 @@ def matches_from_table(
     ----------
     data : astropy Table or mapping of arrays
     columns : mapping of str to str, optional
-        Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag.
-        What is not named is looked for under its usual names (`ALIASES`), in any case of letters;
-        an empty name leaves a quantity out.  With ra and dec, u and v are the tangent plane in
-        arcsec.
+        Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag
+        star.  What is not named is looked for under its usual names (`ALIASES`), in any case of
+        letters; an empty name leaves a quantity out.  With ra and dec, u and v are the tangent
+        plane in arcsec.
     source : str, optional
         File, for errors.
     unit : str, optional
@@ -365,6 +366,8 @@ def match_columns(
         out["exposure"], out["exposure_names"] = column("exposure").labels()
     if "filter" in found:
         out["filter"], out["filter_names"] = column("filter").labels()
+    if "star" in found:
+        out["star"] = column("star").integers()
     if "chip" in found:
         numbers, out["chip"] = np.unique(column("chip").integers(), return_inverse=True)
         out["chip_numbers"] = tuple(numbers.tolist())

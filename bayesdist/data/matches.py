@@ -26,6 +26,7 @@ _POSITIONS = ("x", "y", "u", "v")
 _SIGMAS = ("sigma_u", "sigma_v")
 _OPTIONAL = ("epoch", "mag")
 _CODES = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
+_INTEGERS = ("row", "source", "star", *_CODES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,9 @@ class MatchTable:
         Codes into `exposure_names`, `chip_numbers` and `filter_names`.
     exposure_names, filter_names : tuple of str
     chip_numbers : tuple of int
+    star : ndarray of int, optional
+        Code of the reference star of each match, 0 or more: one star may be matched in many
+        exposures.  None where it is not known.
     row : ndarray of int, optional
         0-based row in the file that the star comes from.
     source : ndarray of int, optional
@@ -90,6 +94,7 @@ class MatchTable:
     chip_numbers: tuple[int, ...] = (1,)
     filter: Int = None  # type: ignore[assignment]
     filter_names: tuple[str, ...] = ("",)
+    star: Int | None = None
     row: Int = None  # type: ignore[assignment]
     source: Int = None  # type: ignore[assignment]
     sources: tuple[str, ...] = ("table",)
@@ -152,7 +157,7 @@ class MatchTable:
                 default = np.arange(n) if name == "row" else np.zeros(n, np.int64)
                 object.__setattr__(self, name, default)
         for name in self._array_names():
-            kind = np.int64 if name in ("row", "source", *_CODES) else np.float64
+            kind = np.int64 if name in _INTEGERS else np.float64
             # contiguous and in the machine's byte order, which FITS columns are not
             values = np.ascontiguousarray(getattr(self, name), dtype=kind)
             object.__setattr__(self, name, values)
@@ -166,7 +171,7 @@ class MatchTable:
         object.__setattr__(self, "rejected", dict(self.rejected))
 
     def _array_names(self) -> Iterator[str]:
-        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL, *_CODES, "row", "source"):
+        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL, *_INTEGERS):
             if getattr(self, name) is not None:
                 yield name
 
@@ -193,6 +198,13 @@ class MatchTable:
                     where=", ".join(self.sources),
                     do="give a label for each code",
                 )
+        if self.star is not None and self.star.min() < 0:
+            bad = int(np.argmax(self.star < 0))
+            raise InputError(
+                f"value is {self.star[bad]}, and must not be negative",
+                where=self._where(bad, "star"),
+                do="number the reference stars from 0",
+            )
         for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
             values = getattr(self, name)
             if values is None:
@@ -360,7 +372,8 @@ class MatchTable:
     def concatenate(tables: Sequence[MatchTable]) -> MatchTable:
         """All stars of several tables, in their order.
 
-        Exposures, chips, filters and files of equal name become one.
+        Exposures, chips, filters and files of equal name become one.  Stars keep their codes, which
+        must belong to one catalogue; the codes are left out when one of the tables has none.
 
         Parameters
         ----------
@@ -398,6 +411,8 @@ class MatchTable:
             joined[name] = merged_optional(
                 name, [getattr(t, name) for t in tables], [", ".join(t.sources) for t in tables]
             )
+        stars = [t.star for t in tables if t.star is not None]
+        joined["star"] = np.concatenate(stars) if len(stars) == len(tables) else None
         for name, labels in {**_CODES, "source": "sources"}.items():
             joined[name], joined[labels] = merged_codes(
                 [getattr(t, name) for t in tables],

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.linear_map import LEAST, SAMPLE, LinearMap, iterated_map
+from bayesdist.data.linear_map import LEAST, LinearMap, iterated_map
 from bayesdist.data.matches import MatchTable
+from bayesdist.data.pairs import beats_chance, mutual_pairs, overlap
 from bayesdist.data.voting import mean_spacing, vote_offset
 from bayesdist.errors import InputError
 
@@ -22,7 +23,6 @@ Int = NDArray[np.int64]
 _LOG10_CHANCE = -4.0  # a vote that chance wins more often than this is no match
 _FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows
 _ENOUGH = 15  # pairs that convince although most stars have none
-_DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ def match_to_catalog(
     rough = iterated_map(vote.voters, vote.voted, cKDTree(vote.voted), first, vote.width, reach)
     if rough is None:
         raise failure
-    n_over, area = _overlap(rough(moved), reference)
+    n_over, area = overlap(rough(moved), reference)
     if radius is None:
         radius = float(np.sqrt(-np.log1p(-_FALSE_RATE) * area / (np.pi * n_over)))
     fine = iterated_map(moved, reference, tree, rough, max(reach, radius), radius)
@@ -141,9 +141,10 @@ def match_to_catalog(
     transformation = LinearMap(
         fine.matrix @ start.matrix, fine(start(origin[None]))[0] - origin, origin
     )
-    index, catalog_index = _mutual(transformation(points), reference, tree, radius)
+    found = transformation(points)
+    index, catalog_index, distance = mutual_pairs(found, reference, tree, radius)
     few = len(index) < LEAST or len(index) < min(_ENOUGH, 0.5 * min(len(points), n_over))
-    if few or not _beats_chance(transformation(points), reference, tree, index, catalog_index):
+    if few or not beats_chance(found, reference, tree, distance):
         raise failure
     return Matching(
         index=index,
@@ -153,56 +154,6 @@ def match_to_catalog(
         coincidences=vote.count,
         false_rate=float(-np.expm1(-max(n_over - len(index), 0) / area * np.pi * radius**2)),
     )
-
-
-def _overlap(points: Float, reference: Float) -> tuple[int, float]:
-    """Reference stars in the hull of the points (at least 1), and its area."""
-    try:
-        hull = ConvexHull(points)
-    except (QhullError, ValueError):
-        low, high = points.min(axis=0), points.max(axis=0)
-        inside = ((reference >= low) & (reference <= high)).all(axis=1)
-        area = float(np.prod(high - low))
-    else:
-        inside = np.ones(len(reference), bool)
-        for a, b, c in hull.equations:
-            inside &= reference @ np.array([a, b]) + c <= 0
-        area = hull.volume  # of a hull in two dimensions, qhull's name for the area
-    return max(int(inside.sum()), 1), max(area, np.finfo(float).tiny)
-
-
-def _mutual(points: Float, reference: Float, tree: cKDTree, radius: float) -> tuple[Int, Int]:
-    """Pairs that are each other's nearest within a radius."""
-    _, forth = tree.query(points, distance_upper_bound=radius, workers=-1)
-    found = np.flatnonzero(forth < len(reference))
-    partners = forth[found]
-    asked = np.unique(partners)
-    _, back = cKDTree(points).query(reference[asked], distance_upper_bound=radius, workers=-1)
-    own = np.full(len(reference), -1, np.int64)
-    own[asked] = back
-    mutual = own[partners] == found
-    return found[mutual], partners[mutual].astype(np.int64)
-
-
-def _beats_chance(
-    points: Float, reference: Float, tree: cKDTree, index: Int, catalog_index: Int
-) -> bool:
-    """Whether true pairs are there: displaced detections must find far fewer neighbours.
-
-    Two dense clusters laid over each other give many pairs, but as many when one is moved a little.
-    """
-    distance = np.hypot(*(points[index] - reference[catalog_index]).T)
-    reach = max(float(np.median(distance)), 1e-9 * float(np.abs(reference).max()))
-    sample = points[:: -(-len(points) // SAMPLE)]
-
-    def neighbours(shift: complex) -> int:
-        moved = sample + np.array([shift.real, shift.imag])
-        found = tree.query(moved, distance_upper_bound=reach * (1 + 1e-9), workers=-1)[0]
-        return int(np.isfinite(found).sum())
-
-    here = neighbours(0j)
-    there = float(np.mean([neighbours(4.0 * reach * d) for d in _DIRECTIONS]))
-    return here > 2.0 * there and here - there > 5.0 * np.sqrt(there)
 
 
 def match_table(
@@ -226,8 +177,9 @@ def match_table(
     Returns
     -------
     MatchTable
-        The matched stars, with u, v of the catalogue; the others are counted as rejected.  Errors
-        stay as they are: those of a catalogue are only a part of the error of a match.
+        The matched stars, with u, v and star codes of the catalogue; the others are counted as
+        rejected.  Errors stay as they are: those of a catalogue are only a part of the error of a
+        match.
 
     Raises
     ------
@@ -249,6 +201,7 @@ def match_table(
             do="give the epoch of the exposures",
         )
     u, v = table.u.copy(), table.v.copy()
+    star = np.zeros(len(table), np.int64)
     matched = np.zeros(len(table), bool)
     for code in np.unique(table.exposure):
         rows = np.flatnonzero(table.exposure == code)
@@ -266,6 +219,13 @@ def match_table(
         )
         pairs = rows[found.index]
         u[pairs], v[pairs] = then.u[found.catalog_index], then.v[found.catalog_index]
+        star[pairs] = then.star[found.catalog_index]
         matched[pairs] = True
     kept = table.select(matched, reason="no counterpart in the catalogue")
-    return replace(kept, u=u[matched], v=v[matched], tangent_point=catalog.tangent_point)
+    return replace(
+        kept,
+        u=u[matched],
+        v=v[matched],
+        star=star[matched],
+        tangent_point=catalog.tangent_point,
+    )

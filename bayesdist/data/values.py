@@ -170,6 +170,8 @@ class SourceColumn:
         """
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.integers)
+        if np.asarray(getattr(self.values, "unmasked", self.values)).dtype.kind == "i":
+            return self._plain().astype(np.int64)  # not by way of float64: names may have 19 digits
         values = self.numbers()
         whole = values == np.rint(values)
         if not whole.all():

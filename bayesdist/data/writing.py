@@ -114,6 +114,8 @@ def _schema(table: MatchTable, *, like: pyarrow.Schema | None = None) -> pyarrow
         if getattr(table, name) is not None:
             metadata = {"unit": units[name]} if name in units else None
             out.append(pyarrow.field(name, pyarrow.float64(), metadata=metadata))
+    if table.star is not None:
+        out.append(pyarrow.field("star", pyarrow.int64()))
     for name, (labels, default) in _LABELS.items():
         if getattr(table, labels) != default or (like is not None and name in like.names):
             kind = pyarrow.int64() if name == "chip" else pyarrow.string()

@@ -1,0 +1,229 @@
+"""Logs of exposures: read, written, and made from the headers of images."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Column, MaskedColumn, Table
+from astropy.time import Time
+from numpy.typing import NDArray
+
+from bayesdist.data.exposure_log import NUMBERS, Exposure, ExposureLog
+from bayesdist.data.files import atomic_path
+from bayesdist.data.naming import find_columns
+from bayesdist.data.tables import read_table
+from bayesdist.data.units import conversion
+from bayesdist.data.values import SourceColumn
+from bayesdist.errors import InputError
+
+__all__ = [
+    "Exposure",
+    "ExposureLog",
+    "exposure_of_headers",
+    "read_exposures",
+    "write_exposures",
+]
+
+_UNITS = {"epoch": "yr", "exptime": "s", "pa_v3": "deg", "ra": "deg", "dec": "deg"}
+_FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
+_ALIASES: dict[str, tuple[str, ...]] = {
+    "exposure": ("exposure", "name", "rootname"),
+    "epoch": ("epoch", "year", "date", "mjd", "expstart"),
+    "filter": ("filter", "filt"),
+    "exptime": ("exptime", "exposure_time"),
+    "vafactor": ("vafactor",),
+    "pa_v3": ("pa_v3",),
+    "ra": ("ra", "ra_targ"),
+    "dec": ("dec", "dec_targ"),
+}
+
+
+def read_exposures(
+    path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
+) -> ExposureLog:
+    """Read a log of exposures.
+
+    Parameters
+    ----------
+    path : path-like
+        .ecsv, .csv, .fits or .parquet, one row for each exposure.
+    columns : mapping of str to str, optional
+        Column of each quantity: exposure epoch filter exptime vafactor pa_v3 ra dec.  The epoch may
+        be a decimal year, an ISO date, or a Modified Julian Date with the unit 'd'.  All but
+        exposure and epoch may be missing, in single rows, too.
+
+    Returns
+    -------
+    ExposureLog
+
+    Raises
+    ------
+    InputError
+        For missing columns and values that are wrong, naming the row.
+    """
+    path = Path(path)
+    table = read_table(path)
+    found = find_columns(table.colnames, columns, _ALIASES, source=str(path))
+    for key in ("exposure", "epoch"):
+        if key not in found:
+            raise InputError(
+                f"no column for {key!r} among {', '.join(table.colnames) or 'none'}",
+                where=str(path),
+                do="name it in the option 'columns'",
+            )
+    if not len(table):
+        raise InputError("holds no exposures", where=str(path), do="name at least one")
+
+    def column(key: str) -> SourceColumn:
+        return SourceColumn(table[found[key]], str(path), found[key])
+
+    codes, labels = column("exposure").labels()
+    rows: dict[str, list[Any]] = {
+        "name": [labels[code] for code in codes],
+        "epoch": column("epoch").years().tolist(),
+    }
+    if "filter" in found:
+        rows["filter"] = _filled(table[found["filter"]], column("filter"))
+    for key in NUMBERS:
+        if key in found:
+            rows[key] = _known_numbers(column(key), _UNITS.get(key))
+    exposures = []
+    for k in range(len(table)):
+        try:
+            exposures.append(Exposure(**{key: values[k] for key, values in rows.items()}))
+        except InputError as error:
+            where = f"{path}, row {k + 1}, {error.where}".rstrip(", ")
+            raise InputError(error.cause, where=where, do=error.do) from None
+    return ExposureLog(tuple(exposures), source=str(path))
+
+
+def _missing(values: Any) -> NDArray[np.bool_]:
+    """Which values of a column are masked or not a number."""
+    mask = np.array(np.broadcast_to(getattr(values, "mask", False), len(values)))
+    if values.dtype.kind == "f":
+        mask |= np.isnan(np.ma.filled(np.ma.asarray(values), np.nan))
+    return mask
+
+
+def _filled(values: Any, column: SourceColumn) -> list[str]:
+    """Texts of a column, empty where they are missing."""
+    missing = _missing(values)
+    known = np.flatnonzero(~missing)
+    out = [""] * len(values)
+    if len(known):
+        codes, labels = replace(column, values=values[known]).labels()
+        for index, code in zip(known, codes, strict=True):
+            out[index] = labels[code]
+    return out
+
+
+def _known_numbers(column: SourceColumn, unit: str | None) -> list[float | None]:
+    """Numbers of a column, None where they are missing."""
+    missing = _missing(column.values)
+    known = np.flatnonzero(~missing)
+    out: list[float | None] = [None] * len(missing)
+    if not len(known):
+        return out
+    own = column.unit
+    factor = 1.0 if own is None or unit is None else conversion(own, unit, where=column.where)
+    named = replace(
+        column, values=column.values[known], place=lambda k: column.place(int(known[k]))
+    )
+    for index, value in zip(known, named.numbers() * factor, strict=True):
+        out[index] = float(value)
+    return out
+
+
+def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
+    """Write a log as `read_exposures` reads it.
+
+    Parameters
+    ----------
+    log : ExposureLog
+    path : path-like
+        .ecsv, .csv or .fits; replaced atomically.
+
+    Raises
+    ------
+    InputError
+        For another extension, or when the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _FORMATS:
+        raise InputError(
+            f"extension {path.suffix!r} is not one of a log",
+            where=str(path),
+            do=f"choose one of {', '.join(_FORMATS)}",
+        )
+    table = Table()
+    for one in fields(Exposure):
+        values = [getattr(exposure, one.name) for exposure in log]
+        if one.name in ("name", "filter"):
+            table["exposure" if one.name == "name" else one.name] = Column(values, dtype=str)
+            continue
+        missing = [value is None for value in values]
+        if not all(missing):
+            numbers = [np.nan if value is None else value for value in values]
+            column = MaskedColumn(numbers, mask=missing, unit=_UNITS.get(one.name))
+            table[one.name] = column if any(missing) else Column(column)
+    with atomic_path(path) as temporary:
+        table.write(temporary, format=_FORMATS[path.suffix.lower()])
+
+
+def exposure_of_headers(
+    primary: Mapping[str, Any], science: Mapping[str, Any] | None = None
+) -> Exposure:
+    """An exposure from the headers of an ACS `flt` or `flc` file.
+
+    Parameters
+    ----------
+    primary : mapping
+        Primary header: ROOTNAME, EXPSTART (MJD), EXPTIME, FILTER1, FILTER2, PA_V3, RA_TARG,
+        DEC_TARG.
+    science : mapping, optional
+        Header of a science extension: VAFACTOR.
+
+    Returns
+    -------
+    Exposure
+        At the middle of the exposure.  The filter is that of the two wheels which is not clear;
+        two are joined by '+'.
+
+    Raises
+    ------
+    InputError
+        When ROOTNAME or EXPSTART is missing.
+    """
+    for key in ("ROOTNAME", "EXPSTART"):
+        if key not in primary:
+            raise InputError(
+                f"the primary header has no {key}",
+                where=str(primary.get("ROOTNAME", "header")),
+                do="give the header of a calibrated exposure",
+            )
+    exptime = _number(primary, "EXPTIME")
+    middle = float(primary["EXPSTART"]) + 0.5 * (exptime or 0.0) / 86_400.0
+    wheels = (str(primary.get(key, "")).strip() for key in ("FILTER1", "FILTER2"))
+    return Exposure(
+        name=str(primary["ROOTNAME"]).strip().lower(),
+        epoch=float(Time(middle, format="mjd", scale="utc").decimalyear),
+        filter="+".join(one for one in wheels if one and not one.upper().startswith("CLEAR")),
+        exptime=exptime,
+        vafactor=_number(primary if science is None else science, "VAFACTOR"),
+        pa_v3=_number(primary, "PA_V3"),
+        ra=_number(primary, "RA_TARG"),
+        dec=_number(primary, "DEC_TARG"),
+    )
+
+
+def _number(header: Mapping[str, Any], key: str) -> float | None:
+    """A keyword's number, None where it has none."""
+    try:
+        return float(header[key])
+    except (KeyError, TypeError, ValueError):
+        return None

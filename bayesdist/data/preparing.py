@@ -1,0 +1,91 @@
+"""What matches need before the fit: the errors of the centroids, and a scale without aberration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.exposures import ExposureLog
+from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+
+__all__ = ["neutralise_aberration", "with_centroid_errors"]
+
+Float = NDArray[np.float64]
+
+
+def with_centroid_errors(table: MatchTable, errors: MagnitudeErrors) -> MatchTable:
+    """Add the errors of the centroids to those of the catalogue, in quadrature.
+
+    Parameters
+    ----------
+    table : MatchTable
+        With the errors of the catalogue, or none.
+    errors : MagnitudeErrors
+        Of the centroids, in the unit of u, v.
+
+    Returns
+    -------
+    MatchTable
+
+    Raises
+    ------
+    InputError
+        Without magnitudes.
+    """
+    if table.mag is None:
+        raise InputError(
+            "holds no magnitudes, and the errors of the centroids depend on them",
+            where=", ".join(table.sources),
+            do="give lists with magnitudes",
+        )
+    sigma_u, sigma_v = errors.at(table.mag)
+    if table.sigma_u is not None and table.sigma_v is not None:
+        sigma_u, sigma_v = np.hypot(sigma_u, table.sigma_u), np.hypot(sigma_v, table.sigma_v)
+    return table.with_sigma(sigma_u, sigma_v)
+
+
+def neutralise_aberration(
+    table: MatchTable, log: ExposureLog, origin: tuple[float, float] = (0.0, 0.0)
+) -> MatchTable:
+    """Catalogue positions as an aberration-free scale gives them.
+
+    A true offset on the sky is VAFACTOR times what the aberration-free scale of the detector gives,
+    so that offsets from an origin, and their errors, are divided by it.  Another origin shifts all
+    stars of an exposure alike.
+
+    Parameters
+    ----------
+    table : MatchTable
+    log : ExposureLog
+        With VAFACTOR of each exposure of the table.
+    origin : tuple of float, optional
+        In the unit of u, v.
+
+    Returns
+    -------
+    MatchTable
+
+    Raises
+    ------
+    InputError
+        Naming the first exposure without VAFACTOR, or not in the log.
+    """
+    for name in table.exposures:
+        if name not in log:
+            raise InputError(f"has no exposure {name!r}", where=log.source, do="add it to the log")
+    used = log.select(names=table.exposures)
+    used.require("vafactor")
+    factor = np.array(
+        [used[name].vafactor if name in used else 1.0 for name in table.exposure_names], float
+    )[table.exposure]
+    changes: dict[str, Float] = {
+        "u": origin[0] + (table.u - origin[0]) / factor,
+        "v": origin[1] + (table.v - origin[1]) / factor,
+    }
+    if table.sigma_u is not None and table.sigma_v is not None:
+        changes |= {"sigma_u": table.sigma_u / factor, "sigma_v": table.sigma_v / factor}
+    return replace(table, **changes)  # type: ignore[arg-type]
