@@ -69,6 +69,9 @@ def _lines(session: Session) -> Iterator[str]:
         + (" (by magnitude)" if errors is not None else "")
     )
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
+    if len(model.chips) > 1:
+        found = zip(model.chips, session.shards.survey.chips, strict=True)
+        yield "chips        " + ", ".join(f"{c.name} {s.n} stars" for c, s in found)
     yield f"rank         {model.n_params} of {model.n_params}, nothing is degenerate"
     yield f"condition    {number(fit.condition)} (normal matrix, unit diagonal)"
     yield (

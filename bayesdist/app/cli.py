@@ -83,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--seed", type=_seed, metavar="N", help="in place of the configured one")
 
     for stage, text in (
+        ("match", "stage 0 of a campaign: star lists to pairs"),
         ("fit", "stage 1 of a run: the linear fit"),
         ("sample", "stage 2 of a run: the posterior, going on from its checkpoints"),
         ("assess", "stage 3 of a run: maps, budget, margins"),

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     PositiveFloat,
     PositiveInt,
@@ -17,7 +15,9 @@ from pydantic import (
     model_validator,
 )
 
+from bayesdist.app.campaign.config import CampaignBlock, ReleaseBlock, TablesBlock
 from bayesdist.app.config_errors import as_config_error
+from bayesdist.app.section import Section
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
@@ -28,12 +28,6 @@ __all__ = ["Config", "load_config", "load_requirements", "load_text", "parse_con
 Pair = tuple[PositiveFloat, PositiveFloat]
 Unit = Literal["pix", "arcsec", "mas", "deg"]
 Probability = Annotated[float, Field(gt=0, lt=1)]
-
-
-class Section(BaseModel):
-    """A table of the file; keys that it does not know are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Data(Section):
@@ -71,7 +65,7 @@ class Tdd(Section):
 
     epoch0: float | list[float]
     terms: list[tuple[Literal["u", "v"], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]]
-    breaks: list[float] = []
+    breaks: list[float] = Field(default_factory=list)
 
 
 class ModelBlock(Section):
@@ -165,6 +159,7 @@ class RequirementBlock(Section):
     unit: Unit = "pix"
     probability: Probability = 0.95
     epoch: float | None = None
+    chip: int | None = None
 
 
 class PriorBlock(Section):
@@ -202,29 +197,51 @@ class Products(Section):
 
     sip: Sip | None = None
     idctab: Idctab | None = None
+    release: ReleaseBlock | None = None
 
 
 class Config(Section):
     """The whole file."""
 
-    data: Data
+    data: Data | None = None
+    campaign: CampaignBlock | None = None
+    tables: TablesBlock = TablesBlock()
     model: ModelBlock
     detector: Detector = Detector()
-    chip: list[ChipBlock] = []
+    chip: list[ChipBlock] = Field(default_factory=list)
     fit: Fit = Fit()
     outliers: Outliers = Outliers()
     sampler: Sampler = Sampler()
     compute: ComputeBlock = ComputeBlock()
     assess: Assess = Assess()
-    budget: list[BudgetBlock] = []
-    requirement: list[RequirementBlock] = []
-    prior: list[PriorBlock] = []
+    budget: list[BudgetBlock] = Field(default_factory=list)
+    requirement: list[RequirementBlock] = Field(default_factory=list)
+    prior: list[PriorBlock] = Field(default_factory=list)
     products: Products = Products()
 
     @model_validator(mode="after")
+    def _data_or_campaign(self) -> Config:
+        if (self.data is None) == (self.campaign is None):
+            raise ValueError(
+                "a run begins with [data], matched stars, or with [campaign], star lists; give one"
+            )
+        if self.campaign is None and self.products.release is not None:
+            raise ValueError("products.release is of a [campaign]; ask for sip or idctab")
+        if self.campaign is not None and self.model.frames != "none":
+            raise ValueError("a [campaign] has frames of its own; leave model.frames out")
+        if self.campaign is not None and len(self.chip) == 0:
+            raise ValueError("a [campaign] has no [[chip]] blocks; give them, one as the reference")
+        return self
+
+    @model_validator(mode="after")
     def _chips_or_detector(self) -> Config:
-        if len(self.chip) > 1:
-            raise ValueError("a run takes one chip for now: give a single [[chip]] block")
+        if sum(c.reference for c in self.chip) > 1:
+            raise ValueError("reference = true stands in several [[chip]] blocks; keep it in one")
+        for key in ("number", "name"):
+            values = [getattr(c, key) for c in self.chip]
+            twice = next((v for v in values if values.count(v) > 1), None)
+            if twice is not None:
+                raise ValueError(f"two [[chip]] blocks have the {key} {twice!r}; give each its own")
         if self.chip and (self.detector.size or self.model.reference_pixel):
             raise ValueError(
                 "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "

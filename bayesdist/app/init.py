@@ -29,15 +29,10 @@ matches = {matches}
 {unit_line}sigma = {sigma}
 pixel_origin = 1                # of x, y: 1 as in FITS, or 0
 
-[detector]
-name = "{name}"
-size = [{nx}, {ny}]             # columns, rows; {size_note}
-# scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
-
+{detector}
 [model]
 order = {order}                       # 1 to 9
-# reference_pixel = [{cx}, {cy}]  # zero point of the polynomial; the centre by default
-# of each exposure: none | shift | shift_rotation | shift_rotation_scale | affine
+{reference}# of each exposure: none | shift | shift_rotation | shift_rotation_scale | affine
 frames = "{frames}"
 # [model.tdd]                   # terms that drift with time: axis, power of x, power of y
 # epoch0 = 2004.5
@@ -83,6 +78,25 @@ sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
 # idctab = {{instrument = "ACS", detector = "WFC"}}
 """
 
+_CENTRE = """\
+# reference_pixel = [{cx}, {cy}]  # zero point of the polynomial; the centre by default
+"""
+
+_DETECTOR = """\
+[detector]
+name = "{name}"
+size = [{nx}, {ny}]             # columns, rows; guessed from x up to {x:.1f}, y up to {y:.1f}
+# scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
+"""
+
+_CHIP = """\
+[[chip]]
+number = {number}
+name = "chip {number}"
+size = [{nx}, {ny}]             # columns, rows; guessed from x up to {x:.1f}, y up to {y:.1f}
+reference_pixel = [{cx}, {cy}]  # zero point of the polynomial
+"""
+
 
 def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Matches:
     """Write a commented configuration for a file of matches.
@@ -109,23 +123,22 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
     if path.exists() and not force:
         raise InputError("this file exists", where=str(path), do="replace it by --force")
     table, unit_line, sigma = _read(matches)
-    x, y = _reach(table)
-    nx, ny = _guess_size(x), _guess_size(y)
+    chips = {n: _size(*reach) for n, reach in _reach(table).items()}
+    several = len(chips) > 1
+    first = next(iter(chips.values()))
+    name = Path(matches).stem.replace('"', "")
+    blocks = [_CHIP.format(number=n, **size) for n, size in chips.items()]
     relative = os.path.relpath(Path(matches), path.resolve().parent)
     n = len(table)
     text = _TEMPLATE.format(
         matches=_toml(relative),
         unit_line=unit_line,
         sigma=sigma,
-        name=Path(matches).stem.replace('"', ""),
-        nx=nx,
-        ny=ny,
-        size_note=f"guessed from x up to {x:.1f}, y up to {y:.1f}",
+        detector="\n".join(blocks) if several else _DETECTOR.format(name=name, **first),
+        reference="" if several else _CENTRE.format(**first),
         order=4 if n >= 300 else 3 if n >= 100 else 2,
-        cx=(nx + 1) / 2,
-        cy=(ny + 1) / 2,
         frames="shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
-        grid_y=33 if ny == nx else max(3, round(32 * ny / nx) + 1),
+        grid_y=max(3, round(32 * first["ny"] / first["nx"]) + 1),
         unit=table.unit,
     )
     parse_config(text, str(path))
@@ -158,13 +171,26 @@ def _read(matches: str | Path) -> tuple[Matches, str, str]:
     return table, line, guess
 
 
-def _reach(matches: Matches) -> tuple[float, float]:
-    """Largest x and y."""
-    if isinstance(matches, MatchTable):
-        return float(matches.x.max()), float(matches.y.max())
-    corners = [(t.x.max(), t.y.max()) for t in (piece.read() for piece in matches.pieces())]
-    x, y = np.max(corners, axis=0)
-    return float(x), float(y)
+def _reach(matches: Matches) -> dict[int, tuple[float, float]]:
+    """Largest x and y on each chip, by its number."""
+    tables = [matches] if isinstance(matches, MatchTable) else (p.read() for p in matches.pieces())
+    out: dict[int, tuple[float, float]] = {}
+    for table in tables:
+        for code, number in enumerate(table.chip_numbers):
+            rows = table.chip == code
+            if rows.any():
+                x, y = out.get(number, (0.0, 0.0))
+                out[number] = (
+                    max(x, float(table.x[rows].max())),
+                    max(y, float(table.y[rows].max())),
+                )
+    return dict(sorted(out.items()))
+
+
+def _size(x: float, y: float) -> dict[str, float]:
+    """What a chip's size is, as far as its stars say."""
+    nx, ny = _guess_size(x), _guess_size(y)
+    return {"nx": nx, "ny": ny, "x": x, "y": y, "cx": (nx + 1) / 2, "cy": (ny + 1) / 2}
 
 
 def _guess_size(largest: float) -> int:

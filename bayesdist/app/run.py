@@ -6,12 +6,14 @@ import logging
 from contextlib import closing
 from pathlib import Path
 
+from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.stages import CAMPAIGN_STAGES, rehearse_campaign
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import log_file, progress_bar
 from bayesdist.app.session import STAGES, Session
 from bayesdist.app.stages import NEEDS, rehearse, require, run_stage
-from bayesdist.errors import NotConvergedError
+from bayesdist.errors import InputError, NotConvergedError
 
 __all__ = ["continue_stage", "run"]
 
@@ -67,11 +69,13 @@ def run(
         seed=seed,
         command=command,
     )
-    with closing(Session(directory)) as session:
+    with closing(_session_of(directory)) as session:
         _begin(session)
         with log_file(directory / "bayesdist.log"):
             redo = False
             for stage in STAGES:
+                if stage == "match" and settings.campaign is None:
+                    continue
                 if directory.done(stage) and not redo:
                     log.info("%s: done before", stage)
                     continue
@@ -89,8 +93,13 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     BayesdistError
     """
     directory = RunDirectory.open(path)
-    with closing(Session(directory)) as session:
-        require(session, stage, NEEDS[stage])
+    with closing(_session_of(directory)) as session:
+        campaign = session.config.campaign is not None
+        if stage == "match" and not campaign:
+            raise InputError(
+                "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
+            )
+        require(session, stage, ("match",) if campaign and stage == "fit" else NEEDS[stage])
         _begin(session)
         with log_file(directory / "bayesdist.log"):
             _run_stage(session, stage)
@@ -99,19 +108,28 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     return directory
 
 
+def _session_of(directory: RunDirectory) -> Session:
+    campaign = directory.config.campaign is not None
+    return CampaignSession(directory) if campaign else Session(directory)
+
+
 def _begin(session: Session) -> None:
     """Begin a planned run once it is known that it can be carried out."""
     if session.run.begun:
         session.run.follow()
+        return
+    if isinstance(session, CampaignSession):
+        rehearse_campaign(session)
     else:
         rehearse(session)
-        session.run.begin()
+    session.run.begin()
 
 
 def _run_stage(session: Session, stage: str) -> None:
     with progress_bar(stage) as progress:
         session.progress = progress if stage == "sample" else None
-        run_stage(session, stage)
+        campaign = isinstance(session, CampaignSession)
+        run_stage(session, stage, CAMPAIGN_STAGES.get(stage) if campaign else None)
 
 
 def _judge(session: Session, strict: bool) -> None:

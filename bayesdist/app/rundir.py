@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from bayesdist import __version__
+from bayesdist.app.campaign.files import campaign_files
 from bayesdist.app.config import Config, load_config, load_text
-from bayesdist.app.star_files import FOLDER, part_files
+from bayesdist.app.star_files import FOLDER, PAIRS, part_files
 from bayesdist.data import atomic_path, input_files, is_leftover, remove_leftovers, sha256_of
 from bayesdist.errors import InputError
 
@@ -32,7 +33,8 @@ PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 # and nothing else
 OWN_FILES = re.compile(
     r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
-    r"posterior\.nc|(coefficients|budget|margins)\.ecsv|maps\.fits|summary\.json|report\.html"
+    r"posterior\.nc|(coefficients|budget|margins|matching|series|drift)\.ecsv|maps\.fits|"
+    r"(tables|hierarchy|exposure_terms)\.h5|summary\.json|report\.html"
 )
 
 
@@ -262,13 +264,13 @@ class RunDirectory:
             summary = {}
         products = [self / Path(p["path"]).name for p in summary.get("products", [])]
         figures = [self / "figures" / Path(name).name for name in summary.get("figures", [])]
-        return own + products + figures + part_files(self / FOLDER)
+        return own + products + figures + part_files(self / FOLDER) + part_files(self / PAIRS)
 
     def clear(self) -> None:
         """Remove what a run wrote, and nothing else."""
         for path in self._own():
             path.unlink(missing_ok=True)
-        for folder in ("figures", FOLDER):
+        for folder in ("figures", FOLDER, PAIRS):
             remove_leftovers(self / folder)
             try:
                 (self / folder).rmdir()
@@ -392,6 +394,9 @@ class RunDirectory:
 
 
 def _named(config: Config, base: Path) -> Path | list[Path]:
+    if config.campaign is not None:
+        return campaign_files(config.campaign, config.products.release, base)
+    assert config.data is not None
     names = config.data.matches
     return base / names if isinstance(names, str) else [base / name for name in names]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
@@ -25,7 +26,7 @@ from bayesdist.assess import (
     star_sample,
     star_sums,
 )
-from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN
+from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.infer import (
     GaussianPriors,
@@ -44,7 +45,7 @@ from bayesdist.model import DistortionModel
 
 __all__ = ["ERROR_COLUMNS", "STAGES", "Session", "write_table"]
 
-STAGES = ("fit", "sample", "assess", "export", "report")
+STAGES = ("match", "fit", "sample", "assess", "export", "report")
 
 ERROR_COLUMNS = ("mag", "sigma_u", "sigma_v", "n", "scatter_u", "scatter_v")
 
@@ -72,6 +73,7 @@ class Session:
     def raw_matches(self) -> Matches:
         """Matches as read."""
         data = self.config.data
+        assert data is not None
         return load_matches(
             self.run.matches,
             format=data.format,
@@ -85,8 +87,13 @@ class Session:
     @cached_property
     def magnitude_errors(self) -> MagnitudeErrors | None:
         """Errors by magnitude, as the fit left them."""
+        assert self.config.data is not None
+        return self.kept_errors() if self.config.data.sigma == "by_magnitude" else None
+
+    def kept_errors(self) -> MagnitudeErrors | None:
+        """Errors by magnitude that an earlier stage wrote; None where there are none."""
         path = self.run / "magnitude_errors.ecsv"
-        if self.config.data.sigma != "by_magnitude" or not path.exists():
+        if not path.exists():
             return None
         table = Table.read(path)
         return MagnitudeErrors(**{name: np.asarray(table[name]) for name in ERROR_COLUMNS})
@@ -107,7 +114,7 @@ class Session:
         shards = self.__dict__.get("shards")
         if shards is not None:
             shards.close()
-        for name in ("matches", "magnitude_errors", "shards", "sums", "stars", "misfit"):
+        for name in ("matches", "magnitude_errors", "shards", "sums", "stars", "misfits"):
             self.__dict__.pop(name, None)
 
     def close(self) -> None:
@@ -119,6 +126,7 @@ class Session:
     def model(self) -> DistortionModel:
         """The model that the configuration asks for."""
         config = self.config
+        check_chips(config.chips(), self.raw_matches.chip_numbers)
         return build_model(
             self.raw_matches,
             order=config.model.order,
@@ -146,7 +154,7 @@ class Session:
             "radial_weight": fit.radial_weight,
             "priors": self.priors,
         }
-        if self.config.data.sigma == "by_magnitude":
+        if self.config.data is not None and self.config.data.sigma == "by_magnitude":
             options["compute"] = self.config.resources()
             solution, _, errors = fit_by_magnitude(self.raw_matches, self.model, **options)
             return solution, errors
@@ -169,33 +177,44 @@ class Session:
         return None if scale is None else scale / 1000
 
     @cached_property
-    def _partitions(self) -> dict[str, tuple[int, int]]:
-        """Bins of the first chip: of the three tests for structure, and of the diagram."""
-        on_chip = self.shards.survey.chips[0].n / len(self.shards)
-        n = round(self.fit.n_used * on_chip)
-        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MOST_BINS))
-        return partitions_for(n) | {"shown": (side, side)}
+    def _partitions(self) -> dict[int, dict[str, tuple[int, int]]]:
+        """Bins of each chip, by its number: of the tests for structure, and of the diagram."""
+        out = {}
+        for chip, found in zip(self.fit.model.chips, self.shards.survey.chips, strict=True):
+            n = round(self.fit.n_used * found.n / len(self.shards))
+            side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MOST_BINS))
+            out[chip.number] = partitions_for(n) | {"shown": (side, side)}
+        return out
 
     @cached_property
     def sums(self) -> StarSums:
         """Residuals of the least-squares fit, summed over all stars."""
-        partitions = tuple(dict.fromkeys(self._partitions.values()))
+        partitions = {
+            chip: tuple(dict.fromkeys(bins.values())) for chip, bins in self._partitions.items()
+        }
         return self.shards.sum(star_sums, self.fit.mean, self.fit.clip, partitions)
 
     @property
-    def shown_sums(self) -> BinnedSums:
-        """Those of them that the diagram of mean residuals shows."""
-        return self.sums.binned[self._partitions["shown"]]
+    def shown_sums(self) -> tuple[BinnedSums, ...]:
+        """Those of them that the diagrams of mean residuals show, one for each chip."""
+        return tuple(self.sums.binned[c, b["shown"]] for c, b in self._partitions.items())
 
     @cached_property
+    def misfits(self) -> tuple[Misfit, ...]:
+        """Structure that the least-squares fit leaves in the residuals of each chip."""
+        fit, out = self.fit, []
+        for chip, bins in zip(fit.model.chips, self._partitions.values(), strict=True):
+            sums = {
+                name: self.sums.binned[chip.number, bins[name]] for name in bins if name != "shown"
+            }
+            found = misfit_of(sums, n_params=2 * fit.model.n_terms, unit=fit.unit)
+            out.append(replace(found, chip=chip) if len(fit.model.chips) > 1 else found)
+        return tuple(out)
+
+    @property
     def misfit(self) -> Misfit:
-        """Structure that the least-squares fit leaves in the residuals of the first chip."""
-        fit, bins = self.fit, self._partitions
-        return misfit_of(
-            {name: self.sums.binned[bins[name]] for name in bins if name != "shown"},
-            n_params=2 * fit.model.n_terms,
-            unit=fit.unit,
-        )
+        """The worst of them, its probability corrected for the number of chips."""
+        return worst_misfit(self.misfits)
 
     @cached_property
     def stars(self) -> StarSample:
@@ -205,7 +224,7 @@ class Session:
 
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""
-        return np.random.default_rng([self.config.sampler.seed, STAGES.index(stage)])
+        return np.random.default_rng([self.config.sampler.seed, STAGES.index(stage) - 1])
 
     @property
     def epoch(self) -> float | None:

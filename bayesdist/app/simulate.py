@@ -1,17 +1,89 @@
-"""`bayesdist simulate acs`: the 47 Tuc campaign as files."""
+"""`bayesdist simulate acs`: the 47 Tuc campaign as files, and how to calibrate it."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.app.screen import progress_bar, table_text
+from bayesdist.data import atomic_path
 from bayesdist.errors import InputError
-from bayesdist.simulate.acs import AcsCampaign, simulate_acs, write_acs
+from bayesdist.model import DistortionModel
+from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
+from bayesdist.simulate.acs import AcsCampaign, acs_solution, simulate_acs, write_acs
 
 __all__ = ["simulate_campaign"]
+
+Float = NDArray[np.float64]
+
+START = "start_idc.fits"
+SCALE_ARCSEC = 0.05
+V2V3 = (257.4, 302.6)  # arcsec: where the reference chip's zero point lies, about
+
+CONFIG = """\
+# Calibrates one filter of a simulated campaign: bayesdist run THIS -o RUN
+[campaign]
+catalog = "catalog.parquet"
+exposures = "exposures.ecsv"
+lists = "lists"
+start = "{start}"            # a known distortion, for the matching
+filter = "{filter}"
+mag = [-14.0, -10.0]         # instrumental; brighter ones are saturated
+q_max = 0.1
+
+[tables]
+method = "field"             # or "binned", as ACS ISR 2015-06; or "none"
+
+[detector]
+scale_mas = 50.0
+
+[[chip]]
+number = 2
+name = "WFC2"
+size = [4096.0, 2048.0]
+reference_pixel = [2048.0, 1024.0]
+reference = true             # its axes and zero point are the gauge
+
+[[chip]]
+number = 1
+name = "WFC1"
+size = [4096.0, 2048.0]
+reference_pixel = [2048.0, 1024.0]
+
+[model]
+order = 5
+
+[model.tdd]                  # before and after Servicing Mission 4
+epoch0 = [2004.5, 2012.5]
+breaks = [2009.4]
+terms = [["u", 1, 0], ["v", 1, 0], ["v", 0, 1]]
+
+[assess]
+epoch = 2006.5
+grid = [33, 17]
+
+[[requirement]]
+name = "alignment"
+statistic = "p95"
+limit = 0.05
+unit = "pix"
+
+[products.release]
+name = "acs_wfc"
+reference = "{start}"        # how V2 and V3 lie
+[[products.release.period]]
+name = "pre"
+years = [2002.2, 2009.4]
+segment = 0
+[[products.release.period]]
+name = "post"
+years = [2009.4, 2015.0]
+segment = 1
+"""
 
 
 def simulate_campaign(options: argparse.Namespace) -> str:
@@ -51,7 +123,46 @@ def simulate_campaign(options: argparse.Namespace) -> str:
             progress=progress,
         )
     write_acs(campaign, folder, force=options.force)
-    return f"{table_text(_rows(campaign))}\n\n{folder / 'README.txt'} says what the files hold"
+    write_idctab(_stale(), folder / START)
+    for name in campaign.log.filters:
+        path = folder / f"campaign_{name.lower()}.toml"
+        with atomic_path(path) as temporary:
+            temporary.write_text(CONFIG.format(filter=name, start=START), encoding="utf-8")
+    first = campaign.log.filters[0].lower()
+    return (
+        f"{table_text(_rows(campaign))}\n\n{folder / 'README.txt'} says what the files hold\n"
+        f"calibrate it:  bayesdist run {folder / f'campaign_{first}.toml'} -o RUN"
+    )
+
+
+def _stale() -> IdcTab:
+    """What an observer has before the calibration: the distortion of 2004.5, without drift."""
+    model, theta = acs_solution()
+    known = replace(model, time=None)
+    return idctab_from_solution(
+        _Exact(known, theta[: known.n_params]),
+        instrument="ACS",
+        detector="WFC",
+        scale_arcsec=SCALE_ARCSEC,
+        v2ref=V2V3[0],
+        v3ref=V2V3[1],
+        description="Simulated: the distortion of 2004.5, without drift and tables",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Exact:
+    """Given parameters as a solution without errors."""
+
+    model: DistortionModel
+    mean: Float
+
+    @property
+    def cov(self) -> Float:
+        return np.zeros((len(self.mean), len(self.mean)))
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        return np.tile(self.mean, (n, 1))
 
 
 def _rows(campaign: AcsCampaign) -> list[dict[str, object]]:

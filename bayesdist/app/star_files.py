@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from bayesdist.data import MatchTable, remove_leftovers
 from bayesdist.data.parquet_write import write_columns
 from bayesdist.errors import InputError
@@ -11,9 +13,10 @@ from bayesdist.infer import LinearFit, Matches, Posterior
 from bayesdist.infer.membership import memberships_of
 from bayesdist.infer.stars import in_table_order, prepare
 
-__all__ = ["FOLDER", "part_files", "write_star_files"]
+__all__ = ["FOLDER", "PAIRS", "part_files", "write_star_files"]
 
 FOLDER = "stars"
+PAIRS = "pairs"  # of a campaign, as they were matched
 
 
 def part_files(folder: Path) -> list[Path]:
@@ -62,6 +65,7 @@ def _write_part(table: MatchTable, fit: LinearFit, posterior: Posterior, path: P
         "row": table.row,
         "x": table.x,
         "y": table.y,
+        "chip": np.asarray(table.chip_numbers)[table.chip],
         "residual_u": u,
         "residual_v": v,
         "used": in_table_order(fit.clip.keeps_of(stars), order),

@@ -1,11 +1,14 @@
 """What a solution is worth: uncertainty maps, error budget, margins against requirements."""
 
+from bayesdist.assess.alignment import Alignment, alignment_residuals
 from bayesdist.assess.area import AreaMap, area_map
-from bayesdist.assess.budget import BudgetTerm, ErrorBudget, error_budget
+from bayesdist.assess.budget import BudgetTerm, ErrorBudget, error_budget, error_budgets
+from bayesdist.assess.detector_budget import DetectorBudget, detector_budget
 from bayesdist.assess.fields import ErrorFields, error_fields
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
-from bayesdist.assess.misfit import Misfit, misfit_of, partitions_for
+from bayesdist.assess.misfit import Misfit, misfit_of, partitions_for, worst_misfit
+from bayesdist.assess.mosaic import chip_places
 from bayesdist.assess.requirements import Margin, Requirement, check_requirements
 from bayesdist.assess.residuals import (
     BinnedResiduals,
@@ -28,10 +31,12 @@ __all__ = [
     "STATISTICS",
     "TERM_KINDS",
     "UNITS",
+    "Alignment",
     "AreaMap",
     "BinnedResiduals",
     "BinnedSums",
     "BudgetTerm",
+    "DetectorBudget",
     "ErrorBudget",
     "ErrorFields",
     "ExposureSums",
@@ -44,13 +49,17 @@ __all__ = [
     "UncertaintyMap",
     "UserTerm",
     "VectorMap",
+    "alignment_residuals",
     "area_map",
     "binned_residuals",
     "binned_sums",
     "check_requirements",
+    "chip_places",
     "convert",
+    "detector_budget",
     "distortion_vectors",
     "error_budget",
+    "error_budgets",
     "error_fields",
     "field_statistic",
     "flagged_by_exposure",
@@ -62,4 +71,5 @@ __all__ = [
     "star_sample",
     "star_sums",
     "uncertainty_map",
+    "worst_misfit",
 ]

@@ -8,13 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.fields import MODEL, error_fields
+from bayesdist.assess.fields import MODEL, ErrorFields, draw_solution, error_fields_of
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms import UserTerm
 from bayesdist.assess.units import pixel_scale_of
 
-__all__ = ["GIVEN", "MEASURED", "BudgetTerm", "ErrorBudget", "error_budget"]
+__all__ = [
+    "GIVEN",
+    "MEASURED",
+    "BudgetTerm",
+    "ErrorBudget",
+    "budget_row",
+    "error_budget",
+    "error_budgets",
+]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -101,11 +109,12 @@ class ErrorBudget:
         list of dict
             name, kind, u, v, radial (root mean squares over the grid), source.
         """
-        rows = [_row(t.name, t.kind, t.u, t.v, t.source) for t in self.terms]
-        return [*rows, _row("total", "total", self.total_u, self.total_v, "")]
+        rows = [budget_row(t.name, t.kind, t.u, t.v, t.source) for t in self.terms]
+        return [*rows, budget_row("total", "total", self.total_u, self.total_v, "")]
 
 
-def _row(name: str, kind: str, u: Float, v: Float, source: str) -> dict[str, str | float]:
+def budget_row(name: str, kind: str, u: Float, v: Float, source: str) -> dict[str, str | float]:
+    """One row of a budget: root mean squares of the standard deviations u and v, any shape."""
     mean_u, mean_v = float(np.mean(u**2)), float(np.mean(v**2))
     return {
         "name": name,
@@ -159,14 +168,73 @@ def error_budget(
         For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
         needs a pixel scale that is not known.
     """
+    number = place_of(solution.model, epoch=epoch, chip=chip).chip.number
+    (budget,) = error_budgets(
+        solution,
+        (number,),
+        terms=terms,
+        grid=grid,
+        epoch=epoch,
+        n_draws=n_draws,
+        rng=rng,
+        pixel_scale=pixel_scale,
+    )
+    return budget
+
+
+def error_budgets(
+    solution: Solution,
+    chips: Sequence[int],
+    *,
+    terms: Sequence[UserTerm] = (),
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    n_draws: int = 4000,
+    rng: np.random.Generator,
+    pixel_scale: float | None = None,
+) -> tuple[ErrorBudget, ...]:
+    """Error budgets of several chips from one set of draws: the chips share parameters.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    chips : sequence of int
+        Chip numbers.
+    terms, grid, epoch, n_draws, rng, pixel_scale
+        As in `error_budget`.
+
+    Returns
+    -------
+    tuple of ErrorBudget
+
+    Raises
+    ------
+    InputError
+        As `error_budget`.
+    """
     unit = solution.model.unit
     if pixel_scale is None:
-        pixel_scale = pixel_scale_of(solution, chip)
+        pixel_scale = pixel_scale_of(solution, chips[0])
     sigmas = [t.sigma(unit, pixel_scale) for t in terms]  # refuse bad units before the work
-    place = place_of(solution.model, epoch=epoch, chip=chip)
-    x, y = grid_pixels(place.chip.size, grid)
+    grids = [
+        grid_pixels(place_of(solution.model, epoch=epoch, chip=c).chip.size, grid) for c in chips
+    ]
+    theta, exposures = draw_solution(solution, n_draws, rng)
+    out = []
+    for c, (x, y) in zip(chips, grids, strict=True):
+        fields = error_fields_of(solution, theta, exposures, *mesh(x, y), epoch=epoch, chip=c)
+        out.append(_budget(fields, x, y, terms, sigmas))
+    return tuple(out)
+
+
+def _budget(
+    fields: ErrorFields,
+    x: Float,
+    y: Float,
+    terms: Sequence[UserTerm],
+    sigmas: Sequence[tuple[float, float]],
+) -> ErrorBudget:
     shape = (y.size, x.size)
-    fields = error_fields(solution, *mesh(x, y), epoch=epoch, chip=chip, n_draws=n_draws, rng=rng)
     measured = {part: tuple(s.reshape(shape) for s in fields.sigma(part)) for part in fields.parts}
     model_u, model_v = measured.pop(MODEL)
     entries = [BudgetTerm(n, "systematic", u, v, MEASURED) for n, (u, v) in measured.items()]
@@ -176,7 +244,7 @@ def error_budget(
     return ErrorBudget(
         x=x,
         y=y,
-        unit=unit,
+        unit=fields.unit,
         chip=fields.chip,
         epoch=fields.epoch,
         terms=tuple(entries),

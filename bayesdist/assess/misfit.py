@@ -6,19 +6,20 @@ nothing of it, and no requirement can be called met.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from bayesdist.assess.residuals import BinnedResiduals, BinnedSums
+from bayesdist.model import Chip
 
-__all__ = ["MOST_BINS", "STARS_PER_BIN", "Misfit", "misfit_of", "partitions_for"]
+__all__ = ["MOST_BINS", "STARS_PER_BIN", "Misfit", "misfit_of", "partitions_for", "worst_misfit"]
 
 STARS_PER_BIN = 25
 MOST_BINS = 32  # along each side
-SIGNIFICANT = 1e-4  # probability of as much structure by chance, over all three tests together
+SIGNIFICANT = 1e-4  # probability of as much structure by chance, over all tests together
 
 
 @dataclass(frozen=True)
@@ -29,18 +30,22 @@ class Misfit:
     ----------
     p_value : float
         Probability of as much structure by chance, of the most telling of three partitions: cells,
-        columns, rows; multiplied by three.
+        columns, rows; multiplied by three, and by the number of chips where the worst of several is
+        named.
     partition : str
         Which one that is.
     structure : float
         Rms over that partition of the mean residual, its noise subtracted (both axes together).
     unit : str
+    chip : Chip or None
+        The chip, where the detector has several.
     """
 
     p_value: float
     partition: str
     structure: float
     unit: str
+    chip: Chip | None = None
 
     @property
     def significant(self) -> bool:
@@ -50,9 +55,10 @@ class Misfit:
     @property
     def sentence(self) -> str:
         """What it means, as a clause."""
+        part = "the detector" if self.chip is None else f"chip {self.chip.name}"
         return (
             f"the residuals hold structure that the model does not describe ({self.structure:.2g} "
-            f"{self.unit} rms in {self.partition} of the detector, p = {self.p_value:.1g}), so "
+            f"{self.unit} rms in {self.partition} of {part}, p = {self.p_value:.1g}), so "
             "that errors are larger than the posterior says"
         )
 
@@ -94,6 +100,23 @@ def misfit_of(sums: Mapping[str, BinnedSums], *, n_params: int, unit: str) -> Mi
     found = [(*_test(one.residuals(), n_params), name) for name, one in sums.items()]
     p, structure, name = min(found)
     return Misfit(min(1.0, len(found) * p), name, structure, unit)
+
+
+def worst_misfit(found: Sequence[Misfit]) -> Misfit:
+    """The most telling of several chips, its probability corrected for their number.
+
+    Parameters
+    ----------
+    found : sequence of Misfit
+        One for each chip.
+
+    Returns
+    -------
+    Misfit
+    """
+    # many p-values are zero in double precision: then the larger structure is the worse
+    worst = min(found, key=lambda m: (m.p_value, -m.structure))
+    return replace(worst, p_value=min(1.0, len(found) * worst.p_value))
 
 
 def _test(cells: BinnedResiduals, n_params: int) -> tuple[float, float]:

@@ -18,10 +18,12 @@ from bayesdist.assess.terms import UserTerm, combined_sigma
 from bayesdist.assess.units import UNITS, convert, pixel_scale_of
 from bayesdist.assess.verdict import counting_error, effective_draws, verdict_of
 from bayesdist.errors import InputError
+from bayesdist.model import Chip
 
 __all__ = ["Margin", "Requirement", "check_requirements"]
 
 Float = NDArray[np.float64]
+Case = tuple[float | None, tuple[Chip, ...]]
 
 # Grid points times draws whose errors are held at once: two axes of them are 8 MB.
 BLOCK = 500_000
@@ -29,7 +31,7 @@ BLOCK = 500_000
 
 @dataclass(frozen=True)
 class Requirement:
-    """A limit on a statistic of the position error over the detector.
+    """A limit on a statistic of the position error over the detector, which is all of its chips.
 
     Parameters
     ----------
@@ -44,6 +46,8 @@ class Requirement:
         With which the statistic must be at or under the limit, between 0 and 1.
     epoch : float, optional
         Decimal years.
+    chip : int, optional
+        Number of the one chip that is judged; all chips together by default.
 
     Raises
     ------
@@ -57,6 +61,7 @@ class Requirement:
     unit: str = "pix"
     probability: float = 0.95
     epoch: float | None = None
+    chip: int | None = None
 
     def __post_init__(self) -> None:
         require_known(self.statistic, STATISTICS, "statistic", where=self.where)
@@ -146,6 +151,9 @@ def check_requirements(
     Gaussian error at every grid point.  The statistic of each field gives a distribution, and the
     fraction of draws at or under the limit is compared with the probability asked for.
 
+    The field is that of all chips: the same grid on each of them, so that each has the same weight.
+    A draw of the solution and an offset are common to all chips.
+
     Parameters
     ----------
     solution : LinearFit or Posterior
@@ -156,7 +164,7 @@ def check_requirements(
     epoch : float, optional
         For requirements that name none; decimal years.
     chip : int, optional
-        Chip number; the first chip by default.
+        Chip number, for requirements that name none; all chips by default.
     n_draws : int
     rng : numpy.random.Generator
     pixel_scale : float, optional
@@ -195,39 +203,72 @@ def check_requirements(
     if not requirements:
         return ()
 
-    chip = place_of(solution.model, epoch=epochs[0], chip=chip).chip.number
-    points = mesh(*grid_pixels(solution.model.chips[solution.model.chip_code(chip)].size, grid))
+    # a field of the error is that of some chips at an epoch
+    cases = [
+        (t, _chips_of(r, solution, chip, t)) for r, t in zip(requirements, epochs, strict=True)
+    ]
     theta, exposures = draw_solution(solution, n_draws, rng)
     offsets = rng.normal(size=(len(theta), 2)) * systematic
-    statistics: dict[tuple[float | None, str], Float] = {}
-    for t in dict.fromkeys(epochs):
-        names = {r.statistic for r, e in zip(requirements, epochs, strict=True) if e == t}
-        fields = error_fields_of(solution, theta, exposures, *points, epoch=t, chip=chip)
+    statistics: dict[tuple[Case, str], Float] = {}
+    for case in dict.fromkeys(cases):
+        names = {r.statistic for r, c in zip(requirements, cases, strict=True) if c == case}
+        epoch, chips = case
+        fields = [
+            error_fields_of(
+                solution,
+                theta,
+                exposures,
+                *mesh(*grid_pixels(one.size, grid)),
+                epoch=epoch,
+                chip=one.number,
+            )
+            for one in chips
+        ]
         for name, values in _statistics(fields, sorted(names), offsets, random, rng).items():
-            statistics[t, name] = values
+            statistics[case, name] = values
 
     doubt = _doubt(solution, converged) or doubt
     n_effective = effective_draws(solution, len(theta))
     margins = []
-    for r, t in zip(requirements, epochs, strict=True):
-        draws = statistics[t, r.statistic] * convert(1.0, unit, r.unit, pixel_scale)
-        margins.append(_margin(r, t, draws, n_effective, doubt))
+    for r, case in zip(requirements, cases, strict=True):
+        draws = statistics[case, r.statistic] * convert(1.0, unit, r.unit, pixel_scale)
+        margins.append(_margin(r, case[0], draws, n_effective, doubt))
     return tuple(margins)
 
 
+def _chips_of(
+    requirement: Requirement, solution: Solution, chip: int | None, epoch: float | None
+) -> tuple[Chip, ...]:
+    """The chips whose field is judged."""
+    model = solution.model
+    number = chip if requirement.chip is None else requirement.chip
+    if requirement.chip is not None and number not in [c.number for c in model.chips]:
+        raise InputError(
+            f"there is no chip {number}",
+            where=requirement.where,
+            do=f"name one of {', '.join(str(c.number) for c in model.chips)}, or leave chip out "
+            "for all of them",
+        )
+    if number is None:
+        return model.chips
+    return (place_of(model, epoch=epoch, chip=number).chip,)
+
+
 def _statistics(
-    fields: ErrorFields,
+    fields: Sequence[ErrorFields],
     names: Sequence[str],
     offsets: Float,
     random: tuple[float, float],
     rng: np.random.Generator,
 ) -> dict[str, Float]:
-    """Each statistic of each draw's field, by blocks of draws."""
-    out = {name: np.empty(fields.n_draws) for name in names}
-    step = max(1, BLOCK // fields.x.size)
-    for start in range(0, fields.n_draws, step):
+    """Each statistic of each draw's field over all chips, by blocks of draws."""
+    n_draws = fields[0].n_draws
+    out = {name: np.empty(n_draws) for name in names}
+    step = max(1, BLOCK // sum(f.x.size for f in fields))
+    for start in range(0, n_draws, step):
         rows = slice(start, start + step)
-        error = fields.field(MODEL, rows) + offsets[rows, None, :]
+        error = np.concatenate([f.field(MODEL, rows) for f in fields], axis=1)
+        error += offsets[rows, None, :]
         if any(random):
             error += rng.normal(size=error.shape) * random
         for name in names:

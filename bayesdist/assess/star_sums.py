@@ -61,20 +61,22 @@ class StarSums:
 
     Parameters
     ----------
-    binned : mapping of (int, int) to BinnedSums
-        Residuals of the stars used on the first chip, by the numbers of bins on x and y.
+    binned : mapping of (int, (int, int)) to BinnedSums
+        Residuals of the stars used, by the chip's number and the numbers of bins on x and y.
     exposures : ExposureSums
     """
 
-    binned: Mapping[Bins, BinnedSums]
+    binned: Mapping[tuple[int, Bins], BinnedSums]
     exposures: ExposureSums
 
     def __add__(self, other: StarSums) -> StarSums:
-        binned = {bins: sums + other.binned[bins] for bins, sums in self.binned.items()}
+        binned = {key: sums + other.binned[key] for key, sums in self.binned.items()}
         return StarSums(binned, self.exposures + other.exposures)
 
 
-def star_sums(stars: Stars, theta: Float, clip: Clip, partitions: tuple[Bins, ...]) -> StarSums:
+def star_sums(
+    stars: Stars, theta: Float, clip: Clip, partitions: Mapping[int, tuple[Bins, ...]]
+) -> StarSums:
     """Sums over some stars: a task for `Shards.sum`.
 
     Parameters
@@ -84,8 +86,8 @@ def star_sums(stars: Stars, theta: Float, clip: Clip, partitions: tuple[Bins, ..
         Where the residuals are taken.
     clip : Clip
         Says which stars are used.
-    partitions : tuple of (int, int)
-        Bins on x and on y of the first chip.
+    partitions : mapping of int to tuple of (int, int)
+        Bins on x and on y, by the number of the chip.
 
     Returns
     -------
@@ -94,12 +96,16 @@ def star_sums(stars: Stars, theta: Float, clip: Clip, partitions: tuple[Bins, ..
     used = clip.keeps_of(stars)
     residual = stars.residuals(theta)
     exposures = _exposure_sums(stars, used, residual)
-    good = used & (_of_groups(stars, stars.groups.chip) == 0)
+    code = _of_groups(stars, stars.groups.chip)
     arrays = (*stars.pixels(), *residual.T)
-    if not good.all():
-        arrays = tuple(a[good] for a in arrays)
-    size = stars.model.chips[0].size
-    binned = {bins: binned_sums(*arrays, bins=bins, size=size) for bins in partitions}
+    binned = {}
+    for number, several in partitions.items():
+        k = stars.model.chip_code(number)
+        good = used & (code == k)
+        here = arrays if good.all() else tuple(a[good] for a in arrays)
+        size = stars.model.chips[k].size
+        for bins in several:
+            binned[number, bins] = binned_sums(*here, bins=bins, size=size)
     return StarSums(binned, exposures)
 
 

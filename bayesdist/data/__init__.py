@@ -27,7 +27,7 @@ from bayesdist.data.motions import (
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
 from bayesdist.data.patterns import find_similarity, pattern_index
 from bayesdist.data.pieces import PIECE, Piece
-from bayesdist.data.preparing import neutralise_aberration, with_centroid_errors
+from bayesdist.data.preparing import centroid_errors, neutralise_aberration, with_centroid_errors
 from bayesdist.data.readers import FORMATS, input_files, read_matches
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists, star_list_of_hst1pass
 from bayesdist.data.tangent import mean_direction, tangent_plane
@@ -57,6 +57,7 @@ __all__ = [
     "StarList",
     "atomic_path",
     "catalog_from_table",
+    "centroid_errors",
     "derive_motions",
     "exposure_of_headers",
     "find_similarity",

@@ -12,9 +12,11 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 
-__all__ = ["neutralise_aberration", "with_centroid_errors"]
+__all__ = ["centroid_errors", "neutralise_aberration", "with_centroid_errors"]
 
 Float = NDArray[np.float64]
+
+LEAST_SHARE = 0.25  # of the total scatter that is the centroid's, whatever the catalogue quotes
 
 
 def with_centroid_errors(table: MatchTable, errors: MagnitudeErrors) -> MatchTable:
@@ -46,6 +48,46 @@ def with_centroid_errors(table: MatchTable, errors: MagnitudeErrors) -> MatchTab
     if table.sigma_u is not None and table.sigma_v is not None:
         sigma_u, sigma_v = np.hypot(sigma_u, table.sigma_u), np.hypot(sigma_v, table.sigma_v)
     return table.with_sigma(sigma_u, sigma_v)
+
+
+def centroid_errors(table: MatchTable, total: MagnitudeErrors) -> MagnitudeErrors:
+    """What the errors of the catalogue leave of the scatter of residuals.
+
+    Parameters
+    ----------
+    table : MatchTable
+        With magnitudes and the errors of the catalogue.
+    total : MagnitudeErrors
+        Scatter of its residuals.
+
+    Returns
+    -------
+    MagnitudeErrors
+        Total less catalogue (median of each bin's stars) in quadrature, at least a quarter of the
+        total: the catalogue's quoted errors are not that well known.
+
+    Raises
+    ------
+    InputError
+        Without magnitudes or errors.
+    """
+    if table.mag is None or table.sigma_u is None or table.sigma_v is None:
+        raise InputError(
+            "has no magnitudes, or no errors of the catalogue",
+            where=", ".join(table.sources),
+            do="give lists with magnitudes and a catalogue with errors",
+        )
+    which = np.searchsorted((total.mag[1:] + total.mag[:-1]) / 2, table.mag)
+    left = []
+    for sigma, of_catalog in ((total.sigma_u, table.sigma_u), (total.sigma_v, table.sigma_v)):
+        known = np.array(
+            [
+                np.median(of_catalog[which == k]) if (which == k).any() else 0.0
+                for k in range(len(total.mag))
+            ]
+        )
+        left.append(np.sqrt(np.maximum(sigma**2 - known**2, (LEAST_SHARE * sigma) ** 2)))
+    return replace(total, sigma_u=left[0], sigma_v=left[1])
 
 
 def neutralise_aberration(

@@ -1,44 +1,84 @@
 """From matches to knowledge: the linear fit, the outlier mixture, and its posterior."""
 
+from bayesdist.infer.catalogue_shear import CatalogueShear, catalogue_shear
+from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
+from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.labelled.convergence import Convergence, Limits
 from bayesdist.infer.labelled.fit_file import load_fit, save_fit
 from bayesdist.infer.labelled.posterior_file import load_posterior, save_posterior
-from bayesdist.infer.linear import (
-    LinearFit,
-    build_model,
-    fit_by_magnitude,
-    fit_linear,
-    residuals,
-)
+from bayesdist.infer.linear import LinearFit, build_model, fit_by_magnitude, fit_linear, residuals
 from bayesdist.infer.membership import Memberships, memberships, outlier_probability
 from bayesdist.infer.mixture import OutlierMixture
+from bayesdist.infer.nodes import (
+    TableFit,
+    TablePosterior,
+    binned_table,
+    field_table,
+    fit_with_tables,
+)
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.sampling import sample
 from bayesdist.infer.shards import Compute, Matches, Shards, load
+from bayesdist.infer.star_errors import StarCovariance, star_covariance, with_star_errors
+from bayesdist.infer.views import (
+    LinearTerms,
+    ReferenceGauge,
+    View,
+    in_exposure,
+    linear_terms,
+    lines,
+    reference_gauge,
+    segment,
+    without_frames,
+)
 
 __all__ = [
+    "CatalogueShear",
     "Compute",
     "Convergence",
+    "ExposureSolutions",
     "GaussianPriors",
+    "HierarchicalFit",
     "Limits",
     "LinearFit",
+    "LinearTerms",
     "Matches",
     "Memberships",
     "OutlierMixture",
     "Posterior",
+    "ReferenceGauge",
     "SamplerInfo",
     "Shards",
+    "StarCovariance",
+    "TableFit",
+    "TablePosterior",
+    "View",
+    "binned_table",
     "build_model",
+    "catalogue_shear",
+    "field_table",
     "fit_by_magnitude",
+    "fit_exposures",
+    "fit_hierarchical",
     "fit_linear",
+    "fit_with_tables",
+    "held_in_reference",
+    "in_exposure",
+    "linear_terms",
+    "lines",
     "load",
     "load_fit",
     "load_posterior",
     "memberships",
     "outlier_probability",
+    "reference_gauge",
     "residuals",
     "sample",
     "save_fit",
     "save_posterior",
+    "segment",
+    "star_covariance",
+    "with_star_errors",
+    "without_frames",
 ]

@@ -15,7 +15,7 @@ from bayesdist.errors import DegenerateError
 from bayesdist.infer.arrow import Arrow
 from bayesdist.infer.survey import Survey
 from bayesdist.model import DistortionModel, Groups
-from bayesdist.model.frames import frame_names
+from bayesdist.model.frames import DEVIATIONS, frame_names
 
 __all__ = ["NullSpace", "check_coverage", "null_space"]
 
@@ -104,6 +104,12 @@ def require_full_rank(matrix: Arrow, model: DistortionModel, groups: Groups) -> 
 def _reason(direction: tuple[str, ...], model: DistortionModel, groups: Groups) -> tuple[str, str]:
     kinds = {p.name: p for p in model.parameters}
     parts = [kinds[name] for name in direction]
+    deviations = any(p.kind == "frame" and p.name.endswith(DEVIATIONS) for p in parts)
+    if model.gauge == "held" and deviations:
+        return (
+            ": the scale or shear that all exposures have in common is also in the polynomials",
+            "give scale and shear of every exposure Gaussian priors, or choose gauge 'first'",
+        )
     if any(p.kind == "tdd" for p in parts):
         if len(np.unique(groups.epoch)) == 1:
             return (
@@ -127,8 +133,15 @@ def _reason(direction: tuple[str, ...], model: DistortionModel, groups: Groups) 
     )
 
 
-def check_coverage(model: DistortionModel, survey: Survey) -> None:
+def check_coverage(model: DistortionModel, survey: Survey, n_priors: int = 0) -> None:
     """Refuse data that cannot carry the model, with the plain reason.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    survey : Survey
+    n_priors : int
+        Parameters with a prior: each is a number more.
 
     Raises
     ------
@@ -137,7 +150,7 @@ def check_coverage(model: DistortionModel, survey: Survey) -> None:
         one corner of a chip.
     """
     n = survey.n
-    if 2 * n < model.n_params:
+    if 2 * n + n_priors < model.n_params:
         raise DegenerateError(
             f"{n} stars give {2 * n} numbers, fewer than the {model.n_params} parameters",
             where=survey.where,

@@ -7,7 +7,7 @@ corners.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ __all__ = ["Clip", "LinearFit", "build_model", "fit_by_magnitude", "fit_linear",
 Float = NDArray[np.float64]
 
 RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
+DAMPED = 4  # iterations after which errors by magnitude move half their way
 MEDIAN_STARS = 1_000_000  # stars that a median is taken of
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
@@ -276,7 +277,7 @@ def _fitted(
     radial_weight: float,
     priors: GaussianPriors,
 ) -> LinearFit:
-    check_coverage(model, shards.survey)
+    check_coverage(model, shards.survey, priors.n_informative)
     first = shards.sum(least_squares, None, None, np.inf, np.inf, radial_weight)
     theta = _start(first, model, priors)
     _refuse_absorbed_drift(first, theta, model, priors)
@@ -293,7 +294,7 @@ def _fitted(
     second = shards.sum(least_squares, clip.theta, *rule)
     n_used, n_far = int(second.scalars[0]), int(second.scalars[1])
     n_rejected = len(shards) - n_used
-    if n_used * 2 < model.n_params or n_used < 0.05 * len(shards):
+    if n_used * 2 + priors.n_informative < model.n_params or n_used < 0.05 * len(shards):
         raise DegenerateError(
             f"{n_rejected} of {len(shards)} rows are beyond the rejection limits",
             where="fit",
@@ -396,9 +397,15 @@ def fit_by_magnitude(
     fit = fit_linear(matches.with_sigma(1.0, 1.0), model, priors=priors, **options)
     some = matches.sample(MEDIAN_STARS).with_sigma(1.0, 1.0)
     before: Float | None = None
-    for _ in range(max_iterations):
+    for iteration in range(max_iterations):
         assert some.mag is not None
         errors = estimate(some.mag, *residuals(fit, some).T, n_params=model.n_params)
+        if before is not None and iteration >= DAMPED:
+            # stars that go in and out of the fit may make errors swing between two states
+            middle = np.sqrt(before * np.concatenate([errors.sigma_u, errors.sigma_v]))
+            errors = replace(
+                errors, **dict(zip(("sigma_u", "sigma_v"), np.split(middle, 2), strict=True))
+            )
         table = matches.with_errors_by_magnitude(errors)
         fit = fit_linear(table, model, priors=priors, **options)
         now = np.concatenate([errors.sigma_u, errors.sigma_v])
@@ -417,25 +424,50 @@ def _start(first: NormalEquations, model: DistortionModel, priors: GaussianPrior
     groups = first.groups
     theta = np.zeros(model.n_params)
     if model.n_frame:
-        affine = np.array([_affine(w, r) for w, r in zip(first.weight, first.right, strict=True)])
-        o = np.asarray(model.origin)
-        for e in range(1, len(model.exposures)):
-            for g in np.flatnonzero(groups.exposure == e):
-                gauge = np.flatnonzero((groups.exposure == 0) & (groups.chip == groups.chip[g]))
-                if len(gauge) and np.isfinite(affine[g]).all():
-                    A, A0 = affine[g], affine[gauge[0]]
-                    M = A[:, 1:] @ np.linalg.inv(A0[:, 1:])
-                    d = A[:, 0] - o - M @ (A0[:, 0] - o)
-                    theta[model.frame_slice(e)] = nearest_frame(model.frames, M, d)
-                    break
+        _start_frames(first, theta, model)
     held = first.moved(model.effective(theta, groups))
     matrix, right = held.assemble(model, theta)
     prior = priors.matrix(model)
-    n = model.n_global
+    n = model.n_distortion
     theta[:n] = np.linalg.lstsq(
-        matrix.border + prior.border, right[:n] + priors.pull(theta)[:n], rcond=1e-13
+        (matrix.border + prior.border)[:n, :n], (right + priors.pull(theta))[:n], rcond=1e-13
     )[0]
     return theta
+
+
+def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) -> None:
+    """Frames of `theta` from linear maps: of each exposure that shares a chip with a known one."""
+    groups, o = first.groups, np.asarray(model.origin)
+    affine = np.array([_affine(w, r) for w, r in zip(first.weight, first.right, strict=True)])
+    of_chip: dict[int, Float] = {}  # constant and linear coefficients of w, before the frame
+
+    def enter(e: int) -> None:
+        """Learn the chips of an exposure whose frame is known."""
+        M, d = model.frame(theta, e)
+        for g in np.flatnonzero(groups.exposure == e):
+            if int(groups.chip[g]) not in of_chip and np.isfinite(affine[g]).all():
+                back = np.linalg.solve(M, affine[g] - np.column_stack([o + d, np.zeros((2, 2))]))
+                back[:, 0] += o
+                of_chip[int(groups.chip[g])] = back
+
+    enter(0)
+    waiting = list(range(1, len(model.exposures)))
+    while waiting:
+        still = []
+        for e in waiting:
+            for g in np.flatnonzero(groups.exposure == e):
+                w = of_chip.get(int(groups.chip[g]))
+                if w is not None and np.isfinite(affine[g]).all():
+                    M = affine[g][:, 1:] @ np.linalg.inv(w[:, 1:])
+                    d = affine[g][:, 0] - o - M @ (w[:, 0] - o)
+                    theta[model.frame_slice(e)] = nearest_frame(model.frames, M, d)
+                    enter(e)
+                    break
+            else:
+                still.append(e)
+        if len(still) == len(waiting):
+            return
+        waiting = still
 
 
 def _refuse_absorbed_drift(

@@ -1,15 +1,17 @@
 """The distortion as mathematics: bases, frames, time dependence, look-up tables, and the model."""
 
 from bayesdist.model.basis import PolynomialBasis, polynomial_terms
-from bayesdist.model.distortion import Chip, DistortionModel
-from bayesdist.model.frames import FRAME_KINDS
+from bayesdist.model.distortion import GAUGES, Chip, DistortionModel
+from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS
 from bayesdist.model.grouping import Groups, merge_groups
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.model.timedep import AXES, TimeDependence
 
 __all__ = [
     "AXES",
+    "DEVIATIONS",
     "FRAME_KINDS",
+    "GAUGES",
     "Chip",
     "DistortionModel",
     "Groups",

@@ -21,14 +21,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.model.basis import PolynomialBasis
-from bayesdist.model.frames import FRAME_KINDS, frame_matrix, frame_names, frame_tangent
+from bayesdist.model.frames import FRAME_KINDS, RIGID, frame_matrix, frame_names, frame_tangent
 from bayesdist.model.grouping import Groups, group_by
 from bayesdist.model.timedep import AXES, TimeDependence
 
-__all__ = ["Chip", "DistortionModel", "Parameter"]
+__all__ = ["GAUGES", "Chip", "DistortionModel", "Parameter"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+GAUGES = ("first", "held")
+NO_EXPOSURE = -1  # code of the polynomial itself where it is no exposure's
 
 
 @dataclass(frozen=True)
@@ -85,8 +88,19 @@ class DistortionModel:
     """Structure of a distortion solution: what is fitted, not its values.
 
     theta holds first the *global* parameters (Legendre coefficients of each chip and axis, then
-    the time-dependent terms of each chip), then one *local* block for each exposure but the first,
-    whose frame is the identity and defines the gauge.
+    the time-dependent terms of each chip), then one *local* block for each exposure but the first.
+
+    Polynomials and frames are determined only together: what all frames have in common is a change
+    of the polynomials.  The *gauge* says how the two are told apart.
+
+    - "first": the frame of the first exposure is the identity.  The polynomials are those of that
+      exposure, with its shift, roll angle, scale and shear.
+    - "held": the first exposure's shift and rotation are held at given values, exactly: they are no
+      parameters.  Its scale and shear are parameters like those of all others, and stand at the end
+      of the global ones.  Then scale and shear are *deviations* from polynomials that belong to no
+      exposure, and need a prior that says that they scatter about zero; without it they are
+      degenerate with the linear terms, and `fit_linear` says so.  Held at the first exposure's roll
+      and zero point, the polynomials lie along the detector's axes, and so do the shears.
 
     Parameters
     ----------
@@ -104,11 +118,16 @@ class DistortionModel:
         Names; the first one defines the gauge.
     origin : tuple of float
         Point (u, v) about which frames rotate and scale.
+    gauge : str
+        'first' or 'held'.
+    held : tuple of float
+        With 'held': shift_u, shift_v (unit of u, v) and rotation (radians) of the first exposure.
 
     Raises
     ------
     InputError
-        For an unknown kind of frame, no chip, or a time-dependent term above the order.
+        For an unknown kind of frame, no chip, a time-dependent term above the order, or a gauge
+        that does not go with the frames.
     """
 
     order: int
@@ -118,6 +137,8 @@ class DistortionModel:
     frames: str = "none"
     exposures: tuple[str, ...] = ("1",)
     origin: tuple[float, float] = (0.0, 0.0)
+    gauge: str = "first"
+    held: tuple[float, float, float] = (0.0, 0.0, 0.0)
     _bases: tuple[PolynomialBasis, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -127,6 +148,7 @@ class DistortionModel:
                 where="model.frames",
                 do=f"choose one of {', '.join(FRAME_KINDS)}",
             )
+        self._check_gauge()
         if not self.chips:
             raise InputError("no chip is given", where="chip", do="describe at least one chip")
         for what, given in (
@@ -148,6 +170,32 @@ class DistortionModel:
                 )
         bases = tuple(PolynomialBasis(self.order, c.size, c.reference_pixel) for c in self.chips)
         object.__setattr__(self, "_bases", bases)
+
+    def _check_gauge(self) -> None:
+        if self.gauge not in GAUGES:
+            raise InputError(
+                f"unknown gauge {self.gauge!r}",
+                where="model.gauge",
+                do=f"choose {' or '.join(GAUGES)}",
+            )
+        if self.gauge == "first" and any(self.held):
+            raise InputError(
+                f"the first exposure is held at {self.held} and is the identity",
+                where="model.held",
+                do="choose gauge 'held' or leave the values out",
+            )
+        if self.gauge == "held" and self.frames == "none":
+            raise InputError(
+                "gauge 'held' holds the frame of the first exposure, and there are no frames",
+                where="model.gauge",
+                do="choose a kind of frame or gauge 'first'",
+            )
+        if self.frames == "shift" and self.held[2]:
+            raise InputError(
+                "a frame 'shift' has no rotation to be held",
+                where="model.held",
+                do="choose another kind of frame",
+            )
 
     # -- layout ------------------------------------------------------------------------------------
 
@@ -172,9 +220,22 @@ class DistortionModel:
         return 2 * self.n_terms * len(self.chips)
 
     @property
-    def n_global(self) -> int:
-        """Parameters that do not belong to a single exposure."""
+    def n_distortion(self) -> int:
+        """Parameters of the polynomials and of their drift: all but the frames."""
         return self.n_polynomial + self.n_tdd * len(self.chips)
+
+    @property
+    def n_global(self) -> int:
+        """Parameters that are in no local block."""
+        return self.n_distortion + len(self.free_frame_names(0))
+
+    def free_frame_names(self, exposure: int) -> tuple[str, ...]:
+        """Names of the fitted parameters of the frame of an exposure (by code)."""
+        if exposure > 0:
+            return frame_names(self.frames)
+        if self.gauge == "first" or exposure < 0:
+            return ()
+        return tuple(name for name in frame_names(self.frames) if name not in RIGID)
 
     @property
     def n_params(self) -> int:
@@ -198,11 +259,10 @@ class DistortionModel:
                     name = f"{prefix[chip.number]}tdd.{axis}_{i}_{j}.{value}"
                     unit = f"{self.unit}/yr" if value.startswith("rate") else self.unit
                     out.append(Parameter(name, unit, "tdd", chip.number, axis, i, j))
-        if self.n_frame:
-            for exposure in self.exposures[1:]:
-                for p in frame_names(self.frames):
-                    unit = self.unit if p.startswith("shift") else ""
-                    out.append(Parameter(f"{exposure}.{p}", unit, "frame", exposure=exposure))
+        for code, exposure in enumerate(self.exposures):
+            for p in self.free_frame_names(code):
+                unit = self.unit if p.startswith("shift") else ""
+                out.append(Parameter(f"{exposure}.{p}", unit, "frame", exposure=exposure))
         return tuple(out)
 
     @property
@@ -252,9 +312,11 @@ class DistortionModel:
         return slice(start, start + self.n_tdd)
 
     def frame_slice(self, exposure: int) -> slice:
-        """Where theta holds the frame of an exposure (by code); empty for the first one."""
-        if exposure == 0 or not self.n_frame:
+        """Where theta holds the `free_frame_names` of an exposure (by code)."""
+        if not self.free_frame_names(exposure):
             return slice(0, 0)
+        if exposure == 0:
+            return slice(self.n_distortion, self.n_global)
         start = self.n_global + (exposure - 1) * self.n_frame
         return slice(start, start + self.n_frame)
 
@@ -284,7 +346,8 @@ class DistortionModel:
         epoch : array_like, optional
             Decimal years, one or N; needed by a model with time dependence.
         exposure : array_like, optional
-            Codes into `exposures` or names, one or N; None is the gauge exposure.
+            Codes into `exposures` or names, one or N; None is the polynomial itself, without a
+            frame.
         chip : array_like, optional
             Chip numbers, one or N; None is the first chip.
 
@@ -302,7 +365,7 @@ class DistortionModel:
             numbers = np.broadcast_to(np.asarray(chip), (n,))
             for number in np.unique(numbers):
                 codes[numbers == number] = self.chip_code(int(number))
-        frame = np.zeros(n, np.int64)
+        frame = np.full(n, 0 if self.gauge == "first" else NO_EXPOSURE)
         if exposure is not None and self.n_frame:
             frame = np.broadcast_to(self._exposure_codes(np.asarray(exposure)), (n,))
         time = np.zeros(n)
@@ -338,6 +401,10 @@ class DistortionModel:
                 unit[row, basis.terms.index((i, j))] = sx**-i * sy**-j
             columns.append(basis.from_monomials(unit))
         return tuple(columns), np.array([AXES.index(t[0]) for t in self.time.terms], np.int64)
+
+    def drift_terms(self, chip: int | None = None) -> Float:
+        """Legendre coefficients (n terms, K) of the monomials of a chip (by number) that drift."""
+        return self._tdd_columns[0][0 if chip is None else self.chip_code(chip)]
 
     def _drift(self, chip: Int, epoch: Float) -> list[Float]:
         """Derivative of a group's polynomial by the chip's tdd parameters, (2, K, n_tdd) each."""
@@ -378,9 +445,25 @@ class DistortionModel:
 
     def frame(self, theta: ArrayLike, exposure: int) -> tuple[Float, Float]:
         """Linear part (..., 2, 2) and shift (..., 2) of T_e for an exposure code."""
-        theta = np.asarray(theta, float)
-        kind = self.frames if exposure else "none"
-        return frame_matrix(kind, theta[..., self.frame_slice(exposure)])
+        return frame_matrix(*self._frame(np.asarray(theta, float), exposure))
+
+    def _has_frame(self, exposure: int) -> bool:
+        return self.n_frame > 0 and (exposure > 0 or (exposure == 0 and self.gauge == "held"))
+
+    def _frame(self, theta: Float, exposure: int) -> tuple[str, Float]:
+        """Kind of an exposure's frame and all its parameters (..., q), held ones included."""
+        if not self._has_frame(exposure):
+            return "none", theta[..., :0]
+        values = theta[..., self.frame_slice(exposure)]
+        if exposure:
+            return self.frames, values
+        names, free = frame_names(self.frames), self.free_frame_names(0)
+        out = np.empty((*theta.shape[:-1], len(names)))
+        for k, name in enumerate(names):
+            out[..., k] = (
+                self.held[RIGID.index(name)] if name in RIGID else values[..., free.index(name)]
+            )
+        return self.frames, out
 
     def effective(self, theta: ArrayLike, groups: Groups) -> Float:
         """Effective Legendre coefficients of each group: the whole model as polynomials.
@@ -399,7 +482,7 @@ class DistortionModel:
             return out
         o = np.asarray(self.origin)
         for e in np.unique(groups.exposure):
-            if e == 0:
+            if not self._has_frame(int(e)):
                 continue
             M, d = self.frame(theta, int(e))
             sel = groups.exposure == e
@@ -446,8 +529,10 @@ class DistortionModel:
                 w[:, 0] -= o
                 shift = np.zeros((2, K, 2))
                 shift[0, 0, 0] = shift[1, 0, 1] = 1.0
-                tangent = frame_tangent(self.frames, theta[local])
-                blocks += [shift, np.einsum("mab,bk->akm", tangent, w)]
+                tangent = frame_tangent(*self._frame(theta, e))
+                of_all = np.concatenate([shift, np.einsum("mab,bk->akm", tangent, w)], axis=2)
+                names = frame_names(self.frames)
+                blocks.append(of_all[..., [names.index(n) for n in self.free_frame_names(e)]])
             out.append((np.concatenate(columns), np.concatenate(blocks, axis=2)))
         return out
 
@@ -584,12 +669,27 @@ class DistortionModel:
             "frames": self.frames,
             "exposures": list(self.exposures),
             "origin": list(self.origin),
+            "gauge": self.gauge,
+            "held": list(self.held),
         }
 
     @classmethod
     def from_dict(cls, data: dict) -> DistortionModel:
-        """The model that `to_dict` described."""
+        """The model that `to_dict` described.
+
+        Raises
+        ------
+        InputError
+            For a description by a version in which scale and rotation meant something else.
+        """
         time = data["time"]
+        if "gauge" not in data and data["frames"] in ("shift_rotation_scale", "affine"):
+            raise InputError(
+                f"an earlier version wrote this: '{data['frames']}' had other parameters then",
+                where="model",
+                do="fit again",
+            )
+        shift_u, shift_v, rotation = data.get("held", (0.0, 0.0, 0.0))
         return cls(
             order=data["order"],
             chips=tuple(
@@ -607,6 +707,8 @@ class DistortionModel:
             frames=data["frames"],
             exposures=tuple(data["exposures"]),
             origin=_pair(data["origin"]),
+            gauge=data.get("gauge", "first"),
+            held=(float(shift_u), float(shift_v), float(rotation)),
         )
 
 

@@ -1,9 +1,13 @@
-"""The transformation T_e of one exposure: shift, rotation, scale, or a general linear map.
+"""The transformation T_e of one exposure: shift, rotation, scale, shear.
 
     T(w) = o + d + M (w - o)
+    M = R(rotation) [(1 + scale) I + shear_plus diag(1, -1) + shear_cross offdiag(1, 1)]
 
-about a fixed origin o, so that shifts and linear terms are nearly uncorrelated.  The linear kinds
-are linear in their parameters; only 'shift_rotation' is not.
+about a fixed origin o, so that shifts and linear terms are nearly uncorrelated.  R turns u towards
+v by an angle in radians.  Each kind has the parameters of the one before it and some more, with the
+same meaning.  Scale and shear act along the axes of w, before the rotation: they are deviations of
+the detector, small at any roll angle, and a Gaussian prior on each of them by itself makes sense.
+Near zero, M = I + scale I + rotation J + shear_plus diag(1, -1) + shear_cross offdiag(1, 1).
 """
 
 from __future__ import annotations
@@ -11,7 +15,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["FRAME_KINDS", "frame_matrix", "frame_names", "frame_tangent", "nearest_frame"]
+__all__ = [
+    "DEVIATIONS",
+    "FRAME_KINDS",
+    "RIGID",
+    "frame_matrix",
+    "frame_names",
+    "frame_tangent",
+    "nearest_frame",
+]
 
 Float = NDArray[np.float64]
 
@@ -19,17 +31,42 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "none": (),
     "shift": ("shift_u", "shift_v"),
     "shift_rotation": ("shift_u", "shift_v", "rotation"),
-    # M = [[1 + scale, -rotation], [rotation, 1 + scale]]: s cos(a) - 1 and s sin(a)
     "shift_rotation_scale": ("shift_u", "shift_v", "scale", "rotation"),
-    "affine": ("shift_u", "shift_v", "m_uu", "m_uv", "m_vu", "m_vv"),
+    "affine": ("shift_u", "shift_v", "scale", "rotation", "shear_plus", "shear_cross"),
 }
 
 FRAME_KINDS = tuple(_NAMES)
+
+RIGID = ("shift_u", "shift_v", "rotation")  # where the telescope pointed
+DEVIATIONS = ("scale", "shear_plus", "shear_cross")  # how the detector differed from its mean
+
+# what scale, shear_plus and shear_cross are multiplied by
+_SHAPES = {
+    "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
+    "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
+    "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
+}
 
 
 def frame_names(kind: str) -> tuple[str, ...]:
     """Names of the parameters of one exposure's frame."""
     return _NAMES[kind]
+
+
+def _rotation(angle: Float) -> Float:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+
+
+def _parts(kind: str, p: Float) -> tuple[Float, Float]:
+    """Rotation (..., 2, 2) and what stands behind it (..., 2, 2)."""
+    names = frame_names(kind)
+    behind = np.broadcast_to(np.eye(2), (*p.shape[:-1], 2, 2)).copy()
+    for name, shape in _SHAPES.items():
+        if name in names:
+            behind += p[..., names.index(name), None, None] * shape
+    angle = p[..., names.index("rotation")] if "rotation" in names else np.zeros(p.shape[:-1])
+    return _rotation(angle), behind
 
 
 def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
@@ -48,23 +85,11 @@ def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
     d : ndarray, shape (..., 2)
     """
     p = np.asarray(p, float)
-    lead = p.shape[:-1]
-    M = np.broadcast_to(np.eye(2), (*lead, 2, 2)).copy()
-    d = np.zeros((*lead, 2))
-    if kind == "none":
-        return M, d
-    d[...] = p[..., :2]
-    if kind == "shift_rotation":
-        c, s = np.cos(p[..., 2]), np.sin(p[..., 2])
-        M[..., 0, 0], M[..., 0, 1], M[..., 1, 0], M[..., 1, 1] = c, -s, s, c
-    elif kind == "shift_rotation_scale":
-        M[..., 0, 0] += p[..., 2]
-        M[..., 1, 1] += p[..., 2]
-        M[..., 0, 1] = -p[..., 3]
-        M[..., 1, 0] = p[..., 3]
-    elif kind == "affine":
-        M += p[..., 2:].reshape(*lead, 2, 2)
-    return M, d
+    if "rotation" in frame_names(kind):
+        turn, behind = _parts(kind, p)
+        return turn @ behind, p[..., :2].copy()
+    M = np.broadcast_to(np.eye(2), (*p.shape[:-1], 2, 2)).copy()
+    return M, p[..., :2].copy() if kind == "shift" else np.zeros((*p.shape[:-1], 2))
 
 
 def frame_tangent(kind: str, p: ArrayLike) -> Float:
@@ -79,14 +104,13 @@ def frame_tangent(kind: str, p: ArrayLike) -> Float:
     -------
     ndarray, shape (q - 2, 2, 2), or (0, 2, 2) where there is none
     """
-    if kind in ("none", "shift"):
+    names = frame_names(kind)[2:]
+    if not names:
         return np.zeros((0, 2, 2))
-    if kind == "shift_rotation":
-        a = float(np.asarray(p, float)[2])
-        return np.array([[[-np.sin(a), -np.cos(a)], [np.cos(a), -np.sin(a)]]])
-    if kind == "shift_rotation_scale":
-        return np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [1.0, 0.0]]])
-    return np.eye(4).reshape(4, 2, 2)
+    p = np.asarray(p, float)
+    turn, behind = _parts(kind, p)
+    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
+    return np.stack([turn @ (quarter @ behind if n == "rotation" else _SHAPES[n]) for n in names])
 
 
 def nearest_frame(kind: str, M: ArrayLike, d: ArrayLike) -> Float:
@@ -101,16 +125,21 @@ def nearest_frame(kind: str, M: ArrayLike, d: ArrayLike) -> Float:
     Returns
     -------
     ndarray, shape (q,)
+        Nearest in the Frobenius norm of the matrices.
     """
     M = np.asarray(M, float)
-    d = np.asarray(d, float)
-    c = (M[0, 0] + M[1, 1]) / 2  # the similarity nearest in the Frobenius norm
-    s = (M[1, 0] - M[0, 1]) / 2
-    linear = {
-        "none": [],
-        "shift": [],
-        "shift_rotation": [np.arctan2(s, c)],
-        "shift_rotation_scale": [c - 1.0, s],
-        "affine": (M - np.eye(2)).ravel(),
-    }[kind]
-    return np.concatenate([d, linear]) if kind != "none" else np.zeros(0)
+    # M z = a z + b conj(z) with z = u + i v; a is the similarity nearest to M
+    a = complex(M[0, 0] + M[1, 1], M[1, 0] - M[0, 1]) / 2
+    b = complex(M[0, 0] - M[1, 1], M[1, 0] + M[0, 1]) / 2
+    angle = float(np.angle(a))
+    shear = b * np.exp(-1j * angle)
+    shift = np.asarray(d, float)
+    value = {
+        "shift_u": shift[0],
+        "shift_v": shift[1],
+        "scale": abs(a) - 1.0,
+        "rotation": angle,
+        "shear_plus": shear.real,
+        "shear_cross": shear.imag,
+    }
+    return np.array([value[name] for name in frame_names(kind)])

@@ -2,38 +2,52 @@
 
 from bayesdist.products.d2im import read_d2im, write_d2im
 from bayesdist.products.idctab import IdcTab, read_idctab, write_idctab
-from bayesdist.products.idctab_build import idctab_from_solution
+from bayesdist.products.idctab_build import idctab_from_solution, idctab_from_solutions
 from bayesdist.products.idctab_lint import lint_idctab
-from bayesdist.products.inspect import (
-    describe,
-    describe_idctab,
-    describe_lookup_file,
-    describe_sip,
-)
+from bayesdist.products.inspect import describe, describe_idctab, describe_lookup_file, describe_sip
 from bayesdist.products.lint import Finding
 from bayesdist.products.lookup_file import LookupFile, read_lookup_file, write_lookup_file
 from bayesdist.products.lookup_lint import lint_lookup_file
 from bayesdist.products.npol import read_npol, write_npol
+from bayesdist.products.orientation import Orientation
+from bayesdist.products.orientation_aperture import orientation_from_aperture
+from bayesdist.products.orientation_idctab import orientation_from_idctab
+from bayesdist.products.oriented import Oriented, oriented
+from bayesdist.products.release import Period, Release, write_release
+from bayesdist.products.siaf import Aperture, read_aperture
 from bayesdist.products.sip import SipHeader
 from bayesdist.products.sip_build import sip_from_solution
 from bayesdist.products.sip_inverse import worst_closure
 from bayesdist.products.sip_lint import lint_sip
 from bayesdist.products.sip_read import read_sip
 from bayesdist.products.sip_write import sip_header, write_sip
+from bayesdist.products.storable import Lost, Stored, storable
 
 __all__ = [
+    "Aperture",
     "Finding",
     "IdcTab",
     "LookupFile",
+    "Lost",
+    "Orientation",
+    "Oriented",
+    "Period",
+    "Release",
     "SipHeader",
+    "Stored",
     "describe",
     "describe_idctab",
     "describe_lookup_file",
     "describe_sip",
     "idctab_from_solution",
+    "idctab_from_solutions",
     "lint_idctab",
     "lint_lookup_file",
     "lint_sip",
+    "orientation_from_aperture",
+    "orientation_from_idctab",
+    "oriented",
+    "read_aperture",
     "read_d2im",
     "read_idctab",
     "read_lookup_file",
@@ -41,10 +55,12 @@ __all__ = [
     "read_sip",
     "sip_from_solution",
     "sip_header",
+    "storable",
     "worst_closure",
     "write_d2im",
     "write_idctab",
     "write_lookup_file",
     "write_npol",
+    "write_release",
     "write_sip",
 ]

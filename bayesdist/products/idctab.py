@@ -2,6 +2,8 @@
 
     Xc ["] = sum CXnj x^j y^(n-j),  Yc ["] = sum CYnj x^j y^(n-j),   x, y from XREF, YREF;  n >= 1
 
+Rows with DIRECTION 'INVERSE' lead back: x and y in pixels from powers of Xc and Yc in arcseconds.
+
 Uncertainties stand in HDUs behind the first table, where stwcs does not look:
 
 SIGMA
@@ -9,8 +11,10 @@ SIGMA
     and the standard deviations of V2REF, V3REF and every coefficient, under the same names.  Those
     of the time-dependent terms are keywords of its header, named as in the primary header.
 COVAR
-    A table with one row for each fitted number of the file: DETCHIP, PARAM (column or keyword
-    name), VALUE, and COV, its covariances with all rows in order.
+    A table with one row for each fitted number of the file: DETCHIP, the filters where these have
+    numbers of their own (of the first row that holds the number), PARAM (column or keyword name),
+    VALUE, and COV, its covariances with all rows in order.  INVERSE rows follow from FORWARD ones
+    and are not in it.
 """
 
 from __future__ import annotations
@@ -321,6 +325,42 @@ class IdcTab:
         dy = np.asarray(y, float) - float(record["YREF"])
         u, v = (evaluate(dict(zip(self.terms, c, strict=True)), dx, dy) for c in both)
         return u, v
+
+    def invert(
+        self,
+        chip: int,
+        Xc: ArrayLike,
+        Yc: ArrayLike,
+        *,
+        filter: str | Sequence[str] | None = None,
+    ) -> tuple[Float, Float]:
+        """Pixels of positions in the aperture's frame, by the INVERSE row.
+
+        Parameters
+        ----------
+        chip, filter
+            As in `row`.
+        Xc, Yc : array_like
+            Arcseconds from the reference pixel, at the reference date of the drift.
+
+        Returns
+        -------
+        x, y : ndarray
+            FITS 1-based pixels.
+
+        Raises
+        ------
+        InputError
+            As `row`.
+        """
+        row = self.row(chip, filter, "INVERSE")
+        record = self.rows[row]
+        Xc, Yc = np.asarray(Xc, float), np.asarray(Yc, float)
+        x, y = (
+            evaluate(dict(zip(self.terms[1:], c[1:], strict=True)), Xc, Yc)
+            for c in self.coefficients_of_row(row)
+        )
+        return x + float(record["XREF"]), y + float(record["YREF"])
 
 
 def _filters(names: Sequence[str]) -> tuple[str, ...]:

@@ -1,8 +1,10 @@
-"""An IDCTAB from a solution, with the sigmas and the covariance of all it holds."""
+"""An IDCTAB from solutions, with the sigmas and the covariance of all it holds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from textwrap import wrap
 
 import numpy as np
 from astropy.io import fits
@@ -13,14 +15,19 @@ from bayesdist.errors import InputError
 from bayesdist.products.blocks import blocks_of
 from bayesdist.products.cards import convergence_cards, number_card, text_card
 from bayesdist.products.idctab import IdcTab
+from bayesdist.products.idctab_cards import closure_cards, provenance_cards, tdd_cards
+from bayesdist.products.idctab_covariance import joint_covariance
+from bayesdist.products.idctab_hdus import Piece, coefficient_hdu, covariance_hdu, sigma_hdu
+from bayesdist.products.idctab_inverse import inverse_of
 from bayesdist.products.idctab_numbers import ChipNumbers, check_time, chip_numbers
 from bayesdist.products.parity import parity_of
 from bayesdist.products.sip_build import ARCSEC
+from bayesdist.products.wheels import combination_of
 
-__all__ = ["idctab_from_solution"]
+__all__ = ["idctab_from_solution", "idctab_from_solutions"]
 
 Float = NDArray[np.float64]
-Combinations = list[tuple[str, ...]]
+Filter = str | tuple[str, ...]
 
 
 def idctab_from_solution(
@@ -38,6 +45,8 @@ def idctab_from_solution(
     pedigree: str | None = None,
     description: str = "Geometric distortion with its uncertainty, by bayesdist",
     chips: Sequence[int] | None = None,
+    inverse: bool = False,
+    history: Sequence[str] = (),
 ) -> IdcTab:
     """IDCTAB of all chips of a solution, in the frame of its first exposure.
 
@@ -71,6 +80,10 @@ def idctab_from_solution(
         DESCRIP.
     chips : sequence of int, optional
         Chip numbers; all by default.
+    inverse : bool
+        Whether to add INVERSE rows (see `bayesdist.products.idctab_inverse`).
+    history : sequence of str
+        Lines for HISTORY.
 
     Returns
     -------
@@ -90,25 +103,132 @@ def idctab_from_solution(
     TDD_DATE is the reference date of the fit.  stwcs dates an exposure by year + day of year /
     365.25, which is within about a day of the decimal year.
     """
-    model = solution.model
-    parity = parity_of(instrument, detector)
     if v2v3 != "aperture":
         raise InputError(f"v2v3 is {v2v3!r}", where="products.idctab.v2v3", do="choose 'aperture'")
+    return _table(
+        [(solution, _combinations(filters, instrument))],
+        instrument,
+        detector,
+        scale_arcsec=scale_arcsec,
+        zero=(v2ref, v3ref),
+        vafactor=vafactor,
+        texts={"DESCRIP": description, "USEAFTER": useafter, "PEDIGREE": pedigree},
+        chips=chips,
+        inverse=inverse,
+        history=history,
+    )
+
+
+def idctab_from_solutions(
+    solutions: Mapping[Filter, Solution],
+    *,
+    instrument: str,
+    detector: str,
+    scale_arcsec: float | None = None,
+    v2ref: float = 0.0,
+    v3ref: float = 0.0,
+    vafactor: float = 1.0,
+    useafter: str | None = None,
+    pedigree: str | None = None,
+    description: str = "Geometric distortion with its uncertainty, by bayesdist",
+    chips: Sequence[int] | None = None,
+    inverse: bool = True,
+    history: Sequence[str] = (),
+) -> IdcTab:
+    """IDCTAB of several filters, each with its own solution.
+
+    stwcs applies one drift to all rows.  It is that of the first solution; the others must have the
+    same reference date and rates, or none: then their constants are those of the reference date.
+
+    Parameters
+    ----------
+    solutions : mapping of filter to Solution
+        A filter is one name ("F814W", whose other wheel is clear), or a tuple with those of both
+        wheels.  Filters with the very same solution object share its rows.
+    inverse : bool
+        Whether to add INVERSE rows; their closure is stated as BDCLOS_c.
+    others
+        As in `idctab_from_solution`.
+
+    Returns
+    -------
+    IdcTab
+        COVAR then names the filters too, one for each solution.  Solutions turned by the same
+        orientation (`bayesdist.products.oriented`) share its error, which stands between their
+        blocks.
+
+    Raises
+    ------
+    InputError
+        As `idctab_from_solution`; for no filter, a filter named twice, solutions of different
+        orders or chips, or a drift other than the first one's.
+    DegenerateError
+        When the linear part of a chip is singular.
+    """
+    groups: dict[int, tuple[Solution, list[tuple[str, ...]]]] = {}
+    seen: set[tuple[str, ...]] = set()
+    for filter, solution in solutions.items():
+        combination = combination_of(filter, instrument)
+        if combination in seen:
+            raise InputError(
+                f"the filter combination {combination} stands twice",
+                where="solutions",
+                do="name each one once",
+            )
+        seen.add(combination)
+        groups.setdefault(id(solution), (solution, []))[1].append(combination)
+    if not groups:
+        raise InputError("no filter is given", where="solutions", do="give at least one")
+    entries = [(s, _combinations(names, instrument)) for s, names in groups.values()]
+    return _table(
+        entries,
+        instrument,
+        detector,
+        scale_arcsec=scale_arcsec,
+        zero=(v2ref, v3ref),
+        vafactor=vafactor,
+        texts={"DESCRIP": description, "USEAFTER": useafter, "PEDIGREE": pedigree},
+        chips=chips,
+        inverse=inverse,
+        history=history,
+    )
+
+
+def _table(
+    entries: Sequence[tuple[Solution, tuple[tuple[str, ...], ...]]],
+    instrument: str,
+    detector: str,
+    *,
+    scale_arcsec: float | None,
+    zero: tuple[float, float],
+    vafactor: float,
+    texts: Mapping[str, str | None],
+    chips: Sequence[int] | None,
+    inverse: bool,
+    history: Sequence[str],
+) -> IdcTab:
+    first = entries[0][0]
+    model = first.model
+    parity = parity_of(instrument, detector)
     _check_positive(vafactor, "vafactor")
     acs_wfc = (instrument, detector) == ("ACS", "WFC")
-    check_time(model, acs_wfc=acs_wfc)
-    combinations = _combinations(filters, instrument)
-    factor = _arcsec(model.unit, scale_arcsec) / vafactor
+    for solution, combinations in entries:
+        check_time(solution.model, acs_wfc=acs_wfc)
+        if solution is not first:
+            _check_alike(solution, first, combinations[0])
     numbers = tuple(c.number for c in model.chips) if chips is None else tuple(chips)
     if not numbers:
         raise InputError("no chip is given", where="chips", do="name at least one")
-    fitted = [
-        chip_numbers(solution, n, factor=factor, parity=parity, zero=(v2ref, v3ref))
-        for n in numbers
-    ]
-    jacobian = np.concatenate([f.jacobian for f in fitted])
-    cov = jacobian @ np.asarray(solution.cov, float) @ jacobian.T
-    scale = _mean_scale(fitted) if scale_arcsec is None else scale_arcsec
+    pieces = []
+    for solution, combinations in entries:
+        factor = _arcsec(solution.model.unit, scale_arcsec) / vafactor
+        fitted = tuple(
+            _numbers(solution, n, factor, parity, zero, drift=solution is first) for n in numbers
+        )
+        back = tuple(inverse_of(f) for f in fitted) if inverse else ()
+        pieces.append(Piece(combinations, fitted, back))
+    cov = joint_covariance([solution for solution, _ in entries], pieces)
+    scale = _mean_scale(pieces[0].fitted) if scale_arcsec is None else scale_arcsec
 
     primary = fits.PrimaryHDU()
     for card in [
@@ -117,21 +237,39 @@ def idctab_from_solution(
         number_card("NORDER", model.order, "order of the polynomials"),
         number_card("PARITY", parity[0] * parity[1]),
         text_card("FILETYPE", "DISTORTION COEFFICIENTS"),
-        text_card("DESCRIP", description),
-        *([text_card("USEAFTER", useafter)] if useafter else []),
-        *([text_card("PEDIGREE", pedigree)] if pedigree else []),
-        *(_tdd_cards(fitted, model.time.epoch0[0] if model.time else None) if acs_wfc else ()),
-        *_provenance_cards(fitted, vafactor, model.unit),
-        *convergence_cards(solution),
+        *(text_card(keyword, text) for keyword, text in texts.items() if text),
+        *tdd_cards(pieces[0].fitted, model.time.epoch0[0] if model.time else None, acs_wfc),
+        *provenance_cards(pieces[0].fitted, vafactor, first),
+        *closure_cards(pieces),
+        *convergence_cards(first),
+        *(text_card("HISTORY", part) for line in history for part in wrap(line, 72) or [""]),
     ]:
         primary.header.append(fits.Card.fromstring(card), end=True)
     hdus = [
         primary,
-        _coefficient_hdu(fitted, combinations, scale),
-        _sigma_hdu(fitted, combinations, cov),
-        _covariance_hdu(fitted, cov),
+        coefficient_hdu(pieces, scale),
+        sigma_hdu(pieces, cov),
+        covariance_hdu(pieces, cov),
     ]
     return IdcTab(blocks_of(hdus), "new IDCTAB")
+
+
+def _numbers(
+    solution: Solution,
+    chip: int,
+    factor: float,
+    parity: tuple[int, int],
+    zero: tuple[float, float],
+    *,
+    drift: bool,
+) -> ChipNumbers:
+    """Numbers of a chip; without `drift` those of its rates are left to another solution."""
+    out = chip_numbers(solution, chip, factor=factor, parity=parity, zero=zero)
+    if drift:
+        return out
+    keep = [k for k, name in enumerate(out.names) if not name.startswith("TDD")]
+    names = tuple(out.names[k] for k in keep)
+    return replace(out, names=names, values=out.values[keep], jacobian=out.jacobian[keep])
 
 
 # -- checks and scales ---------------------------------------------------------------------------
@@ -167,12 +305,48 @@ def _mean_scale(fitted: Sequence[ChipNumbers]) -> float:
     return round(float(np.mean(np.sqrt(np.abs(areas)))), 8)
 
 
+def _check_alike(solution: Solution, first: Solution, combination: tuple[str, ...]) -> None:
+    """A file has one order, one set of chips and one drift."""
+    where = f"filters {' '.join(combination)}"
+    a, b = solution.model, first.model
+    if a.order != b.order or a.chips != b.chips:
+        raise InputError(
+            "the solution has another order or other chips than the first one",
+            where=where,
+            do="fit all filters with one structure",
+        )
+    if a.time is None:
+        return
+    same = b.time is not None and a.time.epoch0 == b.time.epoch0
+    if same and b.time is not None:
+        mine, theirs = (
+            {
+                (chip.number, term): float(value)
+                for chip in m.chips
+                for term, value in zip(
+                    m.time.terms, np.asarray(s.mean)[m.tdd_slice(chip.number)], strict=True
+                )
+            }
+            for s, m in ((solution, a), (first, b))
+        )
+        scale = max(map(abs, theirs.values()), default=0.0)
+        same = all(
+            abs(mine.get(k, 0.0) - theirs.get(k, 0.0)) <= 1e-9 * scale for k in mine | theirs
+        )
+    if not same:
+        raise InputError(
+            "the solution drifts otherwise than the first one, and a file stores one drift",
+            where=where,
+            do="give it the same reference date and rates (bayesdist.products.storable)",
+        )
+
+
 def _combinations(
     filters: Sequence[str] | Sequence[Sequence[str]] | None, instrument: str
-) -> Combinations:
+) -> tuple[tuple[str, ...], ...]:
     """Filter names of each row of a chip; one empty combination where rows serve all filters."""
     if not filters:
-        return [()]
+        return ((),)
     flat = all(isinstance(f, str) for f in filters)
     out = [tuple(map(str, filters))] if flat else [tuple(map(str, f)) for f in filters]
     wanted = 2 if instrument == "ACS" else 1
@@ -183,127 +357,4 @@ def _combinations(
                 where="products.idctab.filters",
                 do=f"give {wanted} for {instrument}, one for each wheel",
             )
-    return out
-
-
-# -- the HDUs ------------------------------------------------------------------------------------
-
-
-def _per_row(fitted: Sequence[ChipNumbers], combinations: Combinations) -> list[ChipNumbers]:
-    """What stands in each row: the chips in turn, for one filter combination after the other."""
-    return [f for _ in combinations for f in fitted]
-
-
-def _key_columns(fitted: Sequence[ChipNumbers], combinations: Combinations) -> list[fits.Column]:
-    rows = _per_row(fitted, combinations)
-    names = [combination for combination in combinations for _ in fitted]
-    columns = [
-        fits.Column("DETCHIP", "1I", unit="chip", array=np.array([f.chip.number for f in rows])),
-        fits.Column("DIRECTION", "8A", array=np.array(["FORWARD"] * len(rows))),
-    ]
-    labels = ("FILTER1", "FILTER2") if len(combinations[0]) == 2 else ("FILTER",)
-    for k, label in enumerate(labels[: len(combinations[0])]):
-        width = max(8, *(len(n[k]) for n in names))
-        columns.append(fits.Column(label, f"{width}A", array=np.array([n[k] for n in names])))
-    return columns
-
-
-def _coefficient_hdu(
-    fitted: Sequence[ChipNumbers], combinations: Combinations, scale: float
-) -> fits.BinTableHDU:
-    rows = _per_row(fitted, combinations)
-
-    def column(name: str, values: list[float], unit: str = "", form: str = "1D") -> fits.Column:
-        return fits.Column(name, form, unit=unit or None, array=np.array(values))
-
-    columns = _key_columns(fitted, combinations)
-    for k, axis in enumerate("XY"):
-        sizes = [int(f.chip.size[k]) for f in rows]
-        columns.append(column(f"{axis}SIZE", sizes, "pixel", "1J"))
-    for k, axis in enumerate("XY"):
-        columns.append(column(f"{axis}REF", [f.chip.reference_pixel[k] for f in rows], "pixel"))
-    for name in _column_names(fitted):
-        if name == "CX10":
-            columns.append(column("SCALE", [scale] * len(rows), "arcsec"))
-        values = [f.column(name) for f in rows]
-        if name == "CX11" and scale != 1.0:
-            # stwcs takes exactly 1 as a sign that coefficients are in units of SCALE
-            values = [np.nextafter(1.0, 0.0) if v == 1.0 else v for v in values]
-        columns.append(column(name, values, _unit(name)))
-    return fits.BinTableHDU.from_columns(columns)
-
-
-def _sigma_hdu(
-    fitted: Sequence[ChipNumbers], combinations: Combinations, cov: Float
-) -> fits.BinTableHDU:
-    deviations = np.sqrt(np.maximum(np.diag(cov), 0.0))  # -1e-40 is a rounded zero
-    ends = np.cumsum([len(f.names) for f in fitted])[:-1]
-    by_chip = [
-        dict(zip(f.names, s.tolist(), strict=True))
-        for f, s in zip(fitted, np.split(deviations, ends), strict=True)
-    ]
-    rows = [sigma for _ in combinations for sigma in by_chip]
-    columns = _key_columns(fitted, combinations) + [
-        fits.Column(name, "1D", unit=_unit(name), array=np.array([s[name] for s in rows]))
-        for name in _column_names(fitted)
-    ]
-    hdu = fits.BinTableHDU.from_columns(columns, name="SIGMA")
-    for sigma in by_chip:
-        for name, value in sigma.items():
-            if name.startswith("TDD"):
-                card = number_card(name, value, "[arcsec/pix/yr] 1-sigma")
-                hdu.header.append(fits.Card.fromstring(card), end=True)
-    return hdu
-
-
-def _covariance_hdu(fitted: Sequence[ChipNumbers], cov: Float) -> fits.BinTableHDU:
-    return fits.BinTableHDU.from_columns(
-        [
-            fits.Column(
-                "DETCHIP", "1I", array=np.array([f.chip.number for f in fitted for _ in f.names])
-            ),
-            fits.Column("PARAM", "8A", array=np.array([name for f in fitted for name in f.names])),
-            fits.Column("VALUE", "1D", array=np.concatenate([f.values for f in fitted])),
-            fits.Column("COV", f"{len(cov)}D", array=cov),
-        ],
-        name="COVAR",
-    )
-
-
-def _column_names(fitted: Sequence[ChipNumbers]) -> list[str]:
-    return [name for name in fitted[0].names if not name.startswith("TDD")]
-
-
-def _unit(name: str) -> str:
-    if name.startswith("V"):
-        return "arcsec"
-    order = int(name[2])
-    return "arcsec/pixel" if order == 1 else f"arcsec/pixel**{order}"
-
-
-# -- the primary header --------------------------------------------------------------------------
-
-
-def _tdd_cards(fitted: Sequence[ChipNumbers], epoch: float | None) -> list[str]:
-    """Time-dependent terms of ACS/WFC in the scheme of 2015, zeros where none was fitted."""
-    comment = "" if epoch is not None else "no time-dependent terms"
-    cards = [number_card("TDD_DATE", 2004.5 if epoch is None else epoch, "[yr] reference date")]
-    rates = {name: f.column(name) for f in fitted for name in f.names if name.startswith("TDD")}
-    for chip in (1, 2):  # stwcs looks for TDD_CTB1 to know the scheme, whatever the chip
-        rates.setdefault(f"TDD_CTB{chip}", 0.0)
-    for name in sorted(rates):
-        cards.append(number_card(name, rates[name], comment or "[arcsec/pix/yr]"))
-    return cards
-
-
-def _provenance_cards(fitted: Sequence[ChipNumbers], vafactor: float, unit: str) -> list[str]:
-    cards = [
-        text_card("CREATOR", "bayesdist"),
-        number_card("BDVAFAC", float(vafactor), "VAFACTOR that was divided out"),
-        text_card("BDUNIT", unit, "unit of u and v in the fit"),
-    ]
-    for f in fitted:
-        for axis, value in zip("UV", f.constant, strict=True):
-            keyword = f"BD{axis}0_{f.chip.number}"
-            cards.append(number_card(keyword, float(value), "[arcsec] constant, now in V2/V3REF"))
-    return cards
+    return tuple(out)

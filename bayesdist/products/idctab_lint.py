@@ -153,7 +153,7 @@ def _table(tab: IdcTab) -> Iterator[Finding]:
 
 def _rounding(tab: IdcTab) -> float:
     """Largest effect of half a unit in the last place of every coefficient, in mas."""
-    rows = tab.rows
+    rows = tab.rows[_forward(tab)]
     hx, hy = (np.maximum(rows[f"{a}REF"], rows[f"{a}SIZE"] - rows[f"{a}REF"]) for a in "XY")
     worst = 0.0
     for prefix in tab.prefixes:
@@ -190,10 +190,12 @@ def _repeated_rows(tab: IdcTab) -> Iterator[Finding]:
 def _coefficients(tab: IdcTab) -> Iterator[Finding]:
     """Scale, index order and parity from the linear terms; values that stand twice."""
     x, y = tab.prefixes
+    forward = _forward(tab)
+    rows = tab.rows[forward]
     cx11, cx10, cy11, cy10 = (
-        tab.rows[f"{p}{n}"].astype(float) for p, n in ((x, 11), (x, 10), (y, 11), (y, 10))
+        rows[f"{p}{n}"].astype(float) for p, n in ((x, 11), (x, 10), (y, 11), (y, 10))
     )
-    scale = tab.rows["SCALE"].astype(float)
+    scale = rows["SCALE"].astype(float)
     determinant = cx11 * cy10 - cx10 * cy11
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(np.abs(determinant)) / np.abs(scale)
@@ -226,8 +228,16 @@ def _coefficients(tab: IdcTab) -> Iterator[Finding]:
     )
     for level, bad, column, message in checks:
         if bad.any():
-            yield Finding(level, f"{_rows(np.flatnonzero(bad))}, column {column}", message)
+            yield Finding(level, f"{_rows(forward[bad])}, column {column}", message)
     yield from _repeated_values(tab)
+
+
+def _forward(tab: IdcTab) -> NDArray[np.intp]:
+    """Indices of the rows whose coefficients are arcseconds from pixels."""
+    if "DIRECTION" not in tab.columns:
+        return np.arange(len(tab.rows))
+    directions = np.char.upper(np.char.strip(tab.rows["DIRECTION"]))
+    return np.flatnonzero(directions != "INVERSE")
 
 
 def _repeated_values(tab: IdcTab) -> Iterator[Finding]:
@@ -282,14 +292,17 @@ def _uncertainty(tab: IdcTab) -> Iterator[Finding]:
         yield Finding("error", where, f"the covariance has shape {cov.shape}")
         return
     worst = 0.0
-    for chip, name, variance in zip(
-        covariance["DETCHIP"], covariance["PARAM"], np.diag(cov), strict=True
-    ):
+    keys = [c for c in ("DETCHIP", *FILTER_COLUMNS) if c in (covariance.dtype.names or ())]
+    forward = _forward(tab) if len(sigma) == len(tab.rows) else np.arange(len(sigma))
+    for entry, variance in zip(covariance, np.diag(cov), strict=True):
+        name = entry["PARAM"]
         if name in (sigma.dtype.names or ()):
-            stated = sigma[name][sigma["DETCHIP"] == chip]
+            same = np.all([sigma[key][forward] == entry[key] for key in keys], axis=0)
+            stated = sigma[name][forward][same]
             scale = max(float(np.max(np.abs(stated), initial=0.0)), np.sqrt(abs(variance)))
             if scale > 0:
-                worst = max(worst, float(np.max(np.abs(stated - np.sqrt(abs(variance))))) / scale)
+                difference = np.abs(stated - np.sqrt(abs(variance)))
+                worst = max(worst, float(np.max(difference, initial=0.0)) / scale)
     if worst > 1e-9:
         yield Finding(
             "error", where, f"sigma and covariance differ by up to {worst:.2g} of themselves"

@@ -114,6 +114,11 @@ def describe_idctab(tab: IdcTab) -> str:
         lines.append("  filters   no columns: the rows serve every filter")
     kept = "standard deviations and covariance" if tab.covariance is not None else "none"
     lines.append(f"  errors    {kept}")
+    if "BDANGLE" in header:
+        lines.append(
+            f"  V2/V3     turned by {header['BDANGLE']:.6g} +- {header['BDANGSIG']:.2g} deg, "
+            f"scale {header['BDSCALE']:.8g} +- {header['BDSCASIG']:.2g} arcsec"
+        )
     for row in _first_rows(tab):
         lines += ["", *_row_text(tab, row)]
     return "\n".join([*lines, "", *_finding_text(lint_idctab(tab))])
@@ -138,17 +143,20 @@ def _row_text(tab: IdcTab, row: int) -> list[str]:
     geometry = [n for n in ("XSIZE", "YSIZE", "XREF", "YREF", "V2REF", "V3REF", "SCALE", "THETA")
                 if n in tab.columns]  # fmt: skip
     lines.append("    " + "  ".join(f"{n} {float(record[n]):.10g}" for n in geometry))
-    lines.append(f"    non-linear part: {_non_linear(tab, row)} px at most")
+    inverse = "DIRECTION" in tab.columns and str(record["DIRECTION"]).strip().upper() == "INVERSE"
+    if not inverse:
+        lines.append(f"    non-linear part: {_non_linear(tab, row)} px at most")
     sigma = tab.sigma
     same = None if sigma is None or len(sigma) != len(tab.rows) else sigma[row]
-    head = "    column        value [arcsec/px^n]" + ("       sigma" if same is not None else "")
+    unit = "px/arcsec^n" if inverse else "arcsec/px^n"
+    head = f"    column        value [{unit}]" + ("       sigma" if same is not None else "")
     lines.append(head)
     for prefix in tab.prefixes:
         for i, j in tab.terms:
             if i + j:
                 name = idctab_column(prefix, i, j)
                 error = f"  {float(same[name]):10.3e}" if same is not None else ""
-                power = f"x^{i} y^{j}"
+                power = f"X^{i} Y^{j}" if inverse else f"x^{i} y^{j}"
                 lines.append(f"    {name:<5} {power:<8} {float(record[name]):21.13e}{error}")
     return lines
 

@@ -20,23 +20,24 @@ PREFIX = {"least squares": "LSQ", "posterior": "MIX"}
 def write_maps(
     path: str | Path,
     maps: Sequence[UncertaintyMap],
-    area: AreaMap | None = None,
+    areas: Sequence[AreaMap] = (),
     *,
     converged: bool = True,
     note: str = "",
 ) -> None:
-    """Write uncertainty maps of one chip.
+    """Write uncertainty maps of all chips of a detector.
 
     Extensions LSQ_SIGMA_U, LSQ_SIGMA_V, LSQ_CORR hold the least-squares ones (outliers rejected),
     MIX_SIGMA_U, MIX_SIGMA_V, MIX_CORR those of the mixture posterior; AREA and AREA_SIGMA the
-    relative pixel area.  A linear WCS gives the detector pixel of each grid point.
+    relative pixel area.  Where there are several chips, the number of the chip follows each name,
+    as in MIX_SIGMA_U_2.  A linear WCS gives the detector pixel of each grid point.
 
     Parameters
     ----------
     path : path
         Replaced atomically.
     maps : sequence of UncertaintyMap
-    area : AreaMap, optional
+    areas : sequence of AreaMap
     converged : bool
         Whether the posterior may be relied on; noted in the primary header.
     note : str
@@ -47,21 +48,26 @@ def write_maps(
     hdus[0].header["BDCONV"] = (converged, "has the sampler converged?")
     if note:
         hdus[0].header["COMMENT"] = note
-    for m in maps:
+    chips = list(dict.fromkeys(m.chip for m in maps))
+    ends = {chip: f"_{chip}" if len(chips) > 1 else "" for chip in chips}
+    for m in sorted(maps, key=lambda m: chips.index(m.chip)):  # which keeps the order within a chip
         prefix = PREFIX[m.kind]
         for name, values, unit in (
             ("SIGMA_U", m.sigma_u, m.unit),
             ("SIGMA_V", m.sigma_v, m.unit),
             ("CORR", m.correlation, ""),
         ):
-            hdu = _image(f"{prefix}_{name}", values, m.x, m.y, unit)
+            hdu = _image(f"{prefix}_{name}{ends[m.chip]}", values, m.x, m.y, unit)
             hdu.header["DETCHIP"] = (m.chip, "chip number")
             if m.epoch is not None:
                 hdu.header["EPOCH"] = (m.epoch, "[yr] decimal year")
             hdus.append(hdu)
-    if area is not None:
-        hdus.append(_image("AREA", area.area, area.x, area.y, ""))
-        hdus.append(_image("AREA_SIGMA", area.sigma, area.x, area.y, ""))
+    for a in areas:
+        for name, values in (("AREA", a.area), ("AREA_SIGMA", a.sigma)):
+            hdu = _image(f"{name}{ends[a.chip]}", values, a.x, a.y, "")
+            if len(chips) > 1:
+                hdu.header["DETCHIP"] = (a.chip, "chip number")
+            hdus.append(hdu)
     with atomic_path(path) as temporary:
         fits.HDUList(hdus).writeto(temporary, checksum=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from bayesdist.report.context import ReportInput
 from bayesdist.report.numerals import count, number, percent
 from bayesdist.report.scales import with_mas
 from bayesdist.report.vectors import CHANCE, significant_cells
+
+if TYPE_CHECKING:
+    from bayesdist.assess import VectorMap
 
 __all__ = ["SECTIONS", "Caption", "caption"]
 
@@ -98,9 +102,8 @@ def _histogram(inputs: ReportInput) -> Caption:
 
 
 def _binned(inputs: ReportInput) -> Caption:
-    b = inputs.binned
-    filled = int((np.asarray(b.count) > 0).sum())
-    significant = int(significant_cells(b).sum())
+    filled = sum(int((np.asarray(c.binned.count) > 0).sum()) for c in inputs.chips)
+    significant = sum(int(significant_cells(c.binned).sum()) for c in inputs.chips)
     return Caption(
         "Binned residuals",
         "Mean residual of each cell; dark arrows differ from zero by more than 2 σ."
@@ -147,29 +150,53 @@ def _traces(inputs: ReportInput) -> Caption:
 
 
 def _flow(inputs: ReportInput) -> Caption:
-    v = inputs.displacement
-    x, y = v.position_of_max
+    v, where = _longest(inputs, "displacement")
+    notes = {c.chip.name: c.displacement.part_note for c in inputs.chips}
+    note = v.part_note
+    if len(set(notes.values())) > 1:
+        note = "; ".join(f"{name} {text}" for name, text in notes.items())
     return Caption(
         "Distortion, zeroth order suppressed",
-        f"Vectors run from the array position to where the distortion puts it, {v.part_note}; the"
-        f" largest is {_length(v.length_max, inputs)} at pixel ({x:.0f}, {y:.0f}), ringed.",
+        f"Vectors run from the array position to where the distortion puts it, {note}; the"
+        f" largest is {_length(v.length_max, inputs)} at {where}, ringed."
+        f"{_suppressed(inputs)}",
         f"Vector-flow diagram of the distortion, largest vector {_length(v.length_max, inputs)}.",
     )
 
 
 def _non_linear(inputs: ReportInput) -> Caption:
-    v = inputs.non_linear
-    x, y = v.position_of_max
+    v, where = _longest(inputs, "non_linear")
     return Caption(
         "Distortion, non-linear part",
         f"Only {v.part_note}: what remains beyond shift, scale, rotation and skew, at most"
-        f" {_length(v.length_max, inputs)} at pixel ({x:.0f}, {y:.0f}), ringed.",
+        f" {_length(v.length_max, inputs)} at {where}, ringed.",
         f"Vector diagram of the non-linear part, largest vector {_length(v.length_max, inputs)}.",
     )
 
 
+def _longest(inputs: ReportInput, which: str) -> tuple[VectorMap, str]:
+    """The vectors of the chip where the longest one is, and its place in words."""
+    worst = max(inputs.chips, key=lambda c: getattr(c, which).length_max)
+    vectors: VectorMap = getattr(worst, which)
+    x, y = vectors.position_of_max
+    return vectors, f"pixel ({x:.0f}, {y:.0f}){inputs.on_chip(worst.chip)}"
+
+
+def _suppressed(inputs: ReportInput) -> str:
+    if not inputs.several:
+        return ""
+    return (
+        " Each chip is compared with its own array: gap and rotation between the chips are not"
+        " shown. All panels have one scale."
+    )
+
+
 def _formal(inputs: ReportInput) -> Caption:
-    found = " and ".join(f"{_length(m.radius_max, inputs)} ({m.kind})" for m in inputs.maps)
+    by_kind = [
+        max(maps, key=lambda m: m.radius_max)
+        for maps in zip(*(c.maps for c in inputs.chips), strict=True)
+    ]
+    found = " and ".join(f"{_length(m.radius_max, inputs)} ({m.kind})" for m in by_kind)
     return Caption(
         "Formal-uncertainty diagram",
         "From each place four vectors to all combinations of ±1 σ in u and ±1 σ in v, enlarged as"
@@ -180,9 +207,10 @@ def _formal(inputs: ReportInput) -> Caption:
 
 def _radius(inputs: ReportInput) -> Caption:
     text = "Radial uncertainty hypot(σ u, σ v), its largest place ringed."
-    if inputs.posterior_map is not None:
-        ratio = inputs.posterior_map.radius / inputs.formal_map.radius
-        low, high = number(float(ratio.min())), number(float(ratio.max()))
+    pairs = [(c.formal_map, c.posterior_map) for c in inputs.chips]
+    ratios = [p.radius / f.radius for f, p in pairs if p is not None]
+    if ratios:
+        low, high = (number(float(end(ratios))) for end in (np.min, np.max))
         text += (
             f" The posterior's is {low} to {high} times the formal one;"
             " above 1, least squares with rejection is too sure of itself."
@@ -191,12 +219,26 @@ def _radius(inputs: ReportInput) -> Caption:
 
 
 def _area(inputs: ReportInput) -> Caption:
-    a = inputs.area
+    areas = [c.area for c in inputs.chips]
+    low, high = min(a.area.min() for a in areas), max(a.area.max() for a in areas)
+    sigma = max(float(a.sigma.max()) for a in areas)
+    own, between = "", ""
+    if inputs.several:
+        own = " of each chip"
+        first, *others = inputs.chips
+        ratios = ", ".join(
+            f"{c.area.reference_area / first.area.reference_area:.5f} ({c.chip.name})"
+            for c in others
+        )
+        between = (
+            f" The reference pixels themselves cover, relative to that of {first.chip.name}:"
+            f" {ratios}."
+        )
     return Caption(
         "Pixel area",
-        f"Relative to the reference pixel the area runs from {a.area.min():.5f} to"
-        f" {a.area.max():.5f}, known to {number(float(a.sigma.max()), 2)} at worst: flat-fielded"
-        " point-source photometry is to be multiplied by it.",
+        f"Relative to the reference pixel{own} the area runs from {low:.5f} to"
+        f" {high:.5f}, known to {number(sigma, 2)} at worst: flat-fielded"
+        f" point-source photometry is to be multiplied by it.{between}",
         "Contour map of the relative pixel area.",
     )
 
@@ -216,13 +258,13 @@ def _terms(inputs: ReportInput) -> Caption:
 def _dominating(inputs: ReportInput) -> Caption:
     assert inputs.budget is not None
     b = inputs.budget
-    share = np.bincount(np.ravel(b.dominant), minlength=len(b.terms)) / b.dominant.size
+    share = b.share
     top = int(share.argmax())
     return Caption(
         "Dominating term",
-        f"Where which term is largest: {b.terms[top].name} on {percent(share[top], 2)} of the grid."
+        f"Where which term is largest: {b.names[top]} on {percent(share[top], 2)} of the grid."
         " A better calibration helps only where a term of the model leads.",
-        f"Map of the dominating term, mostly {b.terms[top].name}.",
+        f"Map of the dominating term, mostly {b.names[top]}.",
     )
 
 

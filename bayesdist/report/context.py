@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     from bayesdist.assess import (
         AreaMap,
         BinnedResiduals,
-        ErrorBudget,
         ExposureSums,
         Margin,
         StarSample,
         UncertaintyMap,
         VectorMap,
     )
+    from bayesdist.assess.detector_budget import DetectorBudget
     from bayesdist.data import MagnitudeErrors
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.model import Chip
 
-__all__ = ["Check", "Product", "ReportInput"]
+__all__ = ["Check", "ChipResults", "Product", "ReportInput"]
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,45 @@ class Product:
 
 
 @dataclass(frozen=True, eq=False)
+class ChipResults:
+    """What was assessed on one chip.
+
+    Parameters
+    ----------
+    chip : Chip
+    formal_map : UncertaintyMap
+        Of the least-squares fit.
+    posterior_map : UncertaintyMap or None
+    displacement : VectorMap
+        The distortion with its zeroth order suppressed.
+    non_linear : VectorMap
+    area : AreaMap
+    binned : BinnedResiduals
+    place : tuple of int
+        Row (0 on top) and column of the chip among the others.
+    """
+
+    chip: Chip
+    formal_map: UncertaintyMap
+    posterior_map: UncertaintyMap | None
+    displacement: VectorMap
+    non_linear: VectorMap
+    area: AreaMap
+    binned: BinnedResiduals
+    place: tuple[int, int] = (0, 0)
+
+    @property
+    def maps(self) -> tuple[UncertaintyMap, ...]:
+        """The uncertainty maps that there are, least squares first."""
+        return tuple(m for m in (self.formal_map, self.posterior_map) if m is not None)
+
+    @property
+    def best_map(self) -> UncertaintyMap:
+        """That of the posterior where there is one."""
+        return self.maps[-1]
+
+
+@dataclass(frozen=True, eq=False)
 class ReportInput:
     """Results of a run, as the report shows them.
 
@@ -88,19 +127,13 @@ class ReportInput:
     fit : LinearFit
     posterior : Posterior or None
         None where nothing was sampled: the report then says that errors are formal ones only.
-    formal_map : UncertaintyMap
-        Of the least-squares fit.
-    posterior_map : UncertaintyMap or None
-    displacement : VectorMap
-        The distortion with its zeroth order suppressed.
-    non_linear : VectorMap
-    area : AreaMap
-    binned : BinnedResiduals
+    chips : tuple of ChipResults
+        In the order of the model's chips.
     coefficients : astropy.table.Table
         Legendre coefficients and all other parameters; columns name, chip, axis, i, j, value,
         sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit.  Those of the
         posterior may be missing or masked.
-    budget : ErrorBudget or None
+    budget : DetectorBudget or None
     margins : tuple of Margin
     products : tuple of Product
     warnings : tuple of str
@@ -119,14 +152,9 @@ class ReportInput:
     exposures: ExposureSums
     fit: LinearFit
     posterior: Posterior | None
-    formal_map: UncertaintyMap
-    posterior_map: UncertaintyMap | None
-    displacement: VectorMap
-    non_linear: VectorMap
-    area: AreaMap
-    binned: BinnedResiduals
+    chips: tuple[ChipResults, ...]
     coefficients: Table
-    budget: ErrorBudget | None = None
+    budget: DetectorBudget | None = None
     margins: tuple[Margin, ...] = ()
     products: tuple[Product, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -157,15 +185,13 @@ class ReportInput:
         return self.fit if self.posterior is None else self.posterior
 
     @property
-    def maps(self) -> tuple[UncertaintyMap, ...]:
-        """The uncertainty maps that there are, least squares first."""
-        return tuple(m for m in (self.formal_map, self.posterior_map) if m is not None)
+    def several(self) -> bool:
+        """Whether the detector has more than one chip."""
+        return len(self.chips) > 1
 
-    @property
-    def chip(self) -> Chip:
-        """The chip that the maps show."""
-        model = self.fit.model
-        return model.chips[model.chip_code(self.formal_map.chip)]
+    def on_chip(self, chip: Chip) -> str:
+        """' of WFC1' where there are several chips, else nothing."""
+        return f" of {chip.name}" if self.several else ""
 
     @property
     def scale_mas(self) -> float | None:

@@ -17,6 +17,7 @@ from bayesdist.report.budget import budget_terms, dominating_term
 from bayesdist.report.context import ReportInput
 from bayesdist.report.corners import corner_coefficients, corner_outliers
 from bayesdist.report.margins import margins_against_limits
+from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.residuals import (
     MixtureCurve,
     residual_histogram,
@@ -53,25 +54,37 @@ def all_figures(inputs: ReportInput) -> dict[str, Figure]:
             stars.table.mag, stars.residual, errors=inputs.magnitude_errors, **drawn
         )
     out["residual_histogram"] = residual_histogram(stars.residual, mixture_curves(inputs), **drawn)
+    chips, mosaic = inputs.chips, mosaic_of(inputs)
     out["residual_vectors"] = residual_vectors(
-        inputs.binned, unit=inputs.unit, size=inputs.chip.size
+        *(c.binned for c in chips), unit=inputs.unit, mosaic=mosaic
     )
     if inputs.posterior is not None:
         if inputs.posterior.hyper:
             out["outliers_corner"] = corner_outliers(inputs.posterior)
         out["coefficients_corner"] = corner_coefficients(inputs.posterior, inputs.fit)
         out["traces"] = traces(inputs.posterior)
-    out["distortion"] = vector_flow(inputs.displacement)
-    out["distortion_non_linear"] = vector_flow(inputs.non_linear)
-    out["formal_uncertainty"] = formal_uncertainty(*inputs.maps)
-    out["uncertainty_radius"] = uncertainty_radius(*inputs.maps)
-    out["pixel_area"] = pixel_area(inputs.area)
+    maps = [m for c in chips for m in c.maps]
+    out["distortion"] = vector_flow(*(c.displacement for c in chips), mosaic=mosaic)
+    out["distortion_non_linear"] = vector_flow(*(c.non_linear for c in chips), mosaic=mosaic)
+    out["formal_uncertainty"] = formal_uncertainty(*maps, mosaic=mosaic)
+    out["uncertainty_radius"] = uncertainty_radius(*maps, mosaic=mosaic)
+    out["pixel_area"] = pixel_area(*(c.area for c in chips), mosaic=mosaic)
     if inputs.budget is not None:
-        out["budget_terms"] = budget_terms(inputs.budget)
-        out["budget_dominating"] = dominating_term(inputs.budget)
+        out["budget_terms"] = budget_terms(inputs.budget, mosaic.names)
+        out["budget_dominating"] = dominating_term(inputs.budget, mosaic)
     if inputs.margins:
         out["margins"] = margins_against_limits(inputs.margins)
     return out
+
+
+def mosaic_of(inputs: ReportInput) -> Mosaic:
+    """How the chips of a run are drawn."""
+    chips = inputs.chips
+    return Mosaic(
+        sizes=tuple(c.chip.size for c in chips),
+        names=tuple(c.chip.name if inputs.several else "" for c in chips),
+        places=tuple(c.place for c in chips),
+    )
 
 
 def mixture_curves(inputs: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:

@@ -66,6 +66,7 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
     environment.filters["number"] = lambda v: v if isinstance(v, str) else number(v)
     return environment.get_template("report.html.jinja").render(
         run=inputs,
+        chips=_chips(inputs),
         verdict=verdict(inputs),
         status=status_checks(inputs),
         pictures={
@@ -85,6 +86,18 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
                 *_present(tables.config_table(inputs)),
             ),
         },
+    )
+
+
+def _chips(inputs: ReportInput) -> str:
+    """Names and sizes of the chips, those of equal size together."""
+    names: dict[str, list[str]] = {}
+    for c in inputs.chips:
+        size = "{:g} × {:g}".format(*c.chip.size)
+        names.setdefault(size, []).append(c.chip.name or f"chip {c.chip.number}")
+    return "; ".join(
+        f"{', '.join(several[:-1])}{' and ' if len(several) > 1 else ''}{several[-1]}, {size}"
+        for size, several in names.items()
     )
 
 

@@ -89,7 +89,8 @@ def _ridge(ax: Axes, k: int, values: Float, color: str) -> None:
 def _label(m: Margin) -> str:
     r = m.requirement
     epoch = "" if m.epoch is None else f", {m.epoch:.6g}"
-    return f"{r.name}\n{r.statistic}{epoch}"
+    chip = "" if r.chip is None else f", chip {r.chip}"
+    return f"{r.name}\n{r.statistic}{epoch}{chip}"
 
 
 def _statement(m: Margin) -> str:

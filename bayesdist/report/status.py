@@ -224,13 +224,15 @@ def _accuracy_sentence(inputs: ReportInput) -> str:
     whose = "posterior" if inputs.posterior is not None else "formal"
     if inputs.provisional:
         whose = f"provisional {whose}"
-    best = inputs.maps[-1]
+    worst = max(inputs.chips, key=lambda c: c.best_map.radius_max)
+    best = worst.best_map
+    median = float(np.median(np.concatenate([c.best_map.radius.ravel() for c in inputs.chips])))
     x, y = best.position_of_max
     text = (
         f"The {whose} uncertainty of the distortion (radial, 1 σ) is"
-        f" {with_mas(float(np.median(best.radius)), inputs.unit, inputs.scale_mas)} at the median"
+        f" {with_mas(median, inputs.unit, inputs.scale_mas)} at the median"
         f" place and at most {with_mas(best.radius_max, inputs.unit, inputs.scale_mas)},"
-        f" at pixel ({x:.0f}, {y:.0f})"
+        f" at pixel ({x:.0f}, {y:.0f}){inputs.on_chip(worst.chip)}"
     )
     if inputs.budget is None:
         return f"{text}."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,13 +14,12 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
+from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.scales import display_scale
 from bayesdist.report.style import (
     CYCLE,
     INK,
     SEQUENTIAL,
-    detector_axes,
-    detector_panels,
     figure_style,
     nice_below,
     vector_key,
@@ -34,7 +34,9 @@ __all__ = ["contour_map", "formal_uncertainty", "uncertainty_radius"]
 Float = NDArray[np.float64]
 
 
-def formal_uncertainty(*maps: UncertaintyMap, magnification: float | None = None) -> Figure:
+def formal_uncertainty(
+    *maps: UncertaintyMap, mosaic: Mosaic | None = None, magnification: float | None = None
+) -> Figure:
     """Formal-uncertainty diagram: four vectors from each place, to (+-sigma_u, +-sigma_v).
 
     As section 6 of the WISE distortion report, which draws them 2000 times larger than the
@@ -43,7 +45,9 @@ def formal_uncertainty(*maps: UncertaintyMap, magnification: float | None = None
     Parameters
     ----------
     *maps : UncertaintyMap
-        One, or least squares and posterior.
+        One, or least squares and posterior; of several chips these of each chip.
+    mosaic : Mosaic, optional
+        How the chips lie; one above the other by default.
     magnification : float, optional
         Pixels of the axes for one unit of the uncertainties; a round number by default.
 
@@ -51,29 +55,48 @@ def formal_uncertainty(*maps: UncertaintyMap, magnification: float | None = None
     -------
     matplotlib.figure.Figure
     """
-    size = grid_size(maps[0].x, maps[0].y)
+    chips, mosaic = _by_chip(maps, mosaic)
     largest = max(float(np.max(m.radius)) for m in maps)
     widest = max(float(max(np.max(m.sigma_u), np.max(m.sigma_v))) for m in maps)
-    rows, columns = square_cells(maps[0].x, maps[0].y)
     # beyond half a grid step crosses overlap: a few do, in the corners, so that the inner ones show
-    step = spacing(maps[0].x[columns], maps[0].y[rows])
+    every = 2 if mosaic.several else 1  # panels of several chips are small
+    step = min(_step(m, every) for m in maps)
     M = magnification or nice_below(0.8 * step / max(widest, 1e-300))
-    fig, axes = detector_panels(len(maps), size)
+    margin = M * widest + 0.02 * max(max(s) for s in mosaic.sizes)
+    fig, panels = mosaic.panels(len(chips[0]))
     with figure_style():
-        for ax, one, color in zip(axes, maps, CYCLE, strict=False):
-            detector_axes(ax, size, margin=M * widest + 0.02 * max(size))
-            ax.add_collection(LineCollection(_crosses(one, M), colors=color, linewidths=0.8))
-            radius = float(np.max(one.radius))
-            text = display_scale(one.unit, radius).text(radius)
-            ax.set_title(f"{one.kind}, max radius {text}", pad=20)
-            # one key serves all panels, but a panel that is cut out must still state its scale
-            vector_key(ax, nice_below(largest), magnification=M, unit=one.unit)
+        for k, (axes, of_chip) in enumerate(zip(panels, chips, strict=True)):
+            for ax, one, color in zip(axes, of_chip, CYCLE, strict=False):
+                mosaic.draw(ax, k, margin=margin)
+                ax.add_collection(
+                    LineCollection(_crosses(one, M, every), colors=color, linewidths=0.8)
+                )
+                radius = float(np.max(one.radius))
+                text = display_scale(one.unit, radius).text(radius)
+                title = mosaic.title(k, f"{one.kind}, max radius {text}", ", ")
+                ax.set_title(title, pad=20)
+                # one key serves all panels, but a panel that is cut out must state its scale too
+                vector_key(ax, nice_below(largest), magnification=M, unit=one.unit)
     return fig
 
 
-def _crosses(m: UncertaintyMap, magnification: float) -> Float:
+def _by_chip(
+    maps: Sequence[UncertaintyMap], mosaic: Mosaic | None
+) -> tuple[list[list[UncertaintyMap]], Mosaic]:
+    """The maps of each chip, and how the chips lie."""
+    numbers = dict.fromkeys(m.chip for m in maps)
+    chips = [[m for m in maps if m.chip == number] for number in numbers]
+    return chips, mosaic or Mosaic.column(*(grid_size(c[0].x, c[0].y) for c in chips))
+
+
+def _step(m: UncertaintyMap, every: int) -> float:
+    rows, columns = square_cells(m.x, m.y, every)
+    return spacing(m.x[columns], m.y[rows])
+
+
+def _crosses(m: UncertaintyMap, magnification: float, every: int) -> Float:
     """The four segments of every place, shape (4 N, 2, 2)."""
-    rows, columns = square_cells(m.x, m.y)
+    rows, columns = square_cells(m.x, m.y, every)
     gx, gy = np.meshgrid(m.x[columns], m.y[rows])
     start = np.stack([gx.ravel(), gy.ravel()], axis=-1)
     sigma = [s[rows, columns].ravel() for s in (m.sigma_u, m.sigma_v)]
@@ -82,32 +105,40 @@ def _crosses(m: UncertaintyMap, magnification: float) -> Float:
     return np.concatenate([np.stack([start, end], axis=1) for end in ends])
 
 
-def uncertainty_radius(*maps: UncertaintyMap) -> Figure:
+def uncertainty_radius(*maps: UncertaintyMap, mosaic: Mosaic | None = None) -> Figure:
     """Radial uncertainty hypot(sigma_u, sigma_v) over the detector, all maps in one colour scale.
 
     Parameters
     ----------
     *maps : UncertaintyMap
-        One, or least squares and posterior.
+        One, or least squares and posterior; of several chips these of each chip.
+    mosaic : Mosaic, optional
+        How the chips lie; one above the other by default.
 
     Returns
     -------
     matplotlib.figure.Figure
     """
-    size = grid_size(maps[0].x, maps[0].y)
+    chips, mosaic = _by_chip(maps, mosaic)
     scale = display_scale(maps[0].unit, max(float(np.max(m.radius)) for m in maps))
-    values = [m.radius * scale.factor for m in maps]
-    levels = contour_levels(np.concatenate([v.ravel() for v in values]))
-    fig, axes = detector_panels(len(maps), size, colorbar=True)
+    levels = contour_levels(np.concatenate([(m.radius * scale.factor).ravel() for m in maps]))
+    fig, panels = mosaic.panels(len(chips[0]), colorbar=True)
     with figure_style():
-        for ax, one, radius in zip(axes, maps, values, strict=False):
-            detector_axes(ax, size)
-            filled = contour_map(ax, one.x, one.y, radius, levels, labels=False)
-            x, y = one.position_of_max
-            ax.plot(x, y, "o", ms=5, mfc="none", mec="white", mew=2.2, clip_on=False, zorder=5)
-            ax.plot(x, y, "o", ms=5, mfc="none", mec=INK, mew=1.0, clip_on=False, zorder=6)
-            ax.set_title(f"{one.kind}: {radius.min():.3g} to {radius.max():.3g} {scale.unit}")
-        fig.colorbar(filled, ax=axes, label=f"radius (1 σ) [{scale.unit}]", fraction=0.05, pad=0.02)
+        for k, (axes, of_chip) in enumerate(zip(panels, chips, strict=True)):
+            for ax, one in zip(axes, of_chip, strict=True):
+                radius = one.radius * scale.factor
+                mosaic.draw(ax, k)
+                filled = contour_map(ax, one.x, one.y, radius, levels, labels=False)
+                x, y = one.position_of_max
+                ring = {"ms": 5, "mfc": "none", "clip_on": False}
+                ax.plot(x, y, "o", mec="white", mew=2.2, zorder=5, **ring)
+                ax.plot(x, y, "o", mec=INK, mew=1.0, zorder=6, **ring)
+                text = f"{one.kind}: {radius.min():.3g} to {radius.max():.3g} {scale.unit}"
+                ax.set_title(mosaic.title(k, text, ", "))
+        every = [ax for axes in panels for ax in axes]
+        fig.colorbar(
+            filled, ax=every, label=f"radius (1 σ) [{scale.unit}]", fraction=0.05, pad=0.02
+        )
     return fig
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.scales import display_scale
 from bayesdist.report.style import (
     INK,
     PALETTE,
-    detector_axes,
-    detector_panels,
     draw_vectors,
     figure_style,
     nice_below,
@@ -50,16 +50,18 @@ def spacing(x: Float, y: Float) -> float:
     return float(min((s.min() for s in steps if s.size), default=1.0))
 
 
-def square_cells(x: Float, y: Float) -> tuple[slice, slice]:
+def square_cells(x: Float, y: Float, every: int = 1) -> tuple[slice, slice]:
     """Rows and columns of a map to draw, so that its arrows stand about as far apart on both axes.
 
-    Only steps that keep both ends are taken: the corners are where distortions are largest.
+    With `every`, only every so manieth of these, for small panels.  Only steps that keep both ends
+    are taken: the corners are where distortions are largest.
     """
     steps = [(a[-1] - a[0]) / (len(a) - 1) for a in (y, x)]
     out = []
     for a, step in zip((y, x), steps, strict=True):
         stride = round(max(steps) / step)
-        out.append(slice(None, None, stride if (len(a) - 1) % stride == 0 else 1))
+        fitting = [s for s in (stride * every, stride, 1) if (len(a) - 1) % s == 0]
+        out.append(slice(None, None, fitting[0]))
     return out[0], out[1]
 
 
@@ -68,7 +70,9 @@ def _magnification(reach: float, length: float) -> float:
     return nice_below(reach / length) if length > 1e-10 * reach else 1.0
 
 
-def vector_flow(vectors: VectorMap, *, magnification: float | None = None) -> Figure:
+def vector_flow(
+    *vectors: VectorMap, mosaic: Mosaic | None = None, magnification: float | None = None
+) -> Figure:
     """Vector-flow diagram: from each array position towards where the distortion puts it.
 
     As section 4 of the WISE distortion report where the zeroth order is suppressed, and as
@@ -76,7 +80,10 @@ def vector_flow(vectors: VectorMap, *, magnification: float | None = None) -> Fi
 
     Parameters
     ----------
-    vectors : VectorMap
+    *vectors : VectorMap
+        One for each chip; all are drawn to the same scale.
+    mosaic : Mosaic, optional
+        How the chips lie; one above the other by default.
     magnification : float, optional
         How much longer than the axes' pixels the vectors are; a round number by default.
 
@@ -85,39 +92,70 @@ def vector_flow(vectors: VectorMap, *, magnification: float | None = None) -> Fi
     matplotlib.figure.Figure
         The vectors are in pixels along x and y, whatever the unit and orientation of u and v.
     """
-    size = grid_size(vectors.x, vectors.y)
-    rows, columns = square_cells(vectors.x, vectors.y)
-    gx, gy = np.meshgrid(vectors.x[columns], vectors.y[rows])
-    along_x, along_y = vectors.on_detector
-    du, dv = along_x[rows, columns], along_y[rows, columns]
-    length = np.hypot(along_x, along_y)
-    largest = float(length.max())
-    iy, ix = np.unravel_index(int(length.argmax()), length.shape)
-    place = float(vectors.x[ix]), float(vectors.y[iy])
+    flows = [_flow(v) for v in vectors]
+    mosaic = mosaic or Mosaic.column(*(f.size for f in flows))
+    largest = max(f.largest for f in flows)
     # one and a half grid steps do not yet hide a vector's neighbours, as they flow alike
-    step = spacing(vectors.x[columns], vectors.y[rows])
-    M = magnification or _magnification(1.5 * step, largest)
-    fig, (ax,) = detector_panels(1, size)
+    M = magnification or _magnification(1.5 * min(f.step for f in flows), largest)
+    margin = max(f.reach(M) for f in flows) + 0.02 * max(max(f.size) for f in flows)
+    fig, panels = mosaic.panels()
     with figure_style():
-        reach_x = np.abs(gx + M * du - (size[0] + 1) / 2).max() - size[0] / 2
-        reach_y = np.abs(gy + M * dv - (size[1] + 1) / 2).max() - size[1] / 2
-        detector_axes(ax, size, margin=max(reach_x, reach_y, 0.0) + 0.02 * max(size))
-        draw_vectors(ax, gx, gy, du, dv, magnification=M)
-        ax.plot(*place, "o", ms=4.5, mfc="none", mec=PALETTE["vermilion"], mew=1.2)
-        ax.set_title(
-            f"largest {display_scale('pix', largest).text(largest, 4)}"
-            f" at ({place[0]:.0f}, {place[1]:.0f})",
-            pad=9,
-        )
-        vector_key(ax, nice_below(largest / 1.5), magnification=M, unit="pix")
+        for k, (f, (ax,)) in enumerate(zip(flows, panels, strict=True)):
+            mosaic.draw(ax, k, margin=margin)
+            draw_vectors(ax, f.gx, f.gy, f.du, f.dv, magnification=M)
+            ax.plot(*f.place, "o", ms=4.5, mfc="none", mec=PALETTE["vermilion"], mew=1.2)
+            text = (
+                f"largest {display_scale('pix', f.largest).text(f.largest, 4)}"
+                f" at ({f.place[0]:.0f}, {f.place[1]:.0f})"
+            )
+            ax.set_title(mosaic.title(k, text), pad=9)
+            vector_key(ax, nice_below(largest / 1.5), magnification=M, unit="pix")
     return fig
 
 
+@dataclass(frozen=True, eq=False)
+class _Flow:
+    """Vectors of one chip as they are drawn, and the largest of all of them."""
+
+    gx: Float
+    gy: Float
+    du: Float
+    dv: Float
+    largest: float
+    place: tuple[float, float]
+    size: tuple[float, float]
+    step: float
+
+    def reach(self, magnification: float) -> float:
+        """How far the vectors stand out beyond the chip, in pixels."""
+        (nx, ny), M = self.size, magnification
+        reach_x = np.abs(self.gx + M * self.du - (nx + 1) / 2).max() - nx / 2
+        reach_y = np.abs(self.gy + M * self.dv - (ny + 1) / 2).max() - ny / 2
+        return float(max(reach_x, reach_y, 0.0))
+
+
+def _flow(vectors: VectorMap) -> _Flow:
+    rows, columns = square_cells(vectors.x, vectors.y)
+    gx, gy = np.meshgrid(vectors.x[columns], vectors.y[rows])
+    along_x, along_y = vectors.on_detector
+    length = np.hypot(along_x, along_y)
+    iy, ix = np.unravel_index(int(length.argmax()), length.shape)
+    return _Flow(
+        gx=gx,
+        gy=gy,
+        du=along_x[rows, columns],
+        dv=along_y[rows, columns],
+        largest=float(length.max()),
+        place=(float(vectors.x[ix]), float(vectors.y[iy])),
+        size=grid_size(vectors.x, vectors.y),
+        step=spacing(vectors.x[columns], vectors.y[rows]),
+    )
+
+
 def residual_vectors(
-    binned: BinnedResiduals,
-    *,
+    *binned: BinnedResiduals,
     unit: str,
-    size: tuple[float, float],
+    mosaic: Mosaic,
     magnification: float | None = None,
 ) -> Figure:
     """Mean residual vector of each cell of the detector.
@@ -127,12 +165,12 @@ def residual_vectors(
 
     Parameters
     ----------
-    binned : BinnedResiduals
-        Empty cells hold NaN and stay empty.
+    *binned : BinnedResiduals
+        One for each chip; all are drawn to the same scale.  Empty cells hold NaN and stay empty.
     unit : str
         Unit of the residuals.
-    size : tuple of float
-        Columns and rows of the detector, in pixels.
+    mosaic : Mosaic
+        Sizes of the chips, and how they lie.
     magnification : float, optional
         Pixels of the axes for one unit of the vectors; a round number by default.
 
@@ -140,26 +178,32 @@ def residual_vectors(
     -------
     matplotlib.figure.Figure
     """
-    gx, gy = np.meshgrid(binned.x, binned.y)
-    du, dv = np.asarray(binned.mean_u, float), np.asarray(binned.mean_v, float)
-    filled = (np.asarray(binned.count) > 0) & np.isfinite(du) & np.isfinite(dv)
-    significant = filled & significant_cells(binned)
-    length = np.where(filled, np.hypot(du, dv), 0.0)
+    filled = [
+        (np.asarray(b.count) > 0) & np.isfinite(b.mean_u) & np.isfinite(b.mean_v) for b in binned
+    ]
+    length = np.concatenate(
+        [np.hypot(b.mean_u, b.mean_v)[full] for b, full in zip(binned, filled, strict=True)]
+    )
     # one bad cell with three stars must not flatten all others
-    typical = float(np.quantile(length[filled], 0.95)) if filled.any() else 0.0
-    M = magnification or _magnification(1.1 * spacing(binned.x, binned.y), typical)
-    fig, (ax,) = detector_panels(1, size)
+    typical = float(np.quantile(length, 0.95)) if length.size else 0.0
+    step = min(spacing(b.x, b.y) for b in binned)
+    M = magnification or _magnification(1.1 * step, typical)
+    fig, panels = mosaic.panels()
     with figure_style():
-        detector_axes(ax, size, margin=0.03 * max(size))
-        for k, color in ((filled & ~significant, "#A9B4C0"), (significant, INK)):
-            draw_vectors(ax, gx[k], gy[k], du[k], dv[k], magnification=M, color=color)
-        ax.plot(gx[filled], gy[filled], ".", ms=1.2, color="#A9B4C0", zorder=2)
-        ax.set_title(
-            f"{int(significant.sum())} of {int(filled.sum())} cells significant,\n"
-            f"{CHANCE * filled.sum():.0f} by chance",
-            pad=9,
-        )
-        vector_key(ax, nice_below(typical), magnification=M, unit=unit)
+        for k, (b, full, (ax,)) in enumerate(zip(binned, filled, panels, strict=True)):
+            gx, gy = np.meshgrid(b.x, b.y)
+            significant = full & significant_cells(b)
+            mosaic.draw(ax, k, margin=0.03 * max(max(s) for s in mosaic.sizes))
+            for cells, color in ((full & ~significant, "#A9B4C0"), (significant, INK)):
+                vectors = b.mean_u[cells], b.mean_v[cells]
+                draw_vectors(ax, gx[cells], gy[cells], *vectors, magnification=M, color=color)
+            ax.plot(gx[full], gy[full], ".", ms=1.2, color="#A9B4C0", zorder=2)
+            text = (
+                f"{int(significant.sum())} of {int(full.sum())} cells significant,\n"
+                f"{CHANCE * full.sum():.0f} by chance"
+            )
+            ax.set_title(mosaic.title(k, text), pad=9)
+            vector_key(ax, nice_below(typical), magnification=M, unit=unit)
     return fig
 
 

@@ -275,13 +275,24 @@ def test_chip_blocks_and_the_detector_exclude_each_other():
         assert "[[chip]]" in str(refusal(config_text(**(bare | more), chip=[CHIP])))
 
 
-def test_a_run_takes_one_chip():
-    """What is assessed is one chip: a second one must not pass unseen."""
+def test_the_reference_chip_stands_first():
     bare = {"detector": None, "model": {"order": 2}}
     (chip,) = parsed(config_text(**bare, chip=[CHIP])).chips()
     assert chip.number == CHIP["number"] and chip.size == tuple(CHIP["size"])
-    two = [CHIP, CHIP | {"number": 1, "name": "WFC1"}]
-    assert "one chip" in str(refusal(config_text(**bare, chip=two)))
+    other = CHIP | {"number": 1, "name": "WFC1", "reference": False}
+    for blocks, order in (
+        ([other, CHIP], [1, 2]),  # as written, where none is the reference
+        ([other, CHIP | {"reference": True}], [2, 1]),
+    ):
+        config = parsed(config_text(**bare, chip=blocks))
+        assert [c.number for c in config.chips()] == order
+
+
+def test_a_requirement_may_name_a_chip():
+    block = {"name": "n", "statistic": "p95", "limit": 1.0}
+    of_all, of_one = parsed(config_text(requirement=[block, block | {"chip": 2}])).requirements()
+    assert (of_all.chip, of_one.chip) == (None, 2)
+    assert "chip" in str(refusal(config_text(requirement=[block | {"chip": "WFC2"}])))
 
 
 def test_text_is_kept_as_written(tmp_path):

@@ -88,8 +88,7 @@ def rich(solution_of):
         mean[model.coefficient_slice(number, 0)][basis.terms.index((1, 0))] = 2048.0
         mean[model.coefficient_slice(number, 1)][basis.terms.index((0, 1))] = 1024.0
     for code, angle in ((1, 0.4), (2, np.pi / 2), (3, -2.0)):
-        turn = np.cos(angle) - 1.0, np.sin(angle)
-        mean[model.frame_slice(code)] = 3.0, -5.0, *turn
+        mean[model.frame_slice(code)] = 3.0, -5.0, 0.0, angle
     # small errors of each parameter in its own size: angles act over thousands of pixels
     size = np.array(
         [1e-6 if name.endswith((".scale", ".rotation")) else 1e-3 for name in model.names]

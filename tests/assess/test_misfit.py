@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import binom
 
-from bayesdist.assess import binned_sums, misfit_of, partitions_for
+from bayesdist.assess import Misfit, binned_sums, misfit_of, partitions_for
+from bayesdist.assess.misfit import worst_misfit
+from bayesdist.model import Chip
 
 SIZE = (1000.0, 800.0)
 
@@ -49,3 +51,28 @@ def test_a_wave_over_the_field_is_found_in_cells():
     r[:, 1] += 0.03 * np.sin(x / 60) * np.sin(y / 60)
     found = _misfit(x, y, r)
     assert found.significant and found.partition == "cells"
+
+
+def test_the_worst_of_several_chips_pays_for_their_number():
+    """The smallest of n uniform probabilities is below p / n with probability p, about."""
+    a, b = (Chip(k, name, SIZE, (1.0, 1.0)) for k, name in ((1, "A"), (2, "B")))
+    found = [Misfit(0.3, "cells", 0.01, "pix", a), Misfit(2e-5, "rows", 0.02, "pix", b)]
+    worst = worst_misfit(found)
+    assert (worst.chip, worst.p_value, worst.partition) == (b, 4e-5, "rows")
+    assert worst.significant and "of chip B" in worst.sentence
+    assert worst_misfit(found[:1]) == found[0]
+    # both beyond what a double holds: the larger structure is named
+    gone = [Misfit(0.0, "cells", 0.01, "pix", a), Misfit(0.0, "cells", 0.03, "pix", b)]
+    assert worst_misfit(gone).chip == b
+    rng = np.random.default_rng(4)
+    p = [
+        worst_misfit([Misfit(q, "cells", 0.0, "pix", a) for q in rng.uniform(size=5)]).p_value
+        for _ in range(2000)
+    ]
+    low, high = binom.ppf([0.001, 0.999], 2000, 0.1)
+    # 1 - (1 - p / n)^n: a little less than p
+    assert low - 0.005 * 2000 <= (np.array(p) < 0.1).sum() <= high
+
+
+def test_the_detector_is_named_where_there_is_one_chip():
+    assert "of the detector," in Misfit(0.0, "cells", 0.1, "pix").sentence

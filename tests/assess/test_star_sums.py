@@ -26,7 +26,7 @@ from bayesdist.infer import (
 from bayesdist.model import Chip, DistortionModel
 
 SIZE = (1016.0, 508.0)
-BINS = ((5, 4), (12, 1))
+BINS = {2: ((5, 4), (12, 1)), 1: ((6, 3), (5, 4))}  # by chip
 
 
 def test_bins_of_pieces_add(rng):
@@ -104,19 +104,36 @@ def several():
     return table, fit_linear(table, model)
 
 
+def test_a_piece_without_a_chip_adds_nothing(several):
+    table, fit = several
+    both = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
+    parts = [
+        load(fit.model, table.select(table.chip == code)).sum(star_sums, fit.mean, fit.clip, BINS)
+        for code in (0, 1)
+    ]
+    assert parts[0].binned[2, (5, 4)].n == 0
+    for key, sums in (parts[0] + parts[1]).binned.items():
+        np.testing.assert_array_equal(sums.count, both.binned[key].count)
+        np.testing.assert_allclose(sums.first, both.binned[key].first, atol=1e-9)
+
+
 def test_one_pass_gives_what_arrays_give(several, monkeypatch):
     table, fit = several
     residual, used = residuals(fit, table), fit.uses(table)
     assert used.sum() == fit.n_used < len(table)
-    first = used & (np.asarray(table.chip_numbers)[table.chip] == fit.model.chips[0].number)
+    numbers = np.asarray(table.chip_numbers)[table.chip]
     for piece in (10_000, 700):
         monkeypatch.setattr("bayesdist.data.matches.PIECE", piece)
         sums = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
-        for bins in BINS:
+        assert set(sums.binned) == {
+            (chip, bins) for chip, several in BINS.items() for bins in several
+        }
+        for chip, bins in sums.binned:
+            here = used & (numbers == chip)
             expected = binned_residuals(
-                table.x[first], table.y[first], *residual[first].T, bins=bins, size=SIZE
+                table.x[here], table.y[here], *residual[here].T, bins=bins, size=SIZE
             )
-            found = sums.binned[bins].residuals()
+            found = sums.binned[chip, bins].residuals()
             np.testing.assert_array_equal(found.count, expected.count)
             for name in ("mean_u", "mean_v", "sem_u", "sem_v"):
                 np.testing.assert_allclose(
@@ -145,7 +162,7 @@ def test_the_task_and_what_it_returns_travel(several):
     one = load(fit.model, table).sum(star_sums, fit.mean, fit.clip, BINS)
     other = pickle.loads(pickle.dumps(load(fit.model, table).sum(task, fit.mean, clip, BINS)))
     np.testing.assert_array_equal(one.exposures.uu, other.exposures.uu)
-    np.testing.assert_array_equal(one.binned[5, 4].second_2, other.binned[5, 4].second_2)
+    np.testing.assert_array_equal(one.binned[2, (5, 4)].second_2, other.binned[2, (5, 4)].second_2)
 
 
 def test_stars_flagged_are_those_that_are_flagged_one_by_one(several, monkeypatch):

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from numpy.polynomial import legendre
+from scipy.linalg import polar
 
 from bayesdist.errors import InputError
 from bayesdist.model import FRAME_KINDS, Chip, DistortionModel, TimeDependence
@@ -76,29 +77,40 @@ def formula(model: DistortionModel, theta, x, y, epoch, exposure, chip) -> np.nd
                 coefficient = value[f"{name}.step_2"] + value[f"{name}.rate_2"] * (epoch - 2012.5)
             monomial = ((x - xref) / (nx / 2)) ** i * ((y - yref) / (ny / 2)) ** j
             w["uv".index(axis)] += coefficient * monomial
-    e = model.exposures[exposure]
-    if exposure == 0 or model.frames == "none":
+    if model.frames == "none" or exposure is None:
         return w
-    d = np.array([value[f"{e}.shift_u"], value[f"{e}.shift_v"]])
-    M = np.eye(2)
-    if model.frames == "shift_rotation":
-        a = value[f"{e}.rotation"]
-        M = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
-    elif model.frames == "shift_rotation_scale":
-        s, r = value[f"{e}.scale"], value[f"{e}.rotation"]
-        M = np.array([[1 + s, -r], [r, 1 + s]])
-    elif model.frames == "affine":
-        M += [
-            [value[f"{e}.m_uu"], value[f"{e}.m_uv"]],
-            [value[f"{e}.m_vu"], value[f"{e}.m_vv"]],
-        ]
-    o = np.array(model.origin)
-    return o + d + M @ (w - o)
+    if exposure == 0 and model.gauge == "first":
+        return w
+    e = model.exposures[exposure]
+    if exposure == 0:
+        value |= {
+            f"{e}.{p}": held
+            for p, held in zip(("shift_u", "shift_v", "rotation"), model.held, strict=True)
+        }
+    p = {
+        name: value.get(f"{e}.{name}", 0.0)
+        for name in ("shift_u", "shift_v", "rotation", "scale", "shear_plus", "shear_cross")
+    }
+    (du, dv), o = w - model.origin, model.origin
+    # the detector deviates, then the telescope rolls, then it points elsewhere
+    su = (1 + p["scale"] + p["shear_plus"]) * du + p["shear_cross"] * dv
+    sv = (1 + p["scale"] - p["shear_plus"]) * dv + p["shear_cross"] * du
+    c, s = np.cos(p["rotation"]), np.sin(p["rotation"])
+    return np.array([o[0] + p["shift_u"] + c * su - s * sv, o[1] + p["shift_v"] + s * su + c * sv])
 
 
-@pytest.mark.parametrize("frames", FRAME_KINDS)
-def test_predict_is_the_formula(frames):
-    model = model_of(frames)
+HELD = {"gauge": "held", "held": (4.0, -3.0, 0.6)}
+GAUGES = [(frames, {}) for frames in FRAME_KINDS] + [
+    (frames, HELD) for frames in ("shift_rotation", "shift_rotation_scale", "affine")
+]
+in_every_gauge = pytest.mark.parametrize(
+    ("frames", "gauge"), GAUGES, ids=[f"{f}-{'held' if g else 'first'}" for f, g in GAUGES]
+)
+
+
+@in_every_gauge
+def test_predict_is_the_formula(frames, gauge):
+    model = model_of(frames, **gauge)
     theta, stars = some_theta(model), some_stars()
     expected = [
         formula(model, theta, *(stars[k][n] for k in ("x", "y", "epoch", "exposure", "chip")))
@@ -172,9 +184,9 @@ def test_inputs_are_not_changed():
         np.testing.assert_array_equal(v, before[1][k])
 
 
-@pytest.mark.parametrize("frames", FRAME_KINDS)
-def test_effective_coefficients_are_the_whole_model(frames):
-    model = model_of(frames)
+@in_every_gauge
+def test_effective_coefficients_are_the_whole_model(frames, gauge):
+    model = model_of(frames, **gauge)
     theta, stars = some_theta(model), some_stars()
     groups = model.groups(60, **{k: stars[k] for k in ("epoch", "exposure", "chip")})
     E = model.effective(theta, groups)
@@ -187,9 +199,9 @@ def test_effective_coefficients_are_the_whole_model(frames):
     np.testing.assert_allclose(out, model.predict(theta, **stars), rtol=1e-12)
 
 
-@pytest.mark.parametrize("frames", FRAME_KINDS)
-def test_jacobian_by_differences(frames):
-    model = model_of(frames)
+@in_every_gauge
+def test_jacobian_by_differences(frames, gauge):
+    model = model_of(frames, **gauge)
     theta, stars = some_theta(model), some_stars(25)
     J = model.jacobian(theta, **stars)
     assert J.shape == (25, 2, model.n_params)
@@ -222,20 +234,47 @@ def test_layout():
     assert units["b.shift_u"] == "mas" and units["b.rotation"] == ""
 
 
-@pytest.mark.parametrize("frames", FRAME_KINDS)
-def test_slices_cover_theta_once(frames):
-    model = model_of(frames)
+@in_every_gauge
+def test_slices_cover_theta_once(frames, gauge):
+    model = model_of(frames, **gauge)
     slices = [model.coefficient_slice(c.number, a) for c in CHIPS for a in (0, 1)]
     slices += [model.tdd_slice(c.number) for c in CHIPS]
-    slices += list(model.local_blocks)
+    assert sum(s.stop - s.start for s in slices) == model.n_distortion
+    slices += [model.frame_slice(0), *model.local_blocks]
     covered = np.concatenate([np.arange(model.n_params)[s] for s in slices])
     np.testing.assert_array_equal(np.sort(covered), np.arange(model.n_params))
-    assert model.frame_slice(0) == slice(0, 0)
+    if not gauge:
+        assert model.frame_slice(0) == slice(0, 0)
+    assert model.frame_slice(-1) == slice(0, 0)
 
 
-@pytest.mark.parametrize("frames", FRAME_KINDS)
-def test_dict_round_trip_through_json(frames):
-    model = model_of(frames)
+def test_what_is_held_is_no_parameter():
+    """The first exposure has its deviations alone, and they stand before the local blocks."""
+    model = model_of("affine", **HELD)
+    assert model.names[model.n_distortion : model.n_global] == (
+        "a.scale",
+        "a.shear_plus",
+        "a.shear_cross",
+    )
+    assert model.n_params == model_of("affine").n_params + 3
+    assert model_of("shift_rotation", **HELD).n_params == model_of("shift_rotation").n_params
+    theta, stars = some_theta(model), some_stars()
+    theta[model.frame_slice(0)] = [0.1, -0.2, 0.15]
+    M, d = model.frame(theta, 0)
+    np.testing.assert_array_equal(d, HELD["held"][:2])
+    turn, stretch = polar(M)
+    assert np.arctan2(turn[1, 0], turn[0, 0]) == pytest.approx(HELD["held"][2])
+    np.testing.assert_allclose(stretch, [[0.9, 0.15], [0.15, 1.3]], atol=1e-14)
+    # without an exposure: the polynomials, whatever the frames
+    other = theta.copy()
+    other[model.n_distortion :] += 1.0
+    where = {k: v for k, v in stars.items() if k != "exposure"}
+    np.testing.assert_array_equal(model.predict(other, **where), model.predict(theta, **where))
+
+
+@in_every_gauge
+def test_dict_round_trip_through_json(frames, gauge):
+    model = model_of(frames, **gauge)
     again = DistortionModel.from_dict(json.loads(json.dumps(model.to_dict())))
     assert again == model
     assert again.names == model.names
@@ -252,6 +291,25 @@ def test_errors_of_the_structure():
         model_of("none", chips=())
     with pytest.raises(InputError, match="v_0_2 is above the polynomial order 1"):
         model_of("none", order=1)
+    with pytest.raises(InputError, match=r"unknown gauge 'mean'.*first or held"):
+        model_of("affine", gauge="mean")
+    with pytest.raises(InputError, match="there are no frames"):
+        model_of("none", gauge="held")
+    with pytest.raises(InputError, match="is the identity"):
+        model_of("affine", held=(1.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="'shift' has no rotation"):
+        model_of("shift", gauge="held", held=(1.0, 0.0, 0.1))
+
+
+@pytest.mark.parametrize("frames", FRAME_KINDS)
+def test_frames_of_an_earlier_version_are_not_misread(frames):
+    """Files without a gauge are older: none is read whose parameters meant something else."""
+    old = {k: v for k, v in model_of(frames).to_dict().items() if k not in ("gauge", "held")}
+    if frames in ("shift_rotation_scale", "affine"):
+        with pytest.raises(InputError, match="earlier version"):
+            DistortionModel.from_dict(old)
+    else:
+        assert DistortionModel.from_dict(old) == model_of(frames)
 
 
 def test_errors_of_prediction():

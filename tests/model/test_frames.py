@@ -17,8 +17,8 @@ PARAMETERS = {
     "none": [],
     "shift": [3.0, -2.0],
     "shift_rotation": [3.0, -2.0, 0.7],
-    "shift_rotation_scale": [3.0, -2.0, 0.01, 0.3],
-    "affine": [3.0, -2.0, 0.01, -0.2, 0.3, -0.04],
+    "shift_rotation_scale": [3.0, -2.0, 0.01, 0.7],
+    "affine": [3.0, -2.0, 0.01, 0.7, -0.2, 0.04],
 }
 
 
@@ -30,17 +30,42 @@ def test_all_kinds_are_tested():
 
 def test_matrices():
     a = 0.7
+    turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
     expected = {
         "none": np.eye(2),
         "shift": np.eye(2),
-        "shift_rotation": [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]],
-        "shift_rotation_scale": [[1.01, -0.3], [0.3, 1.01]],
-        "affine": [[1.01, -0.2], [0.3, 0.96]],
+        "shift_rotation": turn,
+        "shift_rotation_scale": 1.01 * turn,
+        "affine": turn @ [[0.81, 0.04], [0.04, 1.21]],
     }
     for kind, p in PARAMETERS.items():
         M, d = frame_matrix(kind, p)
         np.testing.assert_allclose(M, expected[kind], rtol=1e-15)
         np.testing.assert_array_equal(d, [0, 0] if kind == "none" else [3, -2])
+
+
+@pytest.mark.parametrize("kind", FRAME_KINDS)
+def test_each_kind_is_a_case_of_the_next(kind):
+    """The same names mean the same: what a kind does not have is zero in 'affine'."""
+    value = dict(zip(frame_names(kind), PARAMETERS[kind], strict=True))
+    M, d = frame_matrix(kind, PARAMETERS[kind])
+    general = frame_matrix("affine", [value.get(name, 0.0) for name in frame_names("affine")])
+    np.testing.assert_allclose(M, general[0], rtol=1e-15)
+    np.testing.assert_array_equal(d, general[1])
+
+
+def test_deviations_are_those_of_the_detector_at_any_roll():
+    """What an exposure at roll a sees of a sheared detector is the rotated sight at roll zero."""
+    deviations = [0.0, 0.0, 1e-3, 0.0, 2e-3, -3e-3]
+    straight, _ = frame_matrix("affine", deviations)
+    for a in (0.5, 2.0, -3.0):
+        rolled, _ = frame_matrix("affine", [*deviations[:3], a, *deviations[4:]])
+        turn, _ = frame_matrix("shift_rotation", [0, 0, a])
+        np.testing.assert_allclose(rolled, turn @ straight, rtol=1e-14, atol=1e-15)
+        # singular values do not see the rotation, and a small scale is their mean
+        size = np.linalg.svd(rolled, compute_uv=False)
+        assert size.mean() - 1 == pytest.approx(1e-3)
+        assert (size[0] - size[1]) / 2 == pytest.approx(np.hypot(2e-3, 3e-3))
 
 
 def test_a_rotation_turns_u_towards_v():
@@ -91,3 +116,11 @@ def test_nearest_rotation_and_similarity_minimise_the_frobenius_norm():
     np.testing.assert_allclose(
         nearest_frame("shift_rotation_scale", M, [0, 0])[2:], [s[k], r[k]], atol=3e-3
     )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_linear_map_is_an_affine_frame(seed):
+    M = np.random.default_rng(seed).standard_normal((2, 2))
+    again, d = frame_matrix("affine", nearest_frame("affine", M, [1.0, 2.0]))
+    np.testing.assert_allclose(again, M, atol=1e-14)
+    np.testing.assert_array_equal(d, [1.0, 2.0])

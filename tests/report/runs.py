@@ -19,12 +19,13 @@ from bayesdist.assess import (
     area_map,
     check_requirements,
     distortion_vectors,
-    error_budget,
     flagged_by_exposure,
     star_sample,
     star_sums,
     uncertainty_map,
 )
+from bayesdist.assess.detector_budget import detector_budget
+from bayesdist.assess.mosaic import chip_places
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.labelled.convergence import Convergence, Limits
@@ -34,6 +35,7 @@ from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.shards import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.report import Check, Product, ReportInput
+from bayesdist.report.context import ChipResults
 
 SIZE = (1016.0, 1016.0)
 CENTRE = (508.5, 508.5)
@@ -52,11 +54,11 @@ W2_B = {
 F, JITTER, S_OUT = 0.03, 0.02, 0.6
 
 
-def wise_model(unit: str = "pix", size=SIZE) -> DistortionModel:
+def wise_model(unit: str = "pix", size=SIZE, names=("W2",)) -> DistortionModel:
     centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
     return DistortionModel(
         order=4,
-        chips=(Chip(1, "W2", size, centre),),
+        chips=tuple(Chip(k, name, size, centre) for k, name in zip((1, 2), names, strict=False)),
         unit=unit,
         time=TimeDependence((("u", 1, 0),), (2010.0,)),
         frames="shift",
@@ -68,27 +70,43 @@ def sigma_of(mag):
     return 0.05 + 0.12 * 10 ** (0.4 * (mag - 15.0))
 
 
-def simulated(n: int = 6000, *, unit: str = "pix", size=SIZE, scale: float = 1.0, seed: int = 3):
-    """Stars of the W2 distortion with 3 % false matches; u, v are `scale` units to the pixel."""
+def simulated(
+    n: int = 6000,
+    *,
+    unit: str = "pix",
+    size=SIZE,
+    scale: float = 1.0,
+    seed: int = 3,
+    names=("W2",),
+):
+    """Stars of the W2 distortion with 3 % false matches; u, v are `scale` units to the pixel.
+
+    A second chip lies above the first one, with a gap of 30 pixels.
+    """
     rng = np.random.default_rng(seed)
-    model = wise_model(unit, size)
+    model = wise_model(unit, size, names)
     basis = model.basis(1)
     truth = np.zeros(model.n_params)
-    truth[: model.n_polynomial] = np.concatenate(
-        [basis.from_monomials([c[t] for t in basis.terms]) for c in (W2_A, W2_B)]
-    )
+    for k, chip in enumerate(model.chips):
+        above = {(0, 0): W2_B[0, 0] + k * (size[1] + 30.0)}
+        for axis, c in enumerate((W2_A, W2_B | above)):
+            place = model.coefficient_slice(chip.number, axis)
+            truth[place] = basis.from_monomials([c[t] for t in basis.terms])
     x, y = (rng.uniform(0.5, s + 0.5, n) for s in size)
     mag = 15.5 - rng.exponential(1.0, n)
     sigma = sigma_of(mag)
     exposure = rng.integers(0, 4, n)
     epoch = 2010.0 + 0.1 * exposure
-    uv = model.predict(truth, x, y, exposure=exposure, epoch=epoch)
+    # no random numbers are drawn for it: those of one chip stay what they are
+    chip = np.arange(n) % len(model.chips)
+    uv = model.predict(truth, x, y, exposure=exposure, epoch=epoch, chip=chip + 1)
     false = rng.random(n) < F
     spread = np.where(false, S_OUT, np.hypot(sigma, JITTER))
     uv = scale * (uv + rng.normal(size=(n, 2)) * spread[:, None])
     return MatchTable(
         x, y, uv[:, 0], uv[:, 1], sigma_u=scale * sigma, sigma_v=scale * sigma, unit=unit, mag=mag,
         exposure=exposure, exposure_names=model.exposures, epoch=epoch,
+        chip=chip, chip_numbers=tuple(c.number for c in model.chips),
         sources=("wise-w2.ecsv",), n_rows=n + 23,
         rejected={"quality flag": 20, "no magnitude": 3},
     )  # fmt: skip
@@ -181,6 +199,20 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None) -> Table:
     return t
 
 
+def _chip_results(fit, posterior, chip, where, sums, place) -> ChipResults:
+    solution, place = posterior or fit, place | {"chip": chip.number}
+    return ChipResults(
+        chip=chip,
+        formal_map=uncertainty_map(fit, **place),
+        posterior_map=None if posterior is None else uncertainty_map(posterior, **place),
+        displacement=distortion_vectors(solution, part="no_constant", **place),
+        non_linear=distortion_vectors(solution, part="non_linear", **place),
+        area=area_map(solution, **place),
+        binned=sums.binned[chip.number, (16, 16)].residuals(),
+        place=where,
+    )
+
+
 @lru_cache
 def report_input(
     *,
@@ -191,17 +223,19 @@ def report_input(
     size: tuple[float, float] = SIZE,
     scale: float = 1.0,
     shown: int = 1_000_000,
+    names: tuple[str, ...] = ("W2",),
 ) -> ReportInput:
     """Everything of a run, as the report takes it; at most `shown` stars are drawn."""
     rng = np.random.default_rng(11)
-    table = simulated(unit=unit, size=size, scale=scale)
-    fit = fit_linear(table, wise_model(unit, size))
+    table = simulated(unit=unit, size=size, scale=scale, names=names)
+    fit = fit_linear(table, wise_model(unit, size, names))
     posterior = None
     if sampler:
         posterior = sampled(fit, table, converged=converged, outliers=outliers, scale=scale)
     solution = posterior or fit
     shards = load(fit.model, table)
-    sums = shards.sum(star_sums, fit.mean, fit.clip, ((16, 16),))
+    bins = {chip.number: ((16, 16),) for chip in fit.model.chips}
+    sums = shards.sum(star_sums, fit.mean, fit.clip, bins)
     stars = star_sample(table.sample(shown), len(table), fit, posterior)
     mag, residual = (a[stars.used] for a in (stars.table.mag, stars.fit_residual))
     place = {"epoch": 2010.3}
@@ -217,14 +251,12 @@ def report_input(
         exposures=sums.exposures,
         fit=fit,
         posterior=posterior,
-        formal_map=uncertainty_map(fit, **place),
-        posterior_map=None if posterior is None else uncertainty_map(posterior, **place),
-        displacement=distortion_vectors(solution, part="no_constant", **place),
-        non_linear=distortion_vectors(solution, part="non_linear", **place),
-        area=area_map(solution, **place),
-        binned=sums.binned[16, 16].residuals(),
+        chips=tuple(
+            _chip_results(fit, posterior, chip, where, sums, place)
+            for chip, where in zip(fit.model.chips, chip_places(solution, **place), strict=True)
+        ),
         coefficients=coefficient_table(fit, posterior),
-        budget=error_budget(
+        budget=detector_budget(
             solution, terms=TERMS, n_draws=500, rng=rng, pixel_scale=2757.0, **place
         ),
         margins=check_requirements(

@@ -25,6 +25,7 @@ from bayesdist.report import (
     vector_flow,
 )
 from bayesdist.report.corners import correlated_parameters
+from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.residuals import MixtureCurve
 from bayesdist.report.style import nice_below
 from bayesdist.report.traces import slowest_parameters
@@ -41,7 +42,10 @@ RUNS = {
     "least squares": {"sampler": False},
     "uniform": {"outliers": "uniform"},
     "no outliers": {"outliers": "none"},
+    "two wide chips": {"size": (4096.0, 2048.0), "names": ("WFC2", "WFC1")},
+    "two square chips": {"names": ("A", "B"), "unit": "arcsec", "scale": 0.05},
 }
+WFC = {"size": (4096.0, 2048.0), "names": ("WFC2", "WFC1")}
 
 
 @pytest.fixture(scope="module", params=RUNS, ids=str)
@@ -135,9 +139,9 @@ def test_key_has_the_length_that_arrows_of_that_value_are_drawn_with(unit, size)
 
 
 def test_key_of_the_crosses_is_to_their_scale(converged):
-    fig = formal_uncertainty(*converged.maps, magnification=2000.0)
+    fig = formal_uncertainty(*converged.chips[0].maps, magnification=2000.0)
     fig.canvas.draw()
-    for ax, m in zip(fig.axes, converged.maps, strict=True):
+    for ax, m in zip(fig.axes, converged.chips[0].maps, strict=True):
         stated, _, paper, words = _key(ax)
         assert "×2\u202f000" in words
         (lines,) = [c for c in ax.collections if isinstance(c, LineCollection)]
@@ -146,8 +150,89 @@ def test_key_of_the_crosses_is_to_their_scale(converged):
         assert drawn == pytest.approx(paper * m.radius_max / stated, rel=1e-9)
 
 
+MAPS = ("distortion", "distortion_non_linear", "formal_uncertainty", "uncertainty_radius",
+        "pixel_area", "residual_vectors", "budget_dominating")  # fmt: skip
+
+
+def test_each_chip_has_a_panel_where_it_lies():
+    """WFC1, the second chip, lies above WFC2; one scale of pixels, vectors and colours for both."""
+    run = report_input(**WFC)
+    figs = all_figures(run)
+    for name in MAPS:
+        fig = figs[name]
+        fig.canvas.draw()
+        panels = [ax for ax in fig.axes if ax.get_title(loc="left")]
+        titles = [ax.get_title(loc="left") for ax in panels]
+        kinds = 2 if name in ("formal_uncertainty", "uncertainty_radius") else 1
+        assert len(panels) == 2 * kinds, name
+        high, low = ([ax for ax, t in zip(panels, titles, strict=True) if n in t]
+                     for n in ("WFC1", "WFC2"))  # fmt: skip
+        assert len(high) == len(low) == kinds
+        assert min(ax.bbox.y0 for ax in high) > max(ax.bbox.y1 for ax in low), name
+        # as many pixels of the paper to the detector's pixel, along both axes and on both chips
+        scales = [np.diff(ax.transData.transform([[0, 0], [1, 1]]), axis=0)[0] for ax in panels]
+        np.testing.assert_allclose(scales, scales[0][0], rtol=1e-6)
+        keys = [_key(ax) for ax in panels if any("drawn" in t.get_text() for t in ax.texts)]
+        if name in (
+            "distortion",
+            "distortion_non_linear",
+            "residual_vectors",
+            "formal_uncertainty",
+        ):
+            assert len(keys) == len(panels)
+            assert len({(length, unit, text) for length, unit, _, text in keys}) == 1
+            np.testing.assert_allclose([paper for _, _, paper, _ in keys], keys[0][2], rtol=1e-6)
+        fills = {
+            c.get_clim() for ax in panels for c in ax.collections if c.get_cmap().name == "cividis"
+        }
+        assert len(fills) <= 1
+
+
+def test_chips_of_several_sizes_share_one_scale():
+    m = report_input(**WFC).chips[0].formal_map
+    small = replace(m, x=np.linspace(1, 1014, 33), y=np.linspace(1, 1014, 17), chip=7)
+    fig = formal_uncertainty(m, small)
+    fig.canvas.draw()
+    scales = [np.diff(ax.transData.transform([[0, 0], [1, 1]]), axis=0)[0] for ax in fig.axes]
+    np.testing.assert_allclose(scales, scales[0][0], rtol=1e-6)
+
+
+def test_a_wide_detector_is_drawn_row_by_row_in_panels_that_can_be_read():
+    names = tuple("ABCDEFGH")
+    places = tuple((1 - k // 4, k % 4) for k in range(8))  # A to D below E to H
+    mosaic = Mosaic(8 * ((100.0, 100.0),), names, places)
+    fig, panels = mosaic.panels()
+    for k, (ax,) in enumerate(panels):
+        mosaic.draw(ax, k)
+        ax.set_title(mosaic.title(k, "", ""))
+    fig.canvas.draw()
+    assert len(fig.axes) == 8
+    labelled = [names[k] for k, (ax,) in enumerate(panels) if ax.get_xlabel()]
+    assert labelled == ["B", "C", "D"]  # rows EFG, HAB, CD: under B there is no panel
+    boxes = [ax.bbox for ax in fig.axes]
+    assert min(b.width for b in boxes) > 1.5 * fig.dpi
+    assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[k + 1 :])
+    shown = sorted(fig.axes, key=lambda ax: (-round(ax.bbox.y0), ax.bbox.x0))
+    assert "".join(ax.get_title() for ax in shown) == "EFGHABCD"
+
+
+def test_bars_of_each_chip_stand_beside_those_of_all():
+    run = report_input(**WFC)
+    fig = all_figures(run)["budget_terms"]
+    assert [ax.get_xlabel().split(" [")[0] for ax in fig.axes] == [
+        "rms over all chips",
+        "rms over WFC2",
+        "rms over WFC1",
+    ]
+    parts = [run.budget.rows(), *(b.rows() for b in run.budget.chips)]
+    for ax, rows in zip(fig.axes, parts, strict=True):
+        widths = [bar.get_width() for bar in ax.patches]
+        np.testing.assert_allclose(widths, [r["radial"] for r in rows], rtol=1e-12)
+    assert len({ax.get_xlim() for ax in fig.axes}) == 1
+
+
 def test_crosses_reach_all_four_combinations_of_one_sigma(converged):
-    m = converged.formal_map
+    m = converged.chips[0].formal_map
     fig = formal_uncertainty(m, magnification=2000.0)
     (lines,) = [c for c in fig.axes[0].collections if isinstance(c, LineCollection)]
     steps = np.array([s[1] - s[0] for s in lines.get_segments()]) / 2000.0
@@ -158,15 +243,15 @@ def test_crosses_reach_all_four_combinations_of_one_sigma(converged):
 
 
 def test_the_largest_radius_is_printed(converged):
-    fig = formal_uncertainty(*converged.maps)
-    for ax, m in zip(fig.axes, converged.maps, strict=True):
+    fig = formal_uncertainty(*converged.chips[0].maps)
+    for ax, m in zip(fig.axes, converged.chips[0].maps, strict=True):
         printed = float(re.search(r"max radius ([\d.]+)", ax.get_title(loc="left")).group(1))
         assert printed == pytest.approx(m.radius_max, rel=6e-3)
         assert m.kind in ax.get_title(loc="left")
 
 
 def test_maps_of_one_figure_share_their_colours(converged):
-    fig = uncertainty_radius(*converged.maps)
+    fig = uncertainty_radius(*converged.chips[0].maps)
     limits = {
         c.get_clim()
         for ax in fig.axes[:2]
@@ -196,10 +281,10 @@ def test_vectors_of_a_rotated_frame_are_drawn_along_the_detector():
 
 
 def test_a_map_without_variation_or_vectors_is_drawn(converged):
-    m = converged.formal_map
+    m = converged.chips[0].formal_map
     flat = replace(m, sigma_u=np.full_like(m.sigma_u, 0.01), sigma_v=np.full_like(m.sigma_v, 0.01))
     uncertainty_radius(flat).canvas.draw()
-    v = converged.displacement
+    v = converged.chips[0].displacement
     vector_flow(replace(v, du=0.0 * v.du, dv=0.0 * v.dv)).canvas.draw()
 
 

@@ -16,7 +16,7 @@ from bayesdist.report import Check, Product, write_report
 from bayesdist.report.captions import SECTIONS
 from bayesdist.report.html import render_report
 from bayesdist.report.status import status_checks, verdict
-from bayesdist.report.tables import coefficient_tables
+from bayesdist.report.tables import coefficient_tables, fit_tables
 
 from .runs import coefficient_table, report_input
 
@@ -204,7 +204,7 @@ def test_names_cannot_break_the_page(converged, figures):
         flagged=None,
         fit=converged.fit,
         posterior=None,
-        posterior_map=None,
+        chips=tuple(replace(c, posterior_map=None) for c in converged.chips),
         provenance={"command": evil, "inputs": {evil: "0"}},
         products=(Product(evil, evil, (Check(evil, evil, evil),)),),
     )
@@ -273,3 +273,39 @@ def test_the_file_appears_whole_or_not_at_all(converged, images, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(InputError, match="missing"):
         write_report(tmp_path / "missing" / "report.html", converged, {})
+
+
+def test_tables_of_two_chips_name_them():
+    """The worst chip in the verdict; every number of a table belongs to a named chip, or to all."""
+    run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
+    page = render_report(run, {})
+    parsed(page)
+    text = words(page)
+    worst = max(run.chips, key=lambda c: c.posterior_map.radius_max)
+    x, y = worst.posterior_map.position_of_max
+    assert f"at pixel ({x:.0f}, {y:.0f}) of {worst.chip.name}" in text
+    tree = lxml_html.fromstring(page)
+    names = [t.text_content() for t in tree.xpath("//section[@id='maps']//tbody//th")]
+    assert names == [
+        f"{chip}, {kind}" for chip in ("WFC2", "WFC1") for kind in ("least squares", "posterior")
+    ]
+    chips = [t.text_content() for t in tree.xpath("//section[@id='budget']//tbody//td[1]")]
+    assert chips == [c for c in ("all", "WFC2", "WFC1") for _ in run.budget.rows()]
+    for chip in ("WFC1", "WFC2"):
+        assert f"Monomial coefficients, chip {chip}:" in text
+
+
+def test_the_residuals_of_a_table_are_those_of_its_chip():
+    run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
+    _, table = fit_tables(run)
+    labels = [row[0] for row in table.rows]
+    assert labels == [f"{c}, {a}" for c in ("all", "WFC2", "WFC1") for a in "uv"]
+    t = run.stars.table
+    for row in table.rows:
+        chip, axis = row[0].split(", ")
+        here = run.stars.used & (np.isin(t.chip, [t.chip_numbers.index(n) for n in NUMBERS[chip]]))
+        largest = run.stars.fit_residual[here, "uv".index(axis)].max()
+        assert float(row[4].replace("\u2212", "-")) == pytest.approx(largest, abs=6e-4)
+
+
+NUMBERS = {"all": (1, 2), "WFC2": (1,), "WFC1": (2,)}

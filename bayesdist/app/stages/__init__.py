@@ -20,6 +20,7 @@ log = logging.getLogger("bayesdist")
 REHEARSAL_DRAWS = 100
 
 NEEDS = {
+    "match": (),
     "fit": (),
     "sample": ("fit",),
     "assess": ("fit", "sample"),
@@ -36,11 +37,13 @@ _FUNCTIONS: dict[str, Callable[[Session], None]] = {
 }
 
 
-def run_stage(session: Session, name: str) -> None:
-    """Run one stage and note it as done."""
+def run_stage(
+    session: Session, name: str, function: Callable[[Session], None] | None = None
+) -> None:
+    """Run one stage, in the usual way or by another function, and note it as done."""
     log.info("%s: begins", name)
     with session.run.stage(name):
-        _FUNCTIONS[name](session)
+        (function or _FUNCTIONS[name])(session)
 
 
 def rehearse(session: Session) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,16 +12,17 @@ from astropy.table import Table
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session, write_table
 from bayesdist.assess import (
-    ErrorBudget,
     Margin,
+    Misfit,
     Requirement,
+    UncertaintyMap,
     area_map,
     check_requirements,
-    error_budget,
     pixel_scale_of,
     uncertainty_map,
 )
 from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.detector_budget import DetectorBudget, detector_budget
 from bayesdist.assess.solution import Solution
 from bayesdist.products.maps_file import write_maps
 
@@ -42,10 +43,12 @@ LEAST_CHI2, MOST_CHI2 = 0.67, 1.5
 def run_assess(session: Session) -> None:
     config, run = session.config, session.run
     solution, grid, epoch = session.posterior, config.assess.grid, session.epoch
-    maps = [uncertainty_map(s, grid=grid, epoch=epoch) for s in (session.fit, solution)]
-    area = area_map(solution, grid=grid, epoch=epoch)
+    places = [{"grid": grid, "epoch": epoch, "chip": c.number} for c in solution.model.chips]
+    formal = [uncertainty_map(session.fit, **place) for place in places]
+    maps = [uncertainty_map(solution, **place) for place in places]
+    areas = [area_map(solution, **place) for place in places]
     state = trust(session)
-    write_maps(run / "maps.fits", maps, area, note=solution.approximation, **state)
+    write_maps(run / "maps.fits", [*formal, *maps], areas, note=solution.approximation, **state)
     coefficients = coefficient_table(session.fit, solution)
     coefficients.meta |= state | labelled(session)
     write_table(coefficients, run / "coefficients.ecsv")
@@ -53,7 +56,8 @@ def run_assess(session: Session) -> None:
     for text in warnings:
         log.warning("assess: WARNING: %s", text)
     budget = budget_of(session, solution)
-    table = Table(rows=budget.rows())
+    several = len(budget.chips) > 1
+    table = Table(rows=budget.rows_by_chip() if several else budget.rows())
     for name in ("u", "v", "radial"):
         table[name].unit = solution.unit
     table.meta = {"epoch": epoch, "grid": list(grid), "statistic": "rms over the grid"}
@@ -61,22 +65,53 @@ def run_assess(session: Session) -> None:
     write_table(table, run / "budget.ecsv")
     margins = margins_of(session, config.requirements(), solution)
     write_margins(session, margins)
-    m = maps[1]
     run.summarise(
-        map={
-            "unit": m.unit,
-            "epoch": m.epoch,
+        map=_map_summary(maps, formal),
+        budget=budget.rows(),
+        misfit=_misfit_summary(session),
+        warnings=warnings,
+    )
+    worst = max(maps, key=lambda m: m.radius_max)
+    log.info("assess: largest formal radius %.4g %s", worst.radius_max, worst.unit)
+
+
+def _map_summary(
+    maps: Sequence[UncertaintyMap], formal: Sequence[UncertaintyMap]
+) -> dict[str, Any]:
+    """The worst of all chips, and each chip."""
+    chips = [
+        {
+            "chip": m.chip,
             "sigma_u_max": m.sigma_u_max,
             "sigma_v_max": m.sigma_v_max,
             "radius_max": m.radius_max,
             "position_of_max": list(m.position_of_max),
-            "radius_max_least_squares": maps[0].radius_max,
-        },
-        budget=budget.rows(),
-        misfit=asdict(session.misfit) | {"significant": session.misfit.significant},
-        warnings=warnings,
-    )
-    log.info("assess: largest formal radius %.4g %s", m.radius_max, m.unit)
+            "radius_max_least_squares": least_squares.radius_max,
+        }
+        for m, least_squares in zip(maps, formal, strict=True)
+    ]
+    worst = max(chips, key=lambda c: c["radius_max"])
+    largest = ("sigma_u_max", "sigma_v_max", "radius_max_least_squares")
+    return {
+        "unit": maps[0].unit,
+        "epoch": maps[0].epoch,
+        **worst,
+        **{key: max(c[key] for c in chips) for key in largest},
+        "chips": chips,
+    }
+
+
+def _misfit_summary(session: Session) -> dict[str, Any]:
+    worst = session.misfit
+    out = _misfit_row(worst) | {"unit": worst.unit, "significant": worst.significant}
+    if len(session.misfits) > 1:
+        out["chips"] = [_misfit_row(m) for m in session.misfits]
+    return out
+
+
+def _misfit_row(m: Misfit) -> dict[str, Any]:
+    row = {"p_value": m.p_value, "partition": m.partition, "structure": m.structure}
+    return row if m.chip is None else row | {"chip": m.chip.number}
 
 
 def _assessment(session: Session, solution: Solution, n_draws: int | None) -> dict[str, Any]:
@@ -92,8 +127,8 @@ def _assessment(session: Session, solution: Solution, n_draws: int | None) -> di
     }
 
 
-def budget_of(session: Session, solution: Solution, n_draws: int | None = None) -> ErrorBudget:
-    return error_budget(solution, **_assessment(session, solution, n_draws))
+def budget_of(session: Session, solution: Solution, n_draws: int | None = None) -> DetectorBudget:
+    return detector_budget(solution, **_assessment(session, solution, n_draws))
 
 
 def margins_of(
@@ -159,6 +194,7 @@ def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
             "margin": m.margin,
             "unit": m.unit,
             "epoch": m.epoch,
+            "chip": m.requirement.chip,
             "probability": m.requirement.probability,
             "probability_met": m.probability_met,
             "mc_error": m.mc_error,
@@ -172,12 +208,16 @@ def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
 def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
     """Replace the margins of a run: margins.ecsv and summary.json."""
     rows = margin_rows(margins)
+    several = len(session.posterior.model.chips) > 1
     columns: dict[str, list[Any]] = {}
     for row in rows:
         low, high = row["interval"]
         flat = {**row, "lo95": low, "hi95": high}
         del flat["interval"]
         flat["epoch"] = np.nan if flat["epoch"] is None else flat["epoch"]
+        flat["chip"] = "all" if flat["chip"] is None else str(flat["chip"])
+        if not several:
+            del flat["chip"]
         for name, value in flat.items():
             columns.setdefault(name, []).append(value)
     table = Table(columns)
@@ -188,5 +228,8 @@ def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
 
 def judged_requirements(run: RunDirectory) -> tuple[Requirement, ...]:
     """The requirements behind the margins in summary.json."""
-    keys = ("name", "statistic", "limit", "unit", "probability", "epoch")
-    return tuple(Requirement(**{k: row[k] for k in keys}) for row in run.summary.get("margins", []))
+    keys = ("name", "statistic", "limit", "unit", "probability", "epoch", "chip")
+    # runs of earlier versions had one chip and named none
+    return tuple(
+        Requirement(**{k: row.get(k) for k in keys}) for row in run.summary.get("margins", [])
+    )

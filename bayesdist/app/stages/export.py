@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Any
 
 from bayesdist.app.session import Session
@@ -25,9 +26,10 @@ __all__ = ["idctab_of", "run_export", "sip_of"]
 log = logging.getLogger("bayesdist")
 
 
-def run_export(session: Session) -> None:
+def run_export(session: Session, written: Sequence[dict[str, Any]] = ()) -> None:
+    """Write what the configuration asks for; `written` is what there is already."""
     config, run = session.config, session.run
-    products: list[dict[str, Any]] = []
+    products: list[dict[str, Any]] = [*written]
     if config.products.sip is not None:
         for chip in session.posterior.model.chips:
             several = len(session.posterior.model.chips) > 1

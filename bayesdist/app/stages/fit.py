@@ -7,11 +7,9 @@ import logging
 from astropy.table import Table
 
 from bayesdist.app.session import ERROR_COLUMNS, Session, write_table
-from bayesdist.infer import (
-    save_fit,
-)
+from bayesdist.infer import LinearFit, save_fit
 
-__all__ = ["run_fit"]
+__all__ = ["run_fit", "summarise_fit"]
 
 log = logging.getLogger("bayesdist")
 
@@ -26,10 +24,15 @@ def run_fit(session: Session) -> None:
     # this fit is what all goes by from now on
     if errors is not None:
         session.errors_changed()
-    for stale in ("fit", "sums", "misfit", "stars"):
+    for stale in ("fit", "sums", "misfits", "stars"):
         session.__dict__.pop(stale, None)
+    summarise_fit(session, fit)
+
+
+def summarise_fit(session: Session, fit: LinearFit) -> None:
+    """Sections 'data' and 'fit' of summary.json, and a line of the log."""
     matches = session.raw_matches
-    run.summarise(
+    session.run.summarise(
         data={
             "n_rows": matches.n_rows,
             "n_used": fit.n_used,

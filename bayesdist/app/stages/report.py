@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bayesdist.app.rundir import as_json
 from bayesdist.app.session import Session
@@ -21,6 +21,10 @@ from bayesdist.assess import (
     uncertainty_map,
 )
 from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.mosaic import chip_places
+
+if TYPE_CHECKING:
+    from bayesdist.report.context import ChipResults
 
 __all__ = ["run_report"]
 
@@ -42,9 +46,7 @@ def run_report(session: Session) -> None:
     )
 
     run, config = session.run, session.config
-    fit, posterior, epoch = session.fit, session.posterior, session.epoch
-    chip, grid = fit.model.chips[0], config.assess.grid
-    vectors = {"grid": _vector_grid(chip.size), "epoch": epoch}
+    fit, posterior = session.fit, session.posterior
     several = len(fit.model.exposures) > 1
     record = run.record
     products = tuple(
@@ -62,12 +64,7 @@ def run_report(session: Session) -> None:
         exposures=session.sums.exposures,
         fit=fit,
         posterior=posterior,
-        formal_map=uncertainty_map(fit, grid=grid, epoch=epoch),
-        posterior_map=uncertainty_map(posterior, grid=grid, epoch=epoch),
-        displacement=distortion_vectors(posterior, part="no_constant", **vectors),
-        non_linear=distortion_vectors(posterior, part="non_linear", **vectors),
-        area=area_map(posterior, grid=grid, epoch=epoch),
-        binned=session.shown_sums.residuals(),
+        chips=_chip_results(session),
         coefficients=coefficient_table(fit, posterior),
         budget=budget_of(session, posterior),
         # the requirements that were judged last, be it by `assess` or by `validate`
@@ -89,6 +86,34 @@ def run_report(session: Session) -> None:
     save_images(images, run / "figures")
     write_report(run / "report.html", inputs, images)
     log.info("report: %s", run / "report.html")
+
+
+def _chip_results(session: Session) -> tuple[ChipResults, ...]:
+    from bayesdist.report.context import ChipResults
+
+    fit, posterior, epoch = session.fit, session.posterior, session.epoch
+    out = []
+    for chip, place, sums in zip(
+        posterior.model.chips,
+        chip_places(posterior, epoch=epoch),
+        session.shown_sums,
+        strict=True,
+    ):
+        on_chip = {"grid": session.config.assess.grid, "epoch": epoch, "chip": chip.number}
+        vectors = on_chip | {"grid": _vector_grid(chip.size)}
+        out.append(
+            ChipResults(
+                chip=chip,
+                formal_map=uncertainty_map(fit, **on_chip),
+                posterior_map=uncertainty_map(posterior, **on_chip),
+                displacement=distortion_vectors(posterior, part="no_constant", **vectors),
+                non_linear=distortion_vectors(posterior, part="non_linear", **vectors),
+                area=area_map(posterior, **on_chip),
+                binned=sums.residuals(),
+                place=place,
+            )
+        )
+    return tuple(out)
 
 
 def _product_checks(product: dict[str, Any], check: Callable[..., Any]) -> list[Any]:

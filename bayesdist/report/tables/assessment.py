@@ -15,20 +15,30 @@ __all__ = ["budget_table", "map_table", "margin_table"]
 def map_table(inputs: ReportInput) -> TextTable:
     """Extremes of the uncertainty maps."""
     rows = []
-    for m in inputs.maps:
-        cells = [
-            with_mas(v, m.unit, inputs.scale_mas)
-            for v in (m.sigma_u_max, m.sigma_v_max, m.radius_max, float(np.median(m.radius)))
-        ]
-        cells.append("({:.0f}, {:.0f})".format(*m.position_of_max))
-        if m is inputs.posterior_map:
-            cells = [marked(inputs, c) for c in cells]
-        rows.append((m.kind, *cells))
-    epoch = inputs.formal_map.epoch
-    when = "" if epoch is None else f", epoch {epoch:.2f}"
+    for c in inputs.chips:
+        for m in c.maps:
+            cells = [
+                with_mas(v, m.unit, inputs.scale_mas)
+                for v in (m.sigma_u_max, m.sigma_v_max, m.radius_max, float(np.median(m.radius)))
+            ]
+            cells.append("({:.0f}, {:.0f})".format(*m.position_of_max))
+            if m is c.posterior_map:
+                cells = [marked(inputs, text) for text in cells]
+            name = f"{c.chip.name}, {m.kind}" if inputs.several else m.kind
+            rows.append((name, *cells))
+    first = inputs.chips[0].formal_map
+    when = "" if first.epoch is None else f", epoch {first.epoch:.2f}"
+    which = "each chip" if inputs.several else f"chip {first.chip}"
     return TextTable(
-        f"Uncertainty of the position, 1 σ, chip {inputs.formal_map.chip}{when}",
-        ("Solution", "Largest σ u", "Largest σ v", "Max radius", "Median radius", "At pixel"),
+        f"Uncertainty of the position, 1 σ, {which}{when}",
+        (
+            "Chip, solution" if inputs.several else "Solution",
+            "Largest σ u",
+            "Largest σ v",
+            "Max radius",
+            "Median radius",
+            "At pixel",
+        ),
         tuple(rows),
     )
 
@@ -37,24 +47,27 @@ def budget_table(inputs: ReportInput) -> TextTable | None:
     """The error budget, the total last."""
     if inputs.budget is None:
         return None
-    rows = inputs.budget.rows()
     unit, mas = inputs.budget.unit, inputs.scale_mas
+    names = {str(c.chip.number): c.chip.name for c in inputs.chips} | {"all": "all"}
+    rows = inputs.budget.rows_by_chip() if inputs.several else inputs.budget.rows()
     out = [
         (
             str(r["name"]),
+            *((names[str(r["chip"])],) if inputs.several else ()),
             str(r["kind"]),
             str(r["source"]) or MISSING,
             *(marked(inputs, with_mas(float(r[k]), unit, mas)) for k in ("u", "v", "radial")),
         )
         for r in rows
     ]
+    heads = ("Term", *(("Chip",) if inputs.several else ()), "Kind", "Source", "u", "v", "Radial")
     epoch = inputs.budget.epoch
     when = "" if epoch is None else f" at epoch {epoch:.2f}"
     return TextTable(
         f"Error budget{when}: rms over the detector, 1 σ",
-        ("Term", "Kind", "Source", "u", "v", "Radial"),
+        heads,
         tuple(out),
-        words=(0, 1, 2),
+        words=tuple(range(len(heads) - 3)),
         note="The parts of the model are correlated and enter the total jointly, by draws;"
         " independent terms are added in quadrature. The total therefore need not be the root of"
         " the sum of squares.",
@@ -76,10 +89,12 @@ def margin_table(inputs: ReportInput) -> TextTable | None:
             f"{number(m.probability_met)} ± {number(m.mc_error, 2)}",
         )
         epoch = "" if m.epoch is None else f" at {m.epoch:.2f}"
+        chip = next((c.chip.name for c in inputs.chips if c.chip.number == r.chip), "")
+        on = f" on {chip}" if chip and inputs.several else ""
         out.append(
             (
                 r.name,
-                f"{r.statistic}{epoch} at most {r.limit:g} {r.unit},"
+                f"{r.statistic}{on}{epoch} at most {r.limit:g} {r.unit},"
                 f" with probability {r.probability:g}",
                 *(marked(inputs, c) for c in cells),
                 m.unit,

@@ -88,7 +88,9 @@ def _parameter_table(
 
 def _monomial_table(inputs: ReportInput, chip: int) -> TextTable:
     """Coefficients of (x - xref)^i (y - yref)^j with the errors that carry over."""
-    basis = inputs.fit.model.basis(chip)
+    model = inputs.fit.model
+    basis = model.basis(chip)
+    name = model.chips[model.chip_code(chip)].name if inputs.several else chip
     cells = []
     for axis in (0, 1):
         where = inputs.fit.model.coefficient_slice(chip, axis)
@@ -110,7 +112,7 @@ def _monomial_table(inputs: ReportInput, chip: int) -> TextTable:
             rows.append(("uv"[axis], str(i), str(j), *f, *p))
     x, y = basis.reference_pixel
     return TextTable(
-        f"Monomial coefficients, chip {chip}: of (x − {x:g})^i (y − {y:g})^j"
+        f"Monomial coefficients, chip {name}: of (x − {x:g})^i (y − {y:g})^j"
         f" [{inputs.unit}/pix^(i + j)]",
         ("Axis", "i", "j", "Least squares", "Formal σ", "Posterior mean", "sd"),
         tuple(rows),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.assess import residual_statistics
 from bayesdist.report.context import ReportInput
@@ -36,18 +37,30 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
     names = ("mean", "sigma", "min", "max", "median", "p01", "p99")
     heads = ("Mean", "σ", "Min", "Max", "Median", "1 %", "99 %")
     rows = []
-    for axis, values in zip("uv", stars.fit_residual[stars.used].T, strict=True):
-        s = residual_statistics(values * scale.factor)
-        rows.append((axis, *(rounded(s[k], s["sigma"] / 10) for k in names)))
+    for chip, here in _chips_of_stars(inputs):
+        for axis, values in zip("uv", stars.fit_residual[here].T, strict=True):
+            if values.size:
+                s = residual_statistics(values * scale.factor)
+                rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
     return (
         listing("Linear fit", pairs),
         TextTable(
             f"Residuals of the stars used [{scale.unit}]",
-            ("Axis", *heads),
+            ("Chip, axis" if inputs.several else "Axis", *heads),
             tuple(rows),
             note=f"From {inputs.sample}." if inputs.sample else "",
         ),
     )
+
+
+def _chips_of_stars(inputs: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
+    """Stars (N,) used of all chips and, where there are several, of each; what rows begin with."""
+    table, used = inputs.stars.table, inputs.stars.used
+    if not inputs.several:
+        return [("", used)]
+    numbers = np.asarray(table.chip_numbers)[table.chip]
+    each = [(f"{c.chip.name}, ", used & (numbers == c.chip.number)) for c in inputs.chips]
+    return [("all, ", used), *each]
 
 
 def outlier_table(inputs: ReportInput) -> TextTable | None:

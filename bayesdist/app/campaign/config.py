@@ -1,0 +1,59 @@
+"""What the configuration says of a campaign."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, PositiveFloat
+
+from bayesdist.app.section import Section
+
+__all__ = ["CampaignBlock", "ReleaseBlock", "TablesBlock"]
+
+Between = tuple[float, float]
+
+
+class CampaignBlock(Section):
+    """Star lists, the catalogue that they are matched with, and what is known of the exposures."""
+
+    catalog: str
+    exposures: str
+    lists: str | list[str]
+    start: str
+    filter: str | None = None
+    mag: Between | None = None
+    saturation: float | None = None
+    q_max: PositiveFloat | None = None
+    radius: PositiveFloat | None = None
+    motions: Literal["reliable", "all"] = "reliable"
+    aberration: Literal["log", "earth"] = "log"
+
+
+class TablesBlock(Section):
+    """Look-up tables that are fitted with the polynomial."""
+
+    method: Literal["field", "binned", "none"] = "field"
+    step: tuple[PositiveFloat, PositiveFloat] = (64.0, 64.0)
+    rounds: Annotated[int, Field(ge=1)] = 8
+
+
+class PeriodBlock(Section):
+    """The years that one IDCTAB serves, and the segment of the drift that it holds."""
+
+    name: str
+    years: Between
+    segment: Annotated[int, Field(ge=0)] = 0
+    useafter: str | None = None
+    pedigree: str | None = None
+
+
+class ReleaseBlock(Section):
+    """IDCTABs, D2IMFILE and NPOLFILE, along V2 and V3 as an existing IDCTAB lies."""
+
+    name: str
+    reference: str
+    period: Annotated[list[PeriodBlock], Field(min_length=1)]
+    instrument: str = "ACS"
+    detector: str = "WFC"
+    scale_arcsec: PositiveFloat = 0.05
+    limit_mas: PositiveFloat = 0.1

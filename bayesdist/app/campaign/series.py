@@ -1,0 +1,124 @@
+"""Linear terms against time: what the exposures show, and what may be predicted."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.session import write_table
+from bayesdist.infer.series import Course, Series, SeriesPosterior, describe, fit_series
+
+__all__ = ["run_series"]
+
+log = logging.getLogger("bayesdist")
+
+PREDICTIONS = 25  # epochs at which the drift is tabulated
+FEWEST = 8  # exposures below which nothing is said of time
+
+
+def run_series(session: CampaignSession) -> None:
+    """Write series.ecsv and drift.ecsv, and a section of summary.json."""
+    series, time = session.terms, session.model.time
+    if time is None or len(series.names) < FEWEST:
+        return
+    seed = session.config.sampler.seed
+    course = Course("lines", time.breaks, reference=time.epoch0) if time.breaks else Course("line")
+    posterior = fit_series(series, course, seed=seed)
+    write_table(_exposures(series, posterior), session.run / "series.ecsv")
+    write_table(_predictions(posterior), session.run / "drift.ecsv")
+    verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
+    session.run.summarise(
+        time_dependence={
+            "converged": posterior.convergence.converged,
+            "lines": _lines(posterior),
+            "scatter": dict(
+                zip(
+                    series.coefficients,
+                    posterior.scatter_sigma.mean(axis=0).tolist(),
+                    strict=True,
+                )
+            ),
+            "outlying_exposures": [
+                name
+                for name, p in zip(series.names, posterior.outlier_probability, strict=True)
+                if p > 0.5
+            ],
+            "breaks": _changes(posterior),
+            "verdicts": verdicts,
+        }
+    )
+    for row in verdicts:
+        log.info("assess: %s: %s", row["term"], row["claim"])
+
+
+def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
+    """Which course one term takes, by held-out exposures."""
+    one = Series(
+        series.epoch,
+        series.values[:, [k]],
+        series.cov[:, [k]][:, :, [k]],
+        (series.coefficients[k],),
+        series.names,
+        source=series.source,
+    )
+    verdict = describe(one, breaks=breaks, seed=seed)
+    return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
+
+
+def _lines(posterior: SeriesPosterior) -> list[dict[str, object]]:
+    alpha, beta = posterior.alpha, posterior.beta
+    return [
+        {
+            "segment": s,
+            "term": name,
+            "epoch0": float(posterior.reference[s]),
+            "alpha": float(alpha[:, s, k].mean()),
+            "sigma_alpha": float(alpha[:, s, k].std(ddof=1)),
+            "beta": float(beta[:, s, k].mean()),
+            "sigma_beta": float(beta[:, s, k].std(ddof=1)),
+        }
+        for s in range(alpha.shape[1])
+        for k, name in enumerate(posterior.series.coefficients)
+    ]
+
+
+def _changes(posterior: SeriesPosterior) -> list[dict[str, object]]:
+    out: list[dict[str, object]] = []
+    for number in range(posterior.course.n_breaks):
+        level, slope = posterior.change(number)
+        for k, name in enumerate(posterior.series.coefficients):
+            out.append(
+                {
+                    "break": posterior.course.breaks[number],
+                    "term": name,
+                    "step": float(level.value[k]),
+                    "sigma_step": float(level.sigma[k]),
+                    "slope_change": float(slope.value[k]),
+                    "sigma_slope_change": float(slope.sigma[k]),
+                }
+            )
+    return out
+
+
+def _exposures(series: Series, posterior: SeriesPosterior) -> Table:
+    columns: dict[str, object] = {"exposure": list(series.names), "epoch": series.epoch}
+    sigma = np.sqrt(np.maximum(np.einsum("ekk->ek", series.cov), 0.0))
+    for k, name in enumerate(series.coefficients):
+        columns[name] = series.values[:, k]
+        columns[f"sigma_{name}"] = sigma[:, k]
+    columns["outlier_probability"] = posterior.outlier_probability
+    return Table(columns)
+
+
+def _predictions(posterior: SeriesPosterior) -> Table:
+    first, last = posterior.series.span
+    found = posterior.predict(np.linspace(first, last, PREDICTIONS))
+    columns: dict[str, object] = {"epoch": found.epoch}
+    for k, name in enumerate(posterior.series.coefficients):
+        columns[name] = found.mean[:, k]
+        columns[f"sigma_{name}"] = found.sigma[:, k]
+        columns[f"sigma_new_{name}"] = found.sigma_new[:, k]
+    return Table(columns)

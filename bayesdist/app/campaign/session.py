@@ -1,0 +1,175 @@
+"""What the stages of a campaign's run share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.campaign.config import CampaignBlock
+from bayesdist.app.campaign.inputs import Inputs, read_inputs
+from bayesdist.app.session import Session
+from bayesdist.app.star_files import PAIRS
+from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
+from bayesdist.infer import GaussianPriors, Matches
+from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
+from bayesdist.infer.series import Series
+from bayesdist.model import DistortionModel, LookupTable, corrected
+
+__all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession"]
+
+Float = NDArray[np.float64]
+
+TABLES, HIERARCHY, TERMS = "tables.h5", "hierarchy.h5", "exposure_terms.h5"
+_AGAIN = "run the stage 'fit' again"
+
+
+@dataclass
+class CampaignSession(Session):
+    """What the stages share: pairs as matched, tables, scatter of the exposures, the fit."""
+
+    @property
+    def block(self) -> CampaignBlock:
+        """The campaign's part of the configuration."""
+        assert self.config.campaign is not None
+        return self.config.campaign
+
+    @property
+    def base(self) -> Path:
+        """Folder that the configuration's files are relative to."""
+        return Path(self.run.record["base"])
+
+    @property
+    def reference_chip(self) -> int:
+        """Number of the chip whose axes and zero point define the gauge."""
+        return self.config.chips()[0].number
+
+    @property
+    def unit_arcsec(self) -> float:
+        """Size of the catalogue's unit."""
+        scale = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}.get(self.inputs.catalog.unit)
+        return scale or (self.scale_arcsec or 0.05)
+
+    @cached_property
+    def inputs(self) -> Inputs:
+        """Catalogue, exposures and star lists."""
+        return read_inputs(self.block, self.base)
+
+    @cached_property
+    def pairs(self) -> MatchTable:
+        """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors."""
+        return read_matches(self.run / PAIRS, unit=self.inputs.catalog.unit)
+
+    @cached_property
+    def tables(self) -> tuple[LookupTable, ...]:
+        """Look-up tables of an earlier stage."""
+        path = self.run / TABLES
+        if not path.exists():
+            return ()
+        arrays = read_arrays(path, "", do=_AGAIN)
+        chips = sorted({int(name.split(".")[0]) for name in arrays})
+        return tuple(
+            LookupTable(
+                chip,
+                arrays[f"{chip}.values"],
+                first=tuple(arrays[f"{chip}.first"]),
+                step=tuple(arrays[f"{chip}.step"]),
+                sigma=arrays.get(f"{chip}.sigma"),
+            )
+            for chip in chips
+        )
+
+    def keep_tables(self, tables: tuple[LookupTable, ...]) -> None:
+        """Write tables for the stages that follow."""
+        arrays: dict[str, Any] = {}
+        for table in tables:
+            arrays |= {
+                f"{table.chip}.values": table.values,
+                f"{table.chip}.first": np.array(table.first),
+                f"{table.chip}.step": np.array(table.step),
+            }
+            if table.sigma is not None:
+                arrays[f"{table.chip}.sigma"] = table.sigma
+        write_arrays(self.run / TABLES, "", arrays)
+        self.forget()
+
+    @cached_property
+    def raw_matches(self) -> Matches:
+        """Pairs at the pixels that the tables have corrected."""
+        pairs = self.pairs
+        if not self.tables:
+            return pairs
+        numbers = np.asarray(pairs.chip_numbers)[pairs.chip]
+        x, y = corrected(self.tables, pairs.x, pairs.y, chip=numbers)
+        return on_the_chips(with_columns(pairs, x=x, y=y), self.plain_model)
+
+    @cached_property
+    def magnitude_errors(self) -> MagnitudeErrors | None:
+        """Errors of the centroids, as the fit left them."""
+        return self.kept_errors()
+
+    @cached_property
+    def matches(self) -> Matches:
+        """The same with the errors of centroid and catalogue."""
+        raw, errors = self.raw_matches, self.magnitude_errors
+        assert isinstance(raw, MatchTable)
+        return raw if errors is None else with_centroid_errors(raw, errors)
+
+    @cached_property
+    def plain_model(self) -> DistortionModel:
+        """The configured polynomial, all exposures shifted, turned and scaled freely."""
+        config = self.config
+        return DistortionModel(
+            config.model.order,
+            config.chips(),
+            unit=self.inputs.catalog.unit,
+            time=config.time(),
+            frames="shift_rotation_scale",
+            exposures=self.pairs.exposure_names,
+        )
+
+    @cached_property
+    def model(self) -> DistortionModel:
+        """The model that was fitted."""
+        return self.fit.model
+
+    @cached_property
+    def priors(self) -> GaussianPriors:
+        """Of the deviations of the exposures, as the fit found them to scatter."""
+        arrays = read_arrays(self.run / HIERARCHY, "", do=_AGAIN)
+        return GaussianPriors(arrays["prior_centre"], arrays["prior_precision"])
+
+    @cached_property
+    def terms(self) -> Series:
+        """Linear terms of the exposures, each fitted by itself."""
+        arrays = read_arrays(self.run / TERMS, "", do=_AGAIN)
+        names = [bytes(row.astype(np.uint8)).decode().strip() for row in arrays["names"]]
+        labels = [bytes(row.astype(np.uint8)).decode().strip() for row in arrays["labels"]]
+        return Series(
+            arrays["epoch"],
+            arrays["values"],
+            arrays["cov"],
+            tuple(labels),
+            tuple(names),
+            source="exposures",
+        )
+
+    def keep_terms(self, series: Series) -> None:
+        """Write the linear terms for the stages that follow."""
+        arrays = {"epoch": series.epoch, "values": series.values, "cov": series.cov}
+        for key, texts in (("names", series.names), ("labels", series.coefficients)):
+            width = max(len(text.encode()) for text in texts)
+            rows = [list(text.encode().ljust(width)) for text in texts]
+            arrays[key] = np.array(rows, float)
+        write_arrays(self.run / TERMS, "", arrays)
+
+    def forget(self) -> None:
+        """Forget what rests on pairs, tables and errors."""
+        self.errors_changed()
+        for name in ("pairs", "tables", "raw_matches", "model", "priors", "terms", "plain_model"):
+            self.__dict__.pop(name, None)

@@ -1,0 +1,52 @@
+"""The stages of a run, where those of a campaign differ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from bayesdist.app.campaign.fit import run_campaign_fit
+from bayesdist.app.campaign.matching import run_match
+from bayesdist.app.campaign.release import release
+from bayesdist.app.campaign.series import run_series
+from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.chips import check_chips
+from bayesdist.app.stages.assess import run_assess
+from bayesdist.app.stages.export import run_export
+from bayesdist.products import read_idctab
+
+__all__ = ["CAMPAIGN_STAGES", "rehearse_campaign"]
+
+
+def _assess(session: CampaignSession) -> None:
+    run_assess(session)
+    run_series(session)
+
+
+def _export(session: CampaignSession) -> None:
+    asked = session.config.products.release is not None
+    run_export(session, release(session, session.posterior) if asked else [])
+
+
+CAMPAIGN_STAGES: dict[str, Callable[[Any], None]] = {
+    "match": run_match,
+    "fit": run_campaign_fit,
+    "assess": _assess,
+    "export": _export,
+}
+
+
+def rehearse_campaign(session: CampaignSession) -> None:
+    """Read all that the campaign begins with; nothing is matched or written.
+
+    Raises
+    ------
+    BayesdistError
+        For inputs that cannot be read or do not go together.
+    """
+    chips = sorted({int(n) for one in session.inputs.lists for n in set(one.chip.tolist())})
+    check_chips(session.config.chips(), chips)
+    read_idctab(session.base / session.block.start)
+    if session.config.products.release is not None:
+        read_idctab(session.base / session.config.products.release.reference)
+    session.config.time()

@@ -1,0 +1,121 @@
+"""The error budget of a detector of one or many chips."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.budget import ErrorBudget, budget_row, error_budgets
+from bayesdist.assess.grid import DEFAULT_GRID
+from bayesdist.assess.solution import Solution
+from bayesdist.assess.terms import UserTerm
+
+__all__ = ["DetectorBudget", "detector_budget"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DetectorBudget:
+    """The error budgets of all chips of a detector, from the same draws.
+
+    Parameters
+    ----------
+    chips : tuple of ErrorBudget
+        One for each chip, all with the same terms and the same number of grid points.
+    """
+
+    chips: tuple[ErrorBudget, ...]
+
+    @property
+    def unit(self) -> str:
+        """Unit of all standard deviations."""
+        return self.chips[0].unit
+
+    @property
+    def epoch(self) -> float | None:
+        """Decimal years."""
+        return self.chips[0].epoch
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the terms."""
+        return tuple(t.name for t in self.chips[0].terms)
+
+    @property
+    def share(self) -> Float:
+        """Fraction of the grid points of all chips at which each term is the largest."""
+        dominant = np.concatenate([b.dominant.ravel() for b in self.chips])
+        return np.bincount(dominant, minlength=len(self.names)) / dominant.size
+
+    def rows(self) -> list[dict[str, str | float]]:
+        """The budget as a table: root mean squares over the grid points of all chips.
+
+        Returns
+        -------
+        list of dict
+            name, kind, u, v, radial, source; one for each term, the total last.
+        """
+        rows = []
+        for terms in zip(*(b.terms for b in self.chips), strict=True):
+            u, v = (np.stack([getattr(t, axis) for t in terms]) for axis in "uv")
+            rows.append(budget_row(terms[0].name, terms[0].kind, u, v, terms[0].source))
+        u, v = (np.stack([getattr(b, f"total_{axis}") for b in self.chips]) for axis in "uv")
+        return [*rows, budget_row("total", "total", u, v, "")]
+
+    def rows_by_chip(self) -> list[dict[str, str | float]]:
+        """As `rows`, followed by those of each chip alone; column chip is 'all' or its number."""
+        parts = [("all", self.rows()), *((str(b.chip), b.rows()) for b in self.chips)]
+        return [{"chip": chip} | row for chip, rows in parts for row in rows]
+
+
+def detector_budget(
+    solution: Solution,
+    *,
+    terms: Sequence[UserTerm] = (),
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    n_draws: int = 4000,
+    rng: np.random.Generator,
+    pixel_scale: float | None = None,
+) -> DetectorBudget:
+    """The error budget of a solution over all of its chips, the same grid on each.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    terms : sequence of UserTerm
+    grid : tuple of int
+        Points on x and y of each chip.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    n_draws : int
+    rng : numpy.random.Generator
+    pixel_scale : float, optional
+        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+
+    Returns
+    -------
+    DetectorBudget
+        In the unit of u, v.
+
+    Raises
+    ------
+    InputError
+        As `error_budget`.
+    """
+    return DetectorBudget(
+        error_budgets(
+            solution,
+            tuple(c.number for c in solution.model.chips),
+            terms=terms,
+            grid=grid,
+            epoch=epoch,
+            n_draws=n_draws,
+            rng=rng,
+            pixel_scale=pixel_scale,
+        )
+    )

@@ -1,0 +1,341 @@
+"""All exposures jointly, with scale and shear of each scattered about the common polynomials.
+
+    deviation k of exposure e ~ N(0, tau_k^2)          k: scale, shear_plus, shear_cross
+
+A telescope breathes: the linear terms of its exposures scatter by more than their formal errors,
+and a joint fit that does not know this believes in each star as if it were a new measurement of the
+detector.  The scatter tau is estimated with everything else.
+
+One linear fit with a wide prior on the deviations is enough.  Its mean and covariance tell what the
+data alone say of them; tau, and what follows from any tau for all parameters, is then algebra on
+the deviations (see `Scatter`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.linear import Clip, LinearFit, fit_linear
+from bayesdist.infer.prior import GaussianPriors
+from bayesdist.infer.scatter import Scatter
+from bayesdist.infer.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.views import reference_gauge
+from bayesdist.model import DistortionModel
+from bayesdist.model.frames import DEVIATIONS
+
+__all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference"]
+
+Float = NDArray[np.float64]
+
+SCALE = 1e-4  # of the prior on tau: what velocity aberration does to the scale in a year
+LEAST_DETERMINED = 0.5  # deviations of a kind that the data must determine, out of E
+
+
+@dataclass(frozen=True, eq=False)
+class HierarchicalFit:
+    """A joint solution of all exposures in which scale and shear of each may deviate.
+
+    Mean, covariance and draws are averages over the posterior of tau.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        The linear fit with tau held at its median.
+    scatter : Scatter
+        What the data say of tau.
+    tau_draws : ndarray, shape (n, k)
+        Draws of tau from its posterior.
+    index : ndarray of int, shape (m,)
+        Where theta holds the deviations.
+    deviation_mean : ndarray, shape (m,)
+    deviation_cov : ndarray, shape (m, m)
+        Of the deviations, over tau.
+    others : GaussianPriors
+        The priors that were given.
+    """
+
+    fit: LinearFit
+    scatter: Scatter
+    tau_draws: Float
+    index: NDArray[np.int64]
+    deviation_mean: Float
+    deviation_cov: Float
+    others: GaussianPriors
+
+    @property
+    def model(self) -> DistortionModel:
+        """The distortion model."""
+        return self.fit.model
+
+    @property
+    def unit(self) -> str:
+        """Unit of u and v."""
+        return self.model.unit
+
+    @property
+    def clip(self) -> Clip:
+        """What was left out of the second pass."""
+        return self.fit.clip
+
+    def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
+        """Which stars (N,) of a table were used."""
+        return self.fit.uses(matches)
+
+    @property
+    def tau(self) -> dict[str, float]:
+        """Posterior median of the scatter of each kind of deviation."""
+        median = np.median(self.tau_draws, axis=0)
+        return dict(zip(self.scatter.kinds, map(float, median), strict=True))
+
+    def tau_interval(self, probability: float = 0.68) -> dict[str, tuple[float, float]]:
+        """Central posterior interval of each tau."""
+        tail = (1 - probability) / 2
+        ends = np.quantile(self.tau_draws, [tail, 1 - tail], axis=0).T
+        return {k: (float(a), float(b)) for k, (a, b) in zip(self.scatter.kinds, ends, strict=True)}
+
+    @property
+    def priors(self) -> GaussianPriors:
+        """The given priors and those of the deviations with the median tau, as `sample` wants."""
+        tau = np.array([self.tau[k] for k in self.scatter.kinds])
+        return _with_deviations(self.others, self.index, tau[self.scatter.kind])
+
+    @cached_property
+    def _gain(self) -> Float:
+        """Change of theta (D, n) with the deviations."""
+        b = self.index
+        return np.asarray(np.linalg.solve(self.fit.cov[np.ix_(b, b)], self.fit.cov[b]).T)
+
+    @cached_property
+    def mean(self) -> Float:
+        """Posterior mean of theta, shape (D,)."""
+        return self.fit.mean + self._gain @ (self.deviation_mean - self.fit.mean[self.index])
+
+    @cached_property
+    def cov(self) -> Float:
+        """Posterior covariance of theta, shape (D, D)."""
+        b = self.index
+        change = self.deviation_cov - self.fit.cov[np.ix_(b, b)]
+        cov = self.fit.cov + self._gain @ change @ self._gain.T
+        return (cov + cov.T) / 2
+
+    @property
+    def sigma(self) -> Float:
+        """Posterior standard deviation of theta, shape (D,)."""
+        return np.asarray(np.sqrt(np.diag(self.cov)))
+
+    @threadpool_limits.wrap(limits=1, user_api="blas")
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Parameter vectors (n, D): each with a tau of its own, and deviations drawn with it."""
+        theta = self.fit.draws(n, rng)
+        which = np.sort(rng.integers(len(self.tau_draws), size=n))
+        b = np.empty((n, len(self.index)))
+        for t in np.unique(which):
+            rows = np.flatnonzero(which == t)
+            mean, cov = self.scatter.moments(self.tau_draws[t])
+            scale = np.sqrt(np.diag(cov))
+            root = np.linalg.cholesky(cov / np.outer(scale, scale)) * scale[:, None]
+            b[rows] = mean + rng.standard_normal((len(rows), len(mean))) @ root.T
+        theta = theta + (b - theta[:, self.index]) @ self._gain.T
+        return theta[rng.permutation(n)]
+
+    def deviations(self, exposure: str) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of the deviations of one exposure.
+
+        Raises
+        ------
+        InputError
+            For an unknown exposure.
+        """
+        if exposure not in self.model.exposures:
+            raise InputError(f"there is no exposure {exposure!r}")
+        names = [f"{exposure}.{kind}" for kind in self.scatter.kinds]
+        at = [self.model.names.index(name) for name in names]
+        pairs = zip(self.mean[at], self.sigma[at], strict=True)
+        return {
+            k: (float(m), float(s)) for k, (m, s) in zip(self.scatter.kinds, pairs, strict=True)
+        }
+
+
+def _with_deviations(
+    others: GaussianPriors, index: NDArray[np.int64], sigma: Float
+) -> GaussianPriors:
+    centre, precision = others.centre.copy(), others.precision.copy()
+    centre[index], precision[index] = 0.0, sigma**-2
+    return GaussianPriors(centre, precision)
+
+
+def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -> DistortionModel:
+    """The model in gauge 'held', with polynomials that lie along the reference chip's axes.
+
+    The first exposure's stars on that chip are fitted alone; where its reference pixel lies and how
+    it is turned is where the first exposure is held.  Frames then rotate about the reference pixel,
+    and scale, shear and drift are those of the detector, whatever the roll angles are.
+
+    Parameters
+    ----------
+    matches : MatchTable or PartitionedMatches
+    model : DistortionModel
+        Of all exposures; its gauge is replaced.
+    chip : int
+        Number of the reference chip.
+
+    Returns
+    -------
+    DistortionModel
+
+    Raises
+    ------
+    DegenerateError
+        When the first exposure has too few stars on that chip.
+    """
+    first = model.exposures[0]
+    number = model.chips[model.chip_code(chip)].number
+    parts = []
+    for piece in matches.pieces():
+        table = piece.read()
+        rows = (np.asarray(table.exposure_names)[table.exposure] == first) & (
+            np.asarray(table.chip_numbers)[table.chip] == number
+        )
+        if rows.any():
+            parts.append(table.select(rows))
+    if not parts:
+        raise DegenerateError(
+            f"exposure {first!r}, which defines the gauge, has no stars on the reference chip",
+            where=f"chip {model.chips[model.chip_code(chip)].name}",
+            do="put another exposure first",
+        )
+    alone = replace(
+        model,
+        chips=(model.chips[model.chip_code(chip)],),
+        time=None,
+        frames="none",
+        exposures=("1",),
+        gauge="first",
+        held=(0.0, 0.0, 0.0),
+    )
+    table = MatchTable.concatenate(parts)
+    gauge = reference_gauge(fit_linear(table, alone), chip).gauge
+    assert gauge is not None
+    return replace(model, gauge="held", held=(*gauge.shift, -gauge.rotation), origin=(0.0, 0.0))
+
+
+# matrices here are small: more BLAS threads only get in each other's way
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def fit_hierarchical(
+    matches: Matches | Shards,
+    model: DistortionModel,
+    *,
+    deviations: Sequence[str] | None = None,
+    priors: GaussianPriors | None = None,
+    scale: float = SCALE,
+    n_tau: int = 256,
+    seed: int = 1,
+    clip_chi2: float = 25.0,
+    clip_abs: float | None = 2.0,
+    compute: Compute | None = None,
+) -> HierarchicalFit:
+    """Fit all exposures jointly, with the scatter of their scale and shear.
+
+    Parameters
+    ----------
+    matches : MatchTable, PartitionedMatches or Shards
+        With errors.
+    model : DistortionModel
+        Frames 'shift_rotation_scale' or 'affine' in gauge 'held': see `held_in_reference`.
+    deviations : sequence of str, optional
+        Kinds of deviation that scatter; all that the frames have by default.  The others need a
+        prior.
+    priors : GaussianPriors, optional
+        On other parameters.
+    scale : float
+        Of the half-Student-t prior on each tau, with 4 degrees of freedom.  It is flat for scatter
+        much below, and makes the posterior proper with few exposures.
+    n_tau : int
+        Draws of tau over which results are averaged.
+    seed : int
+        Of these draws.
+    clip_chi2, clip_abs, compute
+        As of `fit_linear`.
+
+    Returns
+    -------
+    HierarchicalFit
+
+    Raises
+    ------
+    InputError
+        For a model without such frames, another gauge, or an unknown deviation.
+    DegenerateError
+        When the data do not determine the scatter, by name; else as `fit_linear`.
+    """
+    has = [d for d in DEVIATIONS if d in model.free_frame_names(0)]
+    kinds = tuple(has if deviations is None else deviations)
+    _check(model, has, kinds)
+    others = priors or GaussianPriors.none(model)
+    names = {name: k for k, name in enumerate(model.names)}
+    index = np.array([names[f"{e}.{kind}"] for kind in kinds for e in model.exposures])
+    kind = np.repeat(np.arange(len(kinds)), len(model.exposures))
+    with opened(model, matches, compute) as shards:
+        wide = np.full(len(index), scale)
+        options: dict[str, Any] = {"clip_chi2": clip_chi2, "clip_abs": clip_abs}
+        first = fit_linear(shards, model, priors=_with_deviations(others, index, wide), **options)
+        scatter = _scatter(first, kinds, kind, index, scale)
+        tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
+        tau = np.median(tau_draws, axis=0)
+        fit = fit_linear(
+            shards, model, priors=_with_deviations(others, index, tau[kind]), **options
+        )
+    return HierarchicalFit(fit, scatter, tau_draws, index, *scatter.over(tau_draws), others)
+
+
+def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> None:
+    if model.gauge != "held" or not has:
+        raise InputError(
+            f"frames '{model.frames}' in gauge '{model.gauge}' leave nothing that scatters",
+            where="model.frames",
+            do="choose 'shift_rotation_scale' or 'affine' in gauge 'held' (held_in_reference)",
+        )
+    unknown = [kind for kind in kinds if kind not in has]
+    if unknown or not kinds:
+        raise InputError(
+            f"{unknown[0]!r} is no deviation of frames '{model.frames}'"
+            if unknown
+            else "no deviation is named",
+            where="deviations",
+            do=f"choose among {', '.join(has)}",
+        )
+
+
+def _scatter(
+    fit: LinearFit,
+    kinds: tuple[str, ...],
+    kind: NDArray[np.int64],
+    index: NDArray[np.int64],
+    scale: float,
+) -> Scatter:
+    """What a fit with the prior N(0, scale^2) on the deviations says of them without it."""
+    inverse = np.linalg.inv(fit.cov[np.ix_(index, index)])
+    pull = inverse @ fit.mean[index]
+    # of E deviations of a kind, so many are known from the data rather than from the prior
+    known = 1 - np.diag(fit.cov)[index] / scale**2
+    determined = np.bincount(kind, known)
+    if (determined < LEAST_DETERMINED).any():
+        worst = kinds[int(np.argmin(determined))]
+        raise DegenerateError(
+            f"the scatter of {worst!r} is not determined: {len(kind) // len(kinds)} exposures are "
+            "no more than the linear terms and their drift absorb",
+            where="model.frames",
+            do="give more exposures, drop the drift, or name fewer deviations",
+        )
+    information = inverse.copy()
+    information[np.diag_indices_from(information)] -= scale**-2
+    return Scatter(kinds, kind, (information + information.T) / 2, pull, scale)

@@ -1,0 +1,215 @@
+"""A look-up table as a Gaussian random field, measured by every star through bilinear weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
+
+from bayesdist.errors import InputError
+from bayesdist.infer.nodes.evidence import Evidence, fitted_field, refined_field
+from bayesdist.infer.nodes.grid import STEP, NodeGrid
+from bayesdist.infer.nodes.jitter import jitter_variance
+from bayesdist.infer.nodes.matern import SMOOTHNESS
+from bayesdist.infer.nodes.posterior import TablePosterior, axis_posterior
+from bayesdist.infer.nodes.sums import BLOCK, NodeSums, interpolation, node_sums
+from bayesdist.model import Chip
+
+__all__ = ["checked_stars", "field_table"]
+
+Float = NDArray[np.float64]
+
+STEADY = 1e-5  # change of the stars' typical variance that no error of the jitter can tell
+ROUNDS = 6
+
+
+# a factorisation of this size is no faster on two threads, and far slower where they are shared
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def field_table(
+    x: ArrayLike,
+    y: ArrayLike,
+    shift: ArrayLike,
+    variance: ArrayLike,
+    *,
+    chip: Chip,
+    order: int,
+    weight: ArrayLike | None = None,
+    filter: str = "",
+    step: tuple[float, float] = STEP,
+    smoothness: Sequence[float] = SMOOTHNESS,
+    earlier: TablePosterior | None = None,
+    hold: bool = False,
+) -> TablePosterior:
+    """The posterior of a table from the residuals of one chip.
+
+        shift = W d + polynomial + noise,  noise variance = quoted variance + jitter^2
+
+    The node values d are a Matern field without its polynomial part.  The polynomial is integrated
+    out under a flat prior, so that a table from the residuals of any earlier polynomial fit is the
+    table of the joint solution.  Amplitude, length and smoothness maximise the marginal likelihood,
+    for each axis by itself: a defect of columns is seen in x alone, and a common value would save
+    no time.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (N,)
+        Raw pixels.
+    shift : array_like, shape (N, 2)
+        What has to be added to them, pixels: see `pixel_shifts`.
+    variance : array_like, shape (N, 2)
+        Square of its error, square pixels.
+    chip : Chip
+    order : int
+        Of the polynomial that goes with the table.
+    weight : array_like, shape (N,), optional
+        Probability of being a true match.
+    filter : str
+        The table's filter; '' for the detector's own.
+    step : tuple of float
+        Pixels between nodes.
+    smoothness : sequence of float
+        Matern smoothness to choose from.
+    earlier : TablePosterior, optional
+        The table of nearly the same stars, of an earlier round: the search begins there.
+    hold : bool
+        Take the hyperparameters of the earlier table and do not look for better ones.
+
+    Returns
+    -------
+    TablePosterior
+
+    Raises
+    ------
+    InputError
+        For arrays of other shapes, values that are not finite, an unknown smoothness, or nothing
+        to hold.
+    DegenerateError
+        When the stars do not determine the polynomial.
+    """
+    bad = [nu for nu in smoothness if nu not in SMOOTHNESS]
+    if bad or not smoothness:
+        raise InputError(
+            f"there is no field of smoothness {bad}" if bad else "no smoothness is given",
+            do=f"choose among {', '.join(map(str, SMOOTHNESS))}",
+        )
+    if hold and earlier is None:
+        raise InputError("there are no hyperparameters to hold", do="give the earlier table")
+    px, py, r, var, w = checked_stars(x, y, shift, variance, weight, chip)
+    grid = NodeGrid(chip, order, step)
+
+    def sums_at(j2: float) -> tuple[NodeSums, NodeSums]:
+        return node_sums(grid, px, py, r, w[:, None] / (var + j2))
+
+    def jitter_at(
+        sums: Sequence[NodeSums], nodes: Sequence[Float], n: float
+    ) -> tuple[float, float]:
+        return jitter_variance(_residual(grid, px, py, r, sums, nodes), var, w, n)
+
+    typical = float(np.median(var))
+    if earlier is None:
+        # a first value without any smoothing: there are no hyperparameters yet
+        rough = [Evidence(grid, s) for s in sums_at(0.0)]
+        n = sum(_n_rough(e) for e in rough)
+        j2, _ = jitter_at([e.sums for e in rough], [e.rough for e in rough], n)
+        sums = sums_at(j2)
+        fields = [fitted_field(Evidence(grid, s), smoothness, thorough=True) for s in sums]
+    else:
+        j2, fields = earlier.jitter**2, [axis.field for axis in earlier.axes]
+        sums = sums_at(j2)
+        if not hold:
+            fields = [
+                refined_field(Evidence(grid, s), f) for s, f in zip(sums, fields, strict=True)
+            ]
+    for _ in range(ROUNDS):
+        axes = (axis_posterior(grid, sums[0], fields[0]), axis_posterior(grid, sums[1], fields[1]))
+        n = sum(axis.n_effective for axis in axes)
+        new, error = jitter_at(sums, [axis.mean for axis in axes], n)
+        if abs(new - j2) < 0.3 * error + STEADY * (typical + j2):
+            break
+        j2, sums = new, sums_at(new)
+    mean = np.stack([axis.mean for axis in axes])
+    sigma = np.stack([axis.sigma for axis in axes])
+    table = grid.table(mean, sigma, filter=filter)
+    # of j where it is large beside its error, of how large it can be where it is zero
+    jitter = float(np.sqrt(j2))
+    spread = float(np.sqrt(j2 + error)) - jitter
+    return TablePosterior(table, grid, axes, jitter, spread, float(w.sum()))
+
+
+def checked_stars(
+    x: ArrayLike,
+    y: ArrayLike,
+    shift: ArrayLike,
+    variance: ArrayLike,
+    weight: ArrayLike | None,
+    chip: Chip,
+) -> tuple[Float, Float, Float, Float, Float]:
+    """Stars as arrays of float64.
+
+    Raises
+    ------
+    InputError
+        For other shapes, no stars, values that are not finite, variances that are not positive, or
+        weights outside 0..1.
+    """
+    where = f"look-up table of chip {chip.number}"
+    px = np.atleast_1d(np.asarray(x, float))
+    n = len(px)
+    given = {
+        "y": np.atleast_1d(np.asarray(y, float)),
+        "shift": np.asarray(shift, float),
+        "variance": np.asarray(variance, float),
+        "weight": np.ones(n) if weight is None else np.asarray(weight, float),
+    }
+    if n == 0:
+        raise InputError("there are no stars", where=where, do="give matches on this chip")
+    for name, array in given.items():
+        wanted = (n, 2) if name in ("shift", "variance") else (n,)
+        if array.shape != wanted:
+            raise InputError(
+                f"'{name}' has shape {array.shape} and {wanted} is expected",
+                where=where,
+                do="give one row for each star",
+            )
+    for name, array in {"x": px, **given}.items():
+        good = np.isfinite(array)
+        if name == "variance":
+            good &= array > 0
+        if name == "weight":
+            good &= (array >= 0) & (array <= 1)
+        if not good.all():
+            k = tuple(np.argwhere(~good)[0])
+            raise InputError(
+                f"'{name}' is {array[k]:g}",
+                where=f"{where}, star {k[0] + 1}",
+                do="give finite values, positive variances and weights from 0 to 1",
+            )
+    return px, given["y"], given["shift"], given["variance"], given["weight"]
+
+
+def _residual(
+    grid: NodeGrid,
+    x: Float,
+    y: Float,
+    shift: Float,
+    sums: Sequence[NodeSums],
+    nodes: Sequence[Float],
+) -> Float:
+    """What node values of both axes, and the polynomials that go with them, leave of the shifts."""
+    values = np.stack(nodes, axis=1)
+    polynomial = np.stack([s.polynomial_of(d) for s, d in zip(sums, nodes, strict=True)], axis=1)
+    out = np.empty_like(shift)
+    for start in range(0, len(x), BLOCK):
+        rows = slice(start, start + BLOCK)
+        fitted = interpolation(grid, x[rows], y[rows]) @ values
+        fitted += grid.basis.evaluate(x[rows], y[rows]) @ polynomial
+        out[rows] = shift[rows] - fitted
+    return out
+
+
+def _n_rough(evidence: Evidence) -> float:
+    """Parameters of a fit without smoothing."""
+    sums = evidence.sums
+    return len(sums.polynomial) + float((sums.information * evidence.noise).sum())

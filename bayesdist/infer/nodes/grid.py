@@ -1,0 +1,129 @@
+"""The nodes of one chip's look-up table, and the part of it that the polynomial already describes.
+
+A table and a polynomial of the pixel overlap: what one takes the other gives.  The overlap goes to
+the polynomial: node values are orthogonal to every polynomial of the model's order, summed over the
+nodes, each of which stands for an equal piece of the detector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.model import Chip, PolynomialBasis
+from bayesdist.model.lookup import LookupTable
+
+__all__ = ["STEP", "NodeGrid"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+STEP = (64.0, 64.0)  # pixels: the grid of D2IMFILE and NPOLFILE
+
+
+@dataclass(frozen=True)
+class NodeGrid:
+    """Nodes at the centres of equal bins of a chip.
+
+    Parameters
+    ----------
+    chip : Chip
+    order : int
+        Of the polynomial that goes with the table.
+    step : tuple of float
+        Size of a bin along x and y, pixels.
+
+    Raises
+    ------
+    InputError
+        When there are too few nodes to hold anything beside the polynomial.
+    """
+
+    chip: Chip
+    order: int
+    step: tuple[float, float] = STEP
+
+    def __post_init__(self) -> None:
+        if not min(self.step) > 0:
+            raise InputError(
+                f"the nodes are {self.step} pixels apart", do="give two positive numbers"
+            )
+        ny, nx = self.shape
+        if min(nx, ny) < 2 or nx * ny <= self.basis.n_terms:
+            raise InputError(
+                f"{nx} x {ny} nodes hold no more than a polynomial of order {self.order}",
+                where=f"look-up table of chip {self.chip.number}",
+                do="give a smaller step or a lower order",
+            )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Nodes along y and x: (ny, nx)."""
+        nx, ny = (
+            int(np.ceil(n / s - 1e-9)) for n, s in zip(self.chip.size, self.step, strict=True)
+        )
+        return ny, nx
+
+    @property
+    def n_nodes(self) -> int:
+        """Nodes of one axis."""
+        ny, nx = self.shape
+        return ny * nx
+
+    @property
+    def basis(self) -> PolynomialBasis:
+        """Polynomials over the chip."""
+        return PolynomialBasis(self.order, self.chip.size, self.chip.reference_pixel)
+
+    def table(self, values: Float, sigma: Float | None = None, *, filter: str = "") -> LookupTable:
+        """A table on these nodes.
+
+        Parameters
+        ----------
+        values, sigma : ndarray, shape (2, n_nodes) or (2, ny, nx)
+        filter : str
+        """
+        shape = (2, *self.shape)
+        first = (self.step[0] + 1) / 2, (self.step[1] + 1) / 2
+        spread = None if sigma is None else np.reshape(sigma, shape)
+        number = self.chip.number
+        return LookupTable(number, np.reshape(values, shape), filter, first, self.step, spread)
+
+    @cached_property
+    def blank(self) -> LookupTable:
+        """The table of zeros: it knows the weights of the nodes at any pixel."""
+        return self.table(np.zeros((2, self.n_nodes)))
+
+    @cached_property
+    def positions(self) -> tuple[Float, Float]:
+        """Pixels x, y (n_nodes,) of the nodes."""
+        x, y = np.meshgrid(*self.blank.nodes())
+        return x.ravel(), y.ravel()
+
+    @cached_property
+    def polynomials(self) -> Float:
+        """Orthonormal polynomials (n_nodes, K) at the nodes."""
+        return np.linalg.qr(self.basis.evaluate(*self.positions))[0]
+
+    def without_polynomials(self, values: Float) -> Float:
+        """Node values (n_nodes, ...) without their polynomial part."""
+        Q = self.polynomials
+        return values - Q @ (Q.T @ values)
+
+    @cached_property
+    def lag(self) -> Int:
+        """For each pair of nodes (n_nodes, n_nodes) the entry of `lags` that tells them apart."""
+        ny, nx = self.shape
+        row, column = np.divmod(np.arange(ny * nx), nx)
+        along_y = np.abs(row[:, None] - row)
+        return along_y * nx + np.abs(column[:, None] - column)
+
+    @cached_property
+    def lags(self) -> Float:
+        """Distances (n_nodes,) in pixels between the first node and each."""
+        x, y = self.positions
+        return np.hypot(x - x[0], y - y[0])

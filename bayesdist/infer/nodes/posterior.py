@@ -1,0 +1,199 @@
+"""What is known of a look-up table: node values, their covariance, draws, errors in between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.infer.nodes.evidence import FittedField
+from bayesdist.infer.nodes.grid import NodeGrid
+from bayesdist.infer.nodes.matern import Matern
+from bayesdist.infer.nodes.sums import NodeSums, interpolation
+from bayesdist.model.lookup import LookupTable
+
+__all__ = ["AxisField", "TablePosterior", "axis_posterior"]
+
+Float = NDArray[np.float64]
+
+BLOCK = 2048  # pixels whose rows over all nodes are held at once
+
+
+@dataclass(frozen=True, eq=False)
+class AxisField:
+    """Posterior of the node values of one axis: Gaussian, the polynomial being integrated out.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (n,)
+        Pixels.
+    root : ndarray, shape (n, n)
+        R with R R^T the covariance.
+    field : FittedField
+        Hyperparameters.
+    sums : NodeSums
+        What the stars say.
+    """
+
+    mean: Float
+    root: Float
+    field: FittedField
+    sums: NodeSums
+
+    @property
+    def sigma(self) -> Float:
+        """Standard error (n,) of each node, pixels."""
+        return np.sqrt(np.einsum("ij,ij->i", self.root, self.root))
+
+    @property
+    def cov(self) -> Float:
+        """Covariance (n, n), square pixels."""
+        return self.root @ self.root.T
+
+    @property
+    def polynomial(self) -> Float:
+        """Polynomial (K,) that goes with the mean: what the polynomial fit has still to change."""
+        return self.sums.polynomial_of(self.mean)
+
+    @property
+    def n_effective(self) -> float:
+        """Parameters, nodes and polynomial, that the stars determine."""
+        nodes = float((self.sums.informed(self.root) * self.root).sum())
+        return len(self.sums.polynomial) + nodes
+
+    def gain(self, rows: Float) -> Float:
+        """How much of an error beneath this table it takes up: rows (N, n) times S A, (N, n)."""
+        return self.sums.informed(self.root @ (self.root.T @ rows.T)).T
+
+
+@dataclass(frozen=True, eq=False)
+class TablePosterior:
+    """Posterior of one look-up table.
+
+    The two axes are independent.
+
+    Parameters
+    ----------
+    table : LookupTable
+        Posterior means, with the standard error of each node.
+    grid : NodeGrid
+    axes : tuple of AxisField
+        Of the x and of the y plane.
+    jitter : float
+        Error of the stars beyond the quoted ones, pixels.
+    jitter_sigma : float
+        Its standard error, pixels.
+    n_stars : float
+        Stars, each counted by its weight.
+    """
+
+    table: LookupTable
+    grid: NodeGrid
+    axes: tuple[AxisField, AxisField]
+    jitter: float
+    jitter_sigma: float
+    n_stars: float
+
+    @property
+    def priors(self) -> tuple[Matern, Matern]:
+        """The fields that the two planes are drawn from."""
+        return self.axes[0].field.prior, self.axes[1].field.prior
+
+    @property
+    def cov(self) -> Float:
+        """Covariance (2, n_nodes, n_nodes) of the node values, square pixels."""
+        return np.stack([axis.cov for axis in self.axes])
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Node values from the posterior.
+
+        Parameters
+        ----------
+        n : int
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        ndarray, shape (n, 2, ny, nx)
+            Pixels.
+        """
+        planes = []
+        for axis in self.axes:
+            xi = rng.standard_normal((n, axis.root.shape[1]))
+            planes.append((axis.mean + xi @ axis.root.T).reshape(n, *self.grid.shape))
+        return np.stack(planes, axis=1)
+
+    def position_sigma(self, x: ArrayLike, y: ArrayLike, *, refitted: bool = False) -> Float:
+        """Standard error of the interpolated shift.
+
+        Parameters
+        ----------
+        x, y : array_like, shape (N,)
+            Raw pixels.
+        refitted : bool
+            What the errors of the table leave after the polynomial has followed them.  The square
+            of this, and the square of the formal error of a polynomial that was fitted with the
+            table held, add up to the error of the whole: exactly, not only where the two hardly
+            know of each other.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+            Pixels.
+        """
+        x, y = (np.atleast_1d(np.asarray(p, float)) for p in (x, y))
+        out = np.empty((len(x), 2))
+        for start in range(0, len(x), BLOCK):
+            rows = slice(start, start + BLOCK)
+            for a, axis in enumerate(self.axes):
+                response = self.rows(x[rows], y[rows], a, refitted=refitted)
+                out[rows, a] = np.linalg.norm(response @ axis.root, axis=1)
+        return out
+
+    def rows(self, x: Float, y: Float, axis: int, *, refitted: bool = False) -> Float:
+        """Derivatives (N, n_nodes) of the shift along an axis by the node values.
+
+        Parameters
+        ----------
+        x, y : ndarray, shape (N,)
+        axis : int
+        refitted : bool
+            As in `position_sigma`.
+        """
+        out: Float = interpolation(self.grid, x, y).toarray()
+        if refitted:
+            out -= self.grid.basis.evaluate(x, y) @ self.axes[axis].sums.absorbed
+        return out
+
+
+def axis_posterior(grid: NodeGrid, sums: NodeSums, field: FittedField) -> AxisField:
+    """Posterior of the node values of one axis at given hyperparameters.
+
+    Parameters
+    ----------
+    grid : NodeGrid
+    sums : NodeSums
+    field : FittedField
+
+    Returns
+    -------
+    AxisField
+
+    Notes
+    -----
+    With d = L z, z ~ N(0, 1) and L the polynomial-free part of the Cholesky factor of the prior,
+    the precision of z is 1 + L^T A L: never singular, whatever bins are empty.
+    """
+    L = np.asarray(np.linalg.cholesky(field.prior.covariance(grid)), np.float64)
+    L = grid.without_polynomials(L)
+    M = L.T @ sums.informed(L)
+    M = (M + M.T) / 2
+    M[np.diag_indices_from(M)] += 1.0
+    root = scipy.linalg.solve_triangular(
+        np.linalg.cholesky(M), L.T, lower=True, overwrite_b=True, check_finite=False
+    ).T
+    # the prior's factor carries rounding of 1e-16 of its size into the polynomial space
+    root = grid.without_polynomials(root)
+    return AxisField(root @ (root.T @ sums.marginal_right), root, field, sums)

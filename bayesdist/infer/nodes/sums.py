@@ -1,0 +1,168 @@
+"""All that the stars say about the nodes and the polynomial of one chip: sums over the stars.
+
+    r = W d + Phi c + noise        r: shifts of the pixel, W: bilinear weights, Phi: polynomials
+
+The sums are small whatever the number of stars, and each star is looked at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from numpy.typing import NDArray
+
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.nodes.grid import NodeGrid
+
+__all__ = ["NodeSums", "interpolation", "node_sums"]
+
+Float = NDArray[np.float64]
+
+BLOCK = 65_536  # stars at once: their polynomials take 11 MB at order 5
+
+
+@dataclass(frozen=True, eq=False)
+class NodeSums:
+    """Normal equations of one axis.
+
+    Parameters
+    ----------
+    nodes : sparse array, shape (n, n)
+        W^T N^-1 W: nine entries in a row.
+    cross : ndarray, shape (K, n)
+        Phi^T N^-1 W.
+    polynomial : ndarray, shape (K, K)
+        Phi^T N^-1 Phi.
+    right : ndarray, shape (n,)
+        W^T N^-1 r.
+    right_polynomial : ndarray, shape (K,)
+        Phi^T N^-1 r.
+    """
+
+    nodes: scipy.sparse.csr_array
+    cross: Float
+    polynomial: Float
+    right: Float
+    right_polynomial: Float
+
+    def __add__(self, other: NodeSums) -> NodeSums:
+        return NodeSums(
+            self.nodes + other.nodes,
+            self.cross + other.cross,
+            self.polynomial + other.polynomial,
+            self.right + other.right,
+            self.right_polynomial + other.right_polynomial,
+        )
+
+    @cached_property
+    def _factor(self) -> tuple[Float, bool]:
+        factor: tuple[Float, bool] = scipy.linalg.cho_factor(self.polynomial, lower=True)
+        return factor
+
+    @cached_property
+    def absorbed(self) -> Float:
+        """What the polynomial takes up of each node, (K, n): its response is minus this."""
+        return scipy.linalg.cho_solve(self._factor, self.cross)
+
+    @cached_property
+    def polynomial_root(self) -> Float:
+        """R (K, K) with R R^T the covariance of the polynomial where the nodes are held."""
+        L, _ = self._factor
+        return scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True).T
+
+    def polynomial_of(self, values: Float) -> Float:
+        """Polynomial (K,) that goes with node values (n,)."""
+        free: Float = scipy.linalg.cho_solve(self._factor, self.right_polynomial)
+        return free - self.absorbed @ values
+
+    @cached_property
+    def marginal_right(self) -> Float:
+        """Right-hand side (n,) of the nodes where the polynomial is free to follow them."""
+        return self.right - self.absorbed.T @ self.right_polynomial
+
+    def informed(self, values: Float) -> Float:
+        """Information about the nodes, the polynomial being free, times values (n, ...)."""
+        return self.nodes @ values - self.cross.T @ (self.absorbed @ values)
+
+    @cached_property
+    def information(self) -> Float:
+        """Information about the nodes (n, n), the polynomial being free to follow them."""
+        return self.nodes.toarray() - self.cross.T @ self.absorbed
+
+
+def interpolation(grid: NodeGrid, x: Float, y: Float) -> scipy.sparse.csr_array:
+    """Bilinear weights W (N, n_nodes) of all nodes at pixels (N,)."""
+    index, weight = grid.blank.weights(x, y)
+    starts = np.arange(0, index.size + 1, 4)
+    return scipy.sparse.csr_array((weight.ravel(), index.ravel(), starts), (len(x), grid.n_nodes))
+
+
+def node_sums(
+    grid: NodeGrid, x: Float, y: Float, shift: Float, precision: Float
+) -> tuple[NodeSums, NodeSums]:
+    """Sums over the stars of one chip, for x and for y.
+
+    Parameters
+    ----------
+    grid : NodeGrid
+    x, y : ndarray, shape (N,)
+        Raw pixels.
+    shift : ndarray, shape (N, 2)
+        What has to be added to them.
+    precision : ndarray, shape (N, 2)
+        Inverse variances; zero for a star that does not count.
+
+    Returns
+    -------
+    tuple of NodeSums
+
+    Raises
+    ------
+    DegenerateError
+        When the stars do not determine the polynomial.
+    """
+    total: tuple[NodeSums, NodeSums] | None = None
+    for start in range(0, len(x), BLOCK):
+        rows = slice(start, start + BLOCK)
+        part = _block(grid, x[rows], y[rows], shift[rows], precision[rows])
+        total = part if total is None else (total[0] + part[0], total[1] + part[1])
+    assert total is not None
+    for sums in total:
+        scale = np.sqrt(np.diag(sums.polynomial))
+        values = (
+            np.linalg.eigvalsh(sums.polynomial / np.outer(scale, scale)) if scale.all() else [0.0]
+        )
+        if values[0] < 1e-11:
+            raise DegenerateError(
+                f"{int((precision[:, 0] > 0).sum())} stars do not determine a polynomial of order "
+                f"{grid.order}",
+                where=f"look-up table of chip {grid.chip.number}",
+                do="give stars over the whole chip, or a lower order",
+            )
+    return total
+
+
+def _block(
+    grid: NodeGrid, x: Float, y: Float, shift: Float, precision: Float
+) -> tuple[NodeSums, NodeSums]:
+    W, phi = interpolation(grid, x, y), grid.basis.evaluate(x, y)
+    transposed = W.T.tocsr()
+
+    def one(axis: int) -> NodeSums:
+        w, r = precision[:, axis], shift[:, axis]
+        weighted = phi * w[:, None]
+        heavy = W.copy()
+        heavy.data = W.data * np.repeat(w, 4)
+        return NodeSums(
+            nodes=(transposed @ heavy).tocsr(),
+            cross=(transposed @ weighted).T,
+            polynomial=phi.T @ weighted,
+            right=transposed @ (w * r),
+            right_polynomial=weighted.T @ r,
+        )
+
+    return one(0), one(1)

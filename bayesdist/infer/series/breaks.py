@@ -1,0 +1,117 @@
+"""Dates of breaks that are to be found: draws given everything but the course's parameters.
+
+The prior of a date is uniform over the span of the series, each segment keeping some exposures.
+Between two neighbouring exposures the date is free, so that a candidate is a gap and a place in it.
+A date is drawn anew among itself and some candidates from a fixed density, each weighted with
+likelihood times prior over that density; the exchange of the present date and a candidate leaves
+the joint density of all as it is, so that the posterior stays (as in Tjelmeland 2004).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.series.course import LEAST_FOUND
+from bayesdist.infer.series.design import Design
+
+__all__ = ["BreakMoves", "Likelihood"]
+
+Float = NDArray[np.float64]
+# log marginal likelihood (C, M) of dates (C, M, B), up to a constant for each chain
+Likelihood = Callable[[Float], Float]
+
+CANDIDATES = 8
+FROM_PRIOR = 0.25
+
+
+class BreakMoves:
+    """Moves of the dates of breaks.
+
+    Parameters
+    ----------
+    design : Design
+    """
+
+    def __init__(self, design: Design) -> None:
+        self.count = design.course.find
+        self.dates = np.unique(design.series.epoch)
+        self.epoch = np.sort(design.series.epoch)
+        self.width = np.diff(self.dates)
+        self.prior = self.width / self.width.sum()
+        self.density = np.tile(self.prior, (self.count, 1))
+        self._seen = np.zeros_like(self.density)
+
+    def possible(self, breaks: Float) -> NDArray[np.bool_]:
+        """Whether dates (..., B) rise and leave each segment enough exposures."""
+        place = np.searchsorted(self.epoch, breaks)
+        shape = (*breaks.shape[:-1], 1)
+        edges = np.concatenate([np.zeros(shape, int), place, np.full(shape, len(self.epoch))], -1)
+        return np.all(np.diff(edges, axis=-1) >= LEAST_FOUND, axis=-1)
+
+    def _at(self, gap: NDArray[np.int64], rng: np.random.Generator) -> Float:
+        return self.dates[gap] + self.width[gap] * rng.random(gap.shape)
+
+    def start(self, n_chains: int, likelihood: Likelihood, rng: np.random.Generator) -> Float:
+        """Dates (C, B) to start from: one break after the other where it explains most."""
+        breaks = np.zeros((n_chains, 0))
+        for _ in range(self.count):
+            gap = np.broadcast_to(np.arange(len(self.width)), (n_chains, len(self.width)))
+            new = self._at(gap, rng)[..., None]
+            old = np.broadcast_to(breaks[:, None], (*gap.shape, breaks.shape[1]))
+            trial = np.sort(np.concatenate([old, new], axis=-1), axis=-1)
+            weight = np.where(self.possible(trial), likelihood(trial), -np.inf)
+            weight += np.log(self.prior)
+            if not np.isfinite(weight).any(axis=1).all():
+                # the breaks so far leave no room: spread them evenly over the exposures
+                places = np.linspace(0, len(self.dates) - 1, self.count + 2)[1:-1].astype(int)
+                return np.tile(self._at(places, rng), (n_chains, 1))
+            breaks = _pick(trial, weight, rng)
+        return breaks
+
+    def scan(self, breaks: Float, likelihood: Likelihood, rng: np.random.Generator) -> Float:
+        """New dates (C, B) among all gaps, one break after the other; what is seen is kept."""
+        for b in range(self.count):
+            gap = np.broadcast_to(np.arange(len(self.width)), (len(breaks), len(self.width)))
+            trial = self._trial(breaks, b, self._at(gap, rng))
+            weight = np.where(self.possible(trial), likelihood(trial), -np.inf)
+            weight = weight + np.log(self.prior)
+            weight -= weight.max(axis=1, keepdims=True)
+            share = np.exp(weight) / np.exp(weight).sum(axis=1, keepdims=True)
+            self._seen[b] += share.mean(axis=0)
+            breaks = _pick(trial, weight, rng)
+        return breaks
+
+    def learn(self) -> None:
+        """Take what the scans have seen for the density of candidates; it is fixed from now on."""
+        total = self._seen.sum(axis=1, keepdims=True)
+        self.density = (1 - FROM_PRIOR) * self._seen / total + FROM_PRIOR * self.prior
+
+    def move(self, breaks: Float, likelihood: Likelihood, rng: np.random.Generator) -> Float:
+        """New dates (C, B) among the present ones and candidates."""
+        n = len(breaks)
+        for b in range(self.count):
+            gap = rng.choice(len(self.width), size=(n, CANDIDATES), p=self.density[b])
+            dates = np.concatenate([breaks[:, b : b + 1], self._at(gap, rng)], axis=1)
+            trial = self._trial(breaks, b, dates)
+            here = np.searchsorted(self.dates, dates, side="right") - 1
+            here = np.clip(here, 0, len(self.width) - 1)
+            weight = np.where(self.possible(trial), likelihood(trial), -np.inf)
+            weight = weight + np.log(self.prior[here] / self.density[b][here])
+            breaks = _pick(trial, weight, rng)
+        return breaks
+
+    @staticmethod
+    def _trial(breaks: Float, b: int, dates: Float) -> Float:
+        trial = np.repeat(breaks[:, None], dates.shape[1], axis=1)
+        trial[..., b] = dates
+        return trial
+
+
+def _pick(trial: Float, log_weight: Float, rng: np.random.Generator) -> Float:
+    """One of the candidates (C, M, B) of each chain, with probability as its weight (C, M)."""
+    noise = rng.gumbel(size=log_weight.shape)
+    best = np.argmax(log_weight + noise, axis=1)
+    return trial[np.arange(len(trial)), best]

@@ -1,0 +1,218 @@
+"""Many chains side by side: where they start, how they warm up, and what they leave behind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.labelled.convergence import Convergence, Limits, diagnose
+from bayesdist.infer.series.breaks import BreakMoves
+from bayesdist.infer.series.gibbs import sweep
+from bayesdist.infer.series.problem import Problem, State, break_likelihood
+from bayesdist.infer.series.series import MAD_TO_SIGMA
+from bayesdist.infer.series.small import cholesky, precision_of
+from bayesdist.infer.series.walk import FRACTION_MOST, FRACTION_PRIOR, KAPPA_RATE, RandomWalk
+
+__all__ = ["Draws", "Engine", "run"]
+
+Float = NDArray[np.float64]
+
+ENSEMBLES = 4  # the chains are judged in as many lots
+SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps
+# the scatter needs further moves above this share of the formal errors in the variance, and with
+# this many exposures of which it is not clear whether they lie off
+FORMAL_SHARE, UNCLEAR = 0.25, 1.0
+EQUAL_WEIGHTS = np.zeros(25)  # no proposal, no importance weights
+
+
+@dataclass(frozen=True, eq=False)
+class Engine:
+    """What a sweep needs besides the state, fixed after the warm-up.
+
+    Parameters
+    ----------
+    problem : Problem
+    walk : RandomWalk or None
+    moves : BreakMoves or None
+    """
+
+    problem: Problem
+    walk: RandomWalk | None
+    moves: BreakMoves | None
+
+    def step(self, state: State, rng: np.random.Generator, kept: Float | None = None) -> State:
+        """The next draw."""
+        return sweep(self.problem, state, rng, kept=kept, walk=self.walk, moves=self.moves)
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Draws of T sweeps of C chains, in units of the spread.
+
+    Parameters
+    ----------
+    b : ndarray, shape (C, T, k, p)
+    sigma : ndarray, shape (C, T, k, k)
+    fraction, kappa2 : ndarray, shape (C, T)
+    breaks : ndarray, shape (C, T, B)
+    drift : ndarray, shape (C, T, k)
+    outlier_probability : ndarray, shape (E,)
+    """
+
+    b: Float
+    sigma: Float
+    fraction: Float
+    kappa2: Float
+    breaks: Float
+    drift: Float
+    outlier_probability: Float
+
+    def judged(self, problem: Problem, limits: Limits) -> Convergence:
+        """Convergence of everything that is reported."""
+        n_chains, n_steps = self.fraction.shape
+        names = problem.series.coefficients
+        k = len(names)
+        design = problem.design
+        parts = [self.b[..., : design.n_fixed].reshape(n_chains, n_steps, -1)]
+        labels = [f"{c}, column {a + 1}" for c in names for a in range(design.n_fixed)]
+        if problem.sigma is None:
+            sd = np.sqrt(np.diagonal(self.sigma, axis1=2, axis2=3))
+            correlation = self.sigma / sd[..., :, None] / sd[..., None, :]
+            row, column = np.tril_indices(k, -1)
+            parts += [np.log(sd), correlation[..., row, column]]
+            labels += [f"scatter of {c}" for c in names]
+            labels += [
+                f"correlation of {names[i]} and {names[j]}"
+                for i, j in zip(row, column, strict=True)
+            ]
+        if problem.outliers:
+            parts += [self.fraction[..., None], np.log(self.kappa2)[..., None]]
+            labels += ["fraction of outliers", "inflation of outliers"]
+        if design.course.find:
+            parts.append(self.breaks)
+            labels += [f"break {i + 1}" for i in range(design.course.find)]
+        if design.drift:
+            parts.append(np.log(self.drift))
+            labels += [f"drift of {c}" for c in names]
+        values = np.concatenate(parts, axis=-1)
+        chains = values.reshape(ENSEMBLES, n_chains // ENSEMBLES, n_steps, -1)
+        return diagnose(
+            np.swapaxes(chains, 1, 2), tuple(labels), EQUAL_WEIGHTS, limits, coupled=False
+        )
+
+
+def starting_state(
+    problem: Problem, moves: BreakMoves | None, n_chains: int, rng: np.random.Generator
+) -> State:
+    """Chains that start far apart in the scatter and in the outliers.
+
+    The scatter starts from differences of successive exposures, which breaks and slopes hardly
+    touch.
+    """
+    k, n = problem.y.shape
+    order = np.argsort(problem.series.epoch, kind="stable")
+    step = np.diff(problem.y[:, order], axis=1)
+    scale = np.maximum(MAD_TO_SIGMA * np.median(np.abs(step), axis=1) / np.sqrt(2), 0.05)
+    if problem.sigma is None:
+        stretch = np.exp(0.5 * rng.standard_normal((k, n_chains)))
+        sigma = np.eye(k)[:, :, None] * (scale[:, None] * stretch) ** 2
+    else:
+        sigma = np.repeat(problem.sigma[:, :, None], n_chains, axis=2)
+    precision = precision_of(cholesky(problem.formal[:, :, None] + sigma[..., None]))
+    breaks = np.zeros((n_chains, 0))
+    if moves is not None:
+        breaks = moves.start(n_chains, break_likelihood(problem, precision), rng)
+    fraction = np.zeros(n_chains)
+    if problem.outliers:
+        fraction = np.clip(rng.beta(*FRACTION_PRIOR, size=n_chains), 1e-6, FRACTION_MOST)
+    return State(
+        b=np.zeros((n_chains, k, problem.design.n_columns)),
+        sigma=sigma,
+        off=np.zeros((n_chains, n), bool),
+        probability=np.zeros((n_chains, n)),
+        fraction=fraction,
+        kappa2=np.full(n_chains, KAPPA_RATE),
+        breaks=breaks,
+        drift=np.exp(rng.standard_normal((n_chains, k))),
+    )
+
+
+def warm_up(
+    problem: Problem, n_chains: int, sweeps: int, rng: np.random.Generator
+) -> tuple[Engine, State]:
+    """Chains that have forgotten their start, and moves that are fixed from now on."""
+    moves = BreakMoves(problem.design) if problem.design.course.find else None
+    state = starting_state(problem, moves, n_chains, rng)
+    seen: list[State] = []
+    for t in range(sweeps):
+        scan = moves is not None and t < SCANS
+        state = sweep(problem, state, rng, moves=moves, scan=scan)
+        if moves is not None and t + 1 == SCANS:
+            moves.learn()
+        if t >= sweeps // 2:
+            seen.append(state)
+    walk = _further_moves(problem, seen) if problem.sigma is None else None
+    return Engine(problem, walk, moves), state
+
+
+def _further_moves(problem: Problem, seen: list[State]) -> RandomWalk | None:
+    """Random-walk steps, where exact draws alone would creep."""
+    sigma = np.concatenate([s.sigma for s in seen], axis=-1)
+    formal = np.median(np.diagonal(problem.formal), axis=0)
+    intrinsic = np.median(np.diagonal(sigma), axis=0)
+    unclear = np.mean([(s.probability * (1 - s.probability)).sum(axis=1).mean() for s in seen])
+    if unclear < UNCLEAR and (formal < FORMAL_SHARE * (formal + intrinsic)).all():
+        return None
+    fraction = np.concatenate([s.fraction for s in seen])
+    kappa2 = np.concatenate([s.kappa2 for s in seen])
+    return RandomWalk.learn(sigma, fraction, kappa2, outliers=problem.outliers)
+
+
+def run(
+    problem: Problem,
+    rng: np.random.Generator,
+    *,
+    chains: int,
+    warmup: int,
+    sweeps: int,
+    most: int,
+    limits: Limits,
+) -> tuple[Engine, State, Draws, Convergence]:
+    """Warm up, then draw until the limits are reached or the draws are used up.
+
+    Parameters
+    ----------
+    problem : Problem
+    rng : numpy.random.Generator
+    chains, warmup, sweeps : int
+        Chains; sweeps to warm up; sweeps to draw before convergence is judged, each time.
+    most : int
+        Sweeps to draw at most.
+    limits : Limits
+
+    Returns
+    -------
+    Engine, State, Draws, Convergence
+    """
+    engine, state = warm_up(problem, chains, warmup, rng)
+    states: list[State] = []
+    while True:
+        for _ in range(sweeps):
+            state = engine.step(state, rng)
+            states.append(state)
+        draws = _collected(states)
+        convergence = draws.judged(problem, limits)
+        if convergence.converged or len(states) + sweeps > most:
+            return engine, state, draws, convergence
+
+
+def _collected(states: list[State]) -> Draws:
+    def stacked(name: str) -> Float:
+        return np.stack([getattr(s, name) for s in states], axis=1)
+
+    sigma = np.stack([np.moveaxis(s.sigma, -1, 0) for s in states], axis=1)
+    probability = np.mean([s.probability.mean(axis=0) for s in states], axis=0)
+    names = ("b", "fraction", "kappa2", "breaks", "drift")
+    return Draws(**{n: stacked(n) for n in names}, sigma=sigma, outlier_probability=probability)

@@ -1,0 +1,230 @@
+"""Which course the exposures carry: by how well each predicts exposures that it has not seen.
+
+A difference counts where it is at least 4 and at least as many of its standard errors as Student's
+t needs for 95 %: below 4 standard errors are too small themselves (Sivula et al. 2020).  Where the
+exposures hang together in time, whole blocks of them are held out: an exposure's neighbours would
+give it away, and an irregular drift would pass for a line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+from scipy.stats import t as student_t
+
+from bayesdist.errors import InputError
+from bayesdist.infer.series.course import KINDS, Course
+from bayesdist.infer.series.fit import fit_series
+from bayesdist.infer.series.heldout import LOTS, HeldOut, block_folds, exposure_folds, held_out
+from bayesdist.infer.series.posterior import SeriesPosterior
+from bayesdist.infer.series.series import Series
+
+__all__ = ["Comparison", "compare", "serial_correlation"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+LEAST_DIFFERENCE = 4.0
+CONFIDENCE = 0.95
+# lag-1 correlation, in its standard errors, from which exposures are taken to hang together
+SERIAL = 2.33
+LEAST_BLOCKS, CORRELATION_LENGTHS = 6, 3
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Courses of one series, and how each predicts what it has not seen.
+
+    Parameters
+    ----------
+    courses : tuple of Course
+        The simplest first.
+    posteriors : tuple of SeriesPosterior
+    scores : tuple of HeldOut
+    scheme : str
+        How they were held out: 'exposures', 'each', 'blocks', or 'given'.
+    correlation : float
+        Lag-1 correlation of the residuals of the course that leaves least.
+    """
+
+    courses: tuple[Course, ...]
+    posteriors: tuple[SeriesPosterior, ...]
+    scores: tuple[HeldOut, ...]
+    scheme: str
+    correlation: float
+
+    @property
+    def single(self) -> bool:
+        """Whether exposures count as independent of each other."""
+        return self.scheme in ("exposures", "each")
+
+    def difference(self, a: int, b: int) -> tuple[float, float]:
+        """Score of course a minus that of course b, and its standard error."""
+        each = self.scores[a].log_density - self.scores[b].log_density
+        fold = self.scores[a].fold
+        # where whole blocks are held out they are the independent items, else the exposures
+        items = np.bincount(fold, each) if not self.single else each
+        return float(each.sum()), float(np.sqrt(len(items)) * items.std(ddof=1))
+
+    def beats(self, a: int, b: int) -> bool:
+        """Whether course a predicts better than course b beyond doubt."""
+        value, error = self.difference(a, b)
+        n = len(self.scores[a].fold)
+        n = n if self.single else len(np.unique(self.scores[a].fold))
+        quantile = float(student_t.ppf((1 + CONFIDENCE) / 2, n - 1))
+        return value >= LEAST_DIFFERENCE and value >= quantile * error
+
+    @property
+    def best(self) -> int:
+        """Place of the course with the best score."""
+        return int(np.argmax([s.total for s in self.scores]))
+
+    @property
+    def carried(self) -> int:
+        """Place of the simplest course that beats the constant and that the best does not beat.
+
+        The constant's place where nothing beats it.
+        """
+        constant = next(i for i, c in enumerate(self.courses) if c.kind == "constant")
+        for i in range(len(self.courses)):
+            if self.beats(i, constant) and not self.beats(self.best, i):
+                return i
+        return constant
+
+    def table(self) -> Table:
+        """One row for each course, the best first.
+
+        Columns: course, score, its difference to the best with standard error, Monte-Carlo error,
+        share of measurements in the 68 % and 95 % predictive intervals, and whether the posterior
+        converged.
+        """
+        order = sorted(range(len(self.courses)), key=lambda i: -self.scores[i].total)
+        gaps = [self.difference(i, self.best) for i in order]
+        out = Table()
+        out["course"] = [self.courses[i].name for i in order]
+        out["score"] = [self.scores[i].total for i in order]
+        out["difference"] = [g[0] for g in gaps]
+        out["standard_error"] = [g[1] for g in gaps]
+        out["mc_error"] = [self.scores[i].mc_error for i in order]
+        for level in (68, 95):
+            out[f"covered_{level}"] = [
+                float(self.scores[i].covered(level / 100).mean()) for i in order
+            ]
+        out["converged"] = [self.posteriors[i].convergence.converged for i in order]
+        out.meta["held_out"] = self.scheme
+        out.meta["serial_correlation"] = self.correlation
+        out.meta["carried"] = self.courses[self.carried].name
+        return out
+
+
+def compare(
+    series: Series,
+    candidates: Sequence[Course],
+    *,
+    folds: str | Int = "auto",
+    seed: int = 1,
+) -> Comparison:
+    """Compare courses by what they say of exposures that they have not seen.
+
+    Parameters
+    ----------
+    series : Series
+    candidates : sequence of Course
+        The constant is added, and to every course with breaks and slopes the one without slopes:
+        without them a slope could not be told from nothing.
+    folds : str or ndarray of int, shape (E,)
+        'exposures': in 30 lots, neighbours in different ones; 'each': one by one; 'blocks':
+        successive ones together; 'auto': exposures, or blocks where the residuals of every course
+        but the drifting ones are correlated in time; or which to hold out together.
+    seed : int
+
+    Returns
+    -------
+    Comparison
+    """
+    courses = _completed(candidates)
+    posteriors = tuple(fit_series(series, c, seed=seed) for c in courses)
+    found = [serial_correlation(p) for p in posteriors if p.course.kind not in ("spline", "wander")]
+    correlation = min(found, key=abs)
+    breaks = tuple(sorted({b for c in courses for b in c.breaks}))
+    if isinstance(folds, str):
+        if folds not in ("auto", "exposures", "each", "blocks"):
+            raise InputError(
+                f"folds is {folds!r}",
+                where=series.source,
+                do="choose auto, exposures, each or blocks",
+            )
+        scheme = folds
+        if folds == "auto":
+            serial = correlation * np.sqrt(len(series)) > SERIAL
+            scheme = "blocks" if serial else "exposures"
+        fold = _folds(series, scheme, breaks, correlation)
+    else:
+        scheme, fold = "given", np.unique(np.asarray(folds), return_inverse=True)[1]
+        if len(fold) != len(series) or fold.max() < 1:
+            raise InputError(
+                f"{len(fold)} folds for {len(series)} exposures",
+                where=series.source,
+                do="give one for each exposure, at least two different",
+            )
+    scores = tuple(held_out(p, fold, seed=seed) for p in posteriors)
+    return Comparison(courses, posteriors, scores, scheme, correlation)
+
+
+def _completed(candidates: Sequence[Course]) -> tuple[Course, ...]:
+    """With what a claim has to be measured against, the simplest first."""
+    out = list(dict.fromkeys(candidates))
+    groups = out[0].groups if out else "offsets"
+    if not any(c.kind == "constant" for c in out):
+        out.append(Course("constant", groups=groups))
+    for c in tuple(out):
+        flat = Course("step", c.breaks, c.find, groups=c.groups) if c.n_breaks else None
+        if flat and not any((o.kind, o.breaks, o.find) == ("step", c.breaks, c.find) for o in out):
+            out.append(flat)
+
+    def cost(course: Course) -> tuple[int, int, int]:
+        drifts = course.kind in ("spline", "wander")
+        s = course.n_segments
+        columns = {"line": 2, "step": s, "line+step": s + 1, "piecewise": s + 1, "lines": 2 * s}
+        return (drifts, columns.get(course.kind, 1) + course.find, KINDS.index(course.kind))
+
+    return tuple(sorted(out, key=cost))
+
+
+def _folds(series: Series, scheme: str, breaks: tuple[float, ...], correlation: float) -> Int:
+    n = len(series)
+    if scheme != "blocks":
+        return exposure_folds(series.epoch, n if scheme == "each" else LOTS)
+    rho = float(np.clip(correlation, 0.0, 0.95))
+    length = int(np.ceil(CORRELATION_LENGTHS * (1 + rho) / (1 - rho)))
+    return block_folds(series.epoch, breaks, max(1, min(length, n // LEAST_BLOCKS)))
+
+
+def serial_correlation(posterior: SeriesPosterior) -> float:
+    """Correlation of the residuals of successive exposures, the mean over the coefficients.
+
+    Exposures that lie off count as little as they are believed.  Without correlation it scatters
+    by at most 1 / sqrt(E).
+    """
+    series = posterior.series
+    b = posterior.raw.b.mean(axis=(0, 1))
+    if posterior.course.find:
+        # the parameters belong to draws of the breaks: average the course, not its parameters
+        sweeps = np.linspace(0, posterior.raw.b.shape[1] - 1, 20).astype(int)
+        some = posterior.raw.b[:, sweeps].reshape(-1, *b.shape)
+        dates = posterior.raw.breaks[:, sweeps].reshape(len(some), -1)
+        columns = posterior.design.matrix(series.epoch, series.group_code, dates)
+        fitted = (columns @ np.swapaxes(some, 1, 2)).mean(axis=0)
+    else:
+        columns = posterior.design.matrix(series.epoch, series.group_code)[0]
+        fitted = columns @ b.T
+    order = np.argsort(series.epoch, kind="stable")
+    residual = ((series.values - series.centre) / series.spread - fitted)[order]
+    residual = residual * (1 - posterior.outlier_probability[order])[:, None]
+    residual = residual - residual.mean(axis=0)
+    lagged = (residual[1:] * residual[:-1]).sum(axis=0)
+    return float((lagged / (residual**2).sum(axis=0)).mean())

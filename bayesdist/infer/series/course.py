@@ -1,0 +1,123 @@
+"""How a coefficient may run with time: constant, lines, steps, kinks, smooth or irregular drift.
+
+A course is linear in its parameters once the dates of its breaks are known; its columns are the
+same for every coefficient of a series.  R is the reference date of a segment, as RDATE in
+Equation 3 of ACS ISR 2015-06.
+
+    constant    a
+    line        a + b (t - R)
+    step        a_s in segment s
+    line+step   a_s + b (t - R_s)
+    piecewise   continuous, of slope b_s in segment s
+    lines       a_s + b_s (t - R_s)
+    spline      a line, and a smooth deviation: a Wiener process integrated once, seen at few knots
+    wander      a constant, and an irregular deviation: a Wiener process, seen at many knots
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesdist.errors import InputError
+
+__all__ = ["KINDS", "LEAST", "LEAST_FOUND", "Course"]
+
+PLAIN = ("constant", "line", "spline", "wander")
+BROKEN = ("step", "line+step", "piecewise", "lines")
+KINDS = ("constant", "line", "step", "line+step", "piecewise", "lines", "spline", "wander")
+SLOPED = ("line", "line+step", "piecewise", "lines", "spline")
+# exposures that a segment must have: with given breaks, and where the breaks are to be found
+LEAST = {"step": 1, "line+step": 1, "piecewise": 2, "lines": 3}
+LEAST_FOUND = 5
+
+
+@dataclass(frozen=True)
+class Course:
+    """One way of running with time.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    breaks : tuple of float
+        Dates at which a new segment begins, rising, decimal years.
+    find : int
+        How many breaks are to be found, where none are given.
+    reference : tuple of float
+        Reference date of each segment; one date serves all.  By default the mean date of the
+        segment's exposures, or of all where the breaks are to be found.
+    groups : str
+        'offsets': each group but the first has its own offset; 'slopes': and its own slope.
+
+    Raises
+    ------
+    InputError
+        For an unknown kind, breaks that do not rise, or breaks where the kind has none or needs
+        some, and a wrong number of reference dates.
+    """
+
+    kind: str
+    breaks: tuple[float, ...] = ()
+    find: int = 0
+    reference: tuple[float, ...] = ()
+    groups: str = "offsets"
+
+    def __post_init__(self) -> None:
+        where = f"course {self.kind!r}"
+        if self.kind not in KINDS:
+            raise InputError("unknown course", where=where, do=f"choose among {', '.join(KINDS)}")
+        if self.groups not in ("offsets", "slopes"):
+            raise InputError(
+                f"groups is {self.groups!r}", where=where, do="choose offsets or slopes"
+            )
+        if not np.isfinite((*self.breaks, *self.reference)).all():
+            raise InputError("a date is not finite", where=where, do="give decimal years")
+        if list(self.breaks) != sorted(set(self.breaks)):
+            raise InputError(
+                f"breaks {list(self.breaks)} do not rise",
+                where=where,
+                do="sort them and name each once",
+            )
+        if self.kind in PLAIN and (self.breaks or self.find):
+            raise InputError("has no breaks", where=where, do=f"choose among {', '.join(BROKEN)}")
+        if self.kind in BROKEN and bool(self.breaks) == bool(self.find):
+            raise InputError(
+                "needs the dates of its breaks, or how many are to be found",
+                where=where,
+                do="give one of breaks and find",
+            )
+        if self.find < 0:
+            raise InputError(f"find is {self.find}", where=where, do="give 1 or more")
+        if len(self.reference) not in (0, 1, self.n_segments):
+            raise InputError(
+                f"{len(self.reference)} reference dates for {self.n_segments} segments",
+                where=where,
+                do="give one date, or one for each segment",
+            )
+
+    @property
+    def n_breaks(self) -> int:
+        """Breaks, given or to be found."""
+        return self.find or len(self.breaks)
+
+    @property
+    def n_segments(self) -> int:
+        """One more than the breaks."""
+        return self.n_breaks + 1
+
+    @property
+    def name(self) -> str:
+        """Kind, and what is said of the breaks: 'lines, break at 2009.4'."""
+        if self.breaks:
+            dates = ", ".join(f"{b:g}" for b in self.breaks)
+            return f"{self.kind}, break{'s' * (len(self.breaks) > 1)} at {dates}"
+        if self.find:
+            return f"{self.kind}, {self.find} break{'s' * (self.find > 1)} found"
+        return self.kind
+
+    @property
+    def has_slope(self) -> bool:
+        """Whether it claims a drift that goes on."""
+        return self.kind in SLOPED

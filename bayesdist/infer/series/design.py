@@ -1,0 +1,226 @@
+"""The columns of a course for one series, and what their parameters mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.series.course import LEAST, LEAST_FOUND, Course
+from bayesdist.infer.series.drift import Drift
+from bayesdist.infer.series.series import Series
+
+__all__ = ["Design"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+KNOTS = {"spline": 8, "wander": 16}
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """The columns of a course for one series.
+
+    Parameters
+    ----------
+    course : Course
+    series : Series
+
+    Raises
+    ------
+    DegenerateError
+        Where a segment or a group has too few exposures, or exposures of one date only, for what
+        the course asks of it.
+    """
+
+    course: Course
+    series: Series
+
+    def __post_init__(self) -> None:
+        self._check_segments()
+        if self.course.groups == "slopes":
+            for name in self.series.group_names:
+                epoch = self.series.epoch[np.array(self.series.group) == name]
+                if len(epoch) < 3 or np.ptp(epoch) == 0:
+                    raise DegenerateError(
+                        f"{len(epoch)} exposures of group {name!r} do not determine its slope",
+                        where=self.series.source,
+                        do="leave the group out, or let the groups share their slopes",
+                    )
+
+    def _check_segments(self) -> None:
+        course, series = self.course, self.series
+        if np.ptp(series.epoch) == 0 and course.kind != "constant":
+            raise DegenerateError(
+                "all exposures have one date", where=series.source, do="ask for a constant"
+            )
+        if course.find:
+            need = LEAST_FOUND * course.n_segments
+            if len(np.unique(series.epoch)) < need:
+                raise DegenerateError(
+                    f"finding {course.find} breaks needs exposures of at least {need} dates, and "
+                    f"there are {len(np.unique(series.epoch))}",
+                    where=series.source,
+                    do="give the dates of the breaks",
+                )
+            return
+        segment = self.segment(series.epoch)[0]
+        limits = (-np.inf, *course.breaks, np.inf)
+        for s, (first, last) in enumerate(pairwise(limits)):
+            epoch = series.epoch[segment == s]
+            need = LEAST.get(course.kind, 1)
+            if len(epoch) < need or (need > 1 and np.ptp(epoch) == 0):
+                raise DegenerateError(
+                    f"the segment from {first:g} to {last:g} has {len(epoch)} exposures of "
+                    f"{len(np.unique(epoch))} dates, and course {course.kind!r} needs {need}",
+                    where=series.source,
+                    do="take this break away",
+                )
+
+    # -- scales -----------------------------------------------------------------------------------
+
+    @cached_property
+    def reference(self) -> Float:
+        """Reference date of each segment, shape (S,)."""
+        course, epoch = self.course, self.series.epoch
+        if course.reference:
+            return np.broadcast_to(np.array(course.reference, float), (course.n_segments,)).copy()
+        if course.find:
+            return np.full(course.n_segments, epoch.mean())
+        segment = self.segment(epoch)[0]
+        return np.array([epoch[segment == s].mean() for s in range(course.n_segments)])
+
+    @cached_property
+    def years(self) -> float:
+        """Unit of time of the columns: half the span of the series, in years."""
+        return float(np.ptp(self.series.epoch)) / 2 or 1.0
+
+    @cached_property
+    def drift(self) -> Drift | None:
+        """The random part of the course, where it has one."""
+        if self.course.kind not in KNOTS:
+            return None
+        knots = KNOTS[self.course.kind]
+        return Drift.over(self.series.epoch, knots, smooth=self.course.kind == "spline")
+
+    @property
+    def n_groups(self) -> int:
+        """Groups of the series; one where it has none."""
+        return max(len(self.series.group_names), 1)
+
+    @property
+    def n_course(self) -> int:
+        """Columns of the course itself."""
+        s = self.course.n_segments
+        sizes = {"constant": 1, "line": 2, "spline": 2, "wander": 1, "step": s}
+        return {**sizes, "line+step": s + 1, "piecewise": s + 1, "lines": 2 * s}[self.course.kind]
+
+    @property
+    def n_fixed(self) -> int:
+        """Columns whose parameters have a vague prior: the course, then the groups."""
+        each = 2 if self.course.groups == "slopes" else 1
+        return self.n_course + each * (self.n_groups - 1)
+
+    @property
+    def n_columns(self) -> int:
+        """All columns: the fixed ones, then those of the random part."""
+        return self.n_fixed + (self.drift.n_columns if self.drift else 0)
+
+    # -- columns ----------------------------------------------------------------------------------
+
+    def given_breaks(self) -> Float:
+        """The given breaks as one row, shape (1, B)."""
+        return np.array(self.course.breaks, float)[None]
+
+    def segment(self, epoch: Float, breaks: Float | None = None) -> Int:
+        """Segment of each epoch (E,) for breaks (..., B): shape (..., E)."""
+        rows = self.given_breaks() if breaks is None else breaks
+        return (epoch >= rows[..., :, None]).sum(axis=-2)
+
+    def matrix(self, epoch: ArrayLike, group: Int, breaks: Float | None = None) -> Float:
+        """Columns at epochs.
+
+        Parameters
+        ----------
+        epoch : array_like, shape (E,)
+        group : ndarray, shape (E,)
+            Codes of the groups.
+        breaks : ndarray, shape (..., B), optional
+            Dates of the breaks, fewer than the course has if need be; the given ones by default.
+
+        Returns
+        -------
+        ndarray, shape (..., E, p)
+        """
+        t = np.asarray(epoch, float)
+        rows = self.given_breaks() if breaks is None else breaks
+        segment = self.segment(t, rows)
+        n = rows.shape[-1] + 1
+        inside = (segment[..., None] == np.arange(n)).astype(float)
+        one = np.ones((*segment.shape, 1))
+        since = ((t - self.reference[segment]) / self.years)[..., None]
+        kind = self.course.kind
+        if kind in ("constant", "wander"):
+            parts = [one]
+        elif kind in ("line", "spline"):
+            parts = [one, since]
+        elif kind == "step":
+            parts = [inside]
+        elif kind == "line+step":
+            parts = [inside, since]
+        elif kind == "lines":
+            parts = [inside, inside * since]
+        else:
+            after = np.maximum(t[:, None] - rows[..., None, :], 0.0) / self.years
+            whole = ((t - self.reference[0]) / self.years)[:, None] * one
+            parts = [one, whole, after]
+        if self.n_groups > 1:
+            member = (group[:, None] == np.arange(1, self.n_groups)).astype(float)
+            parts.append(member * one)
+            if self.course.groups == "slopes":
+                middle = self.series.epoch.mean()
+                parts.append(member * one * ((t - middle) / self.years)[:, None])
+        if self.drift:
+            parts.append(self.drift.columns(t) * one)
+        return np.concatenate(parts, axis=-1)
+
+    def lines(self, b: Float, breaks: Float) -> tuple[Float, Float]:
+        """Level at the reference date and slope per year of each segment.
+
+        Parameters
+        ----------
+        b : ndarray, shape (n, k, p)
+            Parameters of the columns.
+        breaks : ndarray, shape (n, B) or (1, B)
+
+        Returns
+        -------
+        level, slope : ndarray, shape (n, S, k)
+            Of the first group; of a course with a random part, without it.
+        """
+        s = self.course.n_segments
+        kind = self.course.kind
+        rows = np.swapaxes(b, 1, 2)  # (n, p, k)
+        flat = np.zeros((len(b), s, b.shape[1]))
+        if kind in ("constant", "wander", "step"):
+            return rows[:, :s].copy(), flat
+        if kind in ("line", "spline"):
+            return rows[:, :1].copy(), rows[:, 1:2] / self.years
+        if kind == "line+step":
+            return rows[:, :s].copy(), flat + rows[:, s : s + 1] / self.years
+        if kind == "lines":
+            return rows[:, :s].copy(), rows[:, s : 2 * s] / self.years
+        slope = np.cumsum(rows[:, 1 : s + 1], axis=1) / self.years
+        level = flat + rows[:, :1]
+        # the first segment's line at each reference date, then each kink's part from its date on
+        level += slope[:, :1] * (self.reference - self.reference[0])[:, None]
+        for k in range(s - 1):
+            kink = (slope[:, k + 1] - slope[:, k])[:, None]
+            later = self.reference[k + 1 :] - breaks[:, k : k + 1]
+            level[:, k + 1 :] += kink * np.broadcast_to(later, (len(b), s - 1 - k))[..., None]
+        return level, slope

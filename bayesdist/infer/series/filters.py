@@ -1,0 +1,112 @@
+"""Is the drift the same in every filter?  (ACS ISR 2015-06, section 4.4.4.)
+
+Common slopes with an offset for each filter, against slopes of their own: each further filter's
+slope differs from that of the first by one amount in all segments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesdist.errors import InputError
+from bayesdist.infer.series.compare import Comparison, compare
+from bayesdist.infer.series.course import Course
+from bayesdist.infer.series.posterior import SeriesPosterior
+from bayesdist.infer.series.results import Change
+from bayesdist.infer.series.series import Series
+
+__all__ = ["FilterDependence", "filter_dependence"]
+
+
+@dataclass(frozen=True, eq=False)
+class FilterDependence:
+    """Whether the drift depends on the filter.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Filters; the first has most exposures and is what the others are compared with.
+    offset : dict of str to Change
+        What each further filter adds to the coefficients, with common slopes.
+    slope : dict of str to Change
+        What it adds to their slopes, per year, where it has its own.
+    all_slopes : Change
+        All of these in one vector, filter by filter, with their covariance.
+    common, separate : SeriesPosterior
+    comparison : Comparison
+        Held-out scores of the two, in this order.
+    """
+
+    names: tuple[str, ...]
+    offset: dict[str, Change]
+    slope: dict[str, Change]
+    all_slopes: Change
+    common: SeriesPosterior
+    separate: SeriesPosterior
+    comparison: Comparison
+
+    @property
+    def gain(self) -> tuple[float, float]:
+        """By how much own slopes predict held-out exposures better, with standard error."""
+        return self.comparison.difference(*self._places)
+
+    @property
+    def depends(self) -> bool:
+        """Whether own slopes predict better beyond doubt."""
+        return self.comparison.beats(*self._places)
+
+    @property
+    def _places(self) -> tuple[int, int]:
+        posteriors = self.comparison.posteriors
+        return posteriors.index(self.separate), posteriors.index(self.common)
+
+
+def filter_dependence(series: Series, course: Course, *, seed: int = 1) -> FilterDependence:
+    """Compare common slopes with slopes of each filter's own.
+
+    Parameters
+    ----------
+    series : Series
+        With filters as its groups.
+    course : Course
+        With slopes.
+    seed : int
+
+    Returns
+    -------
+    FilterDependence
+
+    Raises
+    ------
+    InputError
+        For a series of one filter, and a course without slopes.
+    DegenerateError
+        For a filter with fewer than three exposures, or of one date only.
+    """
+    names = series.group_names
+    if len(names) < 2:
+        raise InputError(
+            "there are no two filters to compare",
+            where=series.source,
+            do="give the filter of each exposure as its group",
+        )
+    if not course.has_slope:
+        raise InputError(
+            f"course {course.name!r} has no slopes", where=series.source, do="ask for lines"
+        )
+    both = (replace(course, groups="offsets"), replace(course, groups="slopes"))
+    comparison = compare(series, both, seed=seed)
+    places = [comparison.courses.index(c) for c in both]
+    common, separate = (comparison.posteriors[i] for i in places)
+    slopes = separate.group_slope
+    return FilterDependence(
+        names=names,
+        offset={f: Change.of(common.group_offset[:, i]) for i, f in enumerate(names[1:])},
+        slope={f: Change.of(slopes[:, i]) for i, f in enumerate(names[1:])},
+        all_slopes=Change.of(np.ascontiguousarray(slopes.reshape(len(slopes), -1))),
+        common=common,
+        separate=separate,
+        comparison=comparison,
+    )

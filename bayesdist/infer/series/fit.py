@@ -1,0 +1,81 @@
+"""From a series to its posterior."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bayesdist.errors import InputError
+from bayesdist.infer.labelled.convergence import Limits
+from bayesdist.infer.series.chains import run
+from bayesdist.infer.series.course import Course
+from bayesdist.infer.series.design import Design
+from bayesdist.infer.series.posterior import SeriesPosterior
+from bayesdist.infer.series.problem import Problem
+from bayesdist.infer.series.series import Series
+
+__all__ = ["fit_series"]
+
+CHAINS, WARMUP, SWEEPS = 32, 100, 200
+
+
+def fit_series(
+    series: Series,
+    course: Course,
+    *,
+    seed: int = 1,
+    scatter: ArrayLike | None = None,
+    outliers: bool = True,
+    target_ess: float = 400.0,
+    target_rhat: float = 1.01,
+    max_sweeps: int = 1600,
+) -> SeriesPosterior:
+    """Posterior of a course with time, of the scatter of the exposures, and of what lies off.
+
+    Parameters
+    ----------
+    series : Series
+    course : Course
+    seed : int
+    scatter : array_like, shape (k, k), optional
+        Intrinsic covariance where it is known; it is a parameter by default.
+    outliers : bool
+        Whether exposures may lie off the course.
+    target_ess, target_rhat : float
+        Limits of convergence, for every parameter.
+    max_sweeps : int
+        Draws of each chain at most; 200 are made before convergence is first judged.
+
+    Returns
+    -------
+    SeriesPosterior
+        `convergence` says whether the limits were reached.
+
+    Raises
+    ------
+    DegenerateError
+        Where the exposures do not determine the course: see `Design`.
+    """
+    known = None
+    if scatter is not None:
+        known = np.asarray(scatter, float)
+        k = series.n_coefficients
+        if known.shape != (k, k) or not np.all(np.isfinite(known)):
+            raise InputError(
+                f"scatter has shape {known.shape} or is not finite, and must be a finite matrix "
+                f"{(k, k)}",
+                where=series.source,
+                do="give the covariance of the coefficients",
+            )
+    design = Design(course, series)
+    problem = Problem.of(series, design, known, outliers=outliers)
+    engine, last, draws, convergence = run(
+        problem,
+        np.random.default_rng(seed),
+        chains=CHAINS,
+        warmup=WARMUP,
+        sweeps=SWEEPS,
+        most=max(max_sweeps, SWEEPS),
+        limits=Limits(target_ess, target_rhat),
+    )
+    return SeriesPosterior(series, course, design, draws, convergence, engine, last)

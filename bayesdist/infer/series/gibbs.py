@@ -1,0 +1,191 @@
+"""Draws of a course, of the scatter about it, and of the exposures that lie off it.
+
+    y_e = H(t_e) b + deviation,    deviation ~ N(0, w_e (S_e + Sigma)),    w_e = 1 or kappa^2
+
+with S_e the formal covariance, Sigma the intrinsic one.  An exposure is an outlier (w_e = kappa^2)
+with probability f.  Everything is in units of the series' spread.  Priors, all proper:
+
+    b        Gaussian of standard deviation `WIDE`: flat, as far as any data can tell
+    Sigma    half-Student-t standard deviations, uniform correlations: see scatter.py
+    f        Beta(1, 9), cut off at 0.25: what lies off is the exception
+    kappa    at least 3; inverse gamma on kappa^2, shape 1, most probable log kappa at log 5
+    drift    half-Student-t standard deviation of each coefficient, two degrees of freedom
+    breaks   uniform in time: see breaks.py
+
+A sweep draws the breaks with b and the deviations integrated out, b with the deviations integrated
+out, the drift's amplitude, then memberships, f, kappa and Sigma.  Many chains run side by side;
+some exposures may be held out of some of them, which gives exact refits without one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betainc, betaincinv, gammainc, gammaincinv
+
+from bayesdist.infer.series.breaks import BreakMoves
+from bayesdist.infer.series.problem import Problem, State, break_likelihood, course_equations
+from bayesdist.infer.series.scatter import draw_scatter
+from bayesdist.infer.series.small import cholesky, precision_of
+from bayesdist.infer.series.walk import (
+    FRACTION_MOST,
+    FRACTION_PRIOR,
+    KAPPA_LEAST,
+    KAPPA_RATE,
+    KAPPA_SHAPE,
+    RandomWalk,
+)
+
+__all__ = ["sweep"]
+
+Float = NDArray[np.float64]
+
+DRIFT_NU, DRIFT_SCALE = 2.0, 1.0
+
+
+def sweep(
+    problem: Problem,
+    state: State,
+    rng: np.random.Generator,
+    *,
+    kept: Float | None = None,
+    walk: RandomWalk | None = None,
+    moves: BreakMoves | None = None,
+    scan: bool = False,
+) -> State:
+    """One draw of everything.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+    rng : numpy.random.Generator
+    kept : ndarray, shape (C, E), optional
+        0 for exposures that a chain must not see, else 1.
+    walk : RandomWalk, optional
+        Further moves of the scatter and of the mixture.
+    moves : BreakMoves, optional
+        Of breaks that are to be found.
+    scan : bool
+        Let the breaks be drawn among all gaps; for warming up only.
+
+    Returns
+    -------
+    State
+    """
+    k, n_exposures = problem.y.shape
+    n_chains = len(state.fraction)
+    if kept is None:
+        kept = np.ones((n_chains, n_exposures))
+    factor = cholesky(problem.formal[:, :, None] + state.sigma[..., None])
+    precision = precision_of(factor)
+    seen = precision * (kept / np.where(state.off, state.kappa2[:, None], 1.0))
+
+    breaks = state.breaks
+    if moves is not None:
+        likelihood = break_likelihood(problem, seen)
+        breaks = (moves.scan if scan else moves.move)(breaks, likelihood, rng)
+    columns = problem.columns(breaks)
+    matrix, right = course_equations(problem, seen, columns, state.drift)
+    # if the noise has the covariance of the matrix, its solution has that of the inverse
+    noise = np.linalg.cholesky(matrix) @ rng.standard_normal((*right.shape, 1))
+    b = np.asarray(np.linalg.solve(matrix, right[..., None] + noise), np.float64)
+    b = b.reshape(n_chains, k, -1)
+    state = replace(state, b=b, breaks=breaks)
+
+    if problem.design.drift is not None:
+        state = _move_drift(problem, state, columns, seen, rng)
+    fitted = np.moveaxis(state.b @ np.swapaxes(columns, -1, -2), 1, 0)  # (k, C, E)
+    residual = problem.y[:, None] - fitted
+    if walk is not None:
+        sigma, fraction, kappa2 = walk.move(
+            state.sigma, state.fraction, state.kappa2, residual, problem.formal, kept, rng
+        )
+        state = replace(state, sigma=sigma, fraction=fraction, kappa2=kappa2)
+        precision = precision_of(cholesky(problem.formal[:, :, None] + sigma[..., None]))
+    if problem.outliers:
+        pull = np.einsum("ijce,jce->ice", precision, residual)
+        state = _draw_memberships(state, (residual * pull).sum(axis=0), kept, k, rng)
+    if problem.sigma is None:
+        scaled = residual / np.where(state.off, np.sqrt(state.kappa2)[:, None], 1.0)
+        sigma = _draw_sigma(problem, state.sigma, precision, scaled, kept, rng)
+        state = replace(state, sigma=sigma)
+    return state
+
+
+def _draw_memberships(
+    state: State, distance: Float, kept: Float, k: int, rng: np.random.Generator
+) -> State:
+    """Memberships given squared distances (C, E), then fraction and inflation given them."""
+    f, kappa2 = state.fraction[:, None], state.kappa2[:, None]
+    log_odds = np.log(f / (1 - f)) - 0.5 * k * np.log(kappa2) + 0.5 * distance * (1 - 1 / kappa2)
+    probability = 1 / (1 + np.exp(-np.clip(log_odds, -700, 700)))
+    off = rng.random(probability.shape) < probability
+    count = (off * kept).sum(axis=1)
+    a, b = FRACTION_PRIOR
+    of_good = b + kept.sum(axis=1) - count
+    share = np.maximum(betainc(a + count, of_good, FRACTION_MOST), 1e-290)
+    fraction = betaincinv(a + count, of_good, share * rng.uniform(1e-12, 1.0, len(share)))
+    fraction = np.clip(fraction, 1e-12, FRACTION_MOST)
+    shape = KAPPA_SHAPE + k * count / 2
+    rate = KAPPA_RATE + (off * kept * distance).sum(axis=1) / 2
+    # 1 / kappa^2 is gamma, cut off where kappa would be less than its least value
+    share = np.maximum(gammainc(shape, rate / KAPPA_LEAST**2), 1e-290)
+    inverse = gammaincinv(shape, share * rng.uniform(1e-12, 1.0, len(share))) / rate
+    kappa2_new = np.maximum(1 / np.maximum(inverse, 1e-300), KAPPA_LEAST**2)
+    return replace(state, off=off, probability=probability, fraction=fraction, kappa2=kappa2_new)
+
+
+def _draw_sigma(
+    problem: Problem,
+    sigma: Float,
+    precision: Float,
+    residual: Float,
+    kept: Float,
+    rng: np.random.Generator,
+) -> Float:
+    """Intrinsic covariance given deviations, which are drawn from the residuals (k, C, E)."""
+    # Matheron: a draw from the prior, corrected by what it misses of the residual
+    free = np.einsum("ijc,jce->ice", cholesky(sigma), rng.standard_normal(residual.shape))
+    formal = np.einsum("ije,jce->ice", problem.root, rng.standard_normal(residual.shape))
+    missed = np.einsum("ijce,jce->ice", precision, residual - free - formal)
+    deviation = (free + np.einsum("ijc,jce->ice", sigma, missed)) * kept
+    by_chain = np.moveaxis(deviation, 0, 1)
+    scatter = by_chain @ np.swapaxes(by_chain, 1, 2)
+    return draw_scatter(sigma, scatter, kept.sum(axis=1), rng)
+
+
+def _move_drift(
+    problem: Problem, state: State, columns: Float, precision: Float, rng: np.random.Generator
+) -> State:
+    """Amplitude of the drift, given its parameters and then by stretching them with it."""
+    n = problem.design.n_fixed
+    random = state.b[..., n:]
+    shape = state.drift.shape
+    scale = rng.gamma((DRIFT_NU + 1) / 2, size=shape)
+    scale = scale / (DRIFT_NU / state.drift**2 + DRIFT_SCALE**-2)
+    rate = DRIFT_NU * scale + 0.5 * (random**2).sum(axis=2)
+    drift = np.sqrt(rate / rng.gamma((DRIFT_NU + random.shape[2]) / 2, size=shape))
+    # the second move: the likelihood decides, where the first one would creep near zero
+    b = state.b.copy()
+    moving = np.moveaxis(random @ np.swapaxes(columns[..., n:], -1, -2), 1, 0)
+    fixed = np.moveaxis(b[..., :n] @ np.swapaxes(columns[..., :n], -1, -2), 1, 0)
+    residual = problem.y[:, None] - fixed - moving
+    for j in range(len(problem.y)):
+        step = rng.standard_normal(len(b))
+        factor = np.exp(step)
+        change = (1 - factor)[:, None] * moving[j]
+        pull = np.einsum("jce,jce->ce", precision[j], residual)
+        gain = -(change * pull).sum(axis=1)
+        gain -= 0.5 * (change**2 * precision[j, j]).sum(axis=1)
+        new = drift[:, j] * factor
+        prior = [np.log(d) - 1.5 * np.log1p((d / DRIFT_SCALE) ** 2 / 2) for d in (new, drift[:, j])]
+        taken = np.log(rng.random(len(b))) < gain + prior[0] - prior[1]
+        factor = np.where(taken, factor, 1.0)
+        residual[j] += np.where(taken[:, None], change, 0.0)
+        moving[j] *= factor[:, None]
+        b[:, j, n:] *= factor[:, None]
+        drift[:, j] *= factor
+    return replace(state, b=b, drift=drift)

@@ -1,0 +1,172 @@
+"""How well a course predicts exposures that it has not seen.
+
+The exposures are cut into folds; for each fold the posterior is drawn anew without it.  The chains
+of all folds run side by side from where those of the whole series ended, so that exact refits cost
+little more than the posterior itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from bayesdist.infer.series.posterior import SeriesPosterior
+from bayesdist.infer.series.problem import State
+from bayesdist.infer.series.small import cholesky, solve_factor
+from bayesdist.infer.series.walk import log_mixture
+
+__all__ = ["LOTS", "HeldOut", "block_folds", "exposure_folds", "held_out"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+CHAINS, WARMUP, SWEEPS = 6, 30, 60
+CHAINS_AT_ONCE = 64
+LOTS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """What a course says of each exposure from the others.
+
+    Parameters
+    ----------
+    log_density : ndarray, shape (E,)
+        Log predictive density of all k coefficients together, in units of the spread.
+    rank : ndarray, shape (E, k)
+        Predictive probability of less than what was measured; uniform if the course is right.
+    fold : ndarray, shape (E,)
+        Which exposures were held out together.
+    mc_error : float
+        Monte-Carlo standard error of the sum of `log_density`.
+    """
+
+    log_density: Float
+    rank: Float
+    fold: Int
+    mc_error: float
+
+    @property
+    def total(self) -> float:
+        """Sum of the log densities: the larger, the better."""
+        return float(self.log_density.sum())
+
+    def covered(self, probability: float) -> Float:
+        """Share of measurements (k,) inside the central predictive interval of a probability."""
+        tail = (1 - probability) / 2
+        return ((self.rank > tail) & (self.rank < 1 - tail)).mean(axis=0)
+
+
+def exposure_folds(epoch: Float, lots: int = LOTS) -> Int:
+    """Exposures dealt out in the order of their dates to so many lots, or one to each."""
+    out = np.empty(len(epoch), np.int64)
+    out[np.argsort(epoch, kind="stable")] = np.arange(len(epoch)) % min(len(epoch), lots)
+    return out
+
+
+def block_folds(epoch: Float, breaks: tuple[float, ...], length: int) -> Int:
+    """Blocks of successive exposures, cut where the gaps in time are longest.
+
+    Parameters
+    ----------
+    epoch : ndarray, shape (E,)
+    breaks : tuple of float
+        Given breaks; blocks end there, and no segment is one block only where it has two exposures.
+    length : int
+        Least number of exposures in a block, where the segments allow it.
+
+    Returns
+    -------
+    ndarray of int, shape (E,)
+    """
+    order = np.argsort(epoch, kind="stable")
+    t = epoch[order]
+    n = len(t)
+    cuts = {0, n, *(int(np.searchsorted(t, b)) for b in breaks)}
+    for first, last in zip(sorted(cuts)[:-1], sorted(cuts)[1:], strict=True):
+        least = min(length, (last - first) // 2)
+        inner = sorted(range(first + 1, last), key=lambda i: t[i - 1] - t[i])
+        for i in inner:
+            below = max(c for c in cuts if c < i)
+            above = min((c for c in cuts if c > i), default=n)
+            if least and i in range(below + least, above - least + 1):
+                cuts.add(i)
+    out = np.empty(n, np.int64)
+    out[order] = np.searchsorted(sorted(cuts), np.arange(n), side="right") - 1
+    return out
+
+
+def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut:
+    """Predict each fold from the rest.
+
+    Parameters
+    ----------
+    posterior : SeriesPosterior
+        Of the whole series.
+    fold : ndarray of int, shape (E,)
+    seed : int
+
+    Returns
+    -------
+    HeldOut
+    """
+    rng = np.random.default_rng([seed, 1])
+    n, k = posterior.series.values.shape
+    log_density, rank, error = np.zeros(n), np.zeros((n, k)), np.zeros(n)
+    codes = np.unique(fold)
+    at_once = max(1, CHAINS_AT_ONCE // CHAINS)
+    for start in range(0, len(codes), at_once):
+        some = codes[start : start + at_once]
+        density, below = _densities(posterior, fold, some, rng)
+        for i, code in enumerate(some):
+            rows = fold == code
+            chains = density[i * CHAINS : (i + 1) * CHAINS, rows]
+            top = chains.max(axis=0)
+            each = np.exp(chains - top)
+            log_density[rows] = top + np.log(each.mean(axis=0))
+            error[rows] = each.std(axis=0, ddof=1) / each.mean(axis=0) / np.sqrt(CHAINS)
+            rank[rows] = below[i * CHAINS : (i + 1) * CHAINS, rows].mean(axis=0)
+    return HeldOut(log_density, rank, fold, float(np.sqrt((error**2).sum())))
+
+
+def _densities(
+    posterior: SeriesPosterior, fold: Int, codes: Int, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Mean over the draws of each chain: log density (C, E) and probability of less (C, E, k)."""
+    engine, last = posterior.engine, posterior.last
+    own = np.repeat(codes, CHAINS)
+    kept = (own[:, None] != fold).astype(float)
+    state = last.take(rng.integers(0, len(last.fraction), len(own)))
+    for _ in range(WARMUP):
+        state = engine.step(state, rng, kept)
+    density = np.full(kept.shape, -np.inf)
+    below = np.zeros((*kept.shape, posterior.series.n_coefficients))
+    for _ in range(SWEEPS):
+        state = engine.step(state, rng, kept)
+        log_density, less = predictive(posterior, state)
+        density = np.logaddexp(density, log_density)
+        below += less
+    return density - np.log(SWEEPS), below / SWEEPS
+
+
+def predictive(posterior: SeriesPosterior, state: State) -> tuple[Float, Float]:
+    """Log density (C, E) of each exposure at a draw, and probability of less (C, E, k)."""
+    problem = posterior.engine.problem
+    columns = problem.columns(state.breaks)
+    fitted = np.moveaxis(state.b @ np.swapaxes(columns, -1, -2), 1, 0)
+    residual = problem.y[:, None] - fitted
+    cov = problem.formal[:, :, None] + state.sigma[..., None]
+    factor = cholesky(cov)
+    distance = (solve_factor(factor, residual) ** 2).sum(axis=0)
+    k = len(residual)
+    log_det = 2 * sum(np.log(factor[j, j]) for j in range(k))
+    f, kappa2 = state.fraction, state.kappa2
+    log_density = log_mixture(distance, log_det, k, f, kappa2)
+    sd = np.sqrt(np.stack([cov[j, j] for j in range(k)]))
+    good = ndtr(residual / sd)
+    bad = ndtr(residual / sd / np.sqrt(kappa2)[:, None])
+    f = f[:, None]
+    return log_density, np.moveaxis((1 - f) * good + f * bad, 0, -1)

@@ -1,0 +1,256 @@
+"""What is known of a series: draws of its course and scatter, predictions, changes at breaks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.infer.labelled.convergence import Convergence
+from bayesdist.infer.series.chains import Draws, Engine
+from bayesdist.infer.series.course import Course
+from bayesdist.infer.series.design import Design
+from bayesdist.infer.series.problem import State
+from bayesdist.infer.series.results import Change, Prediction
+from bayesdist.infer.series.series import Series
+
+__all__ = ["SeriesPosterior"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesPosterior:
+    """Posterior of a course and of the scatter about it.
+
+    Parameters
+    ----------
+    series : Series
+    course : Course
+    design : Design
+    raw : Draws
+        In units of the spread.
+    convergence : Convergence
+    engine : Engine
+    last : State
+        Where the chains ended.
+    """
+
+    series: Series
+    course: Course
+    design: Design
+    raw: Draws
+    convergence: Convergence
+    engine: Engine
+    last: State
+
+    @cached_property
+    def _lines(self) -> tuple[Float, Float]:
+        b = self.raw.b.reshape(-1, *self.raw.b.shape[2:])
+        level, slope = self.design.lines(b, self._breaks)
+        unit = self.series.spread
+        return self.series.centre + level * unit, slope * unit
+
+    @cached_property
+    def _breaks(self) -> Float:
+        """Breaks, shape (n, B); one row where they are given."""
+        if not self.course.find:
+            return self.design.given_breaks()
+        return self.raw.breaks.reshape(-1, self.course.find)
+
+    @property
+    def reference(self) -> Float:
+        """Reference date of each segment, shape (S,)."""
+        return self.design.reference
+
+    @property
+    def alpha(self) -> Float:
+        """Draws (n, S, k) of the coefficients at the reference dates, of the first group."""
+        return self._lines[0]
+
+    @property
+    def beta(self) -> Float:
+        """Draws (n, S, k) of the slopes per year; zero where the course has none."""
+        return self._lines[1]
+
+    @cached_property
+    def scatter(self) -> Float:
+        """Draws (n, k, k) of the intrinsic covariance."""
+        unit = self.series.spread
+        k = len(unit)
+        return self.raw.sigma.reshape(-1, k, k) * (unit[:, None] * unit)
+
+    @property
+    def scatter_sigma(self) -> Float:
+        """Draws (n, k) of the intrinsic standard deviations."""
+        return np.sqrt(np.diagonal(self.scatter, axis1=1, axis2=2))
+
+    @property
+    def breaks(self) -> Float:
+        """Draws (n, B) of the breaks that were found."""
+        return self.raw.breaks.reshape(-1, self.course.find)
+
+    @property
+    def outlier_probability(self) -> Float:
+        """Of each exposure, shape (E,)."""
+        return self.raw.outlier_probability
+
+    @property
+    def outlier_fraction(self) -> Float:
+        """Draws (n,) of the fraction of outliers."""
+        return self.raw.fraction.ravel()
+
+    @cached_property
+    def group_offset(self) -> Float:
+        """Draws (n, G - 1, k) of what each further group adds."""
+        return self._group_columns(self.design.n_course) * self.series.spread
+
+    @cached_property
+    def group_slope(self) -> Float:
+        """Draws (n, G - 1, k) of what each further group adds to the slope, per year.
+
+        Raises
+        ------
+        InputError
+            Where the groups share their slopes.
+        """
+        if self.course.groups != "slopes":
+            raise InputError(
+                "the groups share their slopes",
+                where=self.series.source,
+                do="ask for a course with groups='slopes'",
+            )
+        first = self.design.n_course + self.design.n_groups - 1
+        return self._group_columns(first) * self.series.spread / self.design.years
+
+    def _group_columns(self, first: int) -> Float:
+        b = self.raw.b.reshape(-1, *self.raw.b.shape[2:])
+        return np.swapaxes(b[..., first : first + self.design.n_groups - 1], 1, 2)
+
+    def change(self, number: int = 0) -> tuple[Change, Change]:
+        """What changes at a break: the coefficients at its date, and their slopes.
+
+        Parameters
+        ----------
+        number : int
+            Of the break, from 0.
+
+        Returns
+        -------
+        level, slope : Change
+            After minus before.  Where slopes cannot change, theirs is zero with no sigma.
+        """
+        if not 0 <= number < self.course.n_breaks:
+            raise InputError(
+                f"there is no break {number + 1}", where=self.series.source, do="see course.breaks"
+            )
+        date = self._breaks[:, number, None, None]
+        at = self.alpha + self.beta * (date - self.reference[:, None])
+        level = at[:, number + 1] - at[:, number]
+        slope = self.beta[:, number + 1] - self.beta[:, number]
+        return Change.of(level), Change.of(slope)
+
+    # -- prediction -------------------------------------------------------------------------------
+
+    def predict(
+        self, epoch: ArrayLike, *, group: str | None = None, extrapolate: bool = False
+    ) -> Prediction:
+        """The coefficients at any epoch.
+
+        Parameters
+        ----------
+        epoch : array_like, shape (M,)
+            Decimal years.
+        group : str, optional
+            The group with most exposures by default.
+        extrapolate : bool
+            Allow epochs before the first and after the last exposure.
+
+        Returns
+        -------
+        Prediction
+
+        Raises
+        ------
+        InputError
+            For an epoch outside every segment, and an unknown group.
+        """
+        t = np.atleast_1d(np.asarray(epoch, float))
+        course = self._course_draws(t, group, extrapolate)
+        mean = course.mean(axis=0)
+        off = course - mean
+        cov = np.einsum("nmi,nmj->mij", off, off) / (len(off) - 1)
+        drift = self.design.drift
+        if drift:
+            first, last = self.series.span
+            unseen = np.where((t < first) | (t > last), drift.unseen(t), 0.0)
+            k = self.series.n_coefficients
+            power = (self.raw.drift.reshape(-1, k) ** 2).mean(axis=0) * self.series.spread**2
+            cov = cov + unseen[:, None, None] * np.diag(power)
+        return Prediction(t, mean, cov, cov + self.scatter.mean(axis=0))
+
+    def new_exposures(
+        self,
+        epoch: ArrayLike,
+        rng: np.random.Generator,
+        *,
+        cov: Float | None = None,
+        group: str | None = None,
+        extrapolate: bool = False,
+    ) -> Float:
+        """Draws (n, M, k) of what new exposures would show, those that lie off included.
+
+        Parameters
+        ----------
+        epoch : array_like, shape (M,)
+        rng : numpy.random.Generator
+        cov : ndarray, shape (M, k, k), optional
+            Their formal covariance; none by default.
+        group, extrapolate
+            As for `predict`.
+        """
+        t = np.atleast_1d(np.asarray(epoch, float))
+        course = self._course_draws(t, group, extrapolate)
+        n, m, k = course.shape
+        drift = self.design.drift
+        if drift:
+            first, last = self.series.span
+            unseen = np.where((t < first) | (t > last), drift.unseen(t), 0.0)
+            amplitude = self.raw.drift.reshape(-1, k) * self.series.spread
+            course = course + np.sqrt(unseen)[:, None] * amplitude[:, None] * rng.standard_normal(
+                course.shape
+            )
+        total = self.scatter[:, None] + (0.0 if cov is None else np.asarray(cov, float))
+        unit = self.series.spread
+        factor = np.linalg.cholesky(total / (unit[:, None] * unit))
+        noise = unit * (factor @ rng.standard_normal((n, m, k, 1)))[..., 0]
+        off = rng.random((n, m)) < self.outlier_fraction[:, None]
+        stretch = np.where(off, np.sqrt(self.raw.kappa2.ravel())[:, None], 1.0)
+        return course + stretch[..., None] * noise
+
+    def _course_draws(self, t: Float, group: str | None, extrapolate: bool) -> Float:
+        """Draws (n, M, k) of the course."""
+        first, last = self.series.span
+        outside = ~((t >= first) & (t <= last)) if not extrapolate else ~np.isfinite(t)
+        if outside.any():
+            raise InputError(
+                f"epoch {t[int(np.argmax(outside))]:g} lies outside every segment: the exposures "
+                f"are of {first:.2f} to {last:.2f}",
+                where=self.series.source,
+                do="give another epoch, or ask for extrapolation",
+            )
+        names = self.series.group_names
+        if group is not None and group not in names:
+            raise InputError(
+                f"there is no group {group!r}",
+                where=self.series.source,
+                do=f"choose among {', '.join(names)}" if names else "the series has no groups",
+            )
+        code = np.full(len(t), names.index(group) if group is not None else 0)
+        b = self.raw.b.reshape(-1, *self.raw.b.shape[2:])
+        columns = self.design.matrix(t, code, self._breaks)  # (n or 1, M, p)
+        values = columns @ np.swapaxes(b, 1, 2)
+        return self.series.centre + values * self.series.spread

@@ -1,0 +1,197 @@
+"""A series in units of its spread, where chains are in it, and its normal equations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.series.breaks import Likelihood
+from bayesdist.infer.series.design import Design
+from bayesdist.infer.series.series import Series
+
+__all__ = ["WIDE", "Problem", "State", "break_likelihood", "course_equations"]
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+WIDE = 100.0  # prior standard deviation of the course's parameters
+CANDIDATES_AT_ONCE = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A series in units of its spread, and what is asked of it.
+
+    Parameters
+    ----------
+    series : Series
+    design : Design
+    y : ndarray, shape (k, E)
+    formal, root : ndarray, shape (k, k, E)
+        Formal covariance and a square root of it.
+    sigma : ndarray, shape (k, k), optional
+        The intrinsic covariance where it is known.
+    outliers : bool
+        Whether exposures may lie off the course.
+    """
+
+    series: Series
+    design: Design
+    y: Float
+    formal: Float
+    root: Float
+    sigma: Float | None = None
+    outliers: bool = True
+
+    @classmethod
+    def of(
+        cls, series: Series, design: Design, scatter: Float | None = None, *, outliers: bool = True
+    ) -> Problem:
+        """In units of the spread.
+
+        Parameters
+        ----------
+        series : Series
+        design : Design
+        scatter : ndarray, shape (k, k), optional
+            Known intrinsic covariance, in the unit of the values.
+        outliers : bool
+        """
+        unit = series.spread
+        square = unit[:, None] * unit
+        formal = series.cov / square
+        values, vectors = np.linalg.eigh(formal)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        return cls(
+            series=series,
+            design=design,
+            y=np.ascontiguousarray(((series.values - series.centre) / unit).T),
+            formal=np.ascontiguousarray(np.moveaxis(formal, 0, -1)),
+            root=np.ascontiguousarray(np.moveaxis(root, 0, -1)),
+            sigma=None if scatter is None else np.asarray(scatter, float) / square,
+            outliers=outliers,
+        )
+
+    def columns(self, breaks: Float) -> Float:
+        """Columns (C or 1, E, p) of the course at the exposures, for breaks (..., B)."""
+        given = None if self.design.course.find == 0 else breaks
+        series = self.series
+        return self.design.matrix(series.epoch, series.group_code, given)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where C chains are.
+
+    Parameters
+    ----------
+    b : ndarray, shape (C, k, p)
+    sigma : ndarray, shape (k, k, C)
+    off : ndarray of bool, shape (C, E)
+        Outliers.
+    probability : ndarray, shape (C, E)
+        Of being one, given everything else.
+    fraction, kappa2 : ndarray, shape (C,)
+    breaks : ndarray, shape (C, B)
+        Of those to be found.
+    drift : ndarray, shape (C, k)
+        Amplitude of the random part.
+    """
+
+    b: Float
+    sigma: Float
+    off: Bool
+    probability: Float
+    fraction: Float
+    kappa2: Float
+    breaks: Float
+    drift: Float
+
+    def take(self, chains: NDArray[np.int64]) -> State:
+        """Some of the chains, or some of them several times."""
+        return State(
+            self.b[chains],
+            self.sigma[..., chains],
+            self.off[chains],
+            self.probability[chains],
+            self.fraction[chains],
+            self.kappa2[chains],
+            self.breaks[chains],
+            self.drift[chains],
+        )
+
+
+def prior_precision(problem: Problem, drift: Float) -> Float:
+    """Prior precision (C, k, p) of the columns' parameters."""
+    design = problem.design
+    out = np.full((len(drift), drift.shape[1], design.n_columns), WIDE**-2)
+    out[..., design.n_fixed :] = drift[..., None] ** -2
+    return out
+
+
+def normal_equations(precision: Float, y: Float, columns: Float) -> tuple[Float, Float]:
+    """Normal matrices (..., k p, k p) and right-hand sides (..., k p).
+
+    Parameters
+    ----------
+    precision : ndarray, shape (k, k, C, E)
+        Inverse covariance of each exposure.
+    y : ndarray, shape (k, E)
+    columns : ndarray, shape (C or 1, E, p) or (C, M, E, p)
+    """
+    k = len(y)
+    *_, n, p = columns.shape
+    pairs = (columns[..., :, None] * columns[..., None, :]).reshape(*columns.shape[:-1], p * p)
+    flat = np.moveaxis(precision.reshape(k * k, *precision.shape[2:]), 0, 1)  # (C, k k, E)
+    pull = np.einsum("ijce,je->cie", precision, y)
+    if columns.ndim == 4:
+        flat, pull = flat[:, None], pull[:, None]
+    if columns.ndim == 3 and len(columns) == 1:  # one matrix product for all chains
+        sums = (flat.reshape(-1, n) @ pairs[0]).reshape(-1, k, k, p, p)
+        right = (pull.reshape(-1, n) @ columns[0]).reshape(-1, k * p)
+    else:
+        sums = flat @ pairs
+        sums = sums.reshape(*sums.shape[:-2], k, k, p, p)
+        right = pull @ columns
+        right = right.reshape(*right.shape[:-2], k * p)
+    matrix = np.swapaxes(sums, -3, -2)
+    return matrix.reshape(*matrix.shape[:-4], k * p, k * p), right
+
+
+def course_equations(
+    problem: Problem, precision: Float, columns: Float, drift: Float
+) -> tuple[Float, Float]:
+    """Precision (C, k p, k p) of the parameters b given everything else, and that times their mean.
+
+    Parameters
+    ----------
+    problem : Problem
+    precision : ndarray, shape (k, k, C, E)
+        Inverse covariance of each exposure.
+    columns : ndarray, shape (C or 1, E, p)
+    drift : ndarray, shape (C, k)
+    """
+    matrix, right = normal_equations(precision, problem.y, columns)
+    prior = prior_precision(problem, drift).reshape(len(drift), -1)
+    return matrix + prior[:, :, None] * np.eye(prior.shape[1]), right
+
+
+def break_likelihood(problem: Problem, precision: Float) -> Likelihood:
+    """Function of dates (C, M, B): log likelihood (C, M) with b integrated out."""
+
+    def some(breaks: Float) -> Float:
+        columns = problem.columns(breaks)
+        matrix, right = normal_equations(precision, problem.y, columns)
+        matrix = matrix + WIDE**-2 * np.eye(matrix.shape[-1])
+        half = np.linalg.solve(matrix, right[..., None])[..., 0]
+        log_det = np.linalg.slogdet(matrix)[1]
+        return 0.5 * (right * half).sum(axis=-1) - 0.5 * log_det
+
+    def of(breaks: Float) -> Float:
+        # a few candidates at a time: their columns would not fit into the cache, or into memory
+        places = range(0, breaks.shape[1], CANDIDATES_AT_ONCE)
+        return np.concatenate([some(breaks[:, i : i + CANDIDATES_AT_ONCE]) for i in places], axis=1)
+
+    return of

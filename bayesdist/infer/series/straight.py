@@ -1,0 +1,114 @@
+"""Lines as published: coefficient by coefficient, segment by segment, by least squares.
+
+Beside the posterior it shows what the two-step way gives: Tables 1-3 of ACS ISR 2015-06.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.series.course import Course
+from bayesdist.infer.series.design import Design
+from bayesdist.infer.series.series import Series
+
+__all__ = ["StraightLines", "straight_lines"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class StraightLines:
+    """Lines alpha + beta (t - R) in each of S segments for each of k coefficients.
+
+    Parameters
+    ----------
+    reference : ndarray, shape (S,)
+    alpha, beta : ndarray, shape (S, k)
+        Beta per year.
+    sigma_alpha, sigma_beta : ndarray, shape (S, k)
+        Formal errors.
+    rms : ndarray, shape (S, k)
+        Of the residuals, with n - 2 degrees of freedom.
+    chi2 : ndarray, shape (S, k)
+        Against the formal errors of the exposures; infinite where there are none.
+    count : ndarray, shape (S,)
+        Exposures.
+    """
+
+    reference: Float
+    alpha: Float
+    beta: Float
+    sigma_alpha: Float
+    sigma_beta: Float
+    rms: Float
+    chi2: Float
+    count: NDArray[np.int64]
+
+
+def straight_lines(series: Series, course: Course, *, weighted: bool = False) -> StraightLines:
+    """Fit each coefficient with a line in each segment.
+
+    Parameters
+    ----------
+    series : Series
+    course : Course
+        Of kind 'line', or 'lines' with given breaks.
+    weighted : bool
+        Weight with the formal errors, and propagate them.  By default each exposure counts the
+        same, and the errors come from the scatter about the line.
+
+    Returns
+    -------
+    StraightLines
+
+    Raises
+    ------
+    DegenerateError
+        For another course, fewer than three exposures in a segment, and weights that do not exist.
+    """
+    if course.kind not in ("line", "lines") or course.find:
+        raise DegenerateError(
+            f"course {course.name!r} is no set of lines with known breaks",
+            where=series.source,
+            do="ask for 'line', or for 'lines' with breaks",
+        )
+    if weighted and not np.all(series.sigma > 0):
+        raise DegenerateError(
+            "some exposures have no formal errors to weight with",
+            where=series.source,
+            do="fit without weights",
+        )
+    design = Design(course, series)
+    segment = design.segment(series.epoch)[0]
+    shape = (course.n_segments, series.n_coefficients)
+    alpha, beta, s_alpha, s_beta, rms, chi2 = (np.zeros(shape) for _ in range(6))
+    for s in range(course.n_segments):
+        rows = segment == s
+        since = series.epoch[rows] - design.reference[s]
+        columns = np.stack([np.ones(rows.sum()), since], axis=1)
+        if rows.sum() < 3:
+            raise DegenerateError(
+                f"segment {s + 1} has {rows.sum()} exposures, and a line with errors needs three",
+                where=series.source,
+                do="take this break away",
+            )
+        for j in range(series.n_coefficients):
+            sigma = series.sigma[rows, j]
+            weight = sigma**-2 if weighted else np.ones(rows.sum())
+            cov = np.linalg.inv(columns.T @ (weight[:, None] * columns))
+            # the values are close to each other and far from zero
+            y = series.values[rows, j] - series.centre[j]
+            fit = cov @ columns.T @ (weight * y)
+            residual = y - columns @ fit
+            rms[s, j] = np.sqrt(residual @ residual / (rows.sum() - 2))
+            with np.errstate(divide="ignore"):
+                chi2[s, j] = ((residual / sigma) ** 2).sum() if sigma.all() else np.inf
+            errors = np.sqrt(np.diag(cov)) * (1.0 if weighted else rms[s, j])
+            alpha[s, j], beta[s, j] = fit[0] + series.centre[j], fit[1]
+            s_alpha[s, j], s_beta[s, j] = errors
+    count = np.array([(segment == s).sum() for s in range(course.n_segments)])
+    return StraightLines(design.reference, alpha, beta, s_alpha, s_beta, rms, chi2, count)

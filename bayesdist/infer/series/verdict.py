@@ -1,0 +1,196 @@
+"""A series in words: a line, no line, a break; never more than the comparison carries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.series.compare import Comparison, compare
+from bayesdist.infer.series.course import Course
+from bayesdist.infer.series.posterior import SeriesPosterior
+from bayesdist.infer.series.series import Series
+
+__all__ = ["Verdict", "default_candidates", "describe"]
+
+Float = NDArray[np.float64]
+
+SIGNIFICANT = 3.0  # sigma from which a coefficient's own slope or step is named
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What a series shows.
+
+    Parameters
+    ----------
+    claim : str
+        'no line', 'line', or 'break at 2009.41', with what the segments hold.
+    text : str
+        The claim in full sentences, with what carries it.
+    comparison : Comparison
+    posterior : SeriesPosterior
+        Of the course that is carried.
+    breaks : ndarray, shape (B, 3)
+        Median and central 68 % interval of each break of that course.
+    rivals : tuple of str
+        Names of drifts that predict as well: a spline or a wandering can follow a line, so that
+        one of these beside a claimed slope says that the slope need not go on.
+    """
+
+    claim: str
+    text: str
+    comparison: Comparison
+    posterior: SeriesPosterior
+    breaks: Float
+    rivals: tuple[str, ...]
+
+    @property
+    def is_line(self) -> bool:
+        """Whether a drift is claimed that goes on."""
+        return self.posterior.course.has_slope and self.posterior.course.kind != "spline"
+
+
+def default_candidates(breaks: tuple[float, ...] = ()) -> tuple[Course, ...]:
+    """Courses to compare: with the given breaks, or with one break that is to be found."""
+    search = 0 if breaks else 1
+    broken = ("step", "line+step", "lines")
+    return (
+        Course("constant"),
+        Course("line"),
+        *(Course(kind, breaks, search) for kind in broken),
+        Course("spline"),
+        Course("wander"),
+    )
+
+
+def describe(
+    series: Series,
+    candidates: tuple[Course, ...] | None = None,
+    *,
+    breaks: tuple[float, ...] = (),
+    seed: int = 1,
+) -> Verdict:
+    """Say what a series shows.
+
+    Parameters
+    ----------
+    series : Series
+    candidates : tuple of Course, optional
+        By default a constant, a line, steps and lines with a break, a smooth and an irregular
+        drift.
+    breaks : tuple of float
+        Given breaks of the default candidates; one is to be found where none are given.
+    seed : int
+
+    Returns
+    -------
+    Verdict
+    """
+    chosen = default_candidates(breaks) if candidates is None else candidates
+    comparison = compare(series, chosen, seed=seed)
+    posterior = comparison.posteriors[comparison.carried]
+    dates = _break_dates(posterior)
+    claim = _claim(posterior.course, dates)
+    rivals = _rivals(comparison)
+    text = _text(claim, comparison, posterior, dates, rivals)
+    return Verdict(claim, text, comparison, posterior, dates, rivals)
+
+
+def _rivals(comparison: Comparison) -> tuple[str, ...]:
+    here = comparison.carried
+    return tuple(
+        c.name
+        for i, c in enumerate(comparison.courses)
+        if i != here and c.kind in ("spline", "wander") and not comparison.beats(here, i)
+    )
+
+
+def _break_dates(posterior: SeriesPosterior) -> Float:
+    course = posterior.course
+    if course.find:
+        return np.quantile(posterior.breaks, [0.5, 0.16, 0.84], axis=0).T
+    return np.repeat(np.array(course.breaks)[:, None], 3, axis=1)
+
+
+def _claim(course: Course, dates: Float) -> str:
+    if course.kind == "constant":
+        return "no line"
+    if course.kind == "line":
+        return "line"
+    if course.kind == "spline":
+        return "no line: a smooth drift"
+    if course.kind == "wander":
+        return "no line: an irregular drift"
+    at = "break at " + ", ".join(f"{d[0]:.2f}" for d in dates)
+    segments = {
+        "step": "no line",
+        "line+step": "one slope throughout",
+        "piecewise": "its slope changes there",
+        "lines": "a line in each segment",
+    }
+    return f"{at}: {segments[course.kind]}"
+
+
+def _text(
+    claim: str,
+    comparison: Comparison,
+    posterior: SeriesPosterior,
+    dates: Float,
+    rivals: tuple[str, ...],
+) -> str:
+    courses = comparison.courses
+    constant = next(i for i, c in enumerate(courses) if c.kind == "constant")
+    here = comparison.carried
+    n_folds = len(np.unique(comparison.scores[here].fold))
+    held = "blocks of successive exposures" if comparison.scheme == "blocks" else "exposures"
+    parts = [f"{claim[0].upper()}{claim[1:]}."]
+    if here == constant:
+        others = [i for i in range(len(courses)) if i != constant]
+        best = max(others, key=lambda i: comparison.scores[i].total)
+        value, error = comparison.difference(best, constant)
+        parts.append(
+            f"The best other course ({courses[best].name}) predicts held-out {held} ({n_folds} "
+            f"folds) by {value:.1f} +- {error:.1f} better than a constant, which is not enough."
+        )
+    else:
+        value, error = comparison.difference(here, constant)
+        parts.append(
+            f"It predicts held-out {held} ({n_folds} folds) by {value:.1f} +- {error:.1f} better "
+            "than a constant."
+        )
+    for middle, low, high in dates:
+        if high > low:
+            parts.append(f"Break at {middle:.2f} ({low:.2f} to {high:.2f} with 68 %).")
+    parts += _named_slopes(posterior)
+    if rivals and posterior.course.has_slope:
+        parts.append(f"As well predicts: {', '.join(rivals)}; the slope need not go on.")
+    if comparison.scheme == "blocks":
+        parts.append(
+            f"Successive exposures are correlated ({comparison.correlation:.2f}); sigmas of slopes "
+            "and steps that take them for independent are too small."
+        )
+    if not posterior.convergence.converged:
+        parts.append(f"The draws have not converged: {'; '.join(posterior.convergence.reasons)}.")
+    return " ".join(parts)
+
+
+def _named_slopes(posterior: SeriesPosterior) -> list[str]:
+    """Which coefficients drift, of a course that claims a drift."""
+    course = posterior.course
+    if not course.has_slope or course.kind == "spline":
+        return []
+    slope = posterior.beta
+    mean, sigma = slope.mean(axis=0), slope.std(axis=0, ddof=1)
+    names = posterior.series.coefficients
+    out = []
+    for s in range(1 if course.kind in ("line", "line+step") else course.n_segments):
+        named = [
+            f"{names[j]} {mean[s, j]:.3g} +- {sigma[s, j]:.1g}"
+            for j in range(len(names))
+            if abs(mean[s, j]) > SIGNIFICANT * sigma[s, j]
+        ]
+        label = f" in segment {s + 1}" if course.kind in ("piecewise", "lines") else ""
+        out.append(f"Slopes per year{label}: {', '.join(named) if named else 'none significant'}.")
+    return out

@@ -1,0 +1,489 @@
+"""Solutions seen otherwise: in the reference gauge, in one segment, in one exposure, term by term.
+
+A view is a solution again: its draws are those of its source, transformed one by one, and its
+covariance is the source's through the exact Jacobian of that transformation at the mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.model import DistortionModel, TimeDependence
+
+__all__ = [
+    "LINEAR_TERMS",
+    "LinearTerms",
+    "ReferenceGauge",
+    "Solution",
+    "View",
+    "in_exposure",
+    "linear_terms",
+    "lines",
+    "reference_gauge",
+    "segment",
+    "without_frames",
+]
+
+Float = NDArray[np.float64]
+
+# constant, x and y of both axes as ACS ISR 2015-06 numbers them (Equations 1-2)
+LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
+
+
+class Solution(Protocol):
+    """A fit or a posterior: a model with values, their covariance, and draws of them."""
+
+    @property
+    def model(self) -> DistortionModel: ...
+
+    @property
+    def mean(self) -> Float: ...
+
+    @property
+    def cov(self) -> Float: ...
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float: ...
+
+
+def _root_of_diagonal(cov: Float) -> Float:
+    """Standard deviations; what a gauge fixes has a variance of zero but for rounding."""
+    return np.sqrt(np.maximum(np.diag(cov), 0.0))
+
+
+@dataclass(frozen=True)
+class ReferenceGauge:
+    """What was done to (u, v) to bring one chip to the reference gauge.
+
+        (u', v') = R(rotation) ((u, v) - shift)
+
+    Parameters
+    ----------
+    chip : int
+    epoch : float or None
+        Where the polynomials depend on time: the date at which the gauge holds.
+    rotation : float
+        Radians, from u towards v.
+    shift : tuple of float
+        In the unit of u, v.
+    sigma_rotation : float
+    sigma_shift : tuple of float
+        How well the data determine them.
+    """
+
+    chip: int
+    epoch: float | None
+    rotation: float
+    shift: tuple[float, float]
+    sigma_rotation: float
+    sigma_shift: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A solution made from another one.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    mean : ndarray, shape (D,)
+        The source's mean, transformed.
+    cov : ndarray, shape (D, D)
+    source : Solution
+    transform : callable
+        From parameters (..., D') of the source to (..., D).
+    gauge : ReferenceGauge, optional
+        What `reference_gauge` did.
+    """
+
+    model: DistortionModel
+    mean: Float
+    cov: Float
+    source: Solution
+    transform: Callable[[Float], Float]
+    gauge: ReferenceGauge | None = None
+
+    @property
+    def sigma(self) -> Float:
+        """Standard deviation of each parameter."""
+        return _root_of_diagonal(self.cov)
+
+    @property
+    def unit(self) -> str:
+        """Unit of u and v."""
+        return self.model.unit
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Parameter vectors, shape (n, D): draws of the source, each transformed."""
+        return self.transform(np.asarray(self.source.draws(n, rng), float))
+
+    @property
+    def convergence(self) -> Any:
+        """That of the posterior; a view of a fit has none."""
+        return self.source.convergence  # type: ignore[attr-defined]
+
+    @property
+    def approximation(self) -> str:
+        """That of the posterior; a view of a fit has none."""
+        return str(self.source.approximation)  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearTerms:
+    """Monomial coefficients with their covariance, in the notation of ACS ISR 2015-06.
+
+    Parameters
+    ----------
+    labels : tuple of str
+        'A_1' is the constant of u, 'A_2' its term in x, 'A_3' in y; 'B_...' are those of v.  With
+        the chip's name before it where there are several chips; with '.alpha' and '.beta' behind
+        it for the value at the reference date and the rate.
+    values : ndarray, shape (k,)
+        In the unit of u, v, per pixel, per year.
+    cov : ndarray, shape (k, k)
+    """
+
+    labels: tuple[str, ...]
+    values: Float
+    cov: Float
+
+    @property
+    def sigma(self) -> Float:
+        """Standard deviation of each term."""
+        return _root_of_diagonal(self.cov)
+
+    def select(self, *labels: str) -> LinearTerms:
+        """Some of the terms, in the order asked for.
+
+        Raises
+        ------
+        InputError
+            For an unknown label.
+        """
+        unknown = [label for label in labels if label not in self.labels]
+        if unknown:
+            raise InputError(
+                f"there is no term {unknown[0]!r}", do=f"choose among {', '.join(self.labels)}"
+            )
+        index = [self.labels.index(label) for label in labels]
+        return LinearTerms(labels, self.values[index], self.cov[np.ix_(index, index)])
+
+
+def _bare(model: DistortionModel) -> DistortionModel:
+    """The model of the polynomials alone; its parameters are the first ones of the other."""
+    return replace(
+        model,
+        frames="none",
+        exposures=("1",),
+        origin=(0.0, 0.0),
+        gauge="first",
+        held=(0.0, 0.0, 0.0),
+    )
+
+
+def _viewed(
+    source: Solution, model: DistortionModel, transform: Callable[[Float], Float], jacobian: Float
+) -> View:
+    """A view by a transformation with its Jacobian (D, n) by the source's first n parameters."""
+    n = jacobian.shape[1]
+    cov = jacobian @ np.asarray(source.cov, float)[:n, :n] @ jacobian.T
+    mean = transform(np.asarray(source.mean, float))
+    return View(model, mean, (cov + cov.T) / 2, source, transform)
+
+
+def without_frames(solution: Solution) -> View:
+    """The polynomials and their drift alone.
+
+    Parameters
+    ----------
+    solution : Solution
+
+    Returns
+    -------
+    View
+        Of the polynomials as they are before the frames: those of the first exposure in gauge
+        'first', those from which all exposures deviate in gauge 'held'.
+    """
+    n = solution.model.n_distortion
+    return _viewed(solution, _bare(solution.model), lambda theta: theta[..., :n], np.eye(n))
+
+
+def in_exposure(solution: Solution, exposure: int | str, *, epoch: float | None = None) -> View:
+    """The polynomials of all chips as one exposure saw them, its frame included.
+
+    Parameters
+    ----------
+    solution : Solution
+    exposure : int or str
+        Code or name.
+    epoch : float, optional
+        Its date, decimal years; needed by a model with time dependence.
+
+    Returns
+    -------
+    View
+        Without frames and without time dependence.
+
+    Raises
+    ------
+    InputError
+        For an unknown exposure or a missing epoch.
+    """
+    model = solution.model
+    new = replace(_bare(model), time=None)
+    groups = model.groups(
+        len(model.chips),
+        epoch=epoch if model.time is not None else None,
+        exposure=exposure,
+        chip=[chip.number for chip in model.chips],
+    )
+    order = groups.index  # the group of each chip
+
+    def transform(theta: Float) -> Float:
+        E = model.effective(theta, groups)[..., order, :, :]
+        return E.reshape(*theta.shape[:-1], new.n_params)
+
+    jacobian = np.zeros((len(model.chips), 2 * model.n_terms, model.n_params))
+    for g, (columns, d) in enumerate(model.effective_jacobian(solution.mean, groups)):
+        jacobian[groups.chip[g]][:, columns] = d.reshape(2 * model.n_terms, -1)
+    return _viewed(solution, new, transform, jacobian.reshape(new.n_params, -1))
+
+
+def segment(solution: Solution, s: int) -> View:
+    """One segment of the time dependence, as a model without breaks: what one IDCTAB holds.
+
+    Parameters
+    ----------
+    solution : Solution
+    s : int
+        Number of the segment, from 0.
+
+    Returns
+    -------
+    View
+        Without frames; its coefficients are those at the segment's reference date.
+
+    Raises
+    ------
+    InputError
+        When the model has no such segment.
+    """
+    model = solution.model
+    time = model.time
+    if time is None or not 0 <= s < time.n_segments:
+        raise InputError(
+            f"there is no segment {s}",
+            where="model.tdd",
+            do="the model has none"
+            if time is None
+            else f"choose one of 0 to {time.n_segments - 1}",
+        )
+    new = replace(_bare(model), time=TimeDependence(time.terms, (time.epoch0[s],)))
+    jacobian = np.zeros((new.n_params, model.n_distortion))
+    jacobian[: model.n_polynomial, : model.n_polynomial] = np.eye(model.n_polynomial)
+    for chip in model.chips:
+        old = model.tdd_slice(chip.number).start
+        for t, (axis, _, _) in enumerate(time.terms):
+            first = old + t * time.n_values
+            jacobian[new.tdd_slice(chip.number).start + t, first + 2 * s] = 1.0
+            if s:
+                rows = model.coefficient_slice(chip.number, "uv".index(axis))
+                jacobian[rows, first + 2 * s - 1] = model.drift_terms(chip.number)[t]
+    n = model.n_distortion
+    return _viewed(solution, new, lambda theta: theta[..., :n] @ jacobian.T, jacobian)
+
+
+def reference_gauge(solution: Solution, chip: int = 2, *, epoch: float | None = None) -> View:
+    """Rotate and shift (u, v) so that one chip has A_1 = B_1 = 0 and A_3 = 0.
+
+    The gauge of ACS ISR 2015-06, section 4.2: at the chip's reference pixel there is neither an
+    offset nor a rotation of the column direction against v.  All other chips are carried along, so
+    that gap and rotation between them are in their coefficients.
+
+    Parameters
+    ----------
+    solution : Solution
+    chip : int
+        Number of the reference chip.
+    epoch : float, optional
+        Where the polynomials depend on time: the date at which the gauge holds, the reference date
+        of the first segment by default.
+
+    Returns
+    -------
+    View
+        Without frames; `gauge` says what was done.  A rotation makes a term drift on both axes that
+        drifted on one, so both are in the model of the view.
+
+    Raises
+    ------
+    InputError
+        For an unknown chip.
+    """
+    model = _bare(solution.model)
+    time = model.time
+    if time is not None and epoch is None:
+        epoch = time.epoch0[0]
+    new = model
+    if time is not None:
+        new = replace(model, time=TimeDependence(_both_axes(time), time.epoch0, time.breaks))
+    group = model.groups(1, epoch=epoch if time is not None else None, chip=chip)
+    basis = model.basis(chip)
+    n = model.n_params
+
+    def pose(theta: Float) -> tuple[Float, Float]:
+        """Rotation (...) and shift (..., 2) that bring the polynomials to the gauge."""
+        at = basis.to_monomials(model.effective(theta, group)[..., 0, :, :])
+        return np.arctan2(at[..., 0, 2], at[..., 1, 2]), at[..., :, 0]
+
+    def transform(theta: Float) -> Float:
+        theta = theta[..., :n]
+        angle, shift = pose(theta)
+        return _turned(model, new, theta, np.exp(1j * angle), shift)
+
+    mean = np.asarray(solution.mean, float)[:n]
+    angle, shift = pose(mean)
+    turn = np.exp(1j * angle)
+    [(columns, d)] = model.effective_jacobian(mean, group)
+    by = np.zeros((2, model.n_terms, n))
+    by[:, :, columns] = np.einsum("kl,alm->akm", basis.monomial_matrix, d)
+    a3, b3 = basis.to_monomials(model.effective(mean, group)[0])[:, 2]
+    by_pose = np.vstack([(b3 * by[0, 2] - a3 * by[1, 2]) / (a3**2 + b3**2), by[:, 0]])
+    none = np.zeros(n)
+    jacobian = _turned(model, new, np.eye(n), turn, np.zeros(2)).T
+    jacobian += np.outer(_turned(model, new, mean, 1j * turn, shift), by_pose[0])
+    for axis, unit in enumerate(np.eye(2)):
+        jacobian += np.outer(_turned(model, new, none, turn, unit), by_pose[1 + axis])
+    view = _viewed(solution, new, transform, jacobian)
+    sigma = _root_of_diagonal(by_pose @ np.asarray(solution.cov, float)[:n, :n] @ by_pose.T)
+    gauge = ReferenceGauge(
+        chip=chip,
+        epoch=epoch,
+        rotation=float(angle),
+        shift=(float(shift[0]), float(shift[1])),
+        sigma_rotation=float(sigma[0]),
+        sigma_shift=(float(sigma[1]), float(sigma[2])),
+    )
+    return replace(view, gauge=gauge)
+
+
+def _both_axes(time: TimeDependence) -> tuple[tuple[str, int, int], ...]:
+    """The terms, and behind them those of the other axis that they lack."""
+    partners = (("v" if axis == "u" else "u", i, j) for axis, i, j in time.terms)
+    return (*time.terms, *(p for p in partners if p not in time.terms))
+
+
+def _turned(
+    model: DistortionModel, new: DistortionModel, theta: Float, turn: Any, shift: Float
+) -> Float:
+    """Parameters (..., D') of turn ((u + i v) - shift) from parameters (..., D)."""
+    turn = np.asarray(turn)[..., None]
+    out = np.zeros((*theta.shape[:-1], new.n_params))
+    for chip in model.chips:
+        u, v = (model.coefficient_slice(chip.number, axis) for axis in (0, 1))
+        w = theta[..., u] + 1j * theta[..., v]
+        w[..., 0] -= shift[..., 0] + 1j * shift[..., 1]
+        w = turn * w
+        out[..., u], out[..., v] = w.real, w.imag
+        if model.time is None or new.time is None:
+            continue
+        values = theta[..., model.tdd_slice(chip.number)]
+        values = values.reshape(*values.shape[:-1], len(model.time.terms), model.time.n_values)
+        drift = np.zeros((*theta.shape[:-1], len(new.time.terms), new.time.n_values))
+        for t, (axis, i, j) in enumerate(model.time.terms):
+            z = turn * values[..., t, :] * (1.0 if axis == "u" else 1j)
+            drift[..., new.time.terms.index(("u", i, j)), :] += z.real
+            drift[..., new.time.terms.index(("v", i, j)), :] += z.imag
+        out[..., new.tdd_slice(chip.number)] = drift.reshape(*theta.shape[:-1], -1)
+    return out
+
+
+def linear_terms(
+    solution: Solution, chip: int | None = None, *, epoch: float | None = None
+) -> LinearTerms:
+    """Constant and linear terms at a date, as monomials of the pixel offsets.
+
+    Parameters
+    ----------
+    solution : Solution
+        Of which the polynomials are taken, without frames; see `in_exposure` for one exposure.
+    chip : int, optional
+        Chip number; all chips by default, and then their names stand before the labels.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+
+    Returns
+    -------
+    LinearTerms
+        A_1, A_2, A_3, B_1, B_2, B_3 of each chip.
+
+    Raises
+    ------
+    InputError
+        For an unknown chip or a missing epoch.
+    """
+    labels, jacobian = _linear_jacobian(solution.model, chip, epoch)
+    return _linear(solution, labels, jacobian)
+
+
+def lines(solution: Solution, s: int = 0, *, chip: int | None = None) -> LinearTerms:
+    """The linear terms as lines in time: values at the reference date, and rates.
+
+    Parameters
+    ----------
+    solution : Solution
+    s : int
+        Number of the segment, from 0.
+    chip : int, optional
+        Chip number; all chips by default.
+
+    Returns
+    -------
+    LinearTerms
+        'A_2.alpha' and 'A_2.beta' of each term, as in Tables 1-3 of ACS ISR 2015-06; terms that
+        do not drift have a rate of zero.
+
+    Raises
+    ------
+    InputError
+        For an unknown chip or segment.
+    """
+    view = segment(solution, s)
+    assert view.model.time is not None
+    t0 = view.model.time.epoch0[0]
+    labels, alpha = _linear_jacobian(view.model, chip, t0)
+    _, later = _linear_jacobian(view.model, chip, t0 + 1.0)
+    both = tuple(f"{label}.{part}" for part in ("alpha", "beta") for label in labels)
+    return _linear(view, both, np.vstack([alpha, later - alpha]))
+
+
+def _linear(solution: Solution, labels: tuple[str, ...], jacobian: Float) -> LinearTerms:
+    n = jacobian.shape[1]
+    cov = jacobian @ np.asarray(solution.cov, float)[:n, :n] @ jacobian.T
+    return LinearTerms(labels, jacobian @ np.asarray(solution.mean, float)[:n], (cov + cov.T) / 2)
+
+
+def _linear_jacobian(
+    model: DistortionModel, chip: int | None, epoch: float | None
+) -> tuple[tuple[str, ...], Float]:
+    """Labels (k,) and the matrix (k, n) by which the linear terms follow from the parameters."""
+    bare = _bare(model)
+    labels: list[str] = []
+    rows = []
+    for one in bare.chips:
+        if chip is not None and bare.chip_code(chip) != bare.chip_code(one.number):
+            continue
+        group = bare.groups(1, epoch=epoch if bare.time is not None else None, chip=one.number)
+        # linear in the parameters, whatever their values
+        [(columns, d)] = bare.effective_jacobian(np.zeros(bare.n_params), group)
+        row = np.zeros((2, 3, bare.n_params))
+        row[:, :, columns] = np.einsum("kl,alm->akm", bare.basis(one.number).monomial_matrix[:3], d)
+        rows.append(row.reshape(6, -1))
+        named = chip is None and len(bare.chips) > 1
+        labels += [f"{one.name}.{term}" if named else term for term in LINEAR_TERMS]
+    return tuple(labels), np.vstack(rows)

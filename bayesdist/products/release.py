@@ -1,0 +1,252 @@
+"""A calibration as the set of files that a pipeline takes in.
+
+One IDCTAB for each period, since a file holds one drift; one D2IMFILE, since the detector's pixels
+do not change; one NPOLFILE for each filter.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bayesdist.assess.solution import Solution
+from bayesdist.errors import InputError
+from bayesdist.model.lookup import LookupTable
+from bayesdist.products.d2im import write_d2im
+from bayesdist.products.idctab import IdcTab, write_idctab
+from bayesdist.products.idctab_build import idctab_from_solutions
+from bayesdist.products.npol import write_npol
+from bayesdist.products.orientation import Orientation
+from bayesdist.products.oriented import oriented
+from bayesdist.products.storable import Lost, Stored, storable
+from bayesdist.products.wheels import combination_of
+
+__all__ = ["Period", "Release", "write_release"]
+
+Filter = str | tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Period:
+    """The years that one IDCTAB serves.
+
+    Parameters
+    ----------
+    name : str
+        Part of the file's name, as "pre" and "post".
+    years : tuple of float
+        First and last date, decimal years.
+    segment : int
+        Segment of the solution's time dependence, from 0.
+    useafter : str, optional
+        USEAFTER, as "Mar 01 2002 00:00:00".
+    pedigree : str, optional
+        PEDIGREE, as "INFLIGHT 01/03/2002 01/05/2009".
+    """
+
+    name: str
+    years: tuple[float, float]
+    segment: int = 0
+    useafter: str | None = None
+    pedigree: str | None = None
+
+
+@dataclass(frozen=True)
+class Release:
+    """What was written.
+
+    Parameters
+    ----------
+    idctabs : dict of str to Path
+        By the name of the period.
+    d2im : Path or None
+    npol : dict of str to Path
+        By filter.
+    lost : dict of str to tuple of Lost
+        By the name of the period: drifts that no file could store, with what they amount to.
+    """
+
+    idctabs: dict[str, Path]
+    d2im: Path | None = None
+    npol: dict[str, Path] = field(default_factory=dict)
+    lost: dict[str, tuple[Lost, ...]] = field(default_factory=dict)
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files."""
+        middle = [] if self.d2im is None else [self.d2im]
+        return [*self.idctabs.values(), *middle, *self.npol.values()]
+
+
+def write_release(
+    folder: str | os.PathLike[str],
+    name: str,
+    solutions: Mapping[str, Solution],
+    orientation: Orientation,
+    periods: Sequence[Period],
+    *,
+    tables: Sequence[LookupTable] = (),
+    stand_ins: Mapping[Filter, str] | None = None,
+    instrument: str = "ACS",
+    detector: str = "WFC",
+    scale_arcsec: float = 0.05,
+    limit_mas: float = 0.1,
+    description: str = "Geometric distortion with its uncertainty, by bayesdist",
+    history: Sequence[str] = (),
+) -> Release:
+    """Write <name>_<period>_idc.fits, <name>_d2i.fits and <name>_<filter>_npl.fits.
+
+    Parameters
+    ----------
+    folder : path-like
+        Made where it is not there.
+    name : str
+        What the names of all files begin with.
+    solutions : mapping of filter to Solution
+        Free of velocity aberration, with all segments, in the system of the orientation.  The
+        first one's drift is stored, and must hold for the others (see `storable`).
+    orientation : Orientation
+    periods : sequence of Period
+        One for each IDCTAB.
+    tables : sequence of LookupTable
+        The detector's (filter '') and those of filters, at most one for each chip and filter.
+    stand_ins : mapping of filter to filter, optional
+        Filters without a calibration of their own, and whose rows serve them.  stwcs stops at an
+        exposure whose filters no row names.
+    instrument, detector : str
+    scale_arcsec : float
+        SCALE: size of the pixels onto which images are drizzled.
+    limit_mas : float
+        Largest drift that may stay out of a file.
+    description : str
+        DESCRIP of all files.
+    history : sequence of str
+        Lines for HISTORY of all files.
+
+    Returns
+    -------
+    Release
+
+    Raises
+    ------
+    InputError
+        For no filter or period, periods of one name, a table or stand-in of a filter that has no
+        solution, whatever `oriented`, `storable` and `idctab_from_solutions` refuse, or a file that
+        cannot be written.  No file is written unless all IDCTABs could be made.
+    DegenerateError
+        When the linear part of a chip is singular.
+    """
+    stand_ins = stand_ins or {}
+    _check(solutions, periods, tables, stand_ins)
+    turned = {filter: oriented(solution, orientation) for filter, solution in solutions.items()}
+    made: dict[str, IdcTab] = {}
+    lost: dict[str, tuple[Lost, ...]] = {}
+    for period in periods:
+        base: Stored | None = None
+        rows: dict[Filter, Stored] = {}
+        for filter, solution in turned.items():
+            rows[filter] = storable(
+                solution,
+                years=period.years,
+                segment=period.segment,
+                limit_mas=limit_mas,
+                like=base,
+            )
+            base = base or rows[filter]
+        lost[period.name] = tuple(entry for stored in rows.values() for entry in stored.lost)
+        notes = [
+            f"{filter}: {entry}." if len(rows) > 1 else f"{entry}."
+            for filter, stored in rows.items()
+            for entry in stored.lost
+        ]
+        for filter, other in stand_ins.items():
+            rows[filter] = rows[other]
+        made[period.name] = idctab_from_solutions(
+            rows,
+            instrument=instrument,
+            detector=detector,
+            scale_arcsec=scale_arcsec,
+            v2ref=orientation.v2v3[0],
+            v3ref=orientation.v2v3[1],
+            useafter=period.useafter,
+            pedigree=period.pedigree,
+            description=description,
+            history=[
+                f"For exposures from {period.years[0]:g} to {period.years[1]:g}.",
+                *history,
+                *notes,
+            ],
+        )
+
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"the folder cannot be made ({error.strerror})", where=str(folder), do="choose another"
+        ) from error
+    idctabs = {}
+    for period_name, tab in made.items():
+        idctabs[period_name] = folder / f"{name}_{period_name}_idc.fits"
+        write_idctab(tab, idctabs[period_name])
+    first = periods[0]
+    common = {
+        "description": description,
+        "useafter": first.useafter,
+        "pedigree": first.pedigree,
+        "history": history,
+    }
+    detector_tables = [t for t in tables if not t.filter]
+    d2im = None
+    if detector_tables:
+        d2im = folder / f"{name}_d2i.fits"
+        columns, lines = next(iter(solutions.values())).model.chips[0].size
+        size = (int(columns), int(lines))
+        write_d2im(
+            detector_tables, d2im, instrument=instrument, detector=detector, size=size, **common
+        )
+    npol = {}
+    for filter in dict.fromkeys(t.filter for t in tables if t.filter):
+        npol[filter] = folder / f"{name}_{filter.lower()}_npl.fits"
+        write_npol(
+            [t for t in tables if t.filter == filter],
+            npol[filter],
+            idctab=made[first.name],
+            filters=combination_of(filter, instrument),
+            **common,
+        )
+    return Release(idctabs, d2im, npol, lost)
+
+
+def _check(
+    solutions: Mapping[str, Solution],
+    periods: Sequence[Period],
+    tables: Sequence[LookupTable],
+    stand_ins: Mapping[Filter, str],
+) -> None:
+    if not solutions:
+        raise InputError("no filter is given", where="solutions", do="give at least one")
+    if not periods:
+        raise InputError("no period is given", where="periods", do="give one for each IDCTAB")
+    names = [period.name for period in periods]
+    if len(set(names)) < len(names):
+        raise InputError(
+            "two periods have one name", where="periods", do="give each a name of its own"
+        )
+    known = f"solutions are given for {', '.join(map(str, solutions))}"
+    for table in tables:
+        if table.filter and table.filter not in solutions:
+            raise InputError(
+                f"the look-up table {table.label} is of a filter without a solution",
+                where="tables",
+                do=known,
+            )
+    for filter, other in stand_ins.items():
+        if other not in solutions:
+            raise InputError(
+                f"{other!r} is to stand in for {filter!r} and has no solution",
+                where="stand_ins",
+                do=known,
+            )

@@ -1,0 +1,245 @@
+"""What of a solution an IDCTAB can hold: one segment, and three drifting terms.
+
+A solution that was turned into V2 and V3 drifts in terms that a file has no keyword for: a change
+of the y scale turns into one of CX10, by the sine of 2.2 degrees for ACS/WFC.  Here such terms are
+left out only where what they do over the years of the file is bounded, and the bound is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.solution import Solution
+from bayesdist.errors import InputError
+from bayesdist.infer.views import segment as segment_of
+from bayesdist.model import DistortionModel, TimeDependence
+from bayesdist.products.orientation import Orientation
+from bayesdist.products.sip_build import ARCSEC
+from bayesdist.products.tdd import RATES
+
+__all__ = ["Lost", "Stored", "storable"]
+
+Float = NDArray[np.float64]
+Term = tuple[str, int, int]
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A drift that a file does not hold.
+
+    Parameters
+    ----------
+    chip : str
+        Name of the chip.
+    term : tuple of (str, int, int)
+        Axis, power of x, power of y.
+    mas, sigma : float
+        Largest displacement that is left out, over the chip and the years of the file, and its
+        standard deviation; mas.
+    years : tuple of float
+        First and last date.
+    """
+
+    chip: str
+    term: Term
+    mas: float
+    sigma: float
+    years: tuple[float, float]
+
+    def __str__(self) -> str:
+        axis, i, j = self.term
+        return (
+            f"Not stored: drift of the {axis} term x^{i} y^{j} of {self.chip}, at most "
+            f"{self.mas:.2g} +- {self.sigma:.1g} mas over the chip from {self.years[0]:g} to "
+            f"{self.years[1]:g}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A solution as a file holds it.
+
+    Parameters
+    ----------
+    model : DistortionModel
+        Without breaks, with drifting terms that have keywords.
+    mean : ndarray, shape (D,)
+    cov : ndarray, shape (D, D)
+    source : Solution
+    transform : callable
+        From parameters (..., D') of the source to (..., D); linear.
+    lost : tuple of Lost
+        What was left out.
+    """
+
+    model: DistortionModel
+    mean: Float
+    cov: Float
+    source: Solution
+    transform: Callable[[Float], Float]
+    lost: tuple[Lost, ...]
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Parameter vectors, shape (n, D)."""
+        return self.transform(np.asarray(self.source.draws(n, rng), float))
+
+    @property
+    def orientation(self) -> Orientation:
+        """That of the source; one that was never turned has none."""
+        return self.source.orientation  # type: ignore[attr-defined]
+
+    @property
+    def with_orientation(self) -> Float:
+        """Covariance (D, 4) with the parameters of the orientation."""
+        return self.transform(self.source.with_orientation.T).T  # type: ignore[attr-defined]
+
+    @property
+    def convergence(self) -> object:
+        """That of the posterior; a linear fit has none."""
+        return self.source.convergence  # type: ignore[attr-defined]
+
+    @property
+    def approximation(self) -> str:
+        """That of the posterior; a linear fit has none."""
+        return self.source.approximation  # type: ignore[attr-defined]
+
+
+def storable(
+    solution: Solution,
+    *,
+    years: tuple[float, float],
+    segment: int = 0,
+    limit_mas: float = 0.1,
+    like: Stored | None = None,
+) -> Stored:
+    """One segment of a solution, with the drift that an IDCTAB can store.
+
+    Parameters
+    ----------
+    solution : Solution
+        In an angular unit, along the axes of the IDCTAB (see `bayesdist.products.oriented`).
+    years : tuple of float
+        First and last date for which the file is meant, decimal years.
+    segment : int
+        Number of the segment, from 0.
+    limit_mas : float
+        Largest displacement that may be left out: the sum of all terms of a chip, mas.
+    like : Stored, optional
+        The solution whose drift the file will hold.  This one then gives its coefficients at the
+        reference date, and the difference of the drifts counts as left out.
+
+    Returns
+    -------
+    Stored
+
+    Raises
+    ------
+    InputError
+        When more than `limit_mas` would be left out, for a unit of pixels, years that do not rise,
+        no such segment, or a solution that does not depend on time, or from another date, where
+        `like` does.
+    """
+    if solution.model.unit not in ARCSEC:
+        raise InputError(
+            f"u and v are in {solution.model.unit}, and the axes of an IDCTAB are angles",
+            where="model.unit",
+            do="orient the solution first",
+        )
+    first, last = years
+    if not first < last:
+        raise InputError(
+            f"the years {first} to {last} do not rise", where="years", do="give first and last date"
+        )
+    _check_like(solution, like, segment)
+    view = solution if solution.model.time is None else segment_of(solution, segment)
+    model, time = view.model, view.model.time
+    kept: list[Term] = []
+    if time is not None and like is None:
+        kept = [term for term in time.terms if term in RATES]
+    new = replace(model, time=TimeDependence(tuple(kept), time.epoch0) if time and kept else None)
+    columns = list(range(model.n_polynomial))
+    for chip in model.chips:
+        start = model.tdd_slice(chip.number).start
+        columns += [start + k for k, t in enumerate(time.terms if time else ()) if t in kept]
+    lost = _lost(view, like, kept, (first, last))
+    _check_lost(lost, limit_mas)
+
+    def transform(theta: Float) -> Float:
+        seen = theta if view is solution else view.transform(theta)
+        return seen[..., columns]
+
+    cov = np.asarray(view.cov, float)[np.ix_(columns, columns)]
+    return Stored(new, np.asarray(view.mean, float)[columns], cov, solution, transform, lost)
+
+
+def _check_like(solution: Solution, like: Stored | None, segment: int) -> None:
+    if like is None or like.model.time is None:
+        return
+    time = solution.model.time
+    wanted = like.model.time.epoch0[0]
+    if time is None or not 0 <= segment < time.n_segments or time.epoch0[segment] != wanted:
+        stated = "does not depend on time" if time is None else f"counts from {time.epoch0}"
+        raise InputError(
+            f"the solution {stated}, and the file's drift from {wanted:g}",
+            where="model.tdd",
+            do="fit it with the same segments and reference dates, its rates held if need be",
+        )
+
+
+def _lost(
+    view: Solution, like: Stored | None, kept: list[Term], years: tuple[float, float]
+) -> tuple[Lost, ...]:
+    """What each drifting term does beyond the drift that is stored."""
+    model = view.model
+    if model.time is None:
+        return ()
+    factor = 1e3 * ARCSEC[model.unit]
+    span = max(abs(t - model.time.epoch0[0]) for t in years)
+    out = []
+    for chip in model.chips:
+        rates, sigmas = _rates(view, chip.number)
+        stored = {} if like is None else _rates(like, chip.number)[0]
+        for term in dict.fromkeys([*rates, *stored]):
+            if term in kept:
+                continue
+            _, i, j = term
+            reach = 1.0
+            for n, ref, power in zip(chip.size, chip.reference_pixel, (i, j), strict=True):
+                # in units of half the chip's size, as the model has its rates
+                reach *= (max(n + 0.5 - ref, ref - 0.5) / (n / 2)) ** power
+            lever = factor * span * reach
+            rate = rates.get(term, 0.0) - stored.get(term, 0.0)
+            if rate or term not in stored:
+                sigma = lever * sigmas.get(term, 0.0)
+                out.append(Lost(chip.name, term, lever * abs(rate), sigma, years))
+    return tuple(out)
+
+
+def _rates(solution: Solution, chip: int) -> tuple[dict[Term, float], dict[Term, float]]:
+    """Rates and their sigmas, for a model of one segment."""
+    model = solution.model
+    if model.time is None:
+        return {}, {}
+    place = model.tdd_slice(chip)
+    values = np.asarray(solution.mean, float)[place].tolist()
+    sigmas = np.sqrt(np.diag(np.asarray(solution.cov, float))[place]).tolist()
+    terms = model.time.terms
+    return dict(zip(terms, values, strict=True)), dict(zip(terms, sigmas, strict=True))
+
+
+def _check_lost(lost: tuple[Lost, ...], limit_mas: float) -> None:
+    for chip in dict.fromkeys(entry.chip for entry in lost):
+        mine = [entry for entry in lost if entry.chip == chip]
+        total = sum(entry.mas for entry in mine)
+        if total > limit_mas:
+            worst = max(mine, key=lambda entry: entry.mas)
+            raise InputError(
+                f"an IDCTAB cannot store drifts of {chip} that reach {total:.3g} mas, most of all "
+                f"the term ({', '.join(map(str, worst.term))}) with {worst.mas:.3g} mas",
+                where="model.tdd.terms",
+                do=f"choose a file for fewer years, or a limit above {limit_mas:g} mas",
+            )

@@ -1,0 +1,192 @@
+"""A campaign from star lists to a release: simulated, with the published linear terms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from bayesdist.data import read_exposures, read_matches
+from bayesdist.data.tables import read_table
+from bayesdist.infer import load_posterior
+from bayesdist.infer.views import reference_gauge, segment, without_frames
+from bayesdist.products import read_d2im, read_idctab
+from bayesdist.simulate.acs import read_acs
+from tests.app.support import cli, good, one_sentence, snapshot, summary_of
+
+# ACS ISR 2015-06, Tables 1 to 3: chip, segment (RDATE 2004.5, 2012.5), alpha, beta
+PUBLISHED = {
+    ("A_2", 1, 0): (0.98205648, -9.22e-6),
+    ("A_2", 2, 0): (0.99468101, -9.16e-6),
+    ("A_2", 1, 1): (0.98196909, -2.18e-5),
+    ("A_2", 2, 1): (0.99459657, -2.26e-5),
+    ("B_3", 1, 0): (0.97263238, 2.42e-6),
+    ("B_3", 2, 0): (1.00622300, 3.30e-6),
+    ("B_3", 1, 1): (0.97263233, -1.12e-6),
+    ("B_3", 2, 1): (1.00621870, -8.04e-7),
+    ("B_2", 1, 0): (0.080947069, 3.617e-5),
+    ("B_2", 2, 0): (0.068598586, 3.532e-5),
+    ("B_2", 1, 1): (0.081139194, 3.235e-5),
+    ("B_2", 2, 1): (0.068779336, 3.070e-5),
+}
+GAP = 2079.58  # B_1 of WFC1, Section 4.4.1
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("campaign") / "acs"
+    good("simulate", "acs", "-o", folder, "--exposures", 20, "--stars", 9000, "--seed", 3, "-q")
+    config = folder / "campaign_f606w.toml"
+    text = config.read_text(encoding="utf-8")
+    # wider cells than the pattern's: quick, and leaves the linear terms alone
+    text = text.replace('method = "field"', 'step = [256.0, 256.0]\nmethod = "field"')
+    config.write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    out = folder.parent / "run"
+    good("run", folder / "campaign_f606w.toml", "-o", out, "-q")
+    return out
+
+
+def test_nearly_all_stars_are_matched_and_hardly_any_wrongly(run, folder):
+    found = summary_of(run)["matching"]
+    assert found["n_exposures"] == 20
+    assert found["completeness"]["median"] > 0.95
+    assert found["false_share"] < 0.01
+    truth = read_acs(folder).truth
+    pairs = read_matches(run / "pairs", unit="pix")
+    assert len(pairs) == found["n_pairs"]
+    for code, name in enumerate(pairs.exposure_names[:4]):
+        some = pairs.select(pairs.exposure == code)
+        chip = np.asarray(some.chip_numbers)[some.chip]
+        u, v = truth.to_catalog(name, some.x, some.y, chip).T
+        vafactor = truth.log[name].vafactor
+        apart = np.hypot(some.u * vafactor - u, some.v * vafactor - v)
+        assert np.median(apart) < 0.05  # pixels: centroid and catalogue, not another star
+        assert np.mean(apart > 1.0) < 0.01
+
+
+def test_published_drifts_are_found(run):
+    rows = {(r["term"], r["chip"], r["segment"]): r for r in summary_of(run)["lines"]}
+    pulls = []
+    for key, (alpha, beta) in PUBLISHED.items():
+        row = rows[key]
+        pulls.append((row["alpha"] - alpha) / row["sigma_alpha"])
+        pulls.append((row["beta"] - beta) / row["sigma_beta"])
+        assert row["sigma_alpha"] < 2e-5  # it says something: the drift of B_2 is 2e-4 in 5 years
+    assert np.abs(pulls).max() < 5  # the catalogue's errors, common to all exposures, are not in
+    assert np.median(np.abs(pulls)) < 1.5
+
+
+def test_the_gauge_is_that_of_the_reference_chip(run):
+    view = reference_gauge(without_frames(load_posterior(run)), 2)
+    monomials = {
+        (c, a): view.model.basis(c).to_monomials(view.mean[view.model.coefficient_slice(c, a)])
+        for c in (1, 2)
+        for a in (0, 1)
+    }
+    assert abs(monomials[2, 0][0]) < 1e-9 and abs(monomials[2, 1][0]) < 1e-9
+    assert abs(monomials[2, 0][2]) < 1e-12
+    assert monomials[1, 1][0] == pytest.approx(GAP, abs=0.05)
+
+
+def test_each_period_has_its_table_and_both_are_the_model(run):
+    """Forward maps of the files against the posterior mean, along V2 and V3, at several dates."""
+    products = {p["path"]: p for p in summary_of(run)["products"]}
+    assert set(products) == {"acs_wfc_pre_idc.fits", "acs_wfc_post_idc.fits", "acs_wfc_d2i.fits"}
+    view = reference_gauge(without_frames(load_posterior(run)), 2)
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(1, 4096, 200), rng.uniform(1, 2048, 200)
+    for number, name, dates in (
+        (0, "pre", (2003.0, 2005.0, 2007.0)),
+        (1, "post", (2010.0, 2014.0)),
+    ):
+        tab = read_idctab(run / f"acs_wfc_{name}_idc.fits")
+        one = segment(view, number)
+        for chip in (1, 2):
+            for date in dates:
+                ours = one.model.predict(one.mean, x, y, chip=chip, epoch=np.full(200, date))
+                theirs = np.column_stack(tab.evaluate(chip, x, y, filter="F606W", epoch=date))
+                # one turn, one scale for both files, all dates and chips; zero points are in V2REF
+                a, b = (
+                    np.array(p) @ [1, 1j] for p in (ours - ours.mean(0), theirs - theirs.mean(0))
+                )
+                factor = np.vdot(a, b) / np.vdot(a, a)
+                assert abs(factor) == pytest.approx(0.05, rel=1e-3)
+                assert 1000 * np.abs(b - factor * a).max() < 0.1  # mas
+    assert {t.chip for t in read_d2im(run / "acs_wfc_d2i.fits")} == {1, 2}
+
+
+def test_a_stage_can_be_run_again(run):
+    before = summary_of(run)["lines"]
+    good("match", run, "-q")
+    good("fit", run, "-q")
+    assert summary_of(run)["lines"] == before
+
+
+# -- wrong input ----------------------------------------------------------------------------------
+
+
+def refused(folder, tmp_path, words, **changes):
+    """A run with another configuration must end in one sentence and leave nothing."""
+    text = (folder / "campaign_f606w.toml").read_text(encoding="utf-8")
+    for name in ("catalog.parquet", "exposures.ecsv", "start_idc.fits", '"lists"'):
+        plain = name.strip('"')
+        text = text.replace(f'"{plain}"', f'"{folder / plain}"')
+    for old, new in changes.items():
+        key = old.replace("_", " ") if old not in text else old
+        assert key in text
+        text = text.replace(key, new)
+    config = tmp_path / "config.toml"
+    config.write_text(text, encoding="utf-8")
+    result = cli("run", config, "-o", tmp_path / "run", "-q")
+    assert result.code == 1, result.err
+    one_sentence(result.err, *words)
+    return result.err
+
+
+def test_exposures_without_vafactor(folder, tmp_path):
+    log = Table.read(folder / "exposures.ecsv")
+    log.remove_column("vafactor")
+    log.write(tmp_path / "log.ecsv")
+    changes = {str(folder / "exposures.ecsv"): str(tmp_path / "log.ecsv")}
+    refused(folder, tmp_path, ["vafactor"], **changes)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_filter_that_no_exposure_has(folder, tmp_path):
+    refused(folder, tmp_path, ["F814W"], **{'filter = "F606W"': 'filter = "F814W"'})
+
+
+def test_an_exposure_without_list(folder, tmp_path):
+    log = read_exposures(folder / "exposures.ecsv")
+    first = next(iter(log))
+    lists = tmp_path / "lists"
+    lists.mkdir()
+    for path in sorted((folder / "lists").iterdir()):
+        if path.stem != first.name:
+            (lists / path.name).symlink_to(path)
+    refused(folder, tmp_path, [first.name], **{str(folder / "lists"): str(lists)})
+
+
+def test_a_catalogue_of_another_field(folder, tmp_path):
+    catalog = read_table(folder / "catalog.parquet")
+    rng = np.random.default_rng(2)
+    for name in ("u", "v"):
+        catalog[name][:] = rng.permutation(np.asarray(catalog[name]))
+    catalog.write(tmp_path / "other.ecsv")
+    changes = {str(folder / "catalog.parquet"): str(tmp_path / "other.ecsv")}
+    refused(folder, tmp_path, ["bring together", "where chance gives"], **changes)
+
+
+def test_data_and_campaign_together_are_refused(folder, tmp_path):
+    config = tmp_path / "config.toml"
+    text = (folder / "campaign_f606w.toml").read_text(encoding="utf-8")
+    config.write_text('[data]\nmatches = "stars.ecsv"\n' + text, encoding="utf-8")
+    result = cli("run", config, "-o", tmp_path / "run")
+    assert result.code == 1
+    one_sentence(result.err, "campaign", "data")
+    assert snapshot(tmp_path).keys() == {"config.toml"}

@@ -1,0 +1,134 @@
+"""The marginal likelihood, against the textbook formula on the stars themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bayesdist.infer.nodes.evidence import Evidence, fitted_field
+from bayesdist.infer.nodes.matern import SMOOTHNESS, Matern
+from bayesdist.infer.nodes.sums import node_sums
+from tests.infer.nodes.support import (
+    CHIP,
+    PATTERN,
+    SIZE,
+    STEP,
+    bilinear,
+    grid,
+    matern_covariance,
+    node_pixels,
+    pattern,
+    places,
+    projector,
+)
+from tests.infer.support import legendre_design
+
+NOISE = 0.03
+
+
+def stars(rng, n: int, *, hole: bool = False, prior: Matern = PATTERN):
+    d = pattern(rng, prior)
+    x, y = places(rng, n, gradient=True)
+    if hole:
+        keep = (x < 380) | (y < 300)
+        x, y = x[keep], y[keep]
+    variance = NOISE**2 * rng.uniform(0.5, 4.0, len(x))
+    r = bilinear(x, y) @ d + np.sqrt(variance)[:, None] * rng.standard_normal((len(x), 2))
+    return x, y, r, variance
+
+
+def evidence_of(x, y, r, variance) -> Evidence:
+    return Evidence(grid(), node_sums(grid(), x, y, r, 1 / np.stack([variance] * 2, axis=1))[0])
+
+
+def reml(x, y, r, variance, prior: Matern) -> float:
+    """Patterson and Thompson (1971), with dense matrices over the stars."""
+    W = bilinear(x, y) @ projector()
+    V = W @ matern_covariance(prior, *node_pixels()) @ W.T + np.diag(variance)
+    phi = legendre_design(3, x, y, size=SIZE)
+    L = np.linalg.cholesky(V)
+    z, F = np.linalg.solve(L, r), np.linalg.solve(L, phi)
+    fitted = F @ np.linalg.lstsq(F, z, rcond=None)[0]
+    return float(
+        -np.log(np.diag(L)).sum() - 0.5 * np.linalg.slogdet(F.T @ F)[1] - 0.5 * z @ (z - fitted)
+    )
+
+
+@pytest.mark.parametrize("nu", SMOOTHNESS)
+def test_covariance_is_the_general_formula(nu):
+    prior = Matern(0.1, 80.0, nu)
+    want = matern_covariance(prior, *node_pixels())
+    np.testing.assert_allclose(prior.covariance(grid()), want, rtol=1e-9)
+    P = projector()
+    np.testing.assert_allclose(prior.restricted(grid()), P @ want @ P, atol=1e-13)
+
+
+@pytest.mark.parametrize("hole", [False, True])
+def test_log_likelihood_is_that_of_the_stars(rng, hole):
+    """Differences between hyperparameters: the constant is left out.  Empty bins included."""
+    data = stars(rng, 900, hole=hole)
+    evidence = evidence_of(*data)
+    x, y, r, variance = data
+    priors = [Matern(0.08, 70, 1.5), Matern(0.05, 70, 1.5), Matern(0.1, 40, 0.5), PATTERN]
+    priors.append(Matern(0.03, 150, 2.5))
+    want = np.array([reml(x, y, r[:, 0], variance, p) for p in priors])
+    got = np.array([evidence.log_likelihood(p) for p in priors])
+    np.testing.assert_allclose(np.diff(got), np.diff(want), atol=2e-3, rtol=1e-6)
+
+
+def test_hyperparameters_come_back(rng):
+    """Within their stated errors, over ten truths; and those errors are not idle."""
+    pulls = []
+    for _ in range(10):
+        found = fitted_field(evidence_of(*stars(rng, 20_000)), (1.5,), thorough=True)
+        at = np.log([found.prior.amplitude, found.prior.length])
+        off = at - np.log([PATTERN.amplitude, PATTERN.length])
+        pulls.append(off @ np.linalg.solve(found.covariance, off))
+        assert 0.02 < found.log_sigma[0] < 0.3
+    # sum of ten chi-squares of two degrees each: 20 +- 6.3; 99.9 % lie in 5.9 to 45.3
+    assert 5.9 < sum(pulls) < 45.3
+
+
+@pytest.mark.parametrize("nu", SMOOTHNESS)
+def test_smoothness_is_told_apart(rng, nu):
+    """Over three patterns: a single one of 320 nodes can leave it open."""
+    total = dict.fromkeys(SMOOTHNESS, 0.0)
+    for _ in range(3):
+        evidence = evidence_of(*stars(rng, 30_000, prior=Matern(0.08, 100.0, nu)))
+        for other in SMOOTHNESS:
+            total[other] += fitted_field(evidence, (other,), thorough=True).log_evidence[other]
+        found = fitted_field(evidence, SMOOTHNESS, thorough=True)
+        assert found.log_evidence[found.prior.smoothness] == max(found.log_evidence.values())
+    assert max(total, key=lambda k: total[k]) == nu
+
+
+def test_search_ends_at_the_top(rng):
+    """No better point within a standard error in any direction."""
+    evidence = evidence_of(*stars(rng, 5000))
+    found = fitted_field(evidence, (1.5,), thorough=True)
+
+    def density(point) -> float:
+        prior = Matern(*np.exp(point), 1.5)
+        return evidence.log_likelihood(prior) + evidence.log_prior(prior)
+
+    top = np.log([found.prior.amplitude, found.prior.length])
+    root = np.linalg.cholesky(found.covariance)
+    around = [density(top + root @ [np.cos(a), np.sin(a)]) for a in np.arange(8) * np.pi / 4]
+    drop = density(top) - np.array(around)
+    assert (drop > 0).all()
+    # one standard error away a Gaussian has fallen by one half
+    assert abs(drop.mean() - 0.5) < 0.15
+
+
+def test_the_start_on_tiles_is_near_the_end(rng):
+    evidence = evidence_of(*stars(rng, 20_000))
+    early = fitted_field(evidence, (1.5,), thorough=False)
+    late = fitted_field(evidence, (1.5,), thorough=True)
+    assert abs(np.log(early.prior.amplitude / late.prior.amplitude)) < 0.5
+    assert abs(np.log(early.prior.length / late.prior.length)) < 0.5
+
+
+def test_grid_knows_its_chip():
+    assert grid().shape == (16, 20)
+    assert grid().blank.first == (16.5, 16.5) and grid().blank.step == STEP
+    assert grid().table(np.zeros((2, 320))).chip == CHIP.number

@@ -1,0 +1,126 @@
+"""Small campaigns of known truth: two chips in the reference gauge, exposures at any roll."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer.views import lines
+from bayesdist.model import Chip, DistortionModel, TimeDependence
+from bayesdist.simulate import simulate_matches
+
+CHIPS = (
+    Chip(1, "WFC1", (4096.0, 2048.0), (2048.0, 1024.0)),
+    Chip(2, "WFC2", (4096.0, 2048.0), (2048.0, 1024.0)),
+)
+DRIFT = (("u", 1, 0), ("v", 1, 0), ("v", 0, 1))
+# as ACS ISR 2015-06: A_2, B_3 and B_2, their drift per year, and where WFC1 lies
+LINEAR = {
+    1: {"A_2": (0.98206, -9.2e-6), "B_3": (0.97263, 2.4e-6), "B_2": (0.08095, 3.6e-5)},
+    2: {"A_2": (0.99468, -9.2e-6), "B_3": (1.00622, 3.3e-6), "B_2": (0.06860, 3.5e-5)},
+}
+PLACE = {
+    "A_2": ("u", 1, 0),
+    "A_3": ("u", 0, 1),
+    "B_2": ("v", 1, 0),
+    "B_3": ("v", 0, 1),
+}
+
+
+def campaign_model(
+    n_exposures: int, *, order: int = 3, time: bool = True, frames: str = "affine", rolls=None
+) -> DistortionModel:
+    """The model in the gauge of WFC2, held at the first exposure's pointing."""
+    return DistortionModel(
+        order,
+        CHIPS,
+        time=TimeDependence(DRIFT, (2004.5,)) if time else None,
+        frames=frames,
+        exposures=tuple(f"j{k + 1:03d}" for k in range(n_exposures)),
+        gauge="held",
+        held=(5000.0, 5100.0, 0.4 if rolls is None else float(rolls[0])),
+    )
+
+
+def campaign_truth(
+    model: DistortionModel, rng: np.random.Generator, *, tau=(7e-6, 5e-6, 3e-6), rolls=None
+) -> np.ndarray:
+    """Parameters in the reference gauge; exposures point and roll as they like."""
+    theta = np.zeros(model.n_params)
+    for chip in model.chips:
+        basis, linear = model.basis(chip.number), LINEAR[chip.number]
+        both = np.zeros((2, model.n_terms))
+        for k, (i, j) in enumerate(basis.terms):
+            if i + j > 1:
+                both[:, k] = 20 * rng.standard_normal(2) / 2048.0 ** (i + j)
+        for name, (value, _) in linear.items():
+            axis, i, j = PLACE[name]
+            both["uv".index(axis), basis.terms.index((i, j))] = value
+        if chip.number == 1:
+            both[:, 0], both[0, basis.terms.index((0, 1))] = (-0.4, 2079.58), 1.3e-3
+        for axis in (0, 1):
+            theta[model.coefficient_slice(chip.number, axis)] = basis.from_monomials(both[axis])
+        if model.time is not None:
+            rates = {PLACE[name]: rate for name, (_, rate) in linear.items()}
+            theta[model.tdd_slice(chip.number)] = [
+                rates[term] * (2048.0 if term[1] else 1024.0) for term in model.time.terms
+            ]
+    for code in range(len(model.exposures)):
+        names = model.free_frame_names(code)
+        value = {
+            "shift_u": 5000 + 300 * rng.standard_normal(),
+            "shift_v": 5000 + 300 * rng.standard_normal(),
+            "rotation": rng.uniform(-np.pi, np.pi) if rolls is None else float(rolls[code]),
+            "scale": tau[0] * rng.standard_normal(),
+            "shear_plus": tau[1] * rng.standard_normal(),
+            "shear_cross": tau[2] * rng.standard_normal(),
+        }
+        theta[model.frame_slice(code)] = [value[name] for name in names]
+    return theta
+
+
+def campaign(
+    seed: int,
+    n_exposures: int,
+    per_exposure: int,
+    *,
+    order: int = 3,
+    time: bool = True,
+    frames: str = "affine",
+    tau=(7e-6, 5e-6, 3e-6),
+    sigma: float = 0.02,
+    fraction: float = 0.0,
+    rolls=None,
+) -> tuple[DistortionModel, MatchTable, np.ndarray]:
+    """Model, matches and true parameters."""
+    rng = np.random.default_rng(seed)
+    model = campaign_model(n_exposures, order=order, time=time, frames=frames, rolls=rolls)
+    theta = campaign_truth(model, rng, tau=tau, rolls=rolls)
+    epochs = np.sort(rng.uniform(2002.3, 2007.1, n_exposures))
+    matches, _ = simulate_matches(
+        model,
+        theta,
+        n_exposures * per_exposure,
+        rng=rng,
+        sigma=sigma,
+        fraction=fraction,
+        outlier_scale=1.0,
+        epochs=epochs,
+    )
+    return model, matches, theta
+
+
+class Truth:
+    """True parameters as a solution without errors."""
+
+    def __init__(self, model: DistortionModel, theta: np.ndarray) -> None:
+        self.model, self.mean = model, theta
+        self.cov = np.zeros((len(theta), len(theta)))
+
+    def draws(self, n, rng):
+        return np.tile(self.mean, (n, 1))
+
+
+def true_lines(model: DistortionModel, theta: np.ndarray):
+    """alpha and beta of the linear terms."""
+    return lines(Truth(model, theta))
