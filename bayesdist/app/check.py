@@ -7,6 +7,8 @@ from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from bayesdist.app.campaign.check import campaign_lines
+from bayesdist.app.campaign.session import CampaignSession, session_of
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number
@@ -48,8 +50,9 @@ def check(path: str | Path) -> str:
     config, text = load_config(path)
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
-    with closing(Session(run)) as session:
-        return "\n".join(_lines(session))
+    with closing(session_of(run)) as session:
+        campaign = isinstance(session, CampaignSession)
+        return "\n".join(campaign_lines(session) if campaign else _lines(session))
 
 
 def _lines(session: Session) -> Iterator[str]:

@@ -193,15 +193,15 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _validate(options: argparse.Namespace) -> int:
+    from bayesdist.app.campaign.session import session_of
     from bayesdist.app.config import load_requirements
     from bayesdist.app.demo import margins_text
     from bayesdist.app.rundir import RunDirectory
-    from bayesdist.app.session import Session
     from bayesdist.app.stages import require
     from bayesdist.app.stages.assess import margin_rows, margins_of, write_margins
 
     requirements = load_requirements(options.requirements)
-    with closing(Session(RunDirectory.open(options.run))) as session:
+    with closing(session_of(RunDirectory.open(options.run))) as session:
         require(session, "validate", ("fit", "sample"))
         margins = margins_of(session, requirements, session.posterior)
         write_margins(session, margins)

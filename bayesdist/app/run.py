@@ -6,7 +6,7 @@ import logging
 from contextlib import closing
 from pathlib import Path
 
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.session import CampaignSession, session_of
 from bayesdist.app.campaign.stages import CAMPAIGN_STAGES, rehearse_campaign
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
@@ -69,7 +69,7 @@ def run(
         seed=seed,
         command=command,
     )
-    with closing(_session_of(directory)) as session:
+    with closing(session_of(directory)) as session:
         _begin(session)
         with log_file(directory / "bayesdist.log"):
             redo = False
@@ -93,7 +93,7 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     BayesdistError
     """
     directory = RunDirectory.open(path)
-    with closing(_session_of(directory)) as session:
+    with closing(session_of(directory)) as session:
         campaign = session.config.campaign is not None
         if stage == "match" and not campaign:
             raise InputError(
@@ -106,11 +106,6 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
         if stage == "sample":
             _judge(session, strict)
     return directory
-
-
-def _session_of(directory: RunDirectory) -> Session:
-    campaign = directory.config.campaign is not None
-    return CampaignSession(directory) if campaign else Session(directory)
 
 
 def _begin(session: Session) -> None:

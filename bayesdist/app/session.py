@@ -171,6 +171,11 @@ class Session:
         return load_posterior(self.run / "posterior.nc")
 
     @property
+    def doubts(self) -> list[str]:
+        """What else, beside misfit and errors, a reader of the numbers has to know."""
+        return []
+
+    @property
     def scale_arcsec(self) -> float | None:
         """Size of a pixel in arcsec, where the configuration gives it."""
         scale = self.config.detector.scale_mas

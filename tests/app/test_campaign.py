@@ -127,6 +127,11 @@ def test_a_stage_can_be_run_again(run):
     assert summary_of(run)["lines"] == before
 
 
+def test_check_says_what_there_is(folder):
+    text = good("check", folder / "campaign_f606w.toml").out
+    assert "20 in F606W" in text and "VAFACTOR" in text and "WARNING" not in text
+
+
 # -- wrong input ----------------------------------------------------------------------------------
 
 

@@ -37,7 +37,8 @@ def run_campaign_fit(session: CampaignSession) -> None:
         "clip_abs": session.config.fit.clip_abs,
     }
     number = session.reference_chip
-    model = held_in_reference(matches, replace(session.plain_model, frames="affine"), number)
+    drifting = replace(session.plain_model, time=session.config.time())
+    model = held_in_reference(matches, drifting, number)
     shards = load(model, matches, session.config.resources())
     joint = fit_hierarchical(shards, model, seed=session.config.sampler.seed, **options)
     shards.close()

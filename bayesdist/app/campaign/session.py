@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.campaign.config import CampaignBlock
 from bayesdist.app.campaign.inputs import Inputs, read_inputs
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
@@ -21,11 +22,12 @@ from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
 from bayesdist.infer.series import Series
 from bayesdist.model import DistortionModel, LookupTable, corrected
 
-__all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession"]
+__all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession", "session_of"]
 
 Float = NDArray[np.float64]
 
 TABLES, HIERARCHY, TERMS = "tables.h5", "hierarchy.h5", "exposure_terms.h5"
+LEAST_RATIO = 0.5  # of the errors of rates, joint over alone, below which the joint is doubted
 _AGAIN = "run the stage 'fit' again"
 
 
@@ -122,14 +124,15 @@ class CampaignSession(Session):
 
     @cached_property
     def plain_model(self) -> DistortionModel:
-        """The configured polynomial, all exposures shifted, turned and scaled freely."""
-        config = self.config
+        """The configured polynomial with a free linear part of each exposure.
+
+        For tables and errors: whatever drifts or scatters in the linear terms is taken up.
+        """
         return DistortionModel(
-            config.model.order,
-            config.chips(),
+            self.config.model.order,
+            self.config.chips(),
             unit=self.inputs.catalog.unit,
-            time=config.time(),
-            frames="shift_rotation_scale",
+            frames="affine",
             exposures=self.pairs.exposure_names,
         )
 
@@ -143,6 +146,32 @@ class CampaignSession(Session):
         """Of the deviations of the exposures, as the fit found them to scatter."""
         arrays = read_arrays(self.run / HIERARCHY, "", do=_AGAIN)
         return GaussianPriors(arrays["prior_centre"], arrays["prior_precision"])
+
+    @property
+    def doubts(self) -> list[str]:
+        """Rates that the joint fit takes for much better known than the exposures alone show.
+
+        It takes the scatter of an exposure for that of all its chips, so that their distance says
+        what the scale of each does; a chip that scatters by itself breaks this.
+        """
+        found = self.run.summary
+        time = self.model.time
+        alone = {
+            (row["term"], row["segment"]): row["sigma_beta"]
+            for row in found.get("time_dependence", {}).get("lines", [])
+        }
+        names = {chip.number: chip.name for chip in self.model.chips}
+        out = []
+        for row in found.get("lines", []) if time is not None else []:
+            term = f"{names[row['chip']]}.{row['term']}"
+            known = alone.get((term, row["segment"]))
+            if known is not None and row["sigma_beta"] < LEAST_RATIO * known:
+                out.append(
+                    f"the rate of {term} in segment {row['segment'] + 1} has an error of "
+                    f"{row['sigma_beta']:.1e} a year in the joint fit and of {known:.1e} from the "
+                    "exposures alone: a chip that scatters by itself makes the first too small"
+                )
+        return out
 
     @cached_property
     def terms(self) -> Series:
@@ -173,3 +202,8 @@ class CampaignSession(Session):
         self.errors_changed()
         for name in ("pairs", "tables", "raw_matches", "model", "priors", "terms", "plain_model"):
             self.__dict__.pop(name, None)
+
+
+def session_of(run: RunDirectory) -> Session:
+    """The session of a run, be it of matched stars or of a campaign."""
+    return CampaignSession(run) if run.config.campaign is not None else Session(run)

@@ -19,8 +19,8 @@ __all__ = ["CAMPAIGN_STAGES", "rehearse_campaign"]
 
 
 def _assess(session: CampaignSession) -> None:
+    run_series(session)  # first: what it finds doubtful is among the warnings
     run_assess(session)
-    run_series(session)
 
 
 def _export(session: CampaignSession) -> None:

@@ -148,7 +148,7 @@ def margins_of(
 
 def warnings_of(session: Session) -> list[str]:
     """What a reader of the numbers has to know, each as a sentence."""
-    fit, out = session.fit, []
+    fit, out = session.fit, [*session.doubts]
     if session.misfit.significant:
         out.append(session.misfit.sentence)
     ratio = fit.chi2 / max(fit.dof, 1)

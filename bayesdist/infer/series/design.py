@@ -53,6 +53,16 @@ class Design:
                         do="leave the group out, or let the groups share their slopes",
                     )
 
+        if not self.course.find and self.n_groups > 1:
+            columns = self.matrix(self.series.epoch, self.series.group_code)[0, :, : self.n_fixed]
+            if np.linalg.matrix_rank(columns) < self.n_fixed:
+                raise DegenerateError(
+                    f"the groups ({', '.join(self.series.group_names)}) cannot be told from the "
+                    f"course {self.course.name!r}: some of them have exposures in one segment only",
+                    where=self.series.source,
+                    do="leave groups out, or take a break away",
+                )
+
     def _check_segments(self) -> None:
         course, series = self.course, self.series
         if np.ptp(series.epoch) == 0 and course.kind != "constant":

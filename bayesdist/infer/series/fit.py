@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.errors import InputError
+from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.labelled.convergence import Limits
 from bayesdist.infer.series.chains import run
 from bayesdist.infer.series.course import Course
@@ -54,7 +54,9 @@ def fit_series(
     Raises
     ------
     DegenerateError
-        Where the exposures do not determine the course: see `Design`.
+        Where the exposures do not determine the course (see `Design`), or have no error at all.
+    InputError
+        For a scatter of another shape.
     """
     known = None
     if scatter is not None:
@@ -66,6 +68,13 @@ def fit_series(
                 f"{(k, k)}",
                 where=series.source,
                 do="give the covariance of the coefficients",
+            )
+        unit = series.spread[:, None] * series.spread
+        if np.linalg.eigvalsh((series.cov + known) / unit).min() <= 1e-12:
+            raise DegenerateError(
+                "with the given scatter some exposures have no error at all",
+                where=series.source,
+                do="give formal errors or a scatter above zero",
             )
     design = Design(course, series)
     problem = Problem.of(series, design, known, outliers=outliers)

@@ -122,3 +122,13 @@ def test_a_filter_with_two_exposures_has_no_slope(rng):
     group = ("F606W",) * 58 + ("F814W",) * 2
     with pytest.raises(DegenerateError, match="2 exposures of group 'F814W'"):
         Design(Course("line", groups="slopes"), series(rng, group=group))
+
+
+def test_a_filter_for_each_segment_is_no_break(rng):
+    """One filter before and another after a break: its step is the filters' offset."""
+    one = series(rng)
+    group = tuple(np.where(one.epoch < BREAKS[0], "F606W", "F814W"))
+    mixed = Series.of(one.epoch, one.values, coefficients=("a", "b"), group=group)
+    with pytest.raises(DegenerateError, match=r"F606W\) cannot be told from the course 'step"):
+        Design(Course("step", BREAKS[:1]), mixed)
+    assert Design(Course("line"), mixed).n_columns == 3

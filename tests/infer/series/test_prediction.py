@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.errors import InputError
+from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.series import Course, Series, fit_series
 
 from .campaign import ALPHA, BETA, BREAK, LINES, REFERENCE, SCATTER, campaign
@@ -121,3 +121,6 @@ def test_units_do_not_matter(rng):
 def test_known_scatter_must_fit(truth):
     with pytest.raises(InputError, match="scatter has shape"):
         fit_series(truth.series, Course("line"), scatter=[[1.0]])
+    exact = Series.of(truth.series.epoch, truth.series.values, coefficients=("a", "b", "c"))
+    with pytest.raises(DegenerateError, match="no error at all"):
+        fit_series(exact, Course("line"), scatter=np.zeros((3, 3)))
