@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from bayesdist.report.numerals import broken_name
 from bayesdist.report.scales import display_scale
 from bayesdist.report.style import HYPER_LABELS, PALETTE, WIDTH, figure_style, new_figure
 
@@ -75,7 +76,7 @@ def corner_coefficients(
     index = [posterior.model.names.index(name) for name in names]
     draws = _thinned(posterior.flat)[:, index] - fit.mean[index]
     columns = [
-        _Column(f"{name}\n− l. s.", posterior.model.units[k], draws[:, c])
+        _Column(f"{broken_name(name)}\n− l. s.", posterior.model.units[k], draws[:, c])
         for c, (name, k) in enumerate(zip(names, index, strict=True))
     ]
     return _corner(columns, formal=np.asarray(fit.cov)[np.ix_(index, index)])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["MISSING", "count", "interval", "number", "percent", "rounded"]
+__all__ = ["MISSING", "broken_name", "count", "interval", "number", "percent", "rounded"]
 
 MISSING = "–"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -109,3 +109,13 @@ def percent(value: Any, digits: int = 3) -> str:
     """A fraction in percent."""
     x = _finite(value)
     return MISSING if x is None else f"{number(100 * x, digits)}\u202f%"
+
+
+def broken_name(name: str, width: int = 10) -> str:
+    """A long name of a parameter on several lines, broken after its points."""
+    lines = [""]
+    for part in name.replace(".", ".\0").split("\0"):
+        if lines[-1] and len(lines[-1]) + len(part) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)

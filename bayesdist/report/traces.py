@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from bayesdist.report.numerals import broken_name
 from bayesdist.report.scales import display_scale
 from bayesdist.report.style import CYCLE, HYPER_LABELS, INK, WIDTH, figure_style, new_figure
 
@@ -61,7 +62,13 @@ def traces(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
     for name in names:
         k = posterior.model.names.index(name)
         mean = float(posterior.mean[k])
-        rows.append((f"{name} − mean", posterior.model.units[k], posterior.theta[..., k] - mean))
+        rows.append(
+            (
+                broken_name(name) + ("\n" if len(name) > 6 else " ") + "− mean",
+                posterior.model.units[k],
+                posterior.theta[..., k] - mean,
+            )
+        )
     for key in ("f", "j", "s_out"):
         if key in posterior.hyper:
             percent = key == "f"
