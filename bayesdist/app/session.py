@@ -18,6 +18,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.assess import (
     SAMPLE,
     BinnedSums,
+    LocalTerm,
     Misfit,
     StarSample,
     StarSums,
@@ -174,6 +175,11 @@ class Session:
     def doubts(self) -> list[str]:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
         return []
+
+    @property
+    def local_terms(self) -> tuple[LocalTerm, ...]:
+        """Errors that were measured beside the solution, on the grid of the assessment."""
+        return ()
 
     @property
     def scale_arcsec(self) -> float | None:

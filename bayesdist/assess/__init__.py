@@ -21,7 +21,7 @@ from bayesdist.assess.solution import Solution
 from bayesdist.assess.star_sample import SAMPLE, StarSample, star_sample
 from bayesdist.assess.star_sums import ExposureSums, StarSums, flagged_by_exposure, star_sums
 from bayesdist.assess.statistics import STATISTICS, field_statistic
-from bayesdist.assess.terms import TERM_KINDS, UserTerm
+from bayesdist.assess.terms import TERM_KINDS, LocalTerm, UserTerm
 from bayesdist.assess.units import UNITS, convert, pixel_scale_of
 from bayesdist.assess.vectors import VectorMap, distortion_vectors
 
@@ -40,6 +40,7 @@ __all__ = [
     "ErrorBudget",
     "ErrorFields",
     "ExposureSums",
+    "LocalTerm",
     "Margin",
     "Misfit",
     "Requirement",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.fields import MODEL, ErrorFields, draw_solution, error_fields_of
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms import UserTerm
+from bayesdist.assess.terms import LOCAL, LocalTerm, UserTerm
 from bayesdist.assess.units import pixel_scale_of
 
 __all__ = [
@@ -39,7 +39,8 @@ class BudgetTerm:
     ----------
     name : str
     kind : str
-        'random' or 'systematic'; the parts of the model are systematic, as all stars share them.
+        'random', 'systematic' (as the parts of the model, which all stars share), or 'local'
+        (shared by the stars at one place).
     u, v : ndarray, shape (ny, nx)
         Standard deviations, in the unit of the budget.
     source : str
@@ -187,6 +188,7 @@ def error_budgets(
     chips: Sequence[int],
     *,
     terms: Sequence[UserTerm] = (),
+    local: Sequence[LocalTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     n_draws: int = 4000,
@@ -200,6 +202,8 @@ def error_budgets(
     solution : LinearFit or Posterior
     chips : sequence of int
         Chip numbers.
+    local : sequence of LocalTerm
+        Measured beside the solution, on this grid.
     terms, grid, epoch, n_draws, rng, pixel_scale
         As in `error_budget`.
 
@@ -223,7 +227,7 @@ def error_budgets(
     out = []
     for c, (x, y) in zip(chips, grids, strict=True):
         fields = error_fields_of(solution, theta, exposures, *mesh(x, y), epoch=epoch, chip=c)
-        out.append(_budget(fields, x, y, terms, sigmas))
+        out.append(_budget(fields, x, y, terms, sigmas, local))
     return tuple(out)
 
 
@@ -233,14 +237,18 @@ def _budget(
     y: Float,
     terms: Sequence[UserTerm],
     sigmas: Sequence[tuple[float, float]],
+    local: Sequence[LocalTerm],
 ) -> ErrorBudget:
     shape = (y.size, x.size)
     measured = {part: tuple(s.reshape(shape) for s in fields.sigma(part)) for part in fields.parts}
     model_u, model_v = measured.pop(MODEL)
     entries = [BudgetTerm(n, "systematic", u, v, MEASURED) for n, (u, v) in measured.items()]
+    n_parts = len(entries)
+    entries += [BudgetTerm(t.name, LOCAL, *t.on(fields.chip, shape), MEASURED) for t in local]
     for t, (su, sv) in zip(terms, sigmas, strict=True):
         entries.append(BudgetTerm(t.name, t.kind, np.full(shape, su), np.full(shape, sv), GIVEN))
-    user_u2, user_v2 = (sum(s[axis] ** 2 for s in sigmas) for axis in (0, 1))
+    others = entries[n_parts:]
+    user_u2, user_v2 = (sum(getattr(t, axis) ** 2 for t in others) for axis in "uv")
     return ErrorBudget(
         x=x,
         y=y,

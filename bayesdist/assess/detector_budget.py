@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.budget import ErrorBudget, budget_row, error_budgets
 from bayesdist.assess.grid import DEFAULT_GRID
 from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms import UserTerm
+from bayesdist.assess.terms import LocalTerm, UserTerm
 
 __all__ = ["DetectorBudget", "detector_budget"]
 
@@ -76,6 +76,7 @@ def detector_budget(
     solution: Solution,
     *,
     terms: Sequence[UserTerm] = (),
+    local: Sequence[LocalTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     n_draws: int = 4000,
@@ -88,6 +89,8 @@ def detector_budget(
     ----------
     solution : LinearFit or Posterior
     terms : sequence of UserTerm
+    local : sequence of LocalTerm
+        Measured beside the solution, on this grid.
     grid : tuple of int
         Points on x and y of each chip.
     epoch : float, optional
@@ -112,6 +115,7 @@ def detector_budget(
             solution,
             tuple(c.number for c in solution.model.chips),
             terms=terms,
+            local=local,
             grid=grid,
             epoch=epoch,
             n_draws=n_draws,

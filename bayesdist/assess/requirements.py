@@ -14,7 +14,7 @@ from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.assess.names import require_known
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.statistics import STATISTICS, field_statistic
-from bayesdist.assess.terms import UserTerm, combined_sigma
+from bayesdist.assess.terms import LocalTerm, UserTerm, combined_sigma
 from bayesdist.assess.units import UNITS, convert, pixel_scale_of
 from bayesdist.assess.verdict import counting_error, effective_draws, verdict_of
 from bayesdist.errors import InputError
@@ -134,6 +134,7 @@ def check_requirements(
     requirements: Sequence[Requirement],
     *,
     terms: Sequence[UserTerm] = (),
+    local: Sequence[LocalTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     chip: int | None = None,
@@ -147,9 +148,10 @@ def check_requirements(
 
     Each draw is an error field over the grid: a draw of the solution minus its mean (all parts of
     the model jointly, so with the correlation between positions), plus for the systematic terms one
-    Gaussian offset of each axis for the whole field, plus for the random terms an independent
-    Gaussian error at every grid point.  The statistic of each field gives a distribution, and the
-    fraction of draws at or under the limit is compared with the probability asked for.
+    Gaussian offset of each axis for the whole field, plus for the random and the local terms an
+    independent Gaussian error at every grid point.  The statistic of each field gives a
+    distribution, and the fraction of draws at or under the limit is compared with the probability
+    asked for.
 
     The field is that of all chips: the same grid on each of them, so that each has the same weight.
     A draw of the solution and an offset are common to all chips.
@@ -159,6 +161,8 @@ def check_requirements(
     solution : LinearFit or Posterior
     requirements : sequence of Requirement
     terms : sequence of UserTerm
+    local : sequence of LocalTerm
+        Measured beside the solution, on this grid.
     grid : tuple of int
         Points on x and y.
     epoch : float, optional
@@ -224,7 +228,8 @@ def check_requirements(
             )
             for one in chips
         ]
-        for name, values in _statistics(fields, sorted(names), offsets, random, rng).items():
+        everywhere = np.concatenate([_at_points(f, random, local, grid) for f in fields])
+        for name, values in _statistics(fields, sorted(names), offsets, everywhere, rng).items():
             statistics[case, name] = values
 
     doubt = _doubt(solution, converged) or doubt
@@ -254,11 +259,25 @@ def _chips_of(
     return (place_of(model, epoch=epoch, chip=number).chip,)
 
 
+def _at_points(
+    fields: ErrorFields,
+    random: tuple[float, float],
+    local: Sequence[LocalTerm],
+    grid: tuple[int, int],
+) -> Float:
+    """Standard deviations (N, 2) of what is independent at the points of a chip's grid."""
+    variance = np.tile(np.square(random), (fields.x.size, 1))
+    for term in local:
+        found = term.on(fields.chip, (grid[1], grid[0]))
+        variance += np.column_stack([sigma.ravel() ** 2 for sigma in found])
+    return np.sqrt(variance)
+
+
 def _statistics(
     fields: Sequence[ErrorFields],
     names: Sequence[str],
     offsets: Float,
-    random: tuple[float, float],
+    random: Float,
     rng: np.random.Generator,
 ) -> dict[str, Float]:
     """Each statistic of each draw's field over all chips, by blocks of draws."""
@@ -269,7 +288,7 @@ def _statistics(
         rows = slice(start, start + step)
         error = np.concatenate([f.field(MODEL, rows) for f in fields], axis=1)
         error += offsets[rows, None, :]
-        if any(random):
+        if random.any():
             error += rng.normal(size=error.shape) * random
         for name in names:
             out[name][rows] = field_statistic(name, error)

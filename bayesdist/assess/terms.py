@@ -1,4 +1,4 @@
-"""Error terms that the data cannot show and the user must give."""
+"""Error terms beside those of the solution: given by the user, or measured in another way."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bayesdist.assess.names import require_known
 from bayesdist.assess.units import UNITS, convert
 from bayesdist.errors import InputError
 
-__all__ = ["TERM_KINDS", "UserTerm", "combined_sigma"]
+__all__ = ["LOCAL", "TERM_KINDS", "LocalTerm", "UserTerm", "combined_sigma"]
+
+Float = NDArray[np.float64]
 
 TERM_KINDS = ("random", "systematic")
+LOCAL = "local"
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,41 @@ class UserTerm:
             for s in (self.sigma_u, self.sigma_v)
         )
         return float(su), float(sv)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalTerm:
+    """A Gaussian error that all stars at a place share, and that differs from place to place.
+
+    Such is the error of a look-up table: its nodes are closer than the points of the grid on which
+    budgets and requirements are evaluated, and there the errors count as independent.
+
+    Parameters
+    ----------
+    name : str
+    sigma : dict of int to ndarray, shape (ny, nx, 2)
+        By chip number: standard deviations of u and v on that grid, in the unit of the solution.
+    """
+
+    name: str
+    sigma: dict[int, Float]
+
+    def on(self, chip: int, shape: tuple[int, int]) -> tuple[Float, Float]:
+        """Standard deviations (u, v), each (ny, nx), on a chip.
+
+        Raises
+        ------
+        InputError
+            For another grid, or a chip without values.
+        """
+        found = self.sigma.get(chip)
+        if found is None or found.shape != (*shape, 2):
+            raise InputError(
+                f"is not known on a grid of {shape[1]} x {shape[0]} points of chip {chip}",
+                where=f"budget term {self.name!r}",
+                do="ask for the grid on which it was computed",
+            )
+        return found[..., 0], found[..., 1]
 
 
 def combined_sigma(

@@ -127,6 +127,14 @@ def test_a_stage_can_be_run_again(run):
     assert summary_of(run)["lines"] == before
 
 
+def test_the_error_of_the_tables_is_in_the_budget(run):
+    rows = {row["name"]: row for row in summary_of(run)["budget"]}
+    tables, total = rows["look-up tables"], rows["total"]
+    assert tables["kind"] == "local" and 0 < tables["u"] < total["u"]
+    model = [rows[n] for n in rows if n not in ("look-up tables", "total")]
+    assert total["u"] ** 2 < sum(r["u"] ** 2 for r in [*model, tables]) * 1.001
+
+
 def test_check_says_what_there_is(folder):
     text = good("check", folder / "campaign_f606w.toml").out
     assert "20 in F606W" in text and "VAFACTOR" in text and "WARNING" not in text

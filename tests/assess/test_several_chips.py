@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess import Requirement, UserTerm, check_requirements, error_budget
+from bayesdist.assess import (
+    LocalTerm,
+    Requirement,
+    UserTerm,
+    check_requirements,
+    error_budget,
+)
 from bayesdist.assess.detector_budget import detector_budget
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.errors import InputError
@@ -69,6 +75,35 @@ def test_random_errors_are_independent_on_each_chip(solution_of):
     req = [Requirement("r", "u_max", limit)]
     (m,) = check_requirements(s, req, terms=terms, grid=(4, 3), n_draws=n, rng=rng())
     assert m.probability_met == pytest.approx(0.5, abs=5 * np.sqrt(0.25 / n))
+
+
+def test_local_errors_differ_from_place_to_place(solution_of):
+    """max |u| <= L of independent Gaussians of known, unequal widths: a product of probabilities."""
+    model = DistortionModel(1, CHIPS)
+    certain = solution_of(model, cov=np.zeros((model.n_params, model.n_params)))
+    widths = np.random.default_rng(5).uniform(0.01, 0.03, size=(2, 2, 3))  # chips, ny, nx
+    local = LocalTerm(
+        "tables", {k: np.stack([w, 0 * w], -1) for k, w in zip((1, 2), widths, strict=True)}
+    )
+    limit, n = 0.05, 20_000
+    (margin,) = check_requirements(
+        certain,
+        [Requirement("all", "u_max", limit)],
+        local=[local],
+        grid=(3, 2),
+        n_draws=n,
+        rng=rng(),
+    )
+    exact = np.prod(2 * stats.norm.cdf(limit / widths) - 1)
+    assert margin.probability_met == pytest.approx(exact, abs=4 * np.sqrt(exact * (1 - exact) / n))
+
+    budget = detector_budget(certain, local=[local], grid=(3, 2), n_draws=50, rng=rng())
+    for chip, width in zip(budget.chips, widths, strict=True):
+        np.testing.assert_allclose(chip.total_u, width)
+        np.testing.assert_allclose(chip.terms[-1].u, width)
+        assert chip.terms[-1].kind == "local"
+    with pytest.raises(InputError, match="grid of 5 x 2"):
+        detector_budget(certain, local=[local], grid=(5, 2), n_draws=50, rng=rng())
 
 
 def test_all_chips_of_everything_at_once_are_its_chips(rich):

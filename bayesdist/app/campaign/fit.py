@@ -7,20 +7,25 @@ from dataclasses import replace
 
 import numpy as np
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from bayesdist.app.campaign.session import HIERARCHY, CampaignSession
 from bayesdist.app.session import ERROR_COLUMNS, write_table
 from bayesdist.app.stages.fit import summarise_fit
+from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.data import MatchTable, centroid_errors
 from bayesdist.infer import fit_by_magnitude, load, save_fit
 from bayesdist.infer.checkpoints import write_arrays
 from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
-from bayesdist.infer.nodes import TableFit, fit_with_tables
+from bayesdist.infer.nodes import TableFit, fit_with_tables, pixel_jacobian
 from bayesdist.infer.series import Series
 from bayesdist.infer.views import LinearTerms, lines, reference_gauge, without_frames
+from bayesdist.model import corrected
 
 __all__ = ["run_campaign_fit"]
+
+Float = NDArray[np.float64]
 
 log = logging.getLogger("bayesdist")
 
@@ -92,8 +97,24 @@ def _fit_tables(session: CampaignSession) -> TableFit | None:
             one.rms,
         ),
     )
-    session.keep_tables(found.tables)
+    session.keep_tables(found.tables, _table_errors(session, found))
     return found
+
+
+def _table_errors(session: CampaignSession, found: TableFit) -> dict[int, Float]:
+    """Errors (ny, nx, 2) of positions by those of the tables, on the grid of the assessment."""
+    part, grid = found.part(), session.config.assess.grid
+    sizes = {chip.number: chip.size for chip in session.plain_model.chips}
+    out = {}
+    for posterior in part.posteriors:
+        number = posterior.table.chip
+        x, y = mesh(*grid_pixels(sizes[number], grid))
+        px, py = corrected(found.tables, x, y, chip=number)
+        J = pixel_jacobian(part.fit.model, part.fit.mean, px, py, chip=number)
+        variance = posterior.position_sigma(x, y, refitted=True) ** 2
+        total = np.einsum("nab,nb->na", J**2, variance)
+        out[number] = np.sqrt(total).reshape(grid[1], grid[0], 2)
+    return out
 
 
 def _fit_errors(session: CampaignSession) -> None:

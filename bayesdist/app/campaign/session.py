@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +16,7 @@ from bayesdist.app.campaign.inputs import Inputs, read_inputs
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
+from bayesdist.assess import LocalTerm
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
 from bayesdist.infer import GaussianPriors, Matches
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
@@ -87,9 +89,25 @@ class CampaignSession(Session):
             for chip in chips
         )
 
-    def keep_tables(self, tables: tuple[LookupTable, ...]) -> None:
-        """Write tables for the stages that follow."""
-        arrays: dict[str, Any] = {}
+    @property
+    def local_terms(self) -> tuple[LocalTerm, ...]:
+        """What the errors of the tables leave of the position, after the polynomial."""
+        path = self.run / TABLES
+        arrays = read_arrays(path, "", do=_AGAIN) if path.exists() else {}
+        sigma = {
+            int(name.split(".")[0]): values
+            for name, values in arrays.items()
+            if name.endswith(".position_sigma")
+        }
+        return (LocalTerm("look-up tables", sigma),) if sigma else ()
+
+    def keep_tables(
+        self, tables: tuple[LookupTable, ...], position_sigma: Mapping[int, Float] | None = None
+    ) -> None:
+        """Write tables, and their error on the grid of the assessment, for the other stages."""
+        arrays: dict[str, Any] = {
+            f"{chip}.position_sigma": sigma for chip, sigma in (position_sigma or {}).items()
+        }
         for table in tables:
             arrays |= {
                 f"{table.chip}.values": table.values,

@@ -119,6 +119,7 @@ def _assessment(session: Session, solution: Solution, n_draws: int | None) -> di
     config = session.config
     return {
         "terms": config.user_terms(),
+        "local": session.local_terms,
         "grid": config.assess.grid,
         "epoch": session.epoch,
         "n_draws": n_draws or config.assess.draws,
