@@ -78,32 +78,25 @@ def test_random_errors_are_independent_on_each_chip(solution_of):
 
 
 def test_local_errors_differ_from_place_to_place(solution_of):
-    """max |u| <= L of independent Gaussians of known, unequal widths: a product of probabilities."""
+    """max |u| <= L of independent Gaussians of unequal widths: a product of probabilities."""
     model = DistortionModel(1, CHIPS)
     certain = solution_of(model, cov=np.zeros((model.n_params, model.n_params)))
     widths = np.random.default_rng(5).uniform(0.01, 0.03, size=(2, 2, 3))  # chips, ny, nx
-    local = LocalTerm(
-        "tables", {k: np.stack([w, 0 * w], -1) for k, w in zip((1, 2), widths, strict=True)}
-    )
+    chips = zip((1, 2), widths, strict=True)
+    local = [LocalTerm("tables", {k: np.stack([w, 0 * w], axis=-1) for k, w in chips})]
     limit, n = 0.05, 20_000
-    (margin,) = check_requirements(
-        certain,
-        [Requirement("all", "u_max", limit)],
-        local=[local],
-        grid=(3, 2),
-        n_draws=n,
-        rng=rng(),
-    )
+    req = [Requirement("all", "u_max", limit)]
+    (margin,) = check_requirements(certain, req, local=local, grid=(3, 2), n_draws=n, rng=rng())
     exact = np.prod(2 * stats.norm.cdf(limit / widths) - 1)
     assert margin.probability_met == pytest.approx(exact, abs=4 * np.sqrt(exact * (1 - exact) / n))
 
-    budget = detector_budget(certain, local=[local], grid=(3, 2), n_draws=50, rng=rng())
+    budget = detector_budget(certain, local=local, grid=(3, 2), n_draws=50, rng=rng())
     for chip, width in zip(budget.chips, widths, strict=True):
         np.testing.assert_allclose(chip.total_u, width)
         np.testing.assert_allclose(chip.terms[-1].u, width)
         assert chip.terms[-1].kind == "local"
     with pytest.raises(InputError, match="grid of 5 x 2"):
-        detector_budget(certain, local=[local], grid=(5, 2), n_draws=50, rng=rng())
+        detector_budget(certain, local=local, grid=(5, 2), n_draws=50, rng=rng())
 
 
 def test_all_chips_of_everything_at_once_are_its_chips(rich):
