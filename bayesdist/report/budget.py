@@ -29,7 +29,11 @@ if TYPE_CHECKING:
 __all__ = ["budget_terms", "dominating_term", "is_total"]
 
 _MOST_PANELS = 3  # chips whose bars stand beside those of the detector
-_KIND_COLORS = {"random": PALETTE["sky"], "systematic": PALETTE["blue"]}
+_KIND_COLORS = {
+    "random": PALETTE["sky"],
+    "systematic": PALETTE["blue"],
+    "local": PALETTE["green"],
+}
 # one above the other, as both axes are often equal
 _AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}
 _MARKER_STYLE = {"ms": 5.5, "color": PALETTE["yellow"], "mec": INK, "mew": 0.7, "zorder": 4}
