@@ -32,8 +32,8 @@ def part(finished):
 
 def test_each_star_stands_beside_what_is_said_of_it(finished, matches, part):
     assert part.column_names == [
-        "source", "row", "x", "y", "chip", "residual_u", "residual_v", "used", "outlier_probability",
-        "log_likelihood", "log_likelihood_variance",
+        "source", "row", "x", "y", "chip", "residual_u", "residual_v", "used",
+        "outlier_probability", "log_likelihood", "log_likelihood_variance",
     ]  # fmt: skip
     stars = part.to_pydict()
     assert set(stars["source"]) == {str(finished.config.parent / "stars.ecsv")}
