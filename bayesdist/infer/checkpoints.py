@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import h5py
-import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.files import atomic_path
@@ -14,12 +14,10 @@ from bayesdist.errors import InputError
 
 __all__ = ["read_arrays", "write_arrays"]
 
-Float = NDArray[np.float64]
-
 
 def read_arrays(
     path: Path, fingerprint: str, names: Sequence[str] | None = None, *, do: str
-) -> dict[str, Float]:
+) -> dict[str, NDArray[Any]]:
     """What `write_arrays` kept.
 
     Parameters
@@ -52,7 +50,7 @@ def read_arrays(
     return arrays
 
 
-def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, Float]) -> None:
+def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Keep arrays by name; the file appears whole or not at all."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         for name, values in arrays.items():

@@ -71,12 +71,14 @@ class CampaignSession(Session):
         return read_matches(self.run / PAIRS, unit=self.inputs.catalog.unit)
 
     @cached_property
+    def _kept_tables(self) -> dict[str, Any]:
+        path = self.run / TABLES
+        return read_arrays(path, "", do=_AGAIN) if path.exists() else {}
+
+    @cached_property
     def tables(self) -> tuple[LookupTable, ...]:
         """Look-up tables of an earlier stage."""
-        path = self.run / TABLES
-        if not path.exists():
-            return ()
-        arrays = read_arrays(path, "", do=_AGAIN)
+        arrays = self._kept_tables
         chips = sorted({int(name.split(".")[0]) for name in arrays})
         return tuple(
             LookupTable(
@@ -92,11 +94,9 @@ class CampaignSession(Session):
     @property
     def local_terms(self) -> tuple[LocalTerm, ...]:
         """What the errors of the tables leave of the position, after the polynomial."""
-        path = self.run / TABLES
-        arrays = read_arrays(path, "", do=_AGAIN) if path.exists() else {}
         sigma = {
             int(name.split(".")[0]): values
-            for name, values in arrays.items()
+            for name, values in self._kept_tables.items()
             if name.endswith(".position_sigma")
         }
         return (LocalTerm("look-up tables", sigma),) if sigma else ()
@@ -116,7 +116,10 @@ class CampaignSession(Session):
             }
             if table.sigma is not None:
                 arrays[f"{table.chip}.sigma"] = table.sigma
-        write_arrays(self.run / TABLES, "", arrays)
+        if arrays:
+            write_arrays(self.run / TABLES, "", arrays)
+        else:
+            (self.run / TABLES).unlink(missing_ok=True)
         self.forget()
 
     @cached_property
@@ -201,8 +204,7 @@ class CampaignSession(Session):
     def terms(self) -> Series:
         """Linear terms of the exposures, each fitted by itself."""
         arrays = read_arrays(self.run / TERMS, "", do=_AGAIN)
-        names = [bytes(row.astype(np.uint8)).decode().strip() for row in arrays["names"]]
-        labels = [bytes(row.astype(np.uint8)).decode().strip() for row in arrays["labels"]]
+        names, labels = ([str(t, "utf-8") for t in arrays[key]] for key in ("names", "labels"))
         return Series(
             arrays["epoch"],
             arrays["values"],
@@ -216,15 +218,19 @@ class CampaignSession(Session):
         """Write the linear terms for the stages that follow."""
         arrays = {"epoch": series.epoch, "values": series.values, "cov": series.cov}
         for key, texts in (("names", series.names), ("labels", series.coefficients)):
-            width = max(len(text.encode()) for text in texts)
-            rows = [list(text.encode().ljust(width)) for text in texts]
-            arrays[key] = np.array(rows, float)
+            arrays[key] = np.array([text.encode() for text in texts])
         write_arrays(self.run / TERMS, "", arrays)
+
+    def fit_changed(self) -> None:
+        """Forget what rests on the fit."""
+        self.errors_changed()
+        for name in ("fit", "model", "priors", "terms"):
+            self.__dict__.pop(name, None)
 
     def forget(self) -> None:
         """Forget what rests on pairs, tables and errors."""
-        self.errors_changed()
-        for name in ("pairs", "tables", "raw_matches", "model", "priors", "terms", "plain_model"):
+        self.fit_changed()
+        for name in ("pairs", "_kept_tables", "tables", "raw_matches", "plain_model"):
             self.__dict__.pop(name, None)
 
 

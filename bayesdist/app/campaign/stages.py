@@ -49,4 +49,3 @@ def rehearse_campaign(session: CampaignSession) -> None:
     read_idctab(session.base / session.block.start)
     if session.config.products.release is not None:
         read_idctab(session.base / session.config.products.release.reference)
-    session.config.time()
