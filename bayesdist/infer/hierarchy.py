@@ -1,14 +1,16 @@
 """All exposures jointly, with scale and shear of each scattered about the common polynomials.
 
-    deviation k of exposure e ~ N(0, tau_k^2)          k: scale, shear_plus, shear_cross
+    deviation k of exposure e ~ N(0, tau_k^2)     k: scale, shear_plus, shear_cross, and with
+                                                  `chip_deviations` shift, rotation, scale and shear
+                                                  of every chip but the first
 
 A telescope breathes: the linear terms of its exposures scatter by more than their formal errors,
 and a joint fit that does not know this believes in each star as if it were a new measurement of the
 detector.  The scatter tau is estimated with everything else.
 
-One linear fit with a wide prior on the deviations is enough.  Its mean and covariance tell what the
-data alone say of them; tau, and what follows from any tau for all parameters, is then algebra on
-the deviations (see `Scatter`).
+One linear fit with a wide prior on the deviations is enough.  Its normal equations tell what the
+data alone say of them; tau, and what follows from any tau for all parameters, is then algebra (see
+`Scatter`).
 """
 
 from __future__ import annotations
@@ -25,18 +27,20 @@ from threadpoolctl import threadpool_limits
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.linear import Clip, LinearFit, fit_linear
+from bayesdist.infer.normal import least_squares
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.scatter import Scatter
 from bayesdist.infer.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.views import reference_gauge
 from bayesdist.model import DistortionModel
-from bayesdist.model.frames import DEVIATIONS
 
 __all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference"]
 
 Float = NDArray[np.float64]
 
 SCALE = 1e-4  # of the prior on tau: what velocity aberration does to the scale in a year
+ROUNDS = 5  # of looking for exposures that went wrong
+MOST_OUTLYING = 0.2  # of the exposures: beyond, they are the rule
 LEAST_DETERMINED = 0.5  # deviations of a kind that the data must determine, out of E
 
 
@@ -44,32 +48,35 @@ LEAST_DETERMINED = 0.5  # deviations of a kind that the data must determine, out
 class HierarchicalFit:
     """A joint solution of all exposures in which scale and shear of each may deviate.
 
-    Mean, covariance and draws are averages over the posterior of tau.
+    Draws and mean are over the posterior of tau.  So is the covariance, but for one simplification:
+    for its part within one tau stands that of the root mean square of tau.  Variances are linear in
+    tau^2 where the scatter rules, and more concave elsewhere, so that this errs to the safe side.
 
     Parameters
     ----------
     fit : LinearFit
-        The linear fit with tau held at its median.
+        The linear fit with tau held at its root mean square.
     scatter : Scatter
         What the data say of tau.
     tau_draws : ndarray, shape (n, k)
         Draws of tau from its posterior.
-    index : ndarray of int, shape (m,)
-        Where theta holds the deviations.
-    deviation_mean : ndarray, shape (m,)
-    deviation_cov : ndarray, shape (m, m)
-        Of the deviations, over tau.
     others : GaussianPriors
         The priors that were given.
+    outlying : tuple of str
+        Exposures whose deviations are far beyond the scatter of the others.  They are fitted with a
+        wide prior, and tau is not theirs.
     """
 
     fit: LinearFit
     scatter: Scatter
     tau_draws: Float
-    index: NDArray[np.int64]
-    deviation_mean: Float
-    deviation_cov: Float
     others: GaussianPriors
+    outlying: tuple[str, ...] = ()
+
+    @property
+    def index(self) -> NDArray[np.int64]:
+        """Where theta holds the deviations."""
+        return self.scatter.index
 
     @property
     def model(self) -> DistortionModel:
@@ -104,28 +111,26 @@ class HierarchicalFit:
 
     @property
     def priors(self) -> GaussianPriors:
-        """The given priors and those of the deviations with the median tau, as `sample` wants."""
-        tau = np.array([self.tau[k] for k in self.scatter.kinds])
-        return _with_deviations(self.others, self.index, tau[self.scatter.kind])
+        """The given priors and those of the deviations, as `sample` wants them."""
+        return _with_deviations(
+            self.others, self.index, self.scatter.precision(_root_mean_square(self.tau_draws))
+        )
 
     @cached_property
-    def _gain(self) -> Float:
-        """Change of theta (D, n) with the deviations."""
-        b = self.index
-        return np.asarray(np.linalg.solve(self.fit.cov[np.ix_(b, b)], self.fit.cov[b]).T)
+    def _means(self) -> Float:
+        """Mean of theta for each draw of tau, shape (n, D)."""
+        return np.stack([self.scatter.posterior(tau)[0] for tau in self.tau_draws])
 
     @cached_property
     def mean(self) -> Float:
         """Posterior mean of theta, shape (D,)."""
-        return self.fit.mean + self._gain @ (self.deviation_mean - self.fit.mean[self.index])
+        return np.asarray(self._means.mean(axis=0))
 
     @cached_property
     def cov(self) -> Float:
         """Posterior covariance of theta, shape (D, D)."""
-        b = self.index
-        change = self.deviation_cov - self.fit.cov[np.ix_(b, b)]
-        cov = self.fit.cov + self._gain @ change @ self._gain.T
-        return (cov + cov.T) / 2
+        spread = self._means - self.mean
+        return np.asarray(self.fit.cov + spread.T @ spread / len(spread))
 
     @property
     def sigma(self) -> Float:
@@ -134,18 +139,14 @@ class HierarchicalFit:
 
     @threadpool_limits.wrap(limits=1, user_api="blas")
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors (n, D): each with a tau of its own, and deviations drawn with it."""
-        theta = self.fit.draws(n, rng)
+        """Parameter vectors (n, D): each with a tau of its own, and theta drawn with it."""
         which = np.sort(rng.integers(len(self.tau_draws), size=n))
-        b = np.empty((n, len(self.index)))
+        theta = rng.standard_normal((n, len(self.fit.mean)))
         for t in np.unique(which):
-            rows = np.flatnonzero(which == t)
-            mean, cov = self.scatter.moments(self.tau_draws[t])
-            scale = np.sqrt(np.diag(cov))
-            root = np.linalg.cholesky(cov / np.outer(scale, scale)) * scale[:, None]
-            b[rows] = mean + rng.standard_normal((len(rows), len(mean))) @ root.T
-        theta = theta + (b - theta[:, self.index]) @ self._gain.T
-        return theta[rng.permutation(n)]
+            rows = which == t
+            mean, factor = self.scatter.posterior(self.tau_draws[t])
+            theta[rows] = mean + factor.colour(theta[rows])
+        return np.asarray(rng.permutation(theta))
 
     def deviations(self, exposure: str) -> dict[str, tuple[float, float]]:
         """Mean and standard deviation of the deviations of one exposure.
@@ -165,11 +166,15 @@ class HierarchicalFit:
         }
 
 
+def _root_mean_square(tau: Float) -> Float:
+    return np.asarray(np.sqrt((tau**2).mean(axis=0)))
+
+
 def _with_deviations(
-    others: GaussianPriors, index: NDArray[np.int64], sigma: Float
+    others: GaussianPriors, index: NDArray[np.int64], inverse_variance: Float
 ) -> GaussianPriors:
     centre, precision = others.centre.copy(), others.precision.copy()
-    centre[index], precision[index] = 0.0, sigma**-2
+    centre[index], precision[index] = 0.0, inverse_variance
     return GaussianPriors(centre, precision)
 
 
@@ -237,6 +242,7 @@ def fit_hierarchical(
     deviations: Sequence[str] | None = None,
     priors: GaussianPriors | None = None,
     scale: float = SCALE,
+    pixel: float = 1.0,
     n_tau: int = 256,
     seed: int = 1,
     clip_chi2: float = 25.0,
@@ -250,7 +256,8 @@ def fit_hierarchical(
     matches : MatchTable, PartitionedMatches or Shards
         With errors.
     model : DistortionModel
-        Frames 'shift_rotation_scale' or 'affine' in gauge 'held': see `held_in_reference`.
+        Frames 'shift_rotation_scale' or 'affine', or deviations of single chips, in gauge 'held':
+        see `held_in_reference`.
     deviations : sequence of str, optional
         Kinds of deviation that scatter; all that the frames have by default.  The others need a
         prior.
@@ -258,7 +265,10 @@ def fit_hierarchical(
         On other parameters.
     scale : float
         Of the half-Student-t prior on each tau, with 4 degrees of freedom.  It is flat for scatter
-        much below, and makes the posterior proper with few exposures.
+        much below, and makes the posterior proper with few exposures.  For shifts of single chips
+        it counts at half the longest side of a chip.
+    pixel : float
+        Size of a pixel in the unit of u, v.
     n_tau : int
         Draws of tau over which results are averaged.
     seed : int
@@ -277,24 +287,57 @@ def fit_hierarchical(
     DegenerateError
         When the data do not determine the scatter, by name; else as `fit_linear`.
     """
-    has = [d for d in DEVIATIONS if d in model.free_frame_names(0)]
+    has = list(model.free_frame_names(0)) if model.gauge == "held" else []
     kinds = tuple(has if deviations is None else deviations)
     _check(model, has, kinds)
     others = priors or GaussianPriors.none(model)
     names = {name: k for k, name in enumerate(model.names)}
     index = np.array([names[f"{e}.{kind}"] for kind in kinds for e in model.exposures])
-    kind = np.repeat(np.arange(len(kinds)), len(model.exposures))
+    n = len(model.exposures)
+    kind, member = np.divmod(np.arange(len(index)), n)
+    half = max(max(chip.size) for chip in model.chips) / 2
+    scales = np.array([scale * (half * pixel if "shift" in name else 1.0) for name in kinds])
+    options: dict[str, Any] = {"clip_chi2": clip_chi2, "clip_abs": clip_abs}
     with opened(model, matches, compute) as shards:
-        wide = np.full(len(index), scale)
-        options: dict[str, Any] = {"clip_chi2": clip_chi2, "clip_abs": clip_abs}
-        first = fit_linear(shards, model, priors=_with_deviations(others, index, wide), **options)
-        scatter = _scatter(first, kinds, kind, index, scale)
-        tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
-        tau = np.median(tau_draws, axis=0)
-        fit = fit_linear(
-            shards, model, priors=_with_deviations(others, index, tau[kind]), **options
+        wide = _with_deviations(others, index, scales[kind] ** -2)
+        first = fit_linear(shards, model, priors=wide, **options)
+        limits = (first.clip.theta, first.clip.chi2_limit, first.clip.abs_limit)
+        equations = shards.sum(least_squares, first.mean, *limits)
+        matrix, right = equations.assemble(model, first.mean)
+        scatter = Scatter(
+            kinds,
+            kind,
+            index,
+            matrix + others.matrix(model),
+            right + others.pull(first.mean),
+            first.mean,
+            scales,
+            np.zeros(len(index), bool),
         )
-    return HierarchicalFit(fit, scatter, tau_draws, index, *scatter.over(tau_draws), others)
+        _require_determined(scatter)
+        outlying = _outlying(scatter, member)
+        scatter = scatter.loosened(outlying[member])
+        tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
+        precision = scatter.precision(_root_mean_square(tau_draws))
+        fit = fit_linear(
+            shards, model, priors=_with_deviations(others, index, precision), **options
+        )
+    names_of = tuple(model.exposures[e] for e in np.flatnonzero(outlying))
+    return HierarchicalFit(fit, scatter, tau_draws, others, names_of)
+
+
+def _outlying(scatter: Scatter, member: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which exposures went wrong, with tau from the others."""
+    found = scatter.outlying(scatter.robust, member)
+    for _ in range(ROUNDS):
+        # most of the exposures are what is called normal
+        if found.mean() > MOST_OUTLYING:
+            return np.zeros_like(found)
+        before, some = found, scatter.loosened(found[member])
+        found = some.outlying(np.exp(some.mode()), member)
+        if (found == before).all():
+            break
+    return found
 
 
 def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> None:
@@ -315,27 +358,18 @@ def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> No
         )
 
 
-def _scatter(
-    fit: LinearFit,
-    kinds: tuple[str, ...],
-    kind: NDArray[np.int64],
-    index: NDArray[np.int64],
-    scale: float,
-) -> Scatter:
-    """What a fit with the prior N(0, scale^2) on the deviations says of them without it."""
-    inverse = np.linalg.inv(fit.cov[np.ix_(index, index)])
-    pull = inverse @ fit.mean[index]
+def _require_determined(scatter: Scatter) -> None:
+    """Refuse data that hardly say more of a kind of deviation than its prior does."""
+    _, factor = scatter.posterior(scatter.scale)
     # of E deviations of a kind, so many are known from the data rather than from the prior
-    known = 1 - np.diag(fit.cov)[index] / scale**2
-    determined = np.bincount(kind, known)
+    known = 1 - factor.variances()[scatter.index] / scatter.scale[scatter.kind] ** 2
+    determined = np.bincount(scatter.kind, known)
     if (determined < LEAST_DETERMINED).any():
-        worst = kinds[int(np.argmin(determined))]
+        worst = scatter.kinds[int(np.argmin(determined))]
+        n = len(scatter.kind) // len(scatter.kinds)
         raise DegenerateError(
-            f"the scatter of {worst!r} is not determined: {len(kind) // len(kinds)} exposures are "
-            "no more than the linear terms and their drift absorb",
+            f"the scatter of {worst!r} is not determined: {n} exposures are no more than the "
+            "linear terms and their drift absorb",
             where="model.frames",
             do="give more exposures, drop the drift, or name fewer deviations",
         )
-    information = inverse.copy()
-    information[np.diag_indices_from(information)] -= scale**-2
-    return Scatter(kinds, kind, (information + information.T) / 2, pull, scale)

@@ -460,7 +460,8 @@ def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) 
                 if w is not None and np.isfinite(affine[g]).all():
                     M = affine[g][:, 1:] @ np.linalg.inv(w[:, 1:])
                     d = affine[g][:, 0] - o - M @ (w[:, 0] - o)
-                    theta[model.frame_slice(e)] = nearest_frame(model.frames, M, d)
+                    frame = nearest_frame(model.frames, M, d)
+                    theta[model.frame_slice(e)][: len(frame)] = frame
                     enter(e)
                     break
             else:

@@ -141,10 +141,11 @@ class NormalEquations:
             border[tail, glob] += X[:, :n]
             border[glob, tail] += X[:, :n].T
             if n < len(columns):
-                e = (columns[n] - G) // q
-                edge[e, glob] += H[:n, n:]
-                edge[e, tail] += X[:, n:]
-                blocks[e] += H[n:, n:]
+                e, first = divmod(columns[n] - G, q)
+                local = columns[n:] - columns[n] + first
+                edge[np.ix_([e], glob, local)] += H[None, :n, n:]
+                edge[np.ix_([e], np.r_[tail], local)] += X[None, :, n:]
+                blocks[np.ix_([e], local, local)] += H[None, n:, n:]
         return Arrow(border, edge, blocks, n_tail=h), right
 
 

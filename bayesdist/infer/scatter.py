@@ -1,33 +1,47 @@
 """The scatter of deviations, from what the data say of each of them.
 
-Deviations b ~ N(0, T), T = diag(tau^2) with one tau for each kind, and data that say of them, with
-everything else integrated out, the quadratic form b^T S b - 2 s^T b.  Then
+Deviations b ~ N(0, T), T = diag(tau^2) with one tau for each kind, among parameters theta of which
+the data say the quadratic form -1/2 d^T H d + r^T d, d = theta - theta_0.  Then, with P the
+precision T^-1 where theta holds deviations and 0 elsewhere,
 
-    log p(data | tau) = -1/2 log |1 + T^1/2 S T^1/2| + 1/2 s^T (S + T^-1)^-1 s
+    log p(data | tau) = 1/2 [-log |H + P| - log |T| + q^T (H + P)^-1 q - b_0^T T^-1 b_0]
+    q = r - P theta_0
 
-the restricted likelihood (REML: the coefficients are integrated out, not maximised).  Its maximum
-is the fixed point tau_k^2 = mean over e of (b_ek^2 + var b_ek) of the EM algorithm.
+the restricted likelihood (REML: all that is not a deviation is integrated out, not maximised).  Its
+maximum is the fixed point tau_k^2 = mean over e of (b_ek^2 + var b_ek) of the EM algorithm.
+H has arrow shape, so that cost grows linearly with the number of exposures.
+
+An exposure that went wrong would make all others look worse than they are.  Its deviations may be
+called *loose*: they get a wide prior and say nothing of tau.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from bayesdist.errors import DegenerateError
+from bayesdist.infer.arrow import Arrow, ArrowFactor
+from bayesdist.infer.piecewise import PiecewiseExponential
 
 __all__ = ["Scatter"]
 
 Float = NDArray[np.float64]
 
 DEGREES = 4.0  # of freedom of the prior on tau, a half-Student-t
-PROPOSAL_DEGREES = 5.0
-SMALLEST = 1e-6  # of the prior's scale: where the search for tau ends
+MESH = np.concatenate([np.arange(-10.0, -3.0), np.arange(-3.0, 4.25, 0.5), [5.0, 7.0]])  # sigmas
+WIDENED = 0.9  # factor on the logarithm of the proposals' density
+LEAST_CURVATURE = 0.3
+LEAST_EFFICIENCY = 0.05  # effective share of the proposals
+PROPOSALS = 4  # for each draw of tau that is asked for
+SMALLEST, LARGEST = 1e-6, 1e3  # of the prior's scale: where the search for tau ends
+OUTLYING = 10.0  # times tau: scatter of the deviations of exposures that went wrong
+OUTLYING_FRACTION = 0.02  # of the exposures, expected to have gone wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,57 +52,137 @@ class Scatter:
     ----------
     kinds : tuple of str, length k
         Kinds of deviation.
-    kind : ndarray of int, shape (n,)
+    kind : ndarray of int, shape (m,)
         Kind of each deviation.
-    information : ndarray, shape (n, n)
-        S; everything that is not a deviation is integrated out.
-    pull : ndarray, shape (n,)
-        s.
-    scale : float
+    index : ndarray of int, shape (m,)
+        Where theta holds the deviations.
+    matrix : Arrow
+        H, without the prior on the deviations.
+    right : ndarray, shape (D,)
+        r.
+    about : ndarray, shape (D,)
+        theta_0.
+    scale : ndarray, shape (k,)
         Of the half-Student-t prior on each tau, with 4 degrees of freedom.
+    loose : ndarray of bool, shape (m,)
+        Which deviations have the prior N(0, scale^2).
     """
 
     kinds: tuple[str, ...]
     kind: NDArray[np.int64]
-    information: Float
-    pull: Float
-    scale: float
+    index: NDArray[np.int64]
+    matrix: Arrow
+    right: Float
+    about: Float
+    scale: Float
+    loose: NDArray[np.bool_]
 
-    def _factor(self, tau: Float) -> tuple[tuple[Float, bool], Float]:
-        root = tau[self.kind]
-        inner = root[:, None] * self.information * root
-        inner[np.diag_indices_from(inner)] += 1.0
-        return cho_factor(inner, lower=True), root
+    def precision(self, tau: Float) -> Float:
+        """Inverse variances (m,) of the deviations' prior."""
+        return np.asarray(np.where(self.loose, self.scale[self.kind], tau[self.kind]) ** -2)
 
-    def moments(self, tau: Float) -> tuple[Float, Float]:
-        """Mean (n,) and covariance (n, n) of the deviations where their scatter is tau (k,)."""
-        factor, root = self._factor(tau)
-        cov = root[:, None] * cho_solve(factor, np.diag(root))
-        return cov @ self.pull, (cov + cov.T) / 2
+    def _solved(self, tau: Float) -> tuple[ArrowFactor, Float, Float]:
+        """H + P factored, q, and (H + P)^-1 q."""
+        precision, diagonal = self.precision(tau), np.zeros(len(self.about))
+        diagonal[self.index] = precision
+        border, local = self.matrix.split(diagonal)
+        factor = Arrow(
+            self.matrix.border + np.diag(border),
+            self.matrix.edge,
+            self.matrix.blocks + np.einsum("nq,qr->nqr", local, np.eye(local.shape[1])),
+        ).factor()
+        q = self.right - diagonal * self.about
+        return factor, q, factor.solve(q)
+
+    def posterior(self, tau: Float) -> tuple[Float, ArrowFactor]:
+        """Mean of theta (D,), and its precision factored, where the scatter is tau (k,)."""
+        factor, _, step = self._solved(tau)
+        return self.about + step, factor
 
     def log_density(self, tau: Float) -> float:
         """Log posterior density of log tau, up to a constant."""
-        factor, root = self._factor(tau)
-        half = solve_triangular(factor[0], root * self.pull, lower=True)
-        value = 0.5 * half @ half - np.log(np.diag(factor[0])).sum()
+        if (tau > LARGEST * self.scale).any():
+            return -np.inf
+        factor, q, step = self._solved(tau)
+        precision, b = self.precision(tau), self.about[self.index]
+        value = q @ step - factor.logdet + np.log(precision).sum() - precision @ b**2
         prior = -0.5 * (DEGREES + 1) * np.log1p((tau / self.scale) ** 2 / DEGREES)
-        return float(value + (prior + np.log(tau)).sum())
+        return float(0.5 * value + (prior + np.log(tau)).sum())
 
     def gradient(self, tau: Float) -> Float:
         """Derivative of `log_density` by log tau, shape (k,)."""
-        mean, cov = self.moments(tau)
-        second = np.bincount(self.kind, mean**2 + np.diag(cov), len(self.kinds))
+        mean, factor = self.posterior(tau)
+        squares = (mean**2 + factor.variances())[self.index]
+        tight, k = ~self.loose, len(self.kinds)
+        second = np.bincount(self.kind[tight], squares[tight], k)
         ratio = (tau / self.scale) ** 2
         prior = 1.0 - (DEGREES + 1) * ratio / (DEGREES + ratio)
-        return np.asarray(second / tau**2 - np.bincount(self.kind) + prior)
+        return np.asarray(second / tau**2 - np.bincount(self.kind[tight], minlength=k) + prior)
+
+    @cached_property
+    def robust(self) -> Float:
+        """A first tau (k,) that a few exposures which went wrong do not raise much."""
+        mean, factor = self.posterior(self.scale)
+        b, sigma = mean[self.index], np.sqrt(factor.variances()[self.index])
+        out = np.empty(len(self.kinds))
+        for k in range(len(out)):
+            some = b[self.kind == k]
+            spread = 1.4826 * np.median(np.abs(some - np.median(some)))
+            # the deviations are known against each other better than by themselves
+            out[k] = max(spread, 0.1 * float(np.median(sigma[self.kind == k])))
+        return np.minimum(out, self.scale)
+
+    def outlying(self, tau: Float, member: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which groups of deviations scatter much more than the others.
+
+        Parameters
+        ----------
+        tau : ndarray, shape (k,)
+        member : ndarray of int, shape (m,)
+            Group (exposure) of each deviation, from 0.
+
+        Returns
+        -------
+        ndarray of bool, shape (n,)
+            Where "ten times tau" explains the deviations better than tau does, by what all others
+            leave of the group, with odds of 1 to 49 against it beforehand.
+        """
+        mean, factor = self.posterior(tau)
+        precision = self.precision(tau)
+        out = np.zeros(int(member.max()) + 1, bool)
+        for group in range(len(out)):
+            own = np.flatnonzero(member == group)
+            at = self.index[own]
+            columns = np.zeros((len(at), len(self.about)))
+            columns[np.arange(len(at)), at] = 1.0
+            cov = factor.solve(columns)[:, at]
+            inverse = np.linalg.inv((cov + cov.T) / 2)
+            # what the data, and through them the other groups, say of this one
+            information = inverse - np.diag(precision[own])
+            pull = inverse @ mean[at]
+            evidence = []
+            for factor_tau in (1.0, OUTLYING):
+                T = (factor_tau * tau[self.kind[own]]) ** -2.0
+                L = np.linalg.cholesky(information + np.diag(T))
+                half = np.linalg.solve(L, pull)
+                evidence.append(
+                    0.5 * half @ half - np.log(np.diag(L)).sum() + 0.5 * np.log(T).sum()
+                )
+            odds = np.log(OUTLYING_FRACTION / (1 - OUTLYING_FRACTION))
+            out[group] = evidence[1] - evidence[0] + odds > 0
+        return out
+
+    def loosened(self, loose: NDArray[np.bool_]) -> Scatter:
+        """The same with other loose deviations (m,)."""
+        return replace(self, loose=loose)
 
     def mode(self) -> Float:
         """The most probable log tau, shape (k,)."""
-        first = np.full(len(self.kinds), np.log(self.scale) - 2.0)
-        bounds = [(np.log(SMALLEST * self.scale), np.log(self.scale) + 12.0)] * len(first)
+        low, high = np.log(SMALLEST * self.scale), np.log(LARGEST * self.scale)
+        bounds = list(zip(low, high - 1e-6, strict=True))
         found = minimize(
             lambda x: -self.log_density(np.exp(x)),
-            first,
+            np.log(self.robust),
             jac=lambda x: -self.gradient(np.exp(x)),
             method="L-BFGS-B",
             bounds=bounds,
@@ -96,45 +190,25 @@ class Scatter:
         )
         return np.asarray(found.x)
 
-    def over(self, taus: Float) -> tuple[Float, Float]:
-        """Mean and covariance of the deviations, averaged over draws of tau (n, k)."""
-        means, within = np.zeros((len(taus), len(self.pull))), np.zeros_like(self.information)
-        for t, tau in enumerate(taus):
-            means[t], cov = self.moments(tau)
-            within += cov
-        spread = means - means.mean(axis=0)
-        return means.mean(axis=0), (within + spread.T @ spread) / len(taus)
-
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Draws of tau from its posterior, shape (n, k), of equal weight.
 
-        Importance sampling of log tau: Student-t proposals about the mode, resampled.  The factor
-        tau that belongs to log tau makes a mode even where the data allow no scatter at all.
+        Importance sampling of log tau, resampled.  The kinds are proposed independently, each from
+        its density with the others at the mode, made a little wider: what one kind scatters says
+        little of the others.
 
         Raises
         ------
         DegenerateError
             When the proposals do not reach the posterior.
         """
-        x = self.mode()
-        step = 1e-3
-        curvature = np.array(
-            [
-                (self.gradient(np.exp(x - step * e)) - self.gradient(np.exp(x + step * e)))
-                / (2 * step)
-                for e in np.eye(len(x))
-            ]
-        )
-        values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
-        # a tail towards zero falls as exp(x): no wider than a few units of log tau
-        root = vectors / np.sqrt(np.maximum(values, 0.2))
-        z = rng.standard_normal((2 * n, len(x)))
-        z *= np.sqrt(PROPOSAL_DEGREES / rng.chisquare(PROPOSAL_DEGREES, (2 * n, 1)))
-        points = np.exp(np.clip(x + z @ root.T, -80.0, 5.0))
-        log_q = -0.5 * (PROPOSAL_DEGREES + len(x)) * np.log1p((z**2).sum(axis=1) / PROPOSAL_DEGREES)
-        log_w = np.array([self.log_density(t) for t in points]) - log_q
+        proposals = self._proposals(self.mode())
+        u = rng.uniform(size=(PROPOSALS * n, len(proposals)))
+        x = np.stack([one.quantile(p) for one, p in zip(proposals, u.T, strict=True)], axis=1)
+        log_q = sum(one.log_density(t) for one, t in zip(proposals, x.T, strict=True))
+        log_w = np.array([self.log_density(t) for t in np.exp(x)]) - log_q
         w = np.exp(log_w - logsumexp(log_w))
-        if 1 / (w**2).sum() < 0.05 * len(w):
+        if 1 / (w**2).sum() < LEAST_EFFICIENCY * len(w):
             raise DegenerateError(
                 "the posterior of the scatter between exposures has no simple shape",
                 where="model.frames",
@@ -142,4 +216,21 @@ class Scatter:
             )
         # systematic resampling
         at = (np.arange(n) + rng.uniform()) / n
-        return points[np.minimum(np.searchsorted(np.cumsum(w), at), len(w) - 1)]
+        return np.exp(x[np.minimum(np.searchsorted(np.cumsum(w), at), len(w) - 1)])
+
+    def _proposals(self, mode: Float) -> list[PiecewiseExponential]:
+        """A density of log tau for each kind, given the others at the mode."""
+        out, step = [], 1e-3
+        for k, e in enumerate(np.eye(len(mode))):
+            up, down = (self.gradient(np.exp(mode + s * step * e))[k] for s in (1, -1))
+            # towards zero the density falls as tau: no wider than a few units of log tau
+            sigma = 1 / np.sqrt(max((down - up) / (2 * step), LEAST_CURVATURE))
+            mesh = mode[k] + sigma * MESH
+            mesh = mesh[mesh < np.log(LARGEST * self.scale[k])]
+            points = mode + (mesh - mode[k])[:, None] * e
+            values = WIDENED * np.array([self.log_density(np.exp(t)) for t in points])
+            slopes = np.diff(values) / np.diff(mesh)
+            out.append(
+                PiecewiseExponential(mesh, values, max(slopes[0], 0.5), min(slopes[-1], -0.5))
+            )
+        return out

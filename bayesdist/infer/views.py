@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
+from bayesdist.model.similarity import turned, turned_model
 
 __all__ = [
     "LINEAR_TERMS",
+    "Derived",
     "LinearTerms",
     "ReferenceGauge",
     "Solution",
@@ -84,8 +86,24 @@ class ReferenceGauge:
     sigma_shift: tuple[float, float]
 
 
+class Derived:
+    """What a solution made from another one tells of the sampler: the same as its source."""
+
+    source: Solution
+
+    @property
+    def convergence(self) -> Any:
+        """That of the posterior; what is made from a fit has none."""
+        return self.source.convergence  # type: ignore[attr-defined]
+
+    @property
+    def approximation(self) -> str:
+        """That of the posterior; what is made from a fit has none."""
+        return str(self.source.approximation)  # type: ignore[attr-defined]
+
+
 @dataclass(frozen=True, eq=False)
-class View:
+class View(Derived):
     """A solution made from another one.
 
     Parameters
@@ -121,16 +139,6 @@ class View:
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors, shape (n, D): draws of the source, each transformed."""
         return self.transform(np.asarray(self.source.draws(n, rng), float))
-
-    @property
-    def convergence(self) -> Any:
-        """That of the posterior; a view of a fit has none."""
-        return self.source.convergence  # type: ignore[attr-defined]
-
-    @property
-    def approximation(self) -> str:
-        """That of the posterior; a view of a fit has none."""
-        return str(self.source.approximation)  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +191,7 @@ def _bare(model: DistortionModel) -> DistortionModel:
         origin=(0.0, 0.0),
         gauge="first",
         held=(0.0, 0.0, 0.0),
+        chip_deviations=False,
     )
 
 
@@ -329,22 +338,20 @@ def reference_gauge(solution: Solution, chip: int = 2, *, epoch: float | None = 
     time = model.time
     if time is not None and epoch is None:
         epoch = time.epoch0[0]
-    new = model
-    if time is not None:
-        new = replace(model, time=TimeDependence(_both_axes(time), time.epoch0, time.breaks))
     group = model.groups(1, epoch=epoch if time is not None else None, chip=chip)
     basis = model.basis(chip)
     n = model.n_params
 
-    def pose(theta: Float) -> tuple[Float, Float]:
-        """Rotation (...) and shift (..., 2) that bring the polynomials to the gauge."""
+    def pose(theta: Float) -> tuple[Float, NDArray[np.complex128]]:
+        """Rotation (...) and shift (...) that bring the polynomials to the gauge."""
         at = basis.to_monomials(model.effective(theta, group)[..., 0, :, :])
-        return np.arctan2(at[..., 0, 2], at[..., 1, 2]), at[..., :, 0]
+        return np.arctan2(at[..., 0, 2], at[..., 1, 2]), at[..., 0, 0] + 1j * at[..., 1, 0]
 
     def transform(theta: Float) -> Float:
         theta = theta[..., :n]
         angle, shift = pose(theta)
-        return _turned(model, new, theta, np.exp(1j * angle), shift)
+        turn = np.exp(1j * angle)
+        return turned(model, theta, turn, -turn * shift)
 
     mean = np.asarray(solution.mean, float)[:n]
     angle, shift = pose(mean)
@@ -355,52 +362,21 @@ def reference_gauge(solution: Solution, chip: int = 2, *, epoch: float | None = 
     a3, b3 = basis.to_monomials(model.effective(mean, group)[0])[:, 2]
     by_pose = np.vstack([(b3 * by[0, 2] - a3 * by[1, 2]) / (a3**2 + b3**2), by[:, 0]])
     none = np.zeros(n)
-    jacobian = _turned(model, new, np.eye(n), turn, np.zeros(2)).T
-    jacobian += np.outer(_turned(model, new, mean, 1j * turn, shift), by_pose[0])
-    for axis, unit in enumerate(np.eye(2)):
-        jacobian += np.outer(_turned(model, new, none, turn, unit), by_pose[1 + axis])
-    view = _viewed(solution, new, transform, jacobian)
+    jacobian = turned(model, np.eye(n), turn, 0.0).T
+    jacobian += np.outer(turned(model, mean, 1j * turn, -1j * turn * shift), by_pose[0])
+    for axis, unit in enumerate((1.0, 1j)):
+        jacobian += np.outer(turned(model, none, turn, -turn * unit), by_pose[1 + axis])
+    view = _viewed(solution, turned_model(model), transform, jacobian)
     sigma = _root_of_diagonal(by_pose @ np.asarray(solution.cov, float)[:n, :n] @ by_pose.T)
     gauge = ReferenceGauge(
         chip=chip,
         epoch=epoch,
         rotation=float(angle),
-        shift=(float(shift[0]), float(shift[1])),
+        shift=(float(shift.real), float(shift.imag)),
         sigma_rotation=float(sigma[0]),
         sigma_shift=(float(sigma[1]), float(sigma[2])),
     )
     return replace(view, gauge=gauge)
-
-
-def _both_axes(time: TimeDependence) -> tuple[tuple[str, int, int], ...]:
-    """The terms, and behind them those of the other axis that they lack."""
-    partners = (("v" if axis == "u" else "u", i, j) for axis, i, j in time.terms)
-    return (*time.terms, *(p for p in partners if p not in time.terms))
-
-
-def _turned(
-    model: DistortionModel, new: DistortionModel, theta: Float, turn: Any, shift: Float
-) -> Float:
-    """Parameters (..., D') of turn ((u + i v) - shift) from parameters (..., D)."""
-    turn = np.asarray(turn)[..., None]
-    out = np.zeros((*theta.shape[:-1], new.n_params))
-    for chip in model.chips:
-        u, v = (model.coefficient_slice(chip.number, axis) for axis in (0, 1))
-        w = theta[..., u] + 1j * theta[..., v]
-        w[..., 0] -= shift[..., 0] + 1j * shift[..., 1]
-        w = turn * w
-        out[..., u], out[..., v] = w.real, w.imag
-        if model.time is None or new.time is None:
-            continue
-        values = theta[..., model.tdd_slice(chip.number)]
-        values = values.reshape(*values.shape[:-1], len(model.time.terms), model.time.n_values)
-        drift = np.zeros((*theta.shape[:-1], len(new.time.terms), new.time.n_values))
-        for t, (axis, i, j) in enumerate(model.time.terms):
-            z = turn * values[..., t, :] * (1.0 if axis == "u" else 1j)
-            drift[..., new.time.terms.index(("u", i, j)), :] += z.real
-            drift[..., new.time.terms.index(("v", i, j)), :] += z.imag
-        out[..., new.tdd_slice(chip.number)] = drift.reshape(*theta.shape[:-1], -1)
-    return out
 
 
 def linear_terms(

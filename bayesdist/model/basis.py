@@ -45,6 +45,14 @@ def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
     return tuple((n - j, j) for n in range(order + 1) for j in range(n + 1))
 
 
+def _legendre_derivatives(order: int) -> Float:
+    """Matrix whose column i holds the Legendre coefficients of P_i'."""
+    out = np.zeros((order + 1, order + 1))
+    for i in range(1, order + 1):
+        out[:i, i] = legendre.legder(np.eye(order + 1)[i, : i + 1])
+    return out
+
+
 def _legendre_to_powers(order: int) -> Float:
     """Matrix whose row i holds the power coefficients of P_i."""
     out = np.zeros((order + 1, order + 1))
@@ -165,11 +173,52 @@ class PolynomialBasis:
         return self.evaluate_scaled(*self.scaled(x, y))
 
     def evaluate_scaled(self, X: ArrayLike, Y: ArrayLike) -> Float:
-        """As `evaluate`, of positions that `scaled` has brought to [-1, 1]."""
+        """As `evaluate`, of positions that `scaled` has brought to [-1, 1].
+
+        Parameters
+        ----------
+        X, Y : array_like, shape (...)
+
+        Returns
+        -------
+        ndarray, shape (..., n_terms)
+        """
         i, j = np.array(self.terms).T
         px: Float = legendre.legvander(np.asarray(X, float), self.order)
         py: Float = legendre.legvander(np.asarray(Y, float), self.order)
         return px[..., i] * py[..., j]
+
+    @cached_property
+    def derivatives(self) -> tuple[Float, Float]:
+        """Matrices (n_terms, n_terms) from a polynomial's coefficients to its derivatives'.
+
+        By x and by y, per pixel: the derivative of a polynomial is one of lower order in the same
+        basis.
+        """
+        of_one = _legendre_derivatives(self.order)
+        i, j = np.array(self.terms).T
+        half_x, half_y = self.half_size
+        return (
+            of_one[np.ix_(i, i)] * (j[:, None] == j) / half_x,
+            of_one[np.ix_(j, j)] * (i[:, None] == i) / half_y,
+        )
+
+    def gradient(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
+        """Derivatives of all basis functions by the pixel.
+
+        Parameters
+        ----------
+        x, y : array_like, shape (N,)
+            FITS 1-based pixels.
+
+        Returns
+        -------
+        d_dx, d_dy : ndarray, shape (N, n_terms)
+            Per pixel.
+        """
+        values = self.evaluate(x, y)
+        by_x, by_y = self.derivatives
+        return values @ by_x, values @ by_y
 
     @cached_property
     def _to_scaled_powers(self) -> Float:
@@ -222,13 +271,14 @@ class PolynomialBasis:
         Parameters
         ----------
         coef : array_like, shape (..., n_terms)
-            Legendre coefficients of one axis.
+            Legendre coefficients of one axis, in the unit of u, v.
         cov : array_like, shape (n_terms, n_terms), optional
             Their covariance.
 
         Returns
         -------
         ndarray, same shape as `coef`; with `cov`, a pair with the covariance of the result
+            In the unit of u, v per pixel^(i + j).
         """
         m = self.monomial_matrix
         out = np.asarray(coef, float) @ m.T
@@ -242,9 +292,11 @@ class PolynomialBasis:
         Parameters
         ----------
         coef : array_like, shape (..., n_terms)
+            In the unit of u, v per pixel^(i + j).
 
         Returns
         -------
         ndarray, same shape
+            In the unit of u, v.
         """
         return np.asarray(coef, float) @ self._inverse_monomial_matrix.T

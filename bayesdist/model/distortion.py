@@ -4,6 +4,10 @@ For a star on chip c in exposure e at epoch t, at FITS pixel (x, y):
 
     w = sum_k C_ck(t) phi_k(x, y)          (u, v) = T_e(w) = o + d_e + M_e (w - o)
 
+With `chip_deviations` every chip but the first, whose reference pixel lies at c, deviates itself:
+
+    w' = w + d_ec + L_ec (w - c)     (u, v) = o + d_e + M_e (w' - o) - (M_e - R_e) (c - o)
+
 T_e of a polynomial is a polynomial, so every (chip, exposure, epoch) has *effective coefficients*:
 the maps theta -> effective coefficients (`effective`) and its derivative (`effective_jacobian`)
 are all that fits, samplers and predictions need to know of the model.
@@ -21,7 +25,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.model.basis import PolynomialBasis
-from bayesdist.model.frames import FRAME_KINDS, RIGID, frame_matrix, frame_names, frame_tangent
+from bayesdist.model.frames import (
+    CHIP_DEVIATIONS,
+    FRAME_KINDS,
+    RIGID,
+    chip_matrix,
+    frame_matrix,
+    frame_names,
+    frame_tangent,
+    rigid_part,
+)
 from bayesdist.model.grouping import Groups, group_by
 from bayesdist.model.timedep import AXES, TimeDependence
 
@@ -65,7 +78,7 @@ class Parameter:
     kind : str
         'polynomial', 'tdd' or 'frame'.
     chip : int or None
-        Chip number.
+        Chip number; of a frame's parameter that is a chip's own deviation.
     axis : str or None
         'u' or 'v'.
     i, j : int or None
@@ -122,6 +135,11 @@ class DistortionModel:
         'first' or 'held'.
     held : tuple of float
         With 'held': shift_u, shift_v (unit of u, v) and rotation (radians) of the first exposure.
+    chip_deviations : bool
+        Whether every chip but the first one has linear deviations of its own in each exposure.
+        Needs gauge 'held': they have to scatter about zero as the others do.  Scale and shear of a
+        frame then act on each chip about its own reference pixel, so that the distance between the
+        chips, a lever of thousands of pixels, does not pass for a measurement of their scale.
 
     Raises
     ------
@@ -139,6 +157,7 @@ class DistortionModel:
     origin: tuple[float, float] = (0.0, 0.0)
     gauge: str = "first"
     held: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    chip_deviations: bool = False
     _bases: tuple[PolynomialBasis, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -190,6 +209,12 @@ class DistortionModel:
                 where="model.gauge",
                 do="choose a kind of frame or gauge 'first'",
             )
+        if self.chip_deviations and self.gauge != "held":
+            raise InputError(
+                "chips that deviate by themselves have the polynomials for their mean",
+                where="model.chip_deviations",
+                do="choose gauge 'held'",
+            )
         if self.frames == "shift" and self.held[2]:
             raise InputError(
                 "a frame 'shift' has no rotation to be held",
@@ -206,8 +231,15 @@ class DistortionModel:
 
     @property
     def n_frame(self) -> int:
-        """Parameters of one exposure's frame."""
-        return len(frame_names(self.frames))
+        """Parameters of one exposure: of its frame, and of the chips' own deviations."""
+        return len(frame_names(self.frames)) + len(self._own_names)
+
+    @cached_property
+    def _own_names(self) -> tuple[str, ...]:
+        """Names of the deviations of single chips."""
+        if not self.chip_deviations:
+            return ()
+        return tuple(f"{chip.name}.{name}" for chip in self.chips[1:] for name in CHIP_DEVIATIONS)
 
     @property
     def n_tdd(self) -> int:
@@ -230,12 +262,13 @@ class DistortionModel:
         return self.n_distortion + len(self.free_frame_names(0))
 
     def free_frame_names(self, exposure: int) -> tuple[str, ...]:
-        """Names of the fitted parameters of the frame of an exposure (by code)."""
+        """Names of the fitted parameters of an exposure (by code): frame, then single chips."""
         if exposure > 0:
-            return frame_names(self.frames)
+            return (*frame_names(self.frames), *self._own_names)
         if self.gauge == "first" or exposure < 0:
             return ()
-        return tuple(name for name in frame_names(self.frames) if name not in RIGID)
+        free = (name for name in frame_names(self.frames) if name not in RIGID)
+        return (*free, *self._own_names)
 
     @property
     def n_params(self) -> int:
@@ -259,10 +292,19 @@ class DistortionModel:
                     name = f"{prefix[chip.number]}tdd.{axis}_{i}_{j}.{value}"
                     unit = f"{self.unit}/yr" if value.startswith("rate") else self.unit
                     out.append(Parameter(name, unit, "tdd", chip.number, axis, i, j))
+        owner = dict(
+            zip(
+                self._own_names,
+                (c.number for c in self.chips[1:] for _ in CHIP_DEVIATIONS),
+                strict=bool(self._own_names),
+            )
+        )
         for code, exposure in enumerate(self.exposures):
             for p in self.free_frame_names(code):
-                unit = self.unit if p.startswith("shift") else ""
-                out.append(Parameter(f"{exposure}.{p}", unit, "frame", exposure=exposure))
+                unit = self.unit if "shift" in p.split(".")[-1] else ""
+                out.append(
+                    Parameter(f"{exposure}.{p}", unit, "frame", owner.get(p), exposure=exposure)
+                )
         return tuple(out)
 
     @property
@@ -454,16 +496,33 @@ class DistortionModel:
         """Kind of an exposure's frame and all its parameters (..., q), held ones included."""
         if not self._has_frame(exposure):
             return "none", theta[..., :0]
+        names = frame_names(self.frames)
         values = theta[..., self.frame_slice(exposure)]
         if exposure:
-            return self.frames, values
-        names, free = frame_names(self.frames), self.free_frame_names(0)
+            return self.frames, values[..., : len(names)]
+        free = self.free_frame_names(0)
         out = np.empty((*theta.shape[:-1], len(names)))
         for k, name in enumerate(names):
             out[..., k] = (
                 self.held[RIGID.index(name)] if name in RIGID else values[..., free.index(name)]
             )
         return self.frames, out
+
+    def _own(self, chip_code: int, exposure: int) -> slice:
+        """Where an exposure's block holds the own deviations of a chip; empty where there are none.
+
+        A slice of `frame_slice`.
+        """
+        if not (self.chip_deviations and chip_code > 0 and self._has_frame(exposure)):
+            return slice(0, 0)
+        n, q = len(self.free_frame_names(exposure)) - len(self._own_names), len(CHIP_DEVIATIONS)
+        return slice(n + (chip_code - 1) * q, n + chip_code * q)
+
+    def _about_chip(self, w: Float, chip_code: int) -> Float:
+        """w (..., K) of a chip, less its value at the reference pixel."""
+        out = w.copy()
+        out[..., 0] -= w @ self._bases[chip_code].monomial_matrix[0]
+        return out
 
     def effective(self, theta: ArrayLike, groups: Groups) -> Float:
         """Effective Legendre coefficients of each group: the whole model as polynomials.
@@ -477,10 +536,21 @@ class DistortionModel:
         -------
         ndarray, shape (..., G, 2, K)
         """
+        theta = np.asarray(theta, float)
         out = self.polynomials(theta, groups.chip, groups.epoch)
         if not self.n_frame:
             return out
         o = np.asarray(self.origin)
+        if self.chip_deviations:
+            at_centre = np.stack([basis.monomial_matrix[0] for basis in self._bases])
+            centre = np.einsum("...gak,gk->...ga", out, at_centre[groups.chip])
+            for g, (c, e) in enumerate(zip(groups.chip, groups.exposure, strict=True)):
+                own = self._own(int(c), int(e))
+                if own.stop:
+                    L, d = chip_matrix(theta[..., self.frame_slice(int(e))][..., own])
+                    w = out[..., g, :, :]
+                    w += np.einsum("...ab,...bk->...ak", L, self._about_chip(w, int(c)))
+                    w[..., 0] += d
         for e in np.unique(groups.exposure):
             if not self._has_frame(int(e)):
                 continue
@@ -490,6 +560,10 @@ class DistortionModel:
             w[..., 0] -= o
             w = np.einsum("...ab,...gbk->...gak", M, w)
             w[..., 0] += (o + d)[..., None, :]
+            if self.chip_deviations:
+                R, _ = rigid_part(*self._frame(theta, int(e)))
+                back = np.einsum("...ab,...gb->...ga", M - R, centre[..., sel, :] - o)
+                w[..., 0] -= back * (groups.chip[sel] > 0)[:, None]
             out[..., sel, :, :] = w
         return out
 
@@ -516,23 +590,43 @@ class DistortionModel:
         for g in range(len(groups)):
             chip, e = int(groups.chip[g]), int(groups.exposure[g])
             M, _ = self.frame(theta, e)
-            both = slice(2 * K * chip, 2 * K * (chip + 1))
-            columns = [np.r_[both]]
-            blocks = [np.einsum("ab,kl->akbl", M, np.eye(K)).reshape(2, K, 2 * K)]
+            block, own = self.frame_slice(e), self._own(chip, e)
+            values = theta[block][own]
+            L, d = chip_matrix(values) if own.stop else (np.zeros((2, 2)), np.zeros(2))
+
+            # by the polynomial's coefficients, then by what moves these
+            columns = [np.r_[slice(2 * K * chip, 2 * K * (chip + 1))]]
+            direct = np.einsum("ab,kl->akbl", M, np.eye(K))
+            if own.stop:
+                R, turning = rigid_part(*self._frame(theta, e))
+                at_centre = self._bases[chip].monomial_matrix[0]
+                direct += np.einsum("ab,kl->akbl", M @ L, self._about_chip(np.eye(K), chip).T)
+                direct[:, 0] -= np.einsum("ab,l->abl", M - R, at_centre)
+            blocks = [direct.reshape(2, K, 2 * K)]
             if drift is not None:
                 columns.append(np.r_[self._tdd(chip)])
-                blocks.append(np.einsum("ab,bkm->akm", M, drift[g]))
-            local = self.frame_slice(e)
-            if local.stop > local.start:
-                columns.append(np.r_[local])
-                w = poly[g].copy()
-                w[:, 0] -= o
+                blocks.append(np.einsum("akbl,blm->akm", direct, drift[g]))
+            if block.stop > block.start:
+                about_chip = self._about_chip(poly[g], chip)
+                w = poly[g] + L @ about_chip
+                w[:, 0] += d - o
                 shift = np.zeros((2, K, 2))
                 shift[0, 0, 0] = shift[1, 0, 1] = 1.0
                 tangent = frame_tangent(*self._frame(theta, e))
-                of_all = np.concatenate([shift, np.einsum("mab,bk->akm", tangent, w)], axis=2)
+                by_frame = np.einsum("mab,bk->akm", tangent, w)
+                if own.stop:
+                    by_frame[:, 0] -= ((tangent - turning) @ (poly[g] @ at_centre - o)).T
+                of_all = np.concatenate([shift, by_frame], axis=2)
                 names = frame_names(self.frames)
-                blocks.append(of_all[..., [names.index(n) for n in self.free_frame_names(e)]])
+                fitted = [n for n in self.free_frame_names(e) if n in names]
+                columns.append(np.r_[block][: len(fitted)])
+                blocks.append(of_all[..., [names.index(n) for n in fitted]])
+                if own.stop:
+                    shapes, shifts = chip_matrix(np.eye(len(CHIP_DEVIATIONS)))
+                    by_own = np.einsum("mab,bk->akm", shapes, about_chip)
+                    by_own[:, 0] += shifts.T
+                    columns.append(np.r_[block][own])
+                    blocks.append(np.einsum("ab,bkm->akm", M, by_own))
             out.append((np.concatenate(columns), np.concatenate(blocks, axis=2)))
         return out
 
@@ -671,6 +765,7 @@ class DistortionModel:
             "origin": list(self.origin),
             "gauge": self.gauge,
             "held": list(self.held),
+            "chip_deviations": self.chip_deviations,
         }
 
     @classmethod
@@ -709,6 +804,7 @@ class DistortionModel:
             origin=_pair(data["origin"]),
             gauge=data.get("gauge", "first"),
             held=(float(shift_u), float(shift_v), float(rotation)),
+            chip_deviations=data.get("chip_deviations", False),
         )
 
 

@@ -8,6 +8,13 @@ v by an angle in radians.  Each kind has the parameters of the one before it and
 same meaning.  Scale and shear act along the axes of w, before the rotation: they are deviations of
 the detector, small at any roll angle, and a Gaussian prior on each of them by itself makes sense.
 Near zero, M = I + scale I + rotation J + shear_plus diag(1, -1) + shear_cross offdiag(1, 1).
+
+A chip may deviate by itself from the one that the frame is bound to.  About the position c of its
+reference pixel,
+
+    w -> w + d + L (w - c)      L = scale I + rotation J + shear_plus diag(1, -1) + shear_cross ...
+
+These are small, and taken as linear.  Scale and shear of the frame then act about c too.
 """
 
 from __future__ import annotations
@@ -16,13 +23,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "CHIP_DEVIATIONS",
     "DEVIATIONS",
     "FRAME_KINDS",
     "RIGID",
+    "chip_matrix",
     "frame_matrix",
     "frame_names",
     "frame_tangent",
     "nearest_frame",
+    "rigid_part",
 ]
 
 Float = NDArray[np.float64]
@@ -40,12 +50,16 @@ FRAME_KINDS = tuple(_NAMES)
 RIGID = ("shift_u", "shift_v", "rotation")  # where the telescope pointed
 DEVIATIONS = ("scale", "shear_plus", "shear_cross")  # how the detector differed from its mean
 
+CHIP_DEVIATIONS = (*RIGID, *DEVIATIONS)  # of one chip against the reference chip
+
 # what scale, shear_plus and shear_cross are multiplied by
 _SHAPES = {
     "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
     "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
     "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
 }
+
+_QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
 def frame_names(kind: str) -> tuple[str, ...]:
@@ -109,8 +123,51 @@ def frame_tangent(kind: str, p: ArrayLike) -> Float:
         return np.zeros((0, 2, 2))
     p = np.asarray(p, float)
     turn, behind = _parts(kind, p)
-    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
-    return np.stack([turn @ (quarter @ behind if n == "rotation" else _SHAPES[n]) for n in names])
+    return np.stack([turn @ (_QUARTER @ behind if n == "rotation" else _SHAPES[n]) for n in names])
+
+
+def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:
+    """The rotation in M, and its derivatives.
+
+    Parameters
+    ----------
+    kind : str
+    p : array_like, shape (..., q)
+
+    Returns
+    -------
+    R : ndarray, shape (..., 2, 2)
+    tangent : ndarray, shape (..., q - 2, 2, 2), or (..., 0, 2, 2) where there is none
+        By each parameter after the two shifts.
+    """
+    p = np.asarray(p, float)
+    names = frame_names(kind)[2:]
+    turn, _ = _parts(kind, p)
+    tangent = np.zeros((*p.shape[:-1], len(names), 2, 2))
+    if "rotation" in names:
+        tangent[..., names.index("rotation"), :, :] = turn @ _QUARTER
+    return turn, tangent
+
+
+def chip_matrix(p: ArrayLike) -> tuple[Float, Float]:
+    """What a chip's own deviations add.
+
+    Parameters
+    ----------
+    p : array_like, shape (..., 6)
+        In the order of `CHIP_DEVIATIONS`.
+
+    Returns
+    -------
+    L : ndarray, shape (..., 2, 2)
+        Linear in p: `chip_matrix` of the unit vectors is its derivative.
+    d : ndarray, shape (..., 2)
+    """
+    p = np.asarray(p, float)
+    L = np.zeros((*p.shape[:-1], 2, 2))
+    for name, value in zip(CHIP_DEVIATIONS[2:], np.moveaxis(p, -1, 0)[2:], strict=True):
+        L += value[..., None, None] * (_QUARTER if name == "rotation" else _SHAPES[name])
+    return L, p[..., :2].copy()
 
 
 def nearest_frame(kind: str, M: ArrayLike, d: ArrayLike) -> Float:

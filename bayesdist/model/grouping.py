@@ -62,24 +62,37 @@ def group_by(chip: Int, exposure: Int, epoch: Float) -> Groups:
     Parameters
     ----------
     chip, exposure : ndarray of int, shape (N,)
+        Codes into the model's chips and exposures.
     epoch : ndarray, shape (N,)
+        Decimal years, finite.
 
     Returns
     -------
     Groups
+        In the order of chip, exposure, epoch.
     """
-    keys = np.empty(len(chip), dtype=[("chip", "i8"), ("exposure", "i8"), ("epoch", "f8")])
-    keys["chip"], keys["exposure"], keys["epoch"] = chip, exposure, epoch
-    if len(keys) and (keys == keys[0]).all():  # one group: the usual case, without a sort
-        unique, index = keys[:1], np.zeros(len(keys), np.int64)
-    else:
-        unique, index = np.unique(keys, return_inverse=True)
+    # stars of one group mostly stand together: only the first star of each run is sorted
+    heads = _starts_of_runs(chip, exposure, epoch)
+    chip_of, exposure_of, epoch_of = chip[heads], exposure[heads], epoch[heads]
+    order = np.lexsort((epoch_of, exposure_of, chip_of))
+    starts = _starts_of_runs(chip_of[order], exposure_of[order], epoch_of[order])
+    group_of = np.empty(len(order), np.int64)
+    group_of[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(order)))
+    first = order[starts]
     return Groups(
-        index=np.asarray(index, np.int64),
-        chip=unique["chip"].copy(),
-        exposure=unique["exposure"].copy(),
-        epoch=unique["epoch"].copy(),
+        index=np.repeat(group_of, np.diff(heads, append=len(chip))),
+        chip=chip_of[first],
+        exposure=exposure_of[first],
+        epoch=epoch_of[first],
     )
+
+
+def _starts_of_runs(*columns: Int | Float) -> Int:
+    """Where rows differ from the ones before them, the first row included."""
+    starts = np.ones(len(columns[0]), bool)
+    if len(starts):
+        starts[1:] = np.logical_or.reduce([c[1:] != c[:-1] for c in columns])
+    return np.flatnonzero(starts)
 
 
 def merge_groups(a: Groups, b: Groups) -> tuple[Groups, Int, Int]:

@@ -149,6 +149,11 @@ class LookupTable:
         -------
         ndarray, shape (N, 2)
             Pixels; beyond the outermost nodes the value at the nearest point of the grid.
+
+        Raises
+        ------
+        InputError
+            When a pixel is not finite.
         """
         index, weight = self.weights(x, y)
         flat = self.values.reshape(2, -1)
@@ -168,6 +173,11 @@ class LookupTable:
         -------
         ndarray, shape (N, 2, 2)
             [[dx'/dx, dx'/dy], [dy'/dx, dy'/dy]]: the identity where the table is flat.
+
+        Raises
+        ------
+        InputError
+            When a pixel is not finite.
         """
         ix, fx, in_x = self._cell(x, 0)
         iy, fy, in_y = self._cell(y, 1)

@@ -7,6 +7,7 @@ import numpy as np
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.views import lines
 from bayesdist.model import Chip, DistortionModel, TimeDependence
+from bayesdist.model.frames import CHIP_DEVIATIONS
 from bayesdist.simulate import simulate_matches
 
 CHIPS = (
@@ -28,24 +29,39 @@ PLACE = {
 
 
 def campaign_model(
-    n_exposures: int, *, order: int = 3, time: bool = True, frames: str = "affine", rolls=None
+    n_exposures: int,
+    *,
+    order: int = 3,
+    time: bool = True,
+    frames: str = "affine",
+    rolls=None,
+    apart: bool = False,
 ) -> DistortionModel:
     """The model in the gauge of WFC2, held at the first exposure's pointing."""
     return DistortionModel(
         order,
-        CHIPS,
+        CHIPS[::-1] if apart else CHIPS,
         time=TimeDependence(DRIFT, (2004.5,)) if time else None,
         frames=frames,
         exposures=tuple(f"j{k + 1:03d}" for k in range(n_exposures)),
         gauge="held",
         held=(5000.0, 5100.0, 0.4 if rolls is None else float(rolls[0])),
+        chip_deviations=apart,
     )
 
 
 def campaign_truth(
-    model: DistortionModel, rng: np.random.Generator, *, tau=(7e-6, 5e-6, 3e-6), rolls=None
+    model: DistortionModel,
+    rng: np.random.Generator,
+    *,
+    tau=(7e-6, 5e-6, 3e-6),
+    rolls=None,
+    own=None,
 ) -> np.ndarray:
-    """Parameters in the reference gauge; exposures point and roll as they like."""
+    """Parameters in the reference gauge; exposures point and roll as they like.
+
+    `own` is the scatter of WFC1 by itself: of shifts (pixels), rotation, scale, shears.
+    """
     theta = np.zeros(model.n_params)
     for chip in model.chips:
         basis, linear = model.basis(chip.number), LINEAR[chip.number]
@@ -75,6 +91,11 @@ def campaign_truth(
             "shear_plus": tau[1] * rng.standard_normal(),
             "shear_cross": tau[2] * rng.standard_normal(),
         }
+        if own is not None:
+            value |= {
+                f"WFC1.{name}": scatter * rng.standard_normal()
+                for name, scatter in zip(CHIP_DEVIATIONS, own, strict=True)
+            }
         theta[model.frame_slice(code)] = [value[name] for name in names]
     return theta
 
@@ -91,11 +112,18 @@ def campaign(
     sigma: float = 0.02,
     fraction: float = 0.0,
     rolls=None,
+    own=None,
+    wrong=None,
 ) -> tuple[DistortionModel, MatchTable, np.ndarray]:
-    """Model, matches and true parameters."""
+    """Model, matches and true parameters; `wrong` adds to parameters, by name."""
     rng = np.random.default_rng(seed)
-    model = campaign_model(n_exposures, order=order, time=time, frames=frames, rolls=rolls)
-    theta = campaign_truth(model, rng, tau=tau, rolls=rolls)
+    apart = own is not None
+    model = campaign_model(
+        n_exposures, order=order, time=time, frames=frames, rolls=rolls, apart=apart
+    )
+    theta = campaign_truth(model, rng, tau=tau, rolls=rolls, own=own)
+    for name, value in (wrong or {}).items():
+        theta[model.names.index(name)] += value
     epochs = np.sort(rng.uniform(2002.3, 2007.1, n_exposures))
     matches, _ = simulate_matches(
         model,

@@ -65,6 +65,20 @@ def test_evaluate_is_numpys_legendre_series(order):
 
 
 @pytest.mark.parametrize("order", ORDERS)
+def test_gradient_is_that_of_the_monomials(order):
+    """d/dx sum m_ij x^i y^j = sum i m_ij x^(i-1) y^j, in the form without Legendre polynomials."""
+    rng = np.random.default_rng(order)
+    basis = basis_of(order)
+    x, y = pixels(rng, 50)
+    coef = rng.standard_normal(basis.n_terms)
+    grid = as_grid(basis.terms, basis.to_monomials(coef))
+    dx, dy = x - REFERENCE[0], y - REFERENCE[1]
+    for axis, values in enumerate(basis.gradient(x, y)):
+        expected = polynomial.polyval2d(dx, dy, polynomial.polyder(grid, axis=axis))
+        np.testing.assert_allclose(values @ coef, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("reference", [REFERENCE, (1.0, 2000.0)])
 def test_monomial_form_has_the_same_values(order, reference):
     rng = np.random.default_rng(order)

@@ -55,8 +55,8 @@ def named(model: DistortionModel, theta: np.ndarray) -> dict[str, float]:
     return dict(zip(model.names, theta, strict=True))
 
 
-def formula(model: DistortionModel, theta, x, y, epoch, exposure, chip) -> np.ndarray:
-    """(u, v) of one star, from the documented meaning of the parameters' *names*."""
+def before_frames(model: DistortionModel, theta, x, y, epoch, chip) -> np.ndarray:
+    """w of one star, from the documented meaning of the parameters' *names*."""
     value = named(model, theta)
     c = next(c for c in model.chips if c.number == chip)
     prefix = f"{c.name}." if len(model.chips) > 1 else ""
@@ -77,6 +77,13 @@ def formula(model: DistortionModel, theta, x, y, epoch, exposure, chip) -> np.nd
                 coefficient = value[f"{name}.step_2"] + value[f"{name}.rate_2"] * (epoch - 2012.5)
             monomial = ((x - xref) / (nx / 2)) ** i * ((y - yref) / (ny / 2)) ** j
             w["uv".index(axis)] += coefficient * monomial
+    return w
+
+
+def formula(model: DistortionModel, theta, x, y, epoch, exposure, chip) -> np.ndarray:
+    """(u, v) of one star, from the documented meaning of the parameters' *names*."""
+    value = named(model, theta)
+    w = before_frames(model, theta, x, y, epoch, chip)
     if model.frames == "none" or exposure is None:
         return w
     if exposure == 0 and model.gauge == "first":
@@ -91,20 +98,34 @@ def formula(model: DistortionModel, theta, x, y, epoch, exposure, chip) -> np.nd
         name: value.get(f"{e}.{name}", 0.0)
         for name in ("shift_u", "shift_v", "rotation", "scale", "shear_plus", "shear_cross")
     }
-    (du, dv), o = w - model.origin, model.origin
+    c = next(c for c in model.chips if c.number == chip)
+    own = {
+        name: value.get(f"{e}.{c.name}.{name}", 0.0)
+        for name in ("shift_u", "shift_v", "rotation", "scale", "shear_plus", "shear_cross")
+    }
+    centre = before_frames(model, theta, *c.reference_pixel, epoch, chip)
+    du, dv = w - centre
+    w[0] += own["shift_u"] + (own["scale"] + own["shear_plus"]) * du
+    w[0] += (own["shear_cross"] - own["rotation"]) * dv
+    w[1] += own["shift_v"] + (own["scale"] - own["shear_plus"]) * dv
+    w[1] += (own["shear_cross"] + own["rotation"]) * du
+    o = model.origin
     # the detector deviates, then the telescope rolls, then it points elsewhere
-    su = (1 + p["scale"] + p["shear_plus"]) * du + p["shear_cross"] * dv
-    sv = (1 + p["scale"] - p["shear_plus"]) * dv + p["shear_cross"] * du
+    du, dv = w - (centre if model.chip_deviations and c != model.chips[0] else o)
+    su = w[0] - o[0] + (p["scale"] + p["shear_plus"]) * du + p["shear_cross"] * dv
+    sv = w[1] - o[1] + (p["scale"] - p["shear_plus"]) * dv + p["shear_cross"] * du
     c, s = np.cos(p["rotation"]), np.sin(p["rotation"])
     return np.array([o[0] + p["shift_u"] + c * su - s * sv, o[1] + p["shift_v"] + s * su + c * sv])
 
 
 HELD = {"gauge": "held", "held": (4.0, -3.0, 0.6)}
+HELD_APART = HELD | {"chip_deviations": True}
 GAUGES = [(frames, {}) for frames in FRAME_KINDS] + [
     (frames, HELD) for frames in ("shift_rotation", "shift_rotation_scale", "affine")
 ]
+GAUGES += [("shift_rotation", HELD_APART), ("affine", HELD_APART)]
 in_every_gauge = pytest.mark.parametrize(
-    ("frames", "gauge"), GAUGES, ids=[f"{f}-{'held' if g else 'first'}" for f, g in GAUGES]
+    ("frames", "gauge"), GAUGES, ids=[f"{f}-{'-'.join(g) or 'first'}" for f, g in GAUGES]
 )
 
 
@@ -246,6 +267,25 @@ def test_slices_cover_theta_once(frames, gauge):
     if not gauge:
         assert model.frame_slice(0) == slice(0, 0)
     assert model.frame_slice(-1) == slice(0, 0)
+
+
+def test_deviations_of_single_chips():
+    """Those of every chip but the first, in every exposure; they vanish without an exposure."""
+    model = model_of("shift_rotation", **HELD_APART)
+    own = ("shift_u", "shift_v", "rotation", "scale", "shear_plus", "shear_cross")
+    assert model.names[model.n_distortion : model.n_global] == tuple(f"a.WFC1.{n}" for n in own)
+    assert np.array(model.names)[model.frame_slice(2)].tolist() == [
+        "c.shift_u",
+        "c.shift_v",
+        "c.rotation",
+        *(f"c.WFC1.{n}" for n in own),
+    ]
+    found = dict(zip(model.names, model.parameters, strict=True))
+    assert found["b.WFC1.shift_v"].unit == "mas" and found["b.WFC1.scale"].unit == ""
+    assert found["b.WFC1.scale"].chip == 1 and found["b.shift_u"].chip is None
+    assert model_of("affine", chips=CHIPS[:1], **HELD_APART).n_frame == 6
+    with pytest.raises(InputError, match=r"chip_deviations: .*choose gauge 'held'"):
+        model_of("affine", chip_deviations=True)
 
 
 def test_what_is_held_is_no_parameter():

@@ -42,6 +42,17 @@ def test_groups_are_those_of_equal_keys(kinds):
 
 
 @settings(deadline=None)
+@given(keys)
+def test_groups_are_numbered_in_the_order_of_their_keys(members):
+    """Chip before exposure before epoch, however the stars stand: as numpy sorts whole keys."""
+    groups = groups_of(members)
+    kind = [("chip", "i8"), ("exposure", "i8"), ("epoch", "f8")]
+    unique, index = np.unique(np.array(members, dtype=kind), return_inverse=True)
+    assert keys_of(groups) == unique.tolist()
+    np.testing.assert_array_equal(groups.index, index)
+
+
+@settings(deadline=None)
 @given(keys, keys)
 def test_merged_groups_are_the_union_in_the_order_of_the_whole(a, b):
     one, two = groups_of(a), groups_of(b)

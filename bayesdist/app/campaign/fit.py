@@ -41,9 +41,15 @@ def run_campaign_fit(session: CampaignSession) -> None:
     }
     number = session.reference_chip
     drifting = replace(session.plain_model, time=session.config.time())
-    model = held_in_reference(matches, drifting, number)
+    model = replace(held_in_reference(matches, drifting, number), chip_deviations=True)
     shards = load(model, matches, session.config.resources())
-    joint = fit_hierarchical(shards, model, seed=session.config.sampler.seed, **options)
+    joint = fit_hierarchical(
+        shards,
+        model,
+        pixel=(session.scale_arcsec or session.unit_arcsec) / session.unit_arcsec,
+        seed=session.config.sampler.seed,
+        **options,
+    )
     shards.close()
     save_fit(joint.fit, session.run / "fit.nc")
     write_arrays(
@@ -66,6 +72,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
         gauge=_gauge(view),
         lines=_lines(view),
         exposures_skipped=dict(alone.skipped),
+        exposures_outlying=list(joint.outlying),
     )
     log.info(
         "fit: scatter of the exposures %s",
