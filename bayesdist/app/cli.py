@@ -96,6 +96,11 @@ def _parser() -> argparse.ArgumentParser:
         if stage == "sample":
             sub.add_argument("--strict", action="store_true", help="exit 3 unless converged")
 
+    sub = add("release", _release, "one set of files from the finished runs of several filters")
+    sub.add_argument("runs", nargs="+", metavar="RUN", help="the reference filter's first")
+    sub.add_argument("-o", "--output", required=True, metavar="DIR", help="a new folder")
+    sub.add_argument("--force", action="store_true", help="also runs that have not converged")
+
     sub = add("check", _check, "units, rank, null space and expected cost; samples nothing")
     sub.add_argument("config", metavar="CONFIG.toml")
 
@@ -186,6 +191,12 @@ def _stage(options: argparse.Namespace) -> None:
     continue_stage(options.run, options.stage, strict=getattr(options, "strict", False))
 
 
+def _release(options: argparse.Namespace) -> None:
+    from bayesdist.app.release import release_runs
+
+    print(release_runs(options.runs, options.output, force=options.force, command=options.line))
+
+
 def _check(options: argparse.Namespace) -> None:
     from bayesdist.app.check import check
 
@@ -203,7 +214,7 @@ def _validate(options: argparse.Namespace) -> int:
     requirements = load_requirements(options.requirements)
     with closing(session_of(RunDirectory.open(options.run))) as session:
         require(session, "validate", ("fit", "sample"))
-        margins = margins_of(session, requirements, session.posterior)
+        margins = margins_of(session, requirements)
         write_margins(session, margins)
         label = session.posterior.approximation
     print(margins_text(margin_rows(margins)))

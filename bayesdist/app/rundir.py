@@ -34,7 +34,7 @@ PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 OWN_FILES = re.compile(
     r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
     r"posterior\.nc|(coefficients|budget|margins|matching|series|drift)\.ecsv|maps\.fits|"
-    r"(tables|hierarchy|exposure_terms)\.h5|summary\.json|report\.html"
+    r"(tables|hierarchy|exposure_terms|catalogue_errors)\.h5|summary\.json|report\.html"
 )
 
 

@@ -15,6 +15,7 @@ from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.systematics import Systematics
 from bayesdist.assess import (
     SAMPLE,
     BinnedSums,
@@ -170,6 +171,16 @@ class Session:
     def posterior(self) -> Posterior:
         """The posterior of an earlier stage."""
         return load_posterior(self.run / "posterior.nc")
+
+    @cached_property
+    def systematics(self) -> Systematics:
+        """The posterior with all that is known of its errors."""
+        return Systematics(self.posterior)
+
+    @property
+    def solution(self) -> Posterior:
+        """What is assessed, exported and shown: all errors of the parameters are in its draws."""
+        return self.systematics.solution
 
     @property
     def doubts(self) -> list[str]:

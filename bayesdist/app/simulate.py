@@ -21,11 +21,12 @@ __all__ = ["simulate_campaign"]
 Float = NDArray[np.float64]
 
 START = "start_idc.fits"
+REFERENCE = "F606W"  # the filter of the detector's tables and of the drift
 SCALE_ARCSEC = 0.05
 V2V3 = (257.4, 302.6)  # arcsec: where the reference chip's zero point lies, about
 
 CONFIG = """\
-# Calibrates one filter of a simulated campaign: bayesdist run THIS -o RUN
+# Calibrates one filter of a simulated campaign: bayesdist run THIS -o {run}
 [campaign]
 catalog = "catalog.parquet"
 exposures = "exposures.ecsv"
@@ -35,7 +36,7 @@ filter = "{filter}"
 mag = [-14.0, -10.0]         # instrumental; brighter ones are saturated
 q_max = 0.1
 
-[tables]
+[tables]{detector}
 method = "field"             # or "binned", as ACS ISR 2015-06; or "none"
 
 [detector]
@@ -60,7 +61,7 @@ order = 5
 [model.tdd]                  # before and after Servicing Mission 4
 epoch0 = [2004.5, 2012.5]
 breaks = [2009.4]
-terms = [["u", 1, 0], ["v", 1, 0], ["v", 0, 1]]
+terms = [["u", 1, 0], ["v", 1, 0], ["v", 0, 1]]{rates}
 
 [assess]
 epoch = 2006.5
@@ -71,7 +72,9 @@ name = "alignment"
 statistic = "p95"
 limit = 0.05
 unit = "pix"
+"""
 
+RELEASE = """
 [products.release]
 name = "acs_wfc"
 reference = "{start}"        # how V2 and V3 lie
@@ -124,14 +127,44 @@ def simulate_campaign(options: argparse.Namespace) -> str:
         )
     write_acs(campaign, folder, force=options.force)
     write_idctab(_stale(), folder / START)
-    for name in campaign.log.filters:
-        path = folder / f"campaign_{name.lower()}.toml"
-        with atomic_path(path) as temporary:
-            temporary.write_text(CONFIG.format(filter=name, start=START), encoding="utf-8")
-    first = campaign.log.filters[0].lower()
+    filters = campaign.log.filters
+    first = REFERENCE if REFERENCE in filters else filters[0]
+    names = [first, *(name for name in filters if name != first)]
+    for name in names:
+        with atomic_path(folder / _config_of(name)) as temporary:
+            temporary.write_text(_config(name, first), encoding="utf-8")
+    lines = [
+        f"bayesdist run {folder / _config_of(name)} -o {folder / _run(name)}" for name in names
+    ]
+    if len(names) > 1:
+        runs = " ".join(str(folder / _run(name)) for name in names)
+        lines.append(f"bayesdist release {runs} -o {folder / 'release'}")
     return (
         f"{table_text(_rows(campaign))}\n\n{folder / 'README.txt'} says what the files hold\n"
-        f"calibrate it:  bayesdist run {folder / f'campaign_{first}.toml'} -o RUN"
+        "calibrate it:\n  " + "\n  ".join(lines)
+    )
+
+
+def _config_of(filter: str) -> str:
+    return f"campaign_{filter.lower()}.toml"
+
+
+def _run(filter: str) -> str:
+    return f"run_{filter.lower()}"
+
+
+def _config(filter: str, reference: str) -> str:
+    """Text of a configuration: other filters take tables and drift from the reference's run."""
+    text = CONFIG + RELEASE if filter == reference else CONFIG
+    own = filter == reference
+    return text.format(
+        filter=filter,
+        start=START,
+        run=_run(filter),
+        detector=""
+        if own
+        else f'\ndetector = "{_run(reference)}"       # held; fitted is the filter\'s',
+        rates="" if own else f'\nrates = "{_run(reference)}"          # one drift for all filters',
     )
 
 

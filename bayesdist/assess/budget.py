@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.fields import MODEL, ErrorFields, draw_solution, error_fields_of
+from bayesdist.assess.field_terms import FieldTerm
+from bayesdist.assess.fields import MODEL, ErrorFields, draw_errors
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms import LOCAL, LocalTerm, UserTerm
@@ -72,12 +73,12 @@ class ErrorBudget:
     chip : int
     epoch : float or None
     terms : tuple of BudgetTerm
-        Parts of the model first, then the user's.
+        Parts of the model first, then field terms, local ones, and the user's.
     model_u, model_v : ndarray, shape (ny, nx)
-        All parts of the model jointly.  They are correlated, so this may be smaller than any of
-        them.
+        All parts of the model and the field terms jointly.  They are correlated, so this may be
+        smaller than any of them.
     total_u, total_v : ndarray, shape (ny, nx)
-        The model and the user's terms in quadrature.
+        The former, the local terms and the user's in quadrature.
     dominant : ndarray of int, shape (ny, nx)
         Index into `terms` of the one with the largest radial error.
     n_draws : int
@@ -131,6 +132,8 @@ def error_budget(
     solution: Solution,
     *,
     terms: Sequence[UserTerm] = (),
+    fields: Sequence[FieldTerm] = (),
+    aligned: bool = False,
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     chip: int | None = None,
@@ -140,13 +143,18 @@ def error_budget(
 ) -> ErrorBudget:
     """The error budget of a solution over a grid, at an epoch.
 
-    The parts of the model are combined by joint draws, for they are correlated; the user's terms
-    are independent and added in quadrature.
+    The parts of the model and the field terms are combined by joint draws, for they are correlated;
+    the user's terms are independent and added in quadrature.
 
     Parameters
     ----------
     solution : LinearFit or Posterior
     terms : sequence of UserTerm
+    fields : sequence of FieldTerm
+        Errors that are fields over the detector, each a row of its own.
+    aligned : bool
+        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`.
+        The user's terms stay as they are given.
     grid : tuple of int
         Points on x and y.
     epoch : float, optional
@@ -174,6 +182,8 @@ def error_budget(
         solution,
         (number,),
         terms=terms,
+        fields=fields,
+        aligned=aligned,
         grid=grid,
         epoch=epoch,
         n_draws=n_draws,
@@ -188,6 +198,8 @@ def error_budgets(
     chips: Sequence[int],
     *,
     terms: Sequence[UserTerm] = (),
+    fields: Sequence[FieldTerm] = (),
+    aligned: bool = False,
     local: Sequence[LocalTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
@@ -204,7 +216,7 @@ def error_budgets(
         Chip numbers.
     local : sequence of LocalTerm
         Measured beside the solution, on this grid.
-    terms, grid, epoch, n_draws, rng, pixel_scale
+    terms, fields, aligned, grid, epoch, n_draws, rng, pixel_scale
         As in `error_budget`.
 
     Returns
@@ -220,15 +232,12 @@ def error_budgets(
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution, chips[0])
     sigmas = [t.sigma(unit, pixel_scale) for t in terms]  # refuse bad units before the work
-    grids = [
-        grid_pixels(place_of(solution.model, epoch=epoch, chip=c).chip.size, grid) for c in chips
-    ]
-    theta, exposures = draw_solution(solution, n_draws, rng)
-    out = []
-    for c, (x, y) in zip(chips, grids, strict=True):
-        fields = error_fields_of(solution, theta, exposures, *mesh(x, y), epoch=epoch, chip=c)
-        out.append(_budget(fields, x, y, terms, sigmas, local))
-    return tuple(out)
+    grids = {
+        c: grid_pixels(place_of(solution.model, epoch=epoch, chip=c).chip.size, grid) for c in chips
+    }
+    draws = draw_errors(solution, n_draws, rng, fields=fields, aligned=aligned)
+    drawn = draws.at({c: mesh(*xy) for c, xy in grids.items()}, epoch=epoch)
+    return tuple(_budget(f, *grids[f.chip], terms, sigmas, local) for f in drawn)
 
 
 def _budget(

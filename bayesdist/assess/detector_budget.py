@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.budget import ErrorBudget, budget_row, error_budgets
+from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.grid import DEFAULT_GRID
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms import LocalTerm, UserTerm
@@ -76,6 +77,8 @@ def detector_budget(
     solution: Solution,
     *,
     terms: Sequence[UserTerm] = (),
+    fields: Sequence[FieldTerm] = (),
+    aligned: bool = False,
     local: Sequence[LocalTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
@@ -89,6 +92,9 @@ def detector_budget(
     ----------
     solution : LinearFit or Posterior
     terms : sequence of UserTerm
+    fields : sequence of FieldTerm
+    aligned : bool
+        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`.
     local : sequence of LocalTerm
         Measured beside the solution, on this grid.
     grid : tuple of int
@@ -115,6 +121,8 @@ def detector_budget(
             solution,
             tuple(c.number for c in solution.model.chips),
             terms=terms,
+            fields=fields,
+            aligned=aligned,
             local=local,
             grid=grid,
             epoch=epoch,

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.fields import MODEL, ErrorFields, draw_solution, error_fields_of
+from bayesdist.assess.field_terms import FieldTerm
+from bayesdist.assess.fields import MODEL, ErrorFields, draw_errors
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.assess.names import require_known
 from bayesdist.assess.solution import Solution, place_of
@@ -134,6 +135,8 @@ def check_requirements(
     requirements: Sequence[Requirement],
     *,
     terms: Sequence[UserTerm] = (),
+    fields: Sequence[FieldTerm] = (),
+    aligned: bool = False,
     local: Sequence[LocalTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
@@ -147,9 +150,10 @@ def check_requirements(
     """Judge requirements on draws of the position error.
 
     Each draw is an error field over the grid: a draw of the solution minus its mean (all parts of
-    the model jointly, so with the correlation between positions), plus for the systematic terms one
-    Gaussian offset of each axis for the whole field, plus for the random and the local terms an
-    independent Gaussian error at every grid point.  The statistic of each field gives a
+    the model jointly, so with the correlation between positions), plus a draw of every field term
+    that is not among the solution's errors, plus for the systematic terms one Gaussian offset of
+    each axis for the whole field, plus for the random and the local terms an independent Gaussian
+    error at every grid point.  The statistic of each field gives a
     distribution, and the fraction of draws at or under the limit is compared with the probability
     asked for.
 
@@ -161,6 +165,10 @@ def check_requirements(
     solution : LinearFit or Posterior
     requirements : sequence of Requirement
     terms : sequence of UserTerm
+    fields : sequence of FieldTerm
+    aligned : bool
+        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`:
+        over all chips, also where one is judged.  The user's terms stay as they are given.
     local : sequence of LocalTerm
         Measured beside the solution, on this grid.
     grid : tuple of int
@@ -211,29 +219,21 @@ def check_requirements(
     cases = [
         (t, _chips_of(r, solution, chip, t)) for r, t in zip(requirements, epochs, strict=True)
     ]
-    theta, exposures = draw_solution(solution, n_draws, rng)
-    offsets = rng.normal(size=(len(theta), 2)) * systematic
+    added = [term for term in fields if term.without is None]
+    drawn = draw_errors(solution, n_draws, rng, fields=added, aligned=aligned)
+    offsets = rng.normal(size=(n_draws, 2)) * systematic
     statistics: dict[tuple[Case, str], Float] = {}
     for case in dict.fromkeys(cases):
         names = {r.statistic for r, c in zip(requirements, cases, strict=True) if c == case}
         epoch, chips = case
-        fields = [
-            error_fields_of(
-                solution,
-                theta,
-                exposures,
-                *mesh(*grid_pixels(one.size, grid)),
-                epoch=epoch,
-                chip=one.number,
-            )
-            for one in chips
-        ]
-        everywhere = np.concatenate([_at_points(f, random, local, grid) for f in fields])
-        for name, values in _statistics(fields, sorted(names), offsets, everywhere, rng).items():
+        points = {one.number: mesh(*grid_pixels(one.size, grid)) for one in chips}
+        errors = drawn.at(points, epoch=epoch)
+        everywhere = np.concatenate([_at_points(f, random, local, grid) for f in errors])
+        for name, values in _statistics(errors, sorted(names), offsets, everywhere, rng).items():
             statistics[case, name] = values
 
     doubt = _doubt(solution, converged) or doubt
-    n_effective = effective_draws(solution, len(theta))
+    n_effective = effective_draws(solution, n_draws)
     margins = []
     for r, case in zip(requirements, cases, strict=True):
         draws = statistics[case, r.statistic] * convert(1.0, unit, r.unit, pixel_scale)

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.infer.views import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
 
 __all__ = ["Place", "Solution", "kind_of", "place_of", "point_blocks"]
@@ -24,23 +23,6 @@ Float = NDArray[np.float64]
 
 # Points whose basis values are held at once: 55 terms (order 9) of them are 14 MB.
 BLOCK = 32768
-
-
-class Solution(Protocol):
-    """A fit or a posterior: a model with values, their covariance, and draws of them."""
-
-    @property
-    def model(self) -> DistortionModel: ...
-
-    @property
-    def mean(self) -> Float: ...
-
-    @property
-    def cov(self) -> Float: ...
-
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors, shape (n, D)."""
-        ...
 
 
 def kind_of(solution: Solution) -> str:
@@ -88,31 +70,8 @@ class Place:
         return (d @ cov @ d.T).reshape(2, K, 2, K)
 
     def gradient(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Derivatives of the basis functions.
-
-        Parameters
-        ----------
-        x, y : array_like, shape (N,)
-            FITS 1-based pixels.
-
-        Returns
-        -------
-        d_dx, d_dy : ndarray, shape (N, K)
-            Per pixel.
-        """
-        basis = self.basis
-        n = basis.order
-        derivative = np.zeros((n + 1, n + 1))  # column i holds P_i' in Legendre polynomials
-        for i in range(1, n + 1):
-            derivative[:i, i] = legendre.legder(np.eye(n + 1)[i, : i + 1])
-        X, Y = basis.scaled(x, y)
-        px, py = legendre.legvander(X, n), legendre.legvander(Y, n)
-        i, j = np.array(basis.terms).T
-        half_x, half_y = basis.half_size
-        return (
-            (px @ derivative)[:, i] * py[:, j] / half_x,
-            px[:, i] * (py @ derivative)[:, j] / half_y,
-        )
+        """Derivatives of the basis functions by the pixel: see `PolynomialBasis.gradient`."""
+        return self.basis.gradient(x, y)
 
 
 def place_of(

@@ -62,7 +62,9 @@ class StarSums:
     Parameters
     ----------
     binned : mapping of (int, (int, int)) to BinnedSums
-        Residuals of the stars used, by the chip's number and the numbers of bins on x and y.
+        Residuals of the stars used, by the chip's number and the numbers of bins on x and y.  Where
+        exposures have frames that turn, they are along the axes of the polynomials: what belongs to
+        the detector would cancel along those of the sky.
     exposures : ExposureSums
     """
 
@@ -97,7 +99,7 @@ def star_sums(
     residual = stars.residuals(theta)
     exposures = _exposure_sums(stars, used, residual)
     code = _of_groups(stars, stars.groups.chip)
-    arrays = (*stars.pixels(), *residual.T)
+    arrays = (*stars.pixels(), *_along_gauge(stars, theta, residual).T)
     binned = {}
     for number, several in partitions.items():
         k = stars.model.chip_code(number)
@@ -107,6 +109,18 @@ def star_sums(
         for bins in several:
             binned[number, bins] = binned_sums(*here, bins=bins, size=size)
     return StarSums(binned, exposures)
+
+
+def _along_gauge(stars: Stars, theta: Float, residual: Float) -> Float:
+    """Residuals along the axes of the polynomials, before the frames."""
+    if not stars.model.n_frame:
+        return residual
+    out = residual.copy()
+    for g, e in enumerate(stars.groups.exposure):
+        matrix, _ = stars.model.frame(theta, int(e))
+        rows = slice(stars.starts[g], stars.starts[g + 1])
+        out[rows] = np.linalg.solve(matrix, residual[rows].T).T
+    return out
 
 
 def flagged_by_exposure(shards: Shards, posterior: Posterior) -> Int:

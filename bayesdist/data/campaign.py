@@ -10,18 +10,26 @@ catalogue positions (ACS ISR 2015-06, Section 4.1).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.data.campaign_faults import (
+    all_cut,
+    check_campaign,
+    failure,
+    refuse_astray,
+    too_many,
+)
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposure_match import ExposureMatch, match_exposure
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.merging import encoded, merged_counts
+from bayesdist.data.mismatch import mismatch_reason
 from bayesdist.data.patterns import PatternIndex, pattern_index
 from bayesdist.data.starlists import StarCuts, StarList
 from bayesdist.errors import InputError
@@ -36,6 +44,9 @@ Float = NDArray[np.float64]
 Start = Callable[[Float, Float, NDArray[np.int64], float], ArrayLike]
 
 _UNMATCHED = "no counterpart in the catalogue"
+_LEFT_OUT = "exposure left out"
+_ASTRAY = 0.2  # of the matched share of the best chip: a chip below lies elsewhere
+_ENOUGH = 20  # detections of a chip, of which that can be said
 
 
 @dataclass(frozen=True)
@@ -55,6 +66,8 @@ class ExposureReport:
         Matched on each chip of the campaign.
     missing_chips : tuple of int
         Chips of the campaign without a detection that passed the cuts.
+    astray : tuple of int
+        Chips whose detections hardly match, where those of another chip do.
     expected : int
         Catalogue stars in the footprint of the detections and within their range of magnitudes.
     completeness : float
@@ -86,6 +99,7 @@ class ExposureReport:
     matched: int
     per_chip: Mapping[int, int]
     missing_chips: tuple[int, ...]
+    astray: tuple[int, ...]
     expected: int
     completeness: float
     false_rate: float
@@ -110,10 +124,13 @@ class CampaignMatches:
         are those of the catalogue there, without the centroid's error.
     reports : tuple of ExposureReport
         In the order of the lists.
+    left_out : dict of str to str
+        Exposures that did not match, and why.
     """
 
     table: MatchTable
     reports: tuple[ExposureReport, ...]
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def summary(self) -> Table:
         """The reports as a table, a row for each exposure; chips and reasons are columns."""
@@ -152,6 +169,7 @@ def match_campaign(
     hint_rotation: float | Mapping[str, float] | None = None,
     scale: tuple[float, float] = (0.97, 1.03),
     need_all_chips: bool = False,
+    skip: bool = False,
 ) -> CampaignMatches:
     """Match the star lists of many exposures with a catalogue.
 
@@ -180,6 +198,9 @@ def match_campaign(
         Smallest and largest scale from the start's plane to the catalogue.
     need_all_chips : bool, optional
         Whether an exposure without detections on a chip that others have is an error.
+    skip : bool, optional
+        Whether exposures that do not match, or lose all their detections to the cuts, are left out
+        and counted.  More than a fifth of them, or the first two, are an error all the same.
 
     Returns
     -------
@@ -190,9 +211,10 @@ def match_campaign(
     InputError
         When an exposure is not in the log, stands in two lists, loses all its detections to the
         cuts, lacks a chip that it must have, or shows another field: then with the best number of
-        coincidences.
+        coincidences, and with the scale or the mirror image that would match.  When in most
+        exposures one chip does not match where another does.
     """
-    _check(lists, log, catalog)
+    check_campaign(lists, log, catalog)
     cuts = StarCuts() if cuts is None else cuts
     passed = [cuts.passed(one) for one in lists]
     chips = sorted({chip for one in lists for chip in one.chips})
@@ -201,12 +223,11 @@ def match_campaign(
     then: dict[float, ReferenceCatalog] = {}
     found: list[ExposureMatch] = []
     reports: list[ExposureReport] = []
+    failed: dict[str, InputError] = {}
     for one, (good, rejected) in zip(lists, passed, strict=True):
         where = f"{one.source}, exposure {one.exposure}"
         missing = tuple(chip for chip in chips if not (one.chip[good] == chip).any())
-        if not good.any():
-            raise InputError("the cuts leave no detection", where=where, do="widen the cuts")
-        if missing and need_all_chips:
+        if missing and need_all_chips and good.any():
             raise InputError(
                 f"has no detections on chip {missing[0]}",
                 where=where,
@@ -218,48 +239,38 @@ def match_campaign(
         hint = hint_rotation
         if isinstance(hint_rotation, Mapping):
             hint = hint_rotation.get(one.exposure)
-        match = match_exposure(
-            one,
-            good,
-            _started(start, one, epoch),
-            then[epoch],
-            index,
-            radius=radius,
-            hint=hint,  # type: ignore[arg-type]
-            scale=scale,
-            source=where,
-        )
+        plane = _started(start, one, epoch)
+        try:
+            if not good.any():
+                raise all_cut(one, rejected, where)
+            match = match_exposure(
+                one,
+                good,
+                plane,
+                then[epoch],
+                index,
+                radius=radius,
+                hint=hint,  # type: ignore[arg-type]
+                scale=scale,
+                source=where,
+            )
+        except InputError as error:
+            reason = ""
+            if good.any() and not found and not failed:
+                reason = mismatch_reason(plane, one.mag, index)
+            failed[one.exposure] = error
+            if reason or not skip or too_many(len(failed), len(found), len(lists)):
+                raise failure(failed, reason, len(lists)) from error
+            continue
         found.append(match)
-        reports.append(_report(one, log, match, rejected, tuple(chips), missing))
-    return CampaignMatches(_table(lists, log, catalog, found, reports), tuple(reports))
-
-
-def _check(lists: Sequence[StarList], log: ExposureLog, catalog: ReferenceCatalog) -> None:
-    if not lists:
-        raise InputError("there are no star lists to match", do="give at least one")
-    names = [one.exposure for one in lists]
-    for k, one in enumerate(lists):
-        if one.exposure not in log:
-            raise InputError(
-                f"exposure {one.exposure} is not in {log.source}",
-                where=one.source,
-                do="add it to the log, or leave the list out",
-            )
-        if one.exposure in names[:k]:
-            raise InputError(
-                f"exposure {one.exposure} has a list in {lists[names.index(one.exposure)].source}, "
-                "too",
-                where=one.source,
-                do="give one list for each exposure",
-            )
-    for name in ("sigma_u", "sigma_v"):
-        sigma = getattr(catalog, name)
-        if sigma is not None and not (sigma > 0).all():
-            raise InputError(
-                "an error of 0 cannot be the error of a match",
-                where=f"{catalog.source}, row {int(np.argmin(sigma)) + 1}, column {name!r}",
-                do="give positive errors, or leave the columns out",
-            )
+        reports.append(_report(one, good, log, match, rejected, tuple(chips), missing))
+    refuse_astray(reports, catalog)
+    kept = [one for one in lists if one.exposure not in failed]
+    table = _table(kept, log, catalog, found, reports)
+    if failed:
+        n = sum(len(one) for one in lists) - table.n_rows
+        table = replace(table, n_rows=table.n_rows + n, rejected={**table.rejected, _LEFT_OUT: n})
+    return CampaignMatches(table, tuple(reports), {k: e.cause for k, e in failed.items()})
 
 
 def _index(catalog: ReferenceCatalog, epoch: float) -> PatternIndex:
@@ -282,6 +293,7 @@ def _started(start: Start, stars: StarList, epoch: float) -> Float:
 
 def _report(
     stars: StarList,
+    good: NDArray[np.bool_],
     log: ExposureLog,
     match: ExposureMatch,
     rejected: Mapping[str, int],
@@ -289,6 +301,10 @@ def _report(
     missing: tuple[int, ...],
 ) -> ExposureReport:
     exposure = log[stars.exposure]
+    asked = {chip: int((stars.chip[good] == chip).sum()) for chip in chips}
+    matched = {chip: int((stars.chip[match.index] == chip).sum()) for chip in chips}
+    share = {chip: matched[chip] / n for chip, n in asked.items() if n >= _ENOUGH}
+    best = max(share.values(), default=0.0)
     return ExposureReport(
         exposure=exposure.name,
         filter=exposure.filter,
@@ -296,8 +312,9 @@ def _report(
         detected=len(stars),
         rejected=dict(rejected),
         matched=len(match.index),
-        per_chip={chip: int((stars.chip[match.index] == chip).sum()) for chip in chips},
+        per_chip=matched,
         missing_chips=missing,
+        astray=tuple(chip for chip, part in share.items() if part < _ASTRAY * best),
         expected=match.expected,
         completeness=match.completeness,
         false_rate=match.false_rate,

@@ -287,7 +287,7 @@ def catalog_from_table(
         raise InputError(
             f"no columns for u, v or ra, dec among {', '.join(table.colnames) or 'none'}",
             where=source,
-            do="name them in the option 'columns'",
+            do="rename the columns, or name them in the option 'columns'",
         )
 
     def column(key: str) -> SourceColumn:

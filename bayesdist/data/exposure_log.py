@@ -199,7 +199,9 @@ class ExposureLog:
                 if getattr(one, key) in (None, ""):
                     do = "add it to the log"
                     if key == "vafactor":
-                        do += ", or compute it from epoch, ra and dec"
+                        do += (
+                            ", or compute it from epoch, ra and dec (campaign.aberration = 'earth')"
+                        )
                     raise InputError(f"exposure {one.name} has no {key}", where=self.source, do=do)
 
     def values(self, quantity: str) -> NDArray[np.float64]:

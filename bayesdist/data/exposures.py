@@ -74,7 +74,7 @@ def read_exposures(
             raise InputError(
                 f"no column for {key!r} among {', '.join(table.colnames) or 'none'}",
                 where=str(path),
-                do="name it in the option 'columns'",
+                do="rename the column, or name it in the option 'columns'",
             )
     if not len(table):
         raise InputError("holds no exposures", where=str(path), do="name at least one")

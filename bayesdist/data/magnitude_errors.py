@@ -11,7 +11,7 @@ from scipy.optimize import isotonic_regression
 
 from bayesdist.errors import InputError
 
-__all__ = ["MagnitudeErrors", "estimate"]
+__all__ = ["MagnitudeErrors", "estimate", "no_magnitudes"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -68,6 +68,15 @@ class MagnitudeErrors:
             np.exp(PchipInterpolator(self.mag, np.log(sigma))(inside))
             for sigma in (self.sigma_u, self.sigma_v)
         )
+
+
+def no_magnitudes(where: str) -> InputError:
+    """The error for stars whose errors are to follow from magnitudes that they do not have."""
+    return InputError(
+        "holds no magnitudes, and errors by magnitude need them",
+        where=where,
+        do="name the column mag, or give errors as columns or as a number",
+    )
 
 
 def estimate(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.duplicates import first_duplicate
-from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
 from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
 from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
 from bayesdist.data.units import check_unit
@@ -361,11 +361,7 @@ class MatchTable:
             Without magnitudes.
         """
         if self.mag is None:
-            raise InputError(
-                "holds no magnitudes, and errors by magnitude need them",
-                where=", ".join(self.sources),
-                do="give a table with magnitudes",
-            )
+            raise no_magnitudes(", ".join(self.sources))
         return self.with_sigma(*errors.at(self.mag))
 
     @staticmethod

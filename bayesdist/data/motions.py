@@ -169,9 +169,10 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
     sigma = _motion_errors(catalog)
     if catalog.mag is None:
         raise InputError(
-            "has no magnitudes to draw the line by",
+            "has no magnitudes to tell badly measured motions by",
             where=catalog.source,
-            do="give them, or one largest error for all",
+            do="give them, or one largest error for all, or keep all stars "
+            "(campaign.motions = 'all')",
         )
     count = int(np.clip(len(catalog) // _IN_BIN, 1, _MOST))
     parts = np.array_split(np.argsort(catalog.mag, kind="stable"), count)

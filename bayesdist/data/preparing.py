@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.exposures import ExposureLog
-from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 
@@ -39,11 +39,7 @@ def with_centroid_errors(table: MatchTable, errors: MagnitudeErrors) -> MatchTab
         Without magnitudes.
     """
     if table.mag is None:
-        raise InputError(
-            "holds no magnitudes, and the errors of the centroids depend on them",
-            where=", ".join(table.sources),
-            do="give lists with magnitudes",
-        )
+        raise no_magnitudes(", ".join(table.sources))
     sigma_u, sigma_v = errors.at(table.mag)
     if table.sigma_u is not None and table.sigma_v is not None:
         sigma_u, sigma_v = np.hypot(sigma_u, table.sigma_u), np.hypot(sigma_v, table.sigma_v)

@@ -15,6 +15,7 @@ from bayesdist.data.astrometrynet import COLUMNS as CORR_COLUMNS
 from bayesdist.data.astrometrynet import is_astrometrynet, matches_from_corr
 from bayesdist.data.columns import matches_from_table, sky_positions
 from bayesdist.data.hst1pass import is_hst1pass, is_matchup, read_hst1pass, read_matchup
+from bayesdist.data.magnitude_errors import no_magnitudes
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching import match_table
 from bayesdist.data.tables import TABLE_SUFFIXES, read_lines, read_table
@@ -201,11 +202,7 @@ def refuse_missing_errors(
             do="name sigma_u and sigma_v, or set sigma to 'by_magnitude' or a number",
         )
     if sigma == "by_magnitude" and not has_mag:
-        raise InputError(
-            "holds no magnitudes, and errors by magnitude need them",
-            where=where,
-            do="name the column mag, or set sigma to a number",
-        )
+        raise no_magnitudes(where)
 
 
 def _kind(file: Path, columns: Mapping[str, str] | None) -> str:

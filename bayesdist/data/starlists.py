@@ -256,7 +256,7 @@ def _of_table(
             raise InputError(
                 f"no column for {key!r} among {', '.join(table.colnames) or 'none'}",
                 where=source,
-                do="name it in the option 'columns'",
+                do="rename the column, or name it in the option 'columns'",
             )
     if not len(table):
         raise InputError("holds no detections", where=source, do="give a list with stars")

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import DegenerateError, InputError
@@ -26,7 +26,7 @@ from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.shards import Compute, Matches, Shards, opened
 from bayesdist.model import DistortionModel
 
-__all__ = ["SHEARS", "CatalogueShear", "catalogue_shear"]
+__all__ = ["SHEARS", "CatalogueShear", "catalogue_shear", "one_roll_angle", "roll_spread"]
 
 Float = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ _SHAPES = np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
 
 # a shear that is known no better than this is not known: 20 pixels over half of an ACS chip
 KNOWN = 1e-2
-ONE_ROLL = 1e-4  # of `roll_spread`: within half a degree
+ONE_ROLL = 2.0  # degrees: roll angles that scatter by less are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,7 @@ class CatalogueShear:
     cov : ndarray, shape (2, 2)
         With the detector's parameters and all frames free.
     roll_spread : float
-        1 - |mean of exp(2 i roll)| over the exposures: 0 for one roll angle (or two half a turn
-        apart), 1 for angles all around.
+        Of the exposures, see `roll_spread`.
     """
 
     value: Float
@@ -61,6 +60,28 @@ class CatalogueShear:
     def sigma(self) -> Float:
         """Standard deviations, shape (2,)."""
         return np.asarray(np.sqrt(np.diag(self.cov)))
+
+
+def roll_spread(angles: ArrayLike) -> float:
+    """How far roll angles differ, as far as shears can tell: 1 - |mean of exp(2 i angle)|.
+
+    Parameters
+    ----------
+    angles : array_like, shape (E,)
+        Radians.
+
+    Returns
+    -------
+    float
+        0 for one angle, or two half a turn apart; 2 s^2 for angles that scatter by a small s; 1 for
+        angles all around, or two a quarter of a turn apart.
+    """
+    return float(1.0 - abs(np.exp(2j * np.asarray(angles, float)).mean()))
+
+
+def one_roll_angle(angles: ArrayLike) -> bool:
+    """Whether exposures at these angles (E,), in radians, see a shear of the catalogue alike."""
+    return roll_spread(angles) < 2.0 * np.radians(ONE_ROLL) ** 2
 
 
 # matrices here are small: more BLAS threads only get in each other's way
@@ -117,11 +138,10 @@ def catalogue_shear(
     right = np.concatenate([right + priors.pull(fit.mean), own])
 
     rolls = np.array([np.arctan2(M[1, 0], M[0, 0]) for M in _frames(fit, equations)])
-    spread = float(1 - abs(np.exp(2j * rolls).mean()))
     space = null_space(matrix, (*model.names, *SHEARS))
     with_shear = [d for d in space.directions if any(name in SHEARS for name in d)]
     if with_shear:
-        _refuse(with_shear[0], spread, model)
+        _refuse(with_shear[0], rolls, model)
     factor = matrix.factor()
     unit = np.zeros((2, matrix.size))
     unit[:, -2:] = np.eye(2)
@@ -131,8 +151,8 @@ def catalogue_shear(
         direction = factor.solve(unit[int(np.argmax(cov.diagonal()))])
         scale = np.sqrt(matrix.diagonal())
         largest = np.argsort(-np.abs(direction * scale))[:6]
-        _refuse(tuple((*model.names, *SHEARS)[k] for k in largest), spread, model)
-    return CatalogueShear(factor.solve(right)[-2:], cov, spread)
+        _refuse(tuple((*model.names, *SHEARS)[k] for k in largest), rolls, model)
+    return CatalogueShear(factor.solve(right)[-2:], cov, roll_spread(rolls))
 
 
 def _derivative(equations: NormalEquations) -> Float:
@@ -153,10 +173,10 @@ def _frames(fit: LinearFit, equations: NormalEquations) -> list[Float]:
     return [fit.model.frame(fit.mean, int(e))[0] for e in np.unique(equations.groups.exposure)]
 
 
-def _refuse(direction: tuple[str, ...], spread: float, model: DistortionModel) -> None:
+def _refuse(direction: tuple[str, ...], rolls: Float, model: DistortionModel) -> None:
     frames = {p.name for p in model.parameters if p.kind == "frame" and "shear" in p.name}
     do = "trust the catalogue's axes, or add exposures at another roll angle"
-    if spread < ONE_ROLL:
+    if one_roll_angle(rolls):
         reason = "all exposures have one roll angle, or angles half a turn apart"
     elif frames & set(direction):
         reason = f"the frame '{model.frames}' of each exposure absorbs any shear"

@@ -8,6 +8,9 @@ A telescope breathes: the linear terms of its exposures scatter by more than the
 and a joint fit that does not know this believes in each star as if it were a new measurement of the
 detector.  The scatter tau is estimated with everything else.
 
+How the distance between chips goes with scale and shear is left open: it is no ruler, as it may
+drift by itself, and no measurement of its own (see `CAUTION`).
+
 One linear fit with a wide prior on the deviations is enough.  Its normal equations tell what the
 data alone say of them; tau, and what follows from any tau for all parameters, is then algebra (see
 `Scatter`).
@@ -39,6 +42,10 @@ __all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference"]
 Float = NDArray[np.float64]
 
 SCALE = 1e-4  # of the prior on tau: what velocity aberration does to the scale in a year
+# A focal plane that breathes moves its chips too: then the gap's deviations are those of scale and
+# shear over again, and taken as independent they would halve the error of a drift.  At four times
+# their scatter they take 3 % off it.
+CAUTION = 4.0
 ROUNDS = 5  # of looking for exposures that went wrong
 MOST_OUTLYING = 0.2  # of the exposures: beyond, they are the rule
 LEAST_DETERMINED = 0.5  # deviations of a kind that the data must determine, out of E
@@ -113,7 +120,7 @@ class HierarchicalFit:
     def priors(self) -> GaussianPriors:
         """The given priors and those of the deviations, as `sample` wants them."""
         return _with_deviations(
-            self.others, self.index, self.scatter.precision(_root_mean_square(self.tau_draws))
+            self.others, self.index, self.scatter.prior(_root_mean_square(self.tau_draws))
         )
 
     @cached_property
@@ -296,7 +303,8 @@ def fit_hierarchical(
     n = len(model.exposures)
     kind, member = np.divmod(np.arange(len(index)), n)
     half = max(max(chip.size) for chip in model.chips) / 2
-    scales = np.array([scale * (half * pixel if "shift" in name else 1.0) for name in kinds])
+    of_gap = np.array(["shift" in name for name in kinds])
+    scales = scale * np.where(of_gap, half * pixel, 1.0)
     options: dict[str, Any] = {"clip_chi2": clip_chi2, "clip_abs": clip_abs}
     with opened(model, matches, compute) as shards:
         wide = _with_deviations(others, index, scales[kind] ** -2)
@@ -313,12 +321,13 @@ def fit_hierarchical(
             first.mean,
             scales,
             np.zeros(len(index), bool),
+            np.where(of_gap, CAUTION, 1.0),
         )
         _require_determined(scatter)
         outlying = _outlying(scatter, member)
         scatter = scatter.loosened(outlying[member])
         tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
-        precision = scatter.precision(_root_mean_square(tau_draws))
+        precision = scatter.prior(_root_mean_square(tau_draws))
         fit = fit_linear(
             shards, model, priors=_with_deviations(others, index, precision), **options
         )
@@ -360,7 +369,7 @@ def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> No
 
 def _require_determined(scatter: Scatter) -> None:
     """Refuse data that hardly say more of a kind of deviation than its prior does."""
-    _, factor = scatter.posterior(scatter.scale)
+    _, factor = scatter.posterior(scatter.scale / scatter.caution)
     # of E deviations of a kind, so many are known from the data rather than from the prior
     known = 1 - factor.variances()[scatter.index] / scatter.scale[scatter.kind] ** 2
     determined = np.bincount(scatter.kind, known)

@@ -38,7 +38,8 @@ class NullSpace:
     rank : int
     n_params : int
     condition : float
-        Ratio of the extreme eigenvalues of the normal matrix scaled to unit diagonal.
+        Ratio of the extreme eigenvalues of the normal matrix scaled to unit diagonal; infinite
+        where the rank is not full.
     directions : tuple of tuple of str
         Names of the parameters that make up each free direction, the largest part first.
     """
@@ -72,11 +73,10 @@ def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
         size = np.abs(vector)
         parts = np.argsort(-size)[:6]
         directions.append(tuple(names[k] for k in parts if size[k] > 0.1 * size.max()))
-    smallest = max(values[0], np.finfo(float).tiny)
     return NullSpace(
         rank=int((~free).sum()),
         n_params=len(names),
-        condition=float(values[-1] / smallest),
+        condition=float("inf") if free.any() else float(values[-1] / values[0]),
         directions=tuple(directions),
     )
 

@@ -66,6 +66,9 @@ class Scatter:
         Of the half-Student-t prior on each tau, with 4 degrees of freedom.
     loose : ndarray of bool, shape (m,)
         Which deviations have the prior N(0, scale^2).
+    caution : ndarray, shape (k,)
+        Factor, 1 or more, on tau in what follows from it for theta.  A kind that may be correlated
+        with others is kept from telling of them what it takes from its independence.
     """
 
     kinds: tuple[str, ...]
@@ -76,14 +79,19 @@ class Scatter:
     about: Float
     scale: Float
     loose: NDArray[np.bool_]
+    caution: Float
 
     def precision(self, tau: Float) -> Float:
-        """Inverse variances (m,) of the deviations' prior."""
+        """Inverse variances (m,) of the deviations where tau is known."""
         return np.asarray(np.where(self.loose, self.scale[self.kind], tau[self.kind]) ** -2)
 
-    def _solved(self, tau: Float) -> tuple[ArrowFactor, Float, Float]:
+    def prior(self, tau: Float) -> Float:
+        """Inverse variances (m,) of the deviations' prior, with caution."""
+        return self.precision(self.caution * tau)
+
+    def _solved(self, precision: Float) -> tuple[ArrowFactor, Float, Float]:
         """H + P factored, q, and (H + P)^-1 q."""
-        precision, diagonal = self.precision(tau), np.zeros(len(self.about))
+        diagonal = np.zeros(len(self.about))
         diagonal[self.index] = precision
         border, local = self.matrix.split(diagonal)
         factor = Arrow(
@@ -95,23 +103,26 @@ class Scatter:
         return factor, q, factor.solve(q)
 
     def posterior(self, tau: Float) -> tuple[Float, ArrowFactor]:
-        """Mean of theta (D,), and its precision factored, where the scatter is tau (k,)."""
-        factor, _, step = self._solved(tau)
+        """Mean of theta (D,), and its precision factored, given tau (k,) and with caution."""
+        return self._moments(self.prior(tau))
+
+    def _moments(self, precision: Float) -> tuple[Float, ArrowFactor]:
+        factor, _, step = self._solved(precision)
         return self.about + step, factor
 
     def log_density(self, tau: Float) -> float:
         """Log posterior density of log tau, up to a constant."""
         if (tau > LARGEST * self.scale).any():
             return -np.inf
-        factor, q, step = self._solved(tau)
         precision, b = self.precision(tau), self.about[self.index]
+        factor, q, step = self._solved(precision)
         value = q @ step - factor.logdet + np.log(precision).sum() - precision @ b**2
         prior = -0.5 * (DEGREES + 1) * np.log1p((tau / self.scale) ** 2 / DEGREES)
         return float(0.5 * value + (prior + np.log(tau)).sum())
 
     def gradient(self, tau: Float) -> Float:
         """Derivative of `log_density` by log tau, shape (k,)."""
-        mean, factor = self.posterior(tau)
+        mean, factor = self._moments(self.precision(tau))
         squares = (mean**2 + factor.variances())[self.index]
         tight, k = ~self.loose, len(self.kinds)
         second = np.bincount(self.kind[tight], squares[tight], k)
@@ -122,7 +133,7 @@ class Scatter:
     @cached_property
     def robust(self) -> Float:
         """A first tau (k,) that a few exposures which went wrong do not raise much."""
-        mean, factor = self.posterior(self.scale)
+        mean, factor = self._moments(self.precision(self.scale))
         b, sigma = mean[self.index], np.sqrt(factor.variances()[self.index])
         out = np.empty(len(self.kinds))
         for k in range(len(out)):
@@ -147,8 +158,8 @@ class Scatter:
             Where "ten times tau" explains the deviations better than tau does, by what all others
             leave of the group, with odds of 1 to 49 against it beforehand.
         """
-        mean, factor = self.posterior(tau)
         precision = self.precision(tau)
+        mean, factor = self._moments(precision)
         out = np.zeros(int(member.max()) + 1, bool)
         for group in range(len(out)):
             own = np.flatnonzero(member == group)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +23,7 @@ from threadpoolctl import threadpool_limits
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.stars import Stars, prepare
-from bayesdist.infer.views import Solution
+from bayesdist.infer.views import Derived, Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["StarCovariance", "WithStarErrors", "star_covariance", "with_star_errors"]
@@ -58,7 +57,7 @@ class StarCovariance:
 
 
 @dataclass(frozen=True, eq=False)
-class WithStarErrors:
+class WithStarErrors(Derived):
     """A solution with the correlated error of the catalogue in its covariance and its draws.
 
     Parameters
@@ -113,16 +112,6 @@ class WithStarErrors:
         mean = np.asarray(self.mean)
         theta = np.asarray(self.source.draws(n, rng), float)
         return np.asarray(mean + (theta - mean) @ self._recolour.T)
-
-    @property
-    def convergence(self) -> Any:
-        """That of the posterior; a linear fit has none."""
-        return self.source.convergence  # type: ignore[attr-defined]
-
-    @property
-    def approximation(self) -> str:
-        """That of the posterior; a linear fit has none."""
-        return str(self.source.approximation)  # type: ignore[attr-defined]
 
 
 def with_star_errors(solution: Solution, stars: StarCovariance) -> WithStarErrors:

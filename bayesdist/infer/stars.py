@@ -14,7 +14,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import kernel
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Stars", "in_table_order", "prepare"]
+__all__ = ["Stars", "errors_of", "groups_of", "in_table_order", "prepare"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -118,17 +118,8 @@ def prepare(model: DistortionModel, matches: MatchTable) -> tuple[Stars, Int]:
     InputError
         When the table has no errors, another unit, or lacks an epoch that the model needs.
     """
-    if matches.sigma_u is None or matches.sigma_v is None:
-        raise InputError(
-            "the matches carry no errors",
-            do="give sigma columns, a number, or sigma = 'by_magnitude'",
-        )
-    if matches.unit != model.unit:
-        raise InputError(f"the matches are in {matches.unit} and the model is in {model.unit}")
-    numbers = np.asarray(matches.chip_numbers)[matches.chip]
-    groups = model.groups(
-        len(matches), epoch=matches.epoch, exposure=matches.exposure, chip=numbers
-    )
+    sigma_u, sigma_v = errors_of(matches)
+    groups = groups_of(model, matches)
     order: Int | slice = slice(None)  # one group: the usual case, without copies
     if len(groups) > 1:
         order = np.argsort(groups.index, kind="stable")
@@ -140,8 +131,8 @@ def prepare(model: DistortionModel, matches: MatchTable) -> tuple[Stars, Int]:
         rows = slice(starts[g], starts[g + 1])
         basis = model.basis(model.chips[groups.chip[g]].number)
         X[rows], Y[rows] = basis.scaled(x[rows], y[rows])
-    var_u = matches.sigma_u[order] ** 2
-    equal = np.array_equal(matches.sigma_u, matches.sigma_v)
+    var_u = sigma_u[order] ** 2
+    equal = np.array_equal(sigma_u, sigma_v)
     stars = Stars(
         model=model,
         groups=replace(groups, index=NOBODY),
@@ -151,9 +142,40 @@ def prepare(model: DistortionModel, matches: MatchTable) -> tuple[Stars, Int]:
         u=matches.u[order],
         v=matches.v[order],
         var_u=var_u,
-        var_v=var_u if equal else matches.sigma_v[order] ** 2,
+        var_v=var_u if equal else sigma_v[order] ** 2,
     )
     return stars, np.arange(len(x))[order]
+
+
+def errors_of(matches: MatchTable) -> tuple[Float, Float]:
+    """Errors on u and v (N,) of matches that must have them.
+
+    Raises
+    ------
+    InputError
+        When the table has none.
+    """
+    if matches.sigma_u is None or matches.sigma_v is None:
+        raise InputError(
+            "the matches carry no errors",
+            do="give sigma columns, a number, or sigma = 'by_magnitude'",
+        )
+    return matches.sigma_u, matches.sigma_v
+
+
+def groups_of(model: DistortionModel, matches: MatchTable) -> Groups:
+    """Groups of matches with equal effective coefficients.
+
+    Raises
+    ------
+    InputError
+        When the table has another unit than the model, a chip or an exposure that the model does
+        not know, or lacks an epoch that it needs.
+    """
+    if matches.unit != model.unit:
+        raise InputError(f"the matches are in {matches.unit} and the model is in {model.unit}")
+    numbers = np.asarray(matches.chip_numbers)[matches.chip]
+    return model.groups(len(matches), epoch=matches.epoch, exposure=matches.exposure, chip=numbers)
 
 
 def in_table_order(values: NDArray[Any], order: Int) -> NDArray[Any]:

@@ -2,7 +2,7 @@
 
 from bayesdist.products.d2im import read_d2im, write_d2im
 from bayesdist.products.idctab import IdcTab, read_idctab, write_idctab
-from bayesdist.products.idctab_build import idctab_from_solution, idctab_from_solutions
+from bayesdist.products.idctab_build import idctab_from_solution
 from bayesdist.products.idctab_lint import lint_idctab
 from bayesdist.products.inspect import describe, describe_idctab, describe_lookup_file, describe_sip
 from bayesdist.products.lint import Finding
@@ -40,7 +40,6 @@ __all__ = [
     "describe_lookup_file",
     "describe_sip",
     "idctab_from_solution",
-    "idctab_from_solutions",
     "lint_idctab",
     "lint_lookup_file",
     "lint_sip",

@@ -23,7 +23,7 @@ from bayesdist.data.files import atomic_path
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.cards import header_of
 
-__all__ = ["Block", "blocks_of", "parse_blocks", "read_blocks", "write_blocks"]
+__all__ = ["Block", "blocks_of", "content_of", "parse_blocks", "read_blocks", "write_blocks"]
 
 _RECORD = 2880
 
@@ -88,6 +88,33 @@ def _padded(n: int) -> int:
     return -(-n // _RECORD) * _RECORD
 
 
+def content_of(path: str | os.PathLike[str]) -> bytes:
+    """Bytes of a file, decompressed where gzip has compressed it.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is a broken gzip file.
+    """
+    where = str(path)
+    try:
+        raw = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror or error})", where=where, do="check the path"
+        ) from error
+    if raw[:2] != b"\x1f\x8b":
+        return raw
+    try:
+        return gzip.decompress(raw)
+    except (EOFError, OSError, zlib.error) as error:
+        raise FormatError(
+            f"is a broken gzip file ({error})", where=where, do="fetch the file again"
+        ) from error
+
+
 def read_blocks(path: str | os.PathLike[str]) -> tuple[Block, ...]:
     """All HDUs of a FITS file, also of one compressed by gzip.
 
@@ -98,21 +125,7 @@ def read_blocks(path: str | os.PathLike[str]) -> tuple[Block, ...]:
     FormatError
         When it is no FITS file, or is truncated.
     """
-    where = str(path)
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror or error})", where=where, do="check the path"
-        ) from error
-    if raw[:2] == b"\x1f\x8b":
-        try:
-            raw = gzip.decompress(raw)
-        except (EOFError, OSError, zlib.error) as error:
-            raise FormatError(
-                f"is a broken gzip file ({error})", where=where, do="fetch the file again"
-            ) from error
-    return parse_blocks(raw, where)
+    return parse_blocks(content_of(path), str(path))
 
 
 def parse_blocks(raw: bytes, where: str) -> tuple[Block, ...]:

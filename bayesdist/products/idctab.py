@@ -214,7 +214,18 @@ class IdcTab:
         filter: str | Sequence[str] | None = None,
         direction: str = "FORWARD",
     ) -> NDArray[np.int64]:
-        """Indices of all rows of a chip, filter and direction; arguments as in `row`."""
+        """Indices of all rows of a chip, filter and direction.
+
+        Parameters
+        ----------
+        chip, filter, direction
+            As in `row`.
+
+        Returns
+        -------
+        ndarray of int
+            0-based; empty where no row fits.
+        """
         rows, columns = self.rows, self.columns
         keep = np.ones(len(rows), bool)
         if "DETCHIP" in columns:
@@ -267,8 +278,8 @@ class IdcTab:
         Returns
         -------
         cx, cy : ndarray, shape (n_terms,)
-            Arcseconds per pixel^(i + j), as they stand in the table; the first is CX00, 0 where
-            there is no such column.
+            Arcseconds per pixel^(i + j), or pixels per arcsecond^(i + j) in INVERSE rows, as they
+            stand in the table; the first is CX00, 0 where there is no such column.
 
         Raises
         ------
@@ -310,7 +321,8 @@ class IdcTab:
         Raises
         ------
         InputError
-            As `row`; for an epoch with time-dependent terms of another scheme.
+            As `row`; for an epoch where a table of ACS/WFC has time-dependent terms of another
+            scheme than that of 2015.
         """
         row = self.row(chip, filter, direction)
         record = self.rows[row]

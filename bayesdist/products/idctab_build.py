@@ -24,14 +24,14 @@ from bayesdist.products.parity import parity_of
 from bayesdist.products.sip_build import ARCSEC
 from bayesdist.products.wheels import combination_of
 
-__all__ = ["idctab_from_solution", "idctab_from_solutions"]
+__all__ = ["idctab_from_solution"]
 
 Float = NDArray[np.float64]
 Filter = str | tuple[str, ...]
 
 
 def idctab_from_solution(
-    solution: Solution,
+    solution: Solution | Mapping[Filter, Solution],
     *,
     instrument: str,
     detector: str,
@@ -48,16 +48,23 @@ def idctab_from_solution(
     inverse: bool = False,
     history: Sequence[str] = (),
 ) -> IdcTab:
-    """IDCTAB of all chips of a solution, in the frame of its first exposure.
+    """IDCTAB of all chips of a solution, or of several filters with a solution each.
 
+    Frames of exposures are left out: in gauge 'first' the file holds what the first exposure saw.
     Everything is divided by `vafactor`, since stwcs multiplies the sky by that of each exposure.
     The constant of each chip goes to its V2REF and V3REF (and is noted in BDU0_c, BDV0_c), since
     stwcs never uses CX00 and CY00.  A file for ACS/WFC always has TDD_DATE and TDD_CTB1, TDD_CTB2,
     without which stwcs would apply a drift of its own.
 
+    stwcs applies one drift to all rows.  It is that of the first solution; the others must have the
+    same reference date and rates, or none: then their constants are those of the reference date.
+
     Parameters
     ----------
-    solution : LinearFit or Posterior
+    solution : Solution, or mapping of filter to Solution
+        A fit or a posterior.  The filter of a mapping is one name ("F814W", whose other wheel is
+        clear), or a tuple with those of both wheels; filters with the very same solution object
+        share its rows.
     instrument, detector : str
         INSTRUME and DETECTOR, as "ACS" and "WFC".
     scale_arcsec : float, optional
@@ -70,9 +77,10 @@ def idctab_from_solution(
     vafactor : float
         Velocity-aberration factor that the positions (u, v) still contain.
     filters : sequence, optional
-        One combination, as ``("F606W", "CLEAR2L")``, or a sequence of such: a row for each, all
-        with the same coefficients.  Two names (ACS) make columns FILTER1 and FILTER2, one makes
-        FILTER.  Without filters there are no such columns, and the rows serve every filter.
+        Of a single solution: one combination, as ``("F606W", "CLEAR2L")``, or a sequence of such: a
+        row for each, all with the same coefficients.  Two names (ACS) make columns FILTER1 and
+        FILTER2, one makes FILTER.  Without filters there are no such columns, and the rows serve
+        every filter.
     useafter, pedigree : str, optional
         USEAFTER ("Mar 01 2002 00:00:00") and PEDIGREE ("INFLIGHT 01/05/2006"), which only the user
         knows.
@@ -81,20 +89,24 @@ def idctab_from_solution(
     chips : sequence of int, optional
         Chip numbers; all by default.
     inverse : bool
-        Whether to add INVERSE rows (see `bayesdist.products.idctab_inverse`).
+        Whether to add INVERSE rows (see `bayesdist.products.idctab_inverse`); their closure is
+        stated as BDCLOS_c.
     history : sequence of str
         Lines for HISTORY.
 
     Returns
     -------
     IdcTab
-        In doubles, with HDUs SIGMA and COVAR (see `bayesdist.products.idctab`).
+        In doubles, with HDUs SIGMA and COVAR (see `bayesdist.products.idctab`).  COVAR names the
+        filters where there are several solutions.  Solutions turned by the same orientation
+        (`bayesdist.products.oriented`) share its error, which stands between their blocks.
 
     Raises
     ------
     InputError
-        For an unknown detector or chip, a missing scale, filters of different kinds, or
-        time-dependent terms that an IDCTAB cannot store (see `check_time`).
+        For an unknown detector or chip, a missing scale, filters that are none, of different kinds
+        or named twice, time-dependent terms that an IDCTAB cannot store (see `check_time`), and
+        solutions of different orders or chips, or with a drift other than the first one's.
     DegenerateError
         When the linear part of a chip is singular.
 
@@ -105,131 +117,31 @@ def idctab_from_solution(
     """
     if v2v3 != "aperture":
         raise InputError(f"v2v3 is {v2v3!r}", where="products.idctab.v2v3", do="choose 'aperture'")
-    return _table(
-        [(solution, _combinations(filters, instrument))],
-        instrument,
-        detector,
-        scale_arcsec=scale_arcsec,
-        zero=(v2ref, v3ref),
-        vafactor=vafactor,
-        texts={"DESCRIP": description, "USEAFTER": useafter, "PEDIGREE": pedigree},
-        chips=chips,
-        inverse=inverse,
-        history=history,
-    )
-
-
-def idctab_from_solutions(
-    solutions: Mapping[Filter, Solution],
-    *,
-    instrument: str,
-    detector: str,
-    scale_arcsec: float | None = None,
-    v2ref: float = 0.0,
-    v3ref: float = 0.0,
-    vafactor: float = 1.0,
-    useafter: str | None = None,
-    pedigree: str | None = None,
-    description: str = "Geometric distortion with its uncertainty, by bayesdist",
-    chips: Sequence[int] | None = None,
-    inverse: bool = True,
-    history: Sequence[str] = (),
-) -> IdcTab:
-    """IDCTAB of several filters, each with its own solution.
-
-    stwcs applies one drift to all rows.  It is that of the first solution; the others must have the
-    same reference date and rates, or none: then their constants are those of the reference date.
-
-    Parameters
-    ----------
-    solutions : mapping of filter to Solution
-        A filter is one name ("F814W", whose other wheel is clear), or a tuple with those of both
-        wheels.  Filters with the very same solution object share its rows.
-    inverse : bool
-        Whether to add INVERSE rows; their closure is stated as BDCLOS_c.
-    others
-        As in `idctab_from_solution`.
-
-    Returns
-    -------
-    IdcTab
-        COVAR then names the filters too, one for each solution.  Solutions turned by the same
-        orientation (`bayesdist.products.oriented`) share its error, which stands between their
-        blocks.
-
-    Raises
-    ------
-    InputError
-        As `idctab_from_solution`; for no filter, a filter named twice, solutions of different
-        orders or chips, or a drift other than the first one's.
-    DegenerateError
-        When the linear part of a chip is singular.
-    """
-    groups: dict[int, tuple[Solution, list[tuple[str, ...]]]] = {}
-    seen: set[tuple[str, ...]] = set()
-    for filter, solution in solutions.items():
-        combination = combination_of(filter, instrument)
-        if combination in seen:
-            raise InputError(
-                f"the filter combination {combination} stands twice",
-                where="solutions",
-                do="name each one once",
-            )
-        seen.add(combination)
-        groups.setdefault(id(solution), (solution, []))[1].append(combination)
-    if not groups:
-        raise InputError("no filter is given", where="solutions", do="give at least one")
-    entries = [(s, _combinations(names, instrument)) for s, names in groups.values()]
-    return _table(
-        entries,
-        instrument,
-        detector,
-        scale_arcsec=scale_arcsec,
-        zero=(v2ref, v3ref),
-        vafactor=vafactor,
-        texts={"DESCRIP": description, "USEAFTER": useafter, "PEDIGREE": pedigree},
-        chips=chips,
-        inverse=inverse,
-        history=history,
-    )
-
-
-def _table(
-    entries: Sequence[tuple[Solution, tuple[tuple[str, ...], ...]]],
-    instrument: str,
-    detector: str,
-    *,
-    scale_arcsec: float | None,
-    zero: tuple[float, float],
-    vafactor: float,
-    texts: Mapping[str, str | None],
-    chips: Sequence[int] | None,
-    inverse: bool,
-    history: Sequence[str],
-) -> IdcTab:
+    entries = _entries(solution, filters, instrument)
     first = entries[0][0]
     model = first.model
     parity = parity_of(instrument, detector)
     _check_positive(vafactor, "vafactor")
     acs_wfc = (instrument, detector) == ("ACS", "WFC")
-    for solution, combinations in entries:
-        check_time(solution.model, acs_wfc=acs_wfc)
-        if solution is not first:
-            _check_alike(solution, first, combinations[0])
+    for other, combinations in entries:
+        check_time(other.model, acs_wfc=acs_wfc)
+        if other is not first:
+            _check_alike(other, first, combinations[0])
     numbers = tuple(c.number for c in model.chips) if chips is None else tuple(chips)
     if not numbers:
         raise InputError("no chip is given", where="chips", do="name at least one")
     pieces = []
-    for solution, combinations in entries:
-        factor = _arcsec(solution.model.unit, scale_arcsec) / vafactor
+    for one, combinations in entries:
+        factor = _arcsec(one.model.unit, scale_arcsec) / vafactor
         fitted = tuple(
-            _numbers(solution, n, factor, parity, zero, drift=solution is first) for n in numbers
+            _numbers(one, n, factor, parity, (v2ref, v3ref), drift=one is first) for n in numbers
         )
         back = tuple(inverse_of(f) for f in fitted) if inverse else ()
         pieces.append(Piece(combinations, fitted, back))
-    cov = joint_covariance([solution for solution, _ in entries], pieces)
+    cov = joint_covariance([one for one, _ in entries], pieces)
     scale = _mean_scale(pieces[0].fitted) if scale_arcsec is None else scale_arcsec
 
+    texts = {"DESCRIP": description, "USEAFTER": useafter, "PEDIGREE": pedigree}
     primary = fits.PrimaryHDU()
     for card in [
         text_card("INSTRUME", instrument),
@@ -252,6 +164,47 @@ def _table(
         covariance_hdu(pieces, cov),
     ]
     return IdcTab(blocks_of(hdus), "new IDCTAB")
+
+
+def _entries(
+    solution: Solution | Mapping[Filter, Solution],
+    filters: Sequence[str] | Sequence[Sequence[str]] | None,
+    instrument: str,
+) -> list[tuple[Solution, tuple[tuple[str, ...], ...]]]:
+    """Each solution with the filter combinations of its rows; () where rows serve all filters."""
+    where = "products.idctab.filters"
+    named: list[tuple[tuple[str, ...], Solution]]
+    if isinstance(solution, Mapping):
+        if filters:
+            raise InputError(
+                "the filters are given twice", where=where, do="leave them to the solutions"
+            )
+        named = [(combination_of(filter, instrument), one) for filter, one in solution.items()]
+        if not named:
+            raise InputError("no filter is given", where="solutions", do="give at least one")
+    elif not filters:
+        return [(solution, ((),))]
+    elif all(isinstance(f, str) for f in filters):
+        named = [(tuple(map(str, filters)), solution)]
+    else:
+        named = [(tuple(map(str, names)), solution) for names in filters]
+    wanted = 2 if instrument == "ACS" else 1
+    out: dict[int, tuple[Solution, list[tuple[str, ...]]]] = {}
+    seen: set[tuple[str, ...]] = set()
+    for names, one in named:
+        if len(names) != wanted:
+            raise InputError(
+                f"the filter combination {names} has {len(names)} names",
+                where=where,
+                do=f"give {wanted} for {instrument}, one for each wheel",
+            )
+        if names in seen:
+            raise InputError(
+                f"the filter combination {names} stands twice", where=where, do="name each one once"
+            )
+        seen.add(names)
+        out.setdefault(id(one), (one, []))[1].append(names)
+    return [(one, tuple(combinations)) for one, combinations in out.values()]
 
 
 def _numbers(
@@ -339,22 +292,3 @@ def _check_alike(solution: Solution, first: Solution, combination: tuple[str, ..
             where=where,
             do="give it the same reference date and rates (bayesdist.products.storable)",
         )
-
-
-def _combinations(
-    filters: Sequence[str] | Sequence[Sequence[str]] | None, instrument: str
-) -> tuple[tuple[str, ...], ...]:
-    """Filter names of each row of a chip; one empty combination where rows serve all filters."""
-    if not filters:
-        return ((),)
-    flat = all(isinstance(f, str) for f in filters)
-    out = [tuple(map(str, filters))] if flat else [tuple(map(str, f)) for f in filters]
-    wanted = 2 if instrument == "ACS" else 1
-    for names in out:
-        if len(names) != wanted:
-            raise InputError(
-                f"the filter combination {names} has {len(names)} names",
-                where="products.idctab.filters",
-                do=f"give {wanted} for {instrument}, one for each wheel",
-            )
-    return tuple(out)

@@ -163,7 +163,27 @@ class LookupFile:
         filter: str = "",
         first: Sequence[float] | None = None,
     ) -> LookupTable:
-        """Values on the grid of a chip; arguments as in `LookupTable`."""
+        """Values on the grid of a chip.
+
+        Parameters
+        ----------
+        chip : int
+        values, sigma : ndarray, shape (2, ny, nx)
+            Pixels, as in `LookupTable`; `sigma` may be None.
+        filter : str
+            As in `LookupTable`.
+        first : sequence of float, optional
+            Pixel (x, y) of the first node, against what the file says.
+
+        Returns
+        -------
+        LookupTable
+
+        Raises
+        ------
+        FormatError
+            As `pair`, and for what `LookupTable` refuses.
+        """
         x, _ = self.pair(chip)
         place = x.first if first is None else (float(first[0]), float(first[1]))
         try:

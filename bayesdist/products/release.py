@@ -16,7 +16,7 @@ from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.d2im import write_d2im
 from bayesdist.products.idctab import IdcTab, write_idctab
-from bayesdist.products.idctab_build import idctab_from_solutions
+from bayesdist.products.idctab_build import idctab_from_solution
 from bayesdist.products.npol import write_npol
 from bayesdist.products.orientation import Orientation
 from bayesdist.products.oriented import oriented
@@ -133,7 +133,7 @@ def write_release(
     ------
     InputError
         For no filter or period, periods of one name, a table or stand-in of a filter that has no
-        solution, whatever `oriented`, `storable` and `idctab_from_solutions` refuse, or a file that
+        solution, whatever `oriented`, `storable` and `idctab_from_solution` refuse, or a file that
         cannot be written.  No file is written unless all IDCTABs could be made.
     DegenerateError
         When the linear part of a chip is singular.
@@ -163,7 +163,7 @@ def write_release(
         ]
         for filter, other in stand_ins.items():
             rows[filter] = rows[other]
-        made[period.name] = idctab_from_solutions(
+        made[period.name] = idctab_from_solution(
             rows,
             instrument=instrument,
             detector=detector,
@@ -173,6 +173,7 @@ def write_release(
             useafter=period.useafter,
             pedigree=period.pedigree,
             description=description,
+            inverse=True,
             history=[
                 f"For exposures from {period.years[0]:g} to {period.years[1]:g}.",
                 *history,

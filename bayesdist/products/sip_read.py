@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import os
 import warnings
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError, InputError
+from bayesdist.products.blocks import content_of
 from bayesdist.products.cards import card_images
 from bayesdist.products.indices import sip_powers
 from bayesdist.products.sip import SipHeader
@@ -52,7 +50,7 @@ def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> S
         When the file cannot be read.
     """
     with _readable(path) as where:
-        return _parsed(_header(_content(path, where), ext, where), where)
+        return _parsed(_header(content_of(path), ext, where), where)
 
 
 def holds_sip(path: str | os.PathLike[str]) -> bool:
@@ -65,7 +63,7 @@ def holds_sip(path: str | os.PathLike[str]) -> bool:
     """
     try:
         with _readable(path) as where:
-            return "A_ORDER" in _header(_content(path, where), None, where)
+            return "A_ORDER" in _header(content_of(path), None, where)
     except FormatError:
         return False
 
@@ -81,21 +79,10 @@ def _readable(path: str | os.PathLike[str]) -> Iterator[str]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of cards that are not SIP's, and of missing data
             yield where
-    except (fits.VerifyError, ValueError, EOFError, OSError, zlib.error) as error:
+    except (fits.VerifyError, ValueError, EOFError, OSError) as error:
         raise FormatError(
             f"is not a header that can be read ({error})", where=where, do="check the file"
         ) from error
-
-
-def _content(path: str | os.PathLike[str], where: str) -> bytes:
-    """Bytes of the file, decompressed."""
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror or error})", where=where, do="check the path"
-        ) from error
-    return gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw
 
 
 def _header(raw: bytes, ext: int | str | None, where: str) -> fits.Header:

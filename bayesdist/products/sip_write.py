@@ -60,7 +60,17 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
 
 def sip_header(sip: SipHeader) -> fits.Header:
-    """The whole header, as astropy.wcs.WCS takes it."""
+    """The whole header, as astropy.wcs.WCS takes it.
+
+    Parameters
+    ----------
+    sip : SipHeader
+
+    Returns
+    -------
+    astropy.io.fits.Header
+        The cards that were read, with what the fields say otherwise.
+    """
     return header_of(_cards(sip))
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
+from bayesdist.infer.views import Derived
 from bayesdist.infer.views import segment as segment_of
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.products.orientation import Orientation
@@ -60,7 +61,7 @@ class Lost:
 
 
 @dataclass(frozen=True, eq=False)
-class Stored:
+class Stored(Derived):
     """A solution as a file holds it.
 
     Parameters
@@ -96,16 +97,6 @@ class Stored:
     def with_orientation(self) -> Float:
         """Covariance (D, 4) with the parameters of the orientation."""
         return self.transform(self.source.with_orientation.T).T  # type: ignore[attr-defined]
-
-    @property
-    def convergence(self) -> object:
-        """That of the posterior; a linear fit has none."""
-        return self.source.convergence  # type: ignore[attr-defined]
-
-    @property
-    def approximation(self) -> str:
-        """That of the posterior; a linear fit has none."""
-        return self.source.approximation  # type: ignore[attr-defined]
 
 
 def storable(

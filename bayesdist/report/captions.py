@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bayesdist.report.caption import Caption
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numerals import count, number, percent
 from bayesdist.report.scales import with_mas
@@ -32,24 +32,6 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "budget": ("budget_terms", "budget_dominating"),
     "margins": ("margins",),
 }
-
-
-@dataclass(frozen=True)
-class Caption:
-    """Words of a figure.
-
-    Parameters
-    ----------
-    title : str
-    text : str
-        What to see.
-    alt : str
-        What the picture shows, for those who cannot see it.
-    """
-
-    title: str
-    text: str
-    alt: str
 
 
 def caption(name: str, inputs: ReportInput) -> Caption:

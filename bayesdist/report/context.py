@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.model import Chip
+    from bayesdist.report.campaign.context import CampaignResults
 
 __all__ = ["Check", "ChipResults", "Product", "ReportInput"]
 
@@ -144,6 +145,8 @@ class ReportInput:
         Stars of each exposure that are more likely false matches than not.
     provenance : mapping
         Versions, seed, hashes of the input, timings, command; mappings may be nested.
+    campaign : CampaignResults or None
+        What a run that began with star lists adds.
     """
 
     name: str
@@ -161,6 +164,7 @@ class ReportInput:
     magnitude_errors: MagnitudeErrors | None = None
     flagged: NDArray[np.int64] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    campaign: CampaignResults | None = None
 
     @property
     def unit(self) -> str:

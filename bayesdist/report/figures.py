@@ -14,6 +14,7 @@ from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
 from bayesdist.report.area import pixel_area
 from bayesdist.report.budget import budget_terms, dominating_term
+from bayesdist.report.campaign.figures import CampaignFigure, campaign_figures
 from bayesdist.report.context import ReportInput
 from bayesdist.report.corners import corner_coefficients, corner_outliers
 from bayesdist.report.margins import margins_against_limits
@@ -28,7 +29,7 @@ from bayesdist.report.traces import traces
 from bayesdist.report.uncertainty import formal_uncertainty, uncertainty_radius
 from bayesdist.report.vectors import residual_vectors, vector_flow
 
-__all__ = ["DPI", "all_figures", "drawn", "save_images"]
+__all__ = ["DPI", "all_figures", "drawn", "plan_of_campaign", "save_images"]
 
 DPI = 150
 
@@ -55,9 +56,11 @@ def all_figures(inputs: ReportInput) -> dict[str, Figure]:
         )
     out["residual_histogram"] = residual_histogram(stars.residual, mixture_curves(inputs), **drawn)
     chips, mosaic = inputs.chips, mosaic_of(inputs)
-    out["residual_vectors"] = residual_vectors(
-        *(c.binned for c in chips), unit=inputs.unit, mosaic=mosaic
-    )
+    out |= {name: one.draw() for name, one in plan_of_campaign(inputs).items()}
+    if inputs.campaign is None:  # rolled exposures: u and v have no fixed direction on the detector
+        out["residual_vectors"] = residual_vectors(
+            *(c.binned for c in chips), unit=inputs.unit, mosaic=mosaic
+        )
     if inputs.posterior is not None:
         if inputs.posterior.hyper:
             out["outliers_corner"] = corner_outliers(inputs.posterior)
@@ -75,6 +78,13 @@ def all_figures(inputs: ReportInput) -> dict[str, Figure]:
     if inputs.margins:
         out["margins"] = margins_against_limits(inputs.margins)
     return out
+
+
+def plan_of_campaign(inputs: ReportInput) -> dict[str, CampaignFigure]:
+    """The figures that a campaign adds, not yet drawn; none for other runs."""
+    if inputs.campaign is None:
+        return {}
+    return campaign_figures(inputs.campaign, mosaic_of(inputs))
 
 
 def mosaic_of(inputs: ReportInput) -> Mosaic:

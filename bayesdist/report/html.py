@@ -13,9 +13,10 @@ import jinja2
 from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
 from bayesdist.report import tables
+from bayesdist.report.campaign import PARTS, CampaignFigure, campaign_tables
 from bayesdist.report.captions import SECTIONS, Caption, caption
 from bayesdist.report.context import ReportInput
-from bayesdist.report.figures import DPI
+from bayesdist.report.figures import DPI, plan_of_campaign
 from bayesdist.report.numerals import number
 from bayesdist.report.status import status_checks, verdict
 
@@ -28,6 +29,14 @@ class _Picture:
     data: str
     width: float  # inches, at which its letters have the size they were set in
     words: Caption
+
+
+@dataclass(frozen=True)
+class _Part:
+    name: str
+    title: str
+    tables: tuple[tables.TextTable, ...]
+    pictures: list[_Picture]
 
 
 def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
@@ -49,7 +58,8 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
     InputError
         For a figure whose name has no place in the report.
     """
-    placed = [name for names in SECTIONS.values() for name in names]
+    plan = plan_of_campaign(inputs)
+    placed = [*plan, *(name for names in SECTIONS.values() for name in names)]
     for name in images:
         if name not in placed:
             raise InputError(
@@ -70,9 +80,10 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
         verdict=verdict(inputs),
         status=status_checks(inputs),
         pictures={
-            section: [_picture(n, images[n], inputs) for n in names if n in images]
+            section: [_picture(n, images[n], caption(n, inputs)) for n in names if n in images]
             for section, names in SECTIONS.items()
         },
+        campaign=_campaign_parts(inputs, plan, images),
         tables={
             "data": tables.data_tables(inputs),
             "fit": tables.fit_tables(inputs),
@@ -105,10 +116,33 @@ def _present(table: tables.TextTable | None) -> tuple[tables.TextTable, ...]:
     return () if table is None else (table,)
 
 
-def _picture(name: str, png: bytes, inputs: ReportInput) -> _Picture:
+def _campaign_parts(
+    inputs: ReportInput, plan: Mapping[str, CampaignFigure], images: Mapping[str, bytes]
+) -> list[_Part]:
+    """Parts of the section on the campaign; empty ones are left out."""
+    if inputs.campaign is None:
+        return []
+    texts = campaign_tables(inputs.campaign)
+    parts = [
+        _Part(
+            f"campaign-{name}",
+            title,
+            texts.get(name, ()),
+            [
+                _picture(one.name, images[one.name], one.caption)
+                for one in plan.values()
+                if one.part == name and one.name in images
+            ],
+        )
+        for name, title in PARTS.items()
+    ]
+    return [part for part in parts if part.tables or part.pictures]
+
+
+def _picture(name: str, png: bytes, words: Caption) -> _Picture:
     (pixels,) = struct.unpack(">I", png[16:20])  # width, in the first chunk of every PNG file
     data = base64.b64encode(png).decode("ascii")
-    return _Picture(name, data, pixels / DPI, caption(name, inputs))
+    return _Picture(name, data, pixels / DPI, words)
 
 
 def write_report(

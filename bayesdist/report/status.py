@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesdist.report.campaign.status import campaign_checks
 from bayesdist.report.context import Check, ReportInput
 from bayesdist.report.margins import VERDICT_LEVELS
 from bayesdist.report.numerals import count, number, percent, rounded
@@ -48,9 +49,10 @@ def status_checks(inputs: ReportInput) -> dict[str, tuple[Check, ...]]:
     Returns
     -------
     dict of str to tuple of Check
-        Groups 'Sampling', 'Fit', 'Requirements', 'Products'; empty ones are left out.
+        Groups 'Campaign', 'Sampling', 'Fit', 'Requirements', 'Products'; empty ones are left out.
     """
     groups = {
+        "Campaign": () if inputs.campaign is None else campaign_checks(inputs.campaign),
         "Sampling": _sampling_checks(inputs),
         "Fit": _fit_checks(inputs),
         "Requirements": _margin_checks(inputs),

@@ -157,6 +157,7 @@ def residual_vectors(
     unit: str,
     mosaic: Mosaic,
     magnification: float | None = None,
+    key: float | None = None,
 ) -> Figure:
     """Mean residual vector of each cell of the detector.
 
@@ -173,6 +174,8 @@ def residual_vectors(
         Sizes of the chips, and how they lie.
     magnification : float, optional
         Pixels of the axes for one unit of the vectors; a round number by default.
+    key : float, optional
+        Length of the arrow that states the scale; that of a typical vector by default.
 
     Returns
     -------
@@ -203,7 +206,7 @@ def residual_vectors(
                 f"{CHANCE * full.sum():.0f} by chance"
             )
             ax.set_title(mosaic.title(k, text), pad=9)
-            vector_key(ax, nice_below(typical), magnification=M, unit=unit)
+            vector_key(ax, key or nice_below(typical), magnification=M, unit=unit)
     return fig
 
 

@@ -180,3 +180,40 @@ def test_stars_flagged_are_those_that_are_flagged_one_by_one(several, monkeypatc
     np.testing.assert_array_equal(some.outlier_probability > 0.5, flagged[::3])
     np.testing.assert_array_equal(some.used, fit.uses(table)[::3])
     np.testing.assert_allclose(some.residual, residuals(posterior, table)[::3], atol=1e-12)
+
+
+def test_what_belongs_to_the_detector_is_seen_in_turned_exposures(rng):
+    """Columns that are shifted along x, at four rolls: along the axes of the sky they cancel."""
+    model = DistortionModel(
+        1,
+        (Chip(2, "A", SIZE, (508.0, 254.0)),),
+        frames="shift_rotation",
+        exposures=("a", "b", "c", "d"),
+    )
+    theta = np.zeros(model.n_params)
+    for axis, place in ((0, 1), (1, 2)):
+        theta[model.coefficient_slice(2, axis)][place] = SIZE[axis] / 2
+    rolls = np.array([0.0, 1.0, 2.0, 3.0]) * np.pi / 2
+    for code in (1, 2, 3):
+        theta[model.frame_slice(code)] = 30.0 * code, -20.0, rolls[code]
+    n = 40_000
+    x, y = rng.uniform(1, SIZE[0], n), rng.uniform(1, SIZE[1], n)
+    exposure = np.arange(n) % 4
+    pattern = np.where(x // 127 % 2 == 0, 0.05, -0.05)
+    u, v = model.predict(theta, x, y, exposure=exposure).T
+    table = MatchTable(
+        x, y,
+        u + pattern * np.cos(rolls[exposure]) + 0.01 * rng.standard_normal(n),
+        v + pattern * np.sin(rolls[exposure]) + 0.01 * rng.standard_normal(n),
+        sigma_u=np.full(n, 0.01), sigma_v=np.full(n, 0.01), exposure=exposure,
+        exposure_names=model.exposures, chip=np.zeros(n, int), chip_numbers=(2,),
+    )  # fmt: skip
+    fit = fit_linear(table, model)
+    shards = load(model, table)
+    sums = shards.sum(star_sums, fit.mean, fit.clip, {2: ((8, 1),)})
+    shards.close()
+    found = sums.binned[2, (8, 1)].residuals()
+    left = pattern - np.polyval(np.polyfit(x, pattern, 1), x)  # what the polynomial leaves of it
+    expected = [left[x // 127 == k].mean() for k in range(8)]
+    np.testing.assert_allclose(found.mean_u[0], expected, atol=0.002)
+    np.testing.assert_allclose(found.mean_v[0], 0.0, atol=0.002)

@@ -15,6 +15,9 @@ from bayesdist.data import (
 )
 from bayesdist.data.campaign import match_campaign
 from bayesdist.data.exposures import Exposure, ExposureLog
+from bayesdist.data.match_doubts import match_doubts
+from bayesdist.data.mismatch import mismatch_reason
+from bayesdist.data.patterns import pattern_index
 from bayesdist.data.preparing import neutralise_aberration, with_centroid_errors
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists
 from bayesdist.data.tolerance import search_radius
@@ -127,7 +130,7 @@ def test_cuts_are_counted_and_kept_out(rng):
     assert t.mag.max() <= -8.0 + ZERO_POINT
     assert t.rejected["too faint"] == sum(r.rejected["too faint"] for r in found.reports)
     assert len(t) + sum(t.rejected.values()) == t.n_rows
-    with pytest.raises(InputError, match="exposure e0: the cuts leave no detection"):
+    with pytest.raises(InputError, match=r"exposure e0: the cuts leave none of \d+ .* saturated"):
         match_campaign(lists, log, catalog, start, cuts=StarCuts(saturation=90.0))
 
 
@@ -181,6 +184,94 @@ def test_a_wrong_field_is_named_with_the_best_count(rng):
         match_campaign(lists, log, other, start)
 
 
+@pytest.mark.parametrize(("factor", "mirror"), [(0.05, 1), (1000.0, 1), (1.0, -1)])
+def test_what_would_match_is_named(rng, factor, mirror):
+    """The catalogue in arcsec or thousandths, or seen from behind."""
+    catalog, lists, log, _, _ = campaign(rng, 1, stars=4000)
+    other = replace(catalog, u=factor * catalog.u, v=mirror * factor * catalog.v)
+    with pytest.raises(InputError) as error:
+        match_campaign(lists, log, other, start)
+    said = str(error.value)
+    assert "e0.parquet" in said and "bring together" in said
+    if mirror < 0:
+        assert "its mirror image does match: " in said
+    else:
+        scale = float(said.split("does match at ")[1].split()[0])
+        assert scale == pytest.approx(factor, rel=0.01)
+
+
+def test_no_reason_is_made_up(rng):
+    """Where a list matches as it is, or where nothing matches, there is nothing to be named."""
+    catalog, lists, _, _, _ = campaign(rng, 1, stars=4000)
+    plane = start(lists[0].x, lists[0].y, lists[0].chip, 2005.0)
+    uv = np.column_stack([catalog.u, catalog.v])
+    for places in (uv, rng.permuted(uv, axis=0)):
+        index = pattern_index(places, catalog.mag)
+        assert mismatch_reason(plane, lists[0].mag, index) == ""
+
+
+def strewn(rng, one):
+    """The same list with positions of no sky."""
+    return replace(one, x=rng.uniform(1, 4096, len(one)), y=rng.uniform(1, 2048, len(one)))
+
+
+def test_an_exposure_of_no_sky_is_left_out_and_counted(rng):
+    catalog, lists, log, _, _ = campaign(rng, 6, stars=4000)
+    bad = (*lists[:2], strewn(rng, lists[2]), *lists[3:])
+    with pytest.raises(InputError, match=r"e2\.parquet, exposure e2: does not match"):
+        match_campaign(bad, log, catalog, start)
+    found = match_campaign(bad, log, catalog, start, skip=True)
+    assert list(found.left_out) == ["e2"] and "bring together" in found.left_out["e2"]
+    assert found.table.exposure_names == ("e0", "e1", "e3", "e4", "e5")
+    assert found.table.rejected["exposure left out"] == len(lists[2])
+    t = found.table
+    assert len(t) + sum(t.rejected.values()) == t.n_rows == sum(len(one) for one in bad)
+    # the others match as if it had never been
+    rest = match_campaign([*lists[:2], *lists[3:]], log, catalog, start).table
+    np.testing.assert_array_equal(t.u, rest.u)
+    np.testing.assert_array_equal(t.exposure, rest.exposure)
+
+
+@pytest.mark.parametrize("numbers", [(0, 1), (2, 4)], ids=["the first two", "more than a fifth"])
+def test_too_many_of_them_are_an_error(rng, numbers):
+    catalog, lists, log, _, _ = campaign(rng, 6, stars=4000)
+    bad = [strewn(rng, one) if k in numbers else one for k, one in enumerate(lists)]
+    with pytest.raises(InputError, match=rf"exposure e{numbers[0]}: .* 1 more of 6 exposures"):
+        match_campaign(bad, log, catalog, start, skip=True)
+
+
+def turned(one):
+    """Chip 1 read out from the other side."""
+    return replace(one, x=np.where(one.chip == 1, 4097.0 - one.x, one.x))
+
+
+def test_a_chip_that_lies_elsewhere_is_said(rng):
+    catalog, lists, log, _, _ = campaign(rng, 5)
+    found = match_campaign((turned(lists[0]), *lists[1:]), log, catalog, start)
+    assert [one.astray for one in found.reports] == [(1,), (), (), (), ()]
+    said = match_doubts(found, log)
+    assert any("chip 1 hardly match in exposure e0" in text for text in said)
+    with pytest.raises(InputError, match="in 5 of 5 exposures the detections of chip 1 do not"):
+        match_campaign([turned(one) for one in lists], log, catalog, start)
+
+
+def test_odd_exposures_are_named_and_others_are_not(rng):
+    catalog, lists, log, _, _ = campaign(rng, 8)
+    # the lists of this sky know no aberration
+    still = ExposureLog(tuple(replace(one, vafactor=1.0) for one in log))
+    assert match_doubts(match_campaign(lists, still, catalog, start), still) == []
+    thin = lists[5].select(rng.random(len(lists[5])) < 0.5)
+    found = match_campaign((*lists[:5], thin, *lists[6:]), still, catalog, start)
+    (said,) = match_doubts(found, still)
+    assert "completeness" in said and "e5 (0.4" in said
+    wrong = ExposureLog(
+        tuple(replace(one, vafactor=1.00019 if one.name == "e3" else 1.0) for one in log)
+    )
+    found = match_campaign(lists, wrong, catalog, start)
+    (said,) = match_doubts(found, wrong)
+    assert "scale" in said and "e3 (-1.9e-04)" in said
+
+
 def test_wrong_arguments_are_named(rng):
     catalog, lists, log, _, _ = campaign(rng, 2, stars=3000)
     with pytest.raises(InputError, match=r"e1\.parquet: exposure e1 is not in exposure log"):
@@ -193,7 +284,7 @@ def test_wrong_arguments_are_named(rng):
         match_campaign(lists, log, catalog, lambda x, y, chip, epoch: np.zeros(1))
     sigma = np.full(len(catalog), 0.01)
     sigma[6] = 0.0
-    with pytest.raises(InputError, match="standard, row 7, column 'sigma_u': an error of 0"):
+    with pytest.raises(InputError, match="standard, star 1006, column 'sigma_u': an error of 0"):
         match_campaign(lists, log, replace(catalog, sigma_u=sigma), start)
 
 

@@ -11,7 +11,7 @@ from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.infer.catalogue_shear import catalogue_shear
+from bayesdist.infer.catalogue_shear import catalogue_shear, one_roll_angle, roll_spread
 
 from .small_campaign import campaign
 
@@ -129,3 +129,13 @@ def test_frames_without_a_roll_angle_are_refused():
     model, matches, _ = sheared(5, [0.0, 0.0, 0.0], frames="shift")
     with pytest.raises(InputError, match="frames 'shift' hold no roll angle"):
         catalogue_shear(fit_linear(matches, model), matches)
+
+
+def test_how_far_roll_angles_differ():
+    assert roll_spread([0.3, 0.3 + np.pi, 0.3 - np.pi]) == pytest.approx(0.0, abs=1e-12)
+    assert roll_spread([0.3, 0.3 + np.pi / 2]) == pytest.approx(1.0)
+    assert roll_spread(np.linspace(0, np.pi, 7)[:-1]) == pytest.approx(1.0)
+    few = np.radians(np.random.default_rng(1).normal(0, 2.0, 4000))
+    assert roll_spread(few) == pytest.approx(2 * few.var(), rel=0.02)
+    assert one_roll_angle(0.5 * few) and not one_roll_angle(2 * few)
+    assert one_roll_angle([1.0]) and not one_roll_angle(np.radians([0.0, 10.0]))

@@ -61,7 +61,8 @@ def dense(kinds, kind, information, pull, scale):
     matrix = Arrow(information, np.zeros((0, n, 0)), np.zeros((0, 0, 0)))
     scales = np.full(len(kinds), scale)
     loose = np.zeros(n, bool)
-    return Scatter(kinds, kind, np.arange(n), matrix, pull, np.zeros(n), scales, loose)
+    caution = np.ones(len(kinds))
+    return Scatter(kinds, kind, np.arange(n), matrix, pull, np.zeros(n), scales, loose, caution)
 
 
 def a_scatter(rng, n=6, k=2):
@@ -92,6 +93,7 @@ def test_the_restricted_likelihood_is_the_integral_over_everything_else(loose):
         about,
         np.full(2, 30.0),
         wide,
+        np.ones(2),
     )
     basis = np.linalg.svd(X, full_matrices=True)[0][:, 3:]  # contrasts that beta does not touch
 
@@ -246,19 +248,27 @@ def test_scatter_and_lines_over_many_truths(full, own):
     """Pulls of alpha and beta, and where the true tau lies in its posterior."""
     n = 100 if full else 12
     truth = TAU if own is None else np.concatenate([TAU, own])
+    # where the gap lies is quoted with caution
+    gap = () if own is None else ("WFC1.A_1.alpha", "WFC1.B_1.alpha")
+    free, distant = [x for x in FREE if x not in gap], []
     pulls, ranks = [], []
     for seed in range(n):
         model, matches, theta = campaign(1000 + seed, 40, 150, own=own)
         found = fit_hierarchical(matches, model, n_tau=128)
         assert not found.outlying
-        a = lines(reference_gauge(found)).select(*FREE)
-        d = a.values - true_lines(model, theta).select(*FREE).values
+        every, true = lines(reference_gauge(found)), true_lines(model, theta)
+        a = every.select(*free)
+        d = a.values - true.select(*free).values
         pulls.append(d @ np.linalg.solve(a.cov, d))
+        if gap:
+            distant.append(every.select(*gap).values - true.select(*gap).values)
+            distant[-1] /= every.select(*gap).sigma
         ranks.append((found.tau_draws < truth).mean(axis=0))
     # the covariance of the lines describes their errors
-    assert stats.kstest(pulls, stats.chi2(len(FREE)).cdf).pvalue > 1e-3
-    rms = np.sqrt(np.mean(pulls) / len(FREE))
-    assert abs(rms - 1) < 4 / np.sqrt(2 * n * len(FREE))
+    assert stats.kstest(pulls, stats.chi2(len(free)).cdf).pvalue > 1e-3
+    rms = np.sqrt(np.mean(pulls) / len(free))
+    assert abs(rms - 1) < 4 / np.sqrt(2 * n * len(free))
+    assert not gap or np.sqrt(np.mean(np.square(distant))) < 1
     # kinds are nearly independent
     assert stats.kstest(np.ravel(ranks), "uniform").pvalue > 1e-3
 
@@ -279,6 +289,29 @@ def test_a_chip_that_scatters_by_itself_makes_no_rate_well_known():
     of = "WFC1.B_3.beta"
     assert 0.8 * least < apart.select(of).sigma[0] < 1.6 * least  # tau is estimated too
     assert naive.select(of).sigma[0] < 0.6 * least
+
+
+@pytest.mark.slow
+def test_a_gap_that_goes_with_the_shear_is_no_second_measurement_of_it(full):
+    """Scale and shear act on the whole focal plane, as in a telescope that breathes.
+
+    In the gauge of WFC2 its B_2 deviates by twice the shear, and no error of its rate can be below
+    what that scatter leaves of a line through the exposures.
+    """
+    n = 60 if full else 8
+    pulls, ratio = [], []
+    for seed in range(n):
+        whole, matches, theta = campaign(2000 + seed, 40, 150, tau=(5e-6, 5e-6, 5e-6))
+        model = replace(whole, chips=whole.chips[::-1], chip_deviations=True)
+        found = lines(reference_gauge(fit_hierarchical(matches, model, n_tau=128)))
+        for of in ("WFC2.B_2.beta", "WFC1.B_2.beta", "WFC2.B_3.beta", "WFC2.A_2.beta"):
+            d = found.select(of).values - true_lines(whole, theta).select(of).values
+            pulls.append(float(d[0] / found.select(of).sigma[0]))
+        epoch = np.array([matches.epoch[matches.exposure == e][0] for e in range(40)])
+        least = 2 * 5e-6 / np.sqrt(((epoch - epoch.mean()) ** 2).sum())
+        ratio.append(found.select("WFC2.B_2.beta").sigma[0] / least)
+    assert np.median(ratio) > 0.9
+    assert np.sqrt(np.mean(np.square(pulls))) < 1 + 3 / np.sqrt(2 * 2 * n)  # two are independent
 
 
 def test_exposures_that_went_wrong_are_named_and_do_no_harm():

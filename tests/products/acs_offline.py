@@ -5,18 +5,14 @@ And the plane that stwcs makes of an IDCTAB, written down independently of it.
 
 from __future__ import annotations
 
-import contextlib
-import io
-import os
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
+from astropy.wcs import WCS
 from numpy.typing import NDArray
 
-from .stwcs_offline import original_exposure
+from .stwcs_offline import original_exposure, updated
 
 Float = NDArray[np.float64]
 
@@ -47,35 +43,21 @@ def corrected(
     idctab: Path,
     d2im: Path | None = None,
     npol: Path | None = None,
-):
+) -> dict[int, WCS]:
     """HSTWCS of each chip, by chip number."""
-    from stwcs.updatewcs import updatewcs
-    from stwcs.wcsutil import HSTWCS
-
-    path = folder / f"{name}_flt.fits"
-    hdus = original_exposure(idctab, pointing.date)
-    primary = hdus[0].header
-    primary["FILTER1"], primary["FILTER2"] = pointing.filters
-    primary["PA_V3"] = pointing.pa_v3
-    for keyword, file in (("D2IMFILE", d2im), ("NPOLFILE", npol)):
-        primary[keyword] = "N/A" if file is None else str(file)
+    files = {"D2IMFILE": d2im, "NPOLFILE": npol}
+    hdus = original_exposure(
+        idctab,
+        pointing.date,
+        FILTER1=pointing.filters[0],
+        FILTER2=pointing.filters[1],
+        PA_V3=pointing.pa_v3,
+        **{keyword: file for keyword, file in files.items() if file is not None},
+    )
     for hdu in hdus[1:]:
         hdu.header["CRVAL1"], hdu.header["CRVAL2"] = pointing.crval
         hdu.header["VAFACTOR"] = pointing.vafactor
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        hdus.writeto(path, overwrite=True, output_verify="silentfix")
-        before = os.environ.get("ASTROMETRY_STEP_CONTROL")
-        os.environ["ASTROMETRY_STEP_CONTROL"] = "off"
-        try:
-            updatewcs(str(path), use_db=False, checkfiles=False)
-        finally:
-            if before is None:
-                del os.environ["ASTROMETRY_STEP_CONTROL"]
-            else:
-                os.environ["ASTROMETRY_STEP_CONTROL"] = before
-        with fits.open(path) as done:
-            return {done[ext].header["CCDCHIP"]: HSTWCS(done, ext=ext) for ext in (1, 2)}
+    return updated(hdus, folder / f"{name}_flt.fits")
 
 
 def to_sky(V: Float, pointing: Pointing, v2v3: tuple[float, float]) -> Float:

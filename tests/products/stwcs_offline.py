@@ -11,11 +11,12 @@ import io
 import os
 import warnings
 from pathlib import Path
+from unittest import mock
 
 import astropy.wcs
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 FLT = Path(astropy.wcs.__file__).parent / "tests" / "data" / "j94f05bgq_flt.fits"
 CHIP_OF_EXTENSION = {1: 2, 4: 1}
@@ -28,8 +29,13 @@ _ALTERNATE = (
 _WCS = ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2", "CD1_1", "CD1_2", "CD2_1", "CD2_2")
 
 
-def original_exposure(idctab: Path, date: str | None = None) -> fits.HDUList:
-    """The exposure before any distortion correction, pointing at an IDCTAB."""
+def original_exposure(
+    idctab: Path, date: str | None = None, **keywords: Path | str | float
+) -> fits.HDUList:
+    """The exposure before any distortion correction, pointing at an IDCTAB.
+
+    Further keywords of the primary header are set as given: D2IMFILE and NPOLFILE, for one.
+    """
     with fits.open(FLT) as source:
         primary = source[0].header.copy()
         extensions = {ext: source[ext].header.copy() for ext in CHIP_OF_EXTENSION}
@@ -43,8 +49,9 @@ def original_exposure(idctab: Path, date: str | None = None) -> fits.HDUList:
         "OFFTAB",
     ):
         primary.remove(keyword, ignore_missing=True)
-    primary["IDCTAB"] = str(idctab)
     primary["NEXTEND"] = 2
+    for keyword, value in {"IDCTAB": idctab, **keywords}.items():
+        primary[keyword] = str(value) if isinstance(value, Path) else value
     if date is not None:
         primary["DATE-OBS"] = date
     hdus = [fits.PrimaryHDU(header=primary)]
@@ -66,33 +73,33 @@ def original_exposure(idctab: Path, date: str | None = None) -> fits.HDUList:
     return fits.HDUList(hdus)
 
 
-def sky(
-    folder: Path, idctab: Path, x: NDArray, y: NDArray, date: str | None = None
-) -> dict[int, NDArray]:
-    """Sky positions (N, 2) in degrees of pixels of each chip, as stwcs makes them of an IDCTAB."""
+def updated(hdus: fits.HDUList, path: Path) -> dict[int, astropy.wcs.WCS]:
+    """HSTWCS of each chip, by chip number, after stwcs has put all corrections in."""
     from stwcs.updatewcs import updatewcs
     from stwcs.wcsutil import HSTWCS
 
-    path = folder / f"{idctab.stem}_flt.fits"
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+    with (
+        mock.patch.dict(os.environ, ASTROMETRY_STEP_CONTROL="off"),
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(io.StringIO()),
+    ):
         warnings.simplefilter("ignore")
-        original_exposure(idctab, date).writeto(path, overwrite=True, output_verify="silentfix")
-        before = os.environ.get("ASTROMETRY_STEP_CONTROL")
-        os.environ["ASTROMETRY_STEP_CONTROL"] = "off"
-        try:
-            updatewcs(str(path), use_db=False, checkfiles=False)
-        finally:
-            if before is None:
-                del os.environ["ASTROMETRY_STEP_CONTROL"]
-            else:
-                os.environ["ASTROMETRY_STEP_CONTROL"] = before
-        with fits.open(path) as hdus:
-            return {
-                hdus[ext].header["CCDCHIP"]: HSTWCS(hdus, ext=ext).all_pix2world(
-                    np.stack([x, y], axis=1), 1
-                )
-                for ext in (1, 2)
-            }
+        hdus.writeto(path, overwrite=True, output_verify="silentfix")
+        updatewcs(str(path), use_db=False, checkfiles=False)
+        with fits.open(path) as done:
+            return {done[ext].header["CCDCHIP"]: HSTWCS(done, ext=ext) for ext in (1, 2)}
+
+
+def sky(
+    folder: Path, idctab: Path, x: NDArray, y: NDArray, date: str | None = None, **files: Path
+) -> dict[int, NDArray]:
+    """Sky positions (N, 2) in degrees of pixels of each chip, as stwcs makes them.
+
+    Of an IDCTAB, and of D2IMFILE and NPOLFILE where they are given.
+    """
+    hdus = original_exposure(idctab, date, **files)
+    wcs = updated(hdus, folder / f"{idctab.stem}_flt.fits")
+    return {chip: w.all_pix2world(np.stack([x, y], axis=1), 1) for chip, w in wcs.items()}
 
 
 def archived_sky(x: NDArray, y: NDArray) -> dict[int, NDArray]:
@@ -111,3 +118,13 @@ def separation_mas(a: NDArray, b: NDArray) -> NDArray:
     """Distances of pairs of positions, in mas."""
     d_ra = (a[:, 0] - b[:, 0]) * np.cos(np.deg2rad(a[:, 1]))
     return np.hypot(d_ra, a[:, 1] - b[:, 1]) * 3.6e6
+
+
+def gnomonic(positions: NDArray, centre: ArrayLike) -> NDArray:
+    """Tangent-plane coordinates (N, 2) in arcseconds of sky positions (N, 2) in degrees."""
+    ra, dec = np.deg2rad(positions).T
+    ra0, dec0 = np.deg2rad(centre)
+    d = np.sin(dec) * np.sin(dec0) + np.cos(dec) * np.cos(dec0) * np.cos(ra - ra0)
+    xi = np.cos(dec) * np.sin(ra - ra0) / d
+    eta = (np.sin(dec) * np.cos(dec0) - np.cos(dec) * np.sin(dec0) * np.cos(ra - ra0)) / d
+    return np.rad2deg(np.stack([xi, eta], axis=1)) * 3600

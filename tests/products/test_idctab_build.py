@@ -198,6 +198,16 @@ def test_rows_for_several_filters(real) -> None:
     assert [str(f) for f in one.rows["FILTER"]] == ["F606W", "F814W"]
     with pytest.raises(InputError, match="give 2 for ACS"):
         idctab_from_solution(wfc_solution(real), **ACS, filters=("F606W",))
+    with pytest.raises(InputError, match="stands twice"):
+        idctab_from_solution(wfc_solution(real), **ACS, filters=(F606W, F606W))
+
+
+def test_one_solution_for_several_filters_is_told_in_two_ways() -> None:
+    """Names beside a solution, or each name with that solution: the same rows, the same file."""
+    solution = some_solution(2, unit="arcsec")
+    beside = idctab_from_solution(solution, **UVIS, filters=(("F606W",), ("F814W",)))
+    each = idctab_from_solution({"F606W": solution, "F814W": solution}, **UVIS)
+    assert [b.to_bytes() for b in beside.blocks] == [b.to_bytes() for b in each.blocks]
 
 
 @pytest.mark.parametrize(

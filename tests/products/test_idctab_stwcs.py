@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from bayesdist.products import IdcTab, idctab_from_solution, read_idctab, write_idctab
 
-from .stwcs_offline import archived_sky, separation_mas, sky
+from .stwcs_offline import archived_sky, gnomonic, separation_mas, sky
 from .support import F606W, wfc_solution
 
 pytest.importorskip("stwcs")
@@ -123,13 +123,3 @@ def test_the_sky_is_the_models_plane(real, tmp_path, pixels) -> None:
     # the tangent points of the two differ: quadratic terms of 1e-7 arcsec^-1 over 100 arcsec remain
     assert residual.max() < 0.1
     assert np.linalg.det(turn) == pytest.approx(-1.0)  # the sky is seen from inside
-
-
-def gnomonic(positions, centre):
-    """Tangent-plane coordinates in arcseconds."""
-    ra, dec = np.deg2rad(positions).T
-    ra0, dec0 = np.deg2rad(centre)
-    d = np.sin(dec) * np.sin(dec0) + np.cos(dec) * np.cos(dec0) * np.cos(ra - ra0)
-    xi = np.cos(dec) * np.sin(ra - ra0) / d
-    eta = (np.sin(dec) * np.cos(dec0) - np.cos(dec) * np.sin(dec0) * np.cos(ra - ra0)) / d
-    return np.rad2deg(np.stack([xi, eta], axis=1)) * 3600

@@ -20,10 +20,8 @@ from bayesdist.products.d2im import read_d2im, write_d2im
 from bayesdist.products.lookup_file import LookupFile, write_lookup_file
 from bayesdist.products.npol import read_npol, write_npol
 
-from . import stwcs_offline
-from .stwcs_offline import separation_mas, sky
+from .stwcs_offline import gnomonic, separation_mas, sky
 from .support import F606W, wfc_solution
-from .test_idctab_stwcs import gnomonic
 
 pytest.importorskip("stwcs")
 CHIPS = (1, 2)
@@ -61,24 +59,9 @@ def rough(chip: int, amplitude: float, seed: int, filter: str = "", **names) -> 
     return LookupTable(chip, values, filter, sigma=np.full(values.shape, 0.01), **names)
 
 
-def sky_with(monkeypatch, folder: Path, idctab: Path, x, y, *, date=None, **tables: Path):
-    """Sky of both chips by stwcs, with D2IMFILE and NPOLFILE named in the exposure."""
-    original = stwcs_offline.original_exposure
-
-    def exposure(path: Path, date: str | None = None) -> fits.HDUList:
-        hdus = original(path, date)
-        for keyword, table in tables.items():
-            hdus[0].header[keyword] = str(table)
-        return hdus
-
-    with monkeypatch.context() as patch:
-        patch.setattr(stwcs_offline, "original_exposure", exposure)
-        return sky(folder, idctab, x, y, date)
-
-
-def worst_mas(monkeypatch, folder, idctab, pixels, tables, *, date=None, **files: Path) -> float:
+def worst_mas(folder, idctab, pixels, tables, *, date=None, **files: Path) -> float:
     """Largest distance between stwcs with the files and our model, over both chips."""
-    theirs = sky_with(monkeypatch, folder, idctab, *pixels, date=date, **files)
+    theirs = sky(folder, idctab, *pixels, date, **files)
     worst = 0.0
     for chip in CHIPS:
         x, y = corrected(tables, *pixels, chip=chip, filter="F606W")
@@ -88,7 +71,7 @@ def worst_mas(monkeypatch, folder, idctab, pixels, tables, *, date=None, **files
 
 
 @pytest.mark.parametrize("date", DATES)
-def test_detector_and_filter_tables_together(monkeypatch, tmp_path, idctab, pixels, date) -> None:
+def test_detector_and_filter_tables_together(tmp_path, idctab, pixels, date) -> None:
     path, tab = idctab
     detector = [rough(c, 0.2, 1) for c in CHIPS]
     by_filter = [rough(c, 0.05, 2, "F606W") for c in CHIPS]
@@ -96,27 +79,25 @@ def test_detector_and_filter_tables_together(monkeypatch, tmp_path, idctab, pixe
     npol = write_npol(by_filter, tmp_path / "a_npl.fits", idctab=tab, filters=F606W)
     files = {"D2IMFILE": tmp_path / "a_d2i.fits", "NPOLFILE": tmp_path / "a_npl.fits"}
     plain = sky(tmp_path, path, *pixels, date)
-    theirs = sky_with(monkeypatch, tmp_path, path, *pixels, date=date, **files)
+    theirs = sky(tmp_path, path, *pixels, date, **files)
     for chip in CHIPS:  # the tables do something: tens of mas on many pixels, on both chips
         assert np.median(separation_mas(theirs[chip], plain[chip])) > 5
-    worst = worst_mas(
-        monkeypatch, tmp_path, path, pixels, [*by_filter, *detector], date=date, **files
-    )
+    worst = worst_mas(tmp_path, path, pixels, [*by_filter, *detector], date=date, **files)
     assert worst < 0.1
     # and what remains is what the file says of itself, with single precision and ten years' drift
     assert worst < npol.header["BDNPLERR"] + 0.005
 
 
-def test_the_detector_table_alone_is_exact(monkeypatch, tmp_path, idctab, pixels) -> None:
+def test_the_detector_table_alone_is_exact(tmp_path, idctab, pixels) -> None:
     """Only single precision is left: 0.2 px x 6e-8 x 50 mas."""
     path, _ = idctab
     tables = [rough(c, 0.2, 3) for c in CHIPS]
     write_d2im(tables, tmp_path / "a_d2i.fits")
-    worst = worst_mas(monkeypatch, tmp_path, path, pixels, tables, D2IMFILE=tmp_path / "a_d2i.fits")
+    worst = worst_mas(tmp_path, path, pixels, tables, D2IMFILE=tmp_path / "a_d2i.fits")
     assert worst < 1e-5
 
 
-def test_our_own_plane_is_that_of_stwcs(monkeypatch, tmp_path, idctab, pixels) -> None:
+def test_our_own_plane_is_that_of_stwcs(tmp_path, idctab, pixels) -> None:
     """(xi, eta) of stwcs against (Xc, Yc) of the IDCTAB at the corrected pixel, both chips at once.
 
     Left free: one rotation and one shift.  The scale is not: the table has no velocity aberration,
@@ -126,8 +107,8 @@ def test_our_own_plane_is_that_of_stwcs(monkeypatch, tmp_path, idctab, pixels) -
     tables = [rough(c, 0.2, 1) for c in CHIPS] + [rough(c, 0.05, 2, "F606W") for c in CHIPS]
     write_d2im(tables[:2], tmp_path / "a_d2i.fits")
     write_npol(tables[2:], tmp_path / "a_npl.fits", idctab=tab, filters=F606W)
-    theirs = sky_with(
-        monkeypatch, tmp_path, path, *pixels,
+    theirs = sky(
+        tmp_path, path, *pixels,
         D2IMFILE=tmp_path / "a_d2i.fits", NPOLFILE=tmp_path / "a_npl.fits",
     )  # fmt: skip
     epoch = 2005 + 66 / 365.25
@@ -151,9 +132,7 @@ def test_our_own_plane_is_that_of_stwcs(monkeypatch, tmp_path, idctab, pixels) -
     [((32.5, 32.5), (64.0, 64.0), (32, 64)), ((1.0, 1.0), (64.0, 64.0), (33, 65)),
      ((100.0, 77.5), (180.5, 93.0), (20, 22))],
 )  # fmt: skip
-def test_any_registration_is_kept(
-    monkeypatch, tmp_path, idctab, pixels, first, step, shape
-) -> None:
+def test_any_registration_is_kept(tmp_path, idctab, pixels, first, step, shape) -> None:
     path, tab = idctab
     rng = np.random.default_rng(9)
     tables = [
@@ -163,7 +142,7 @@ def test_any_registration_is_kept(
     write_d2im(tables[:2], tmp_path / "a_d2i.fits")
     npol = write_npol(tables[2:], tmp_path / "a_npl.fits", idctab=tab, filters=F606W)
     worst = worst_mas(
-        monkeypatch, tmp_path, path, pixels, tables,
+        tmp_path, path, pixels, tables,
         D2IMFILE=tmp_path / "a_d2i.fits", NPOLFILE=tmp_path / "a_npl.fits",
     )  # fmt: skip
     assert worst < 0.1
@@ -171,9 +150,7 @@ def test_any_registration_is_kept(
 
 
 @pytest.mark.parametrize("first", [(32.5, 32.5), (1.0, 1.0), (100.0, 50.0)])
-def test_tables_without_a_positive_node_do_not_drop_out(
-    monkeypatch, tmp_path, idctab, pixels, first
-) -> None:
+def test_tables_without_a_positive_node_do_not_drop_out(tmp_path, idctab, pixels, first) -> None:
     """stwcs gives their maximum as CPERR, and astropy leaves out what is below zero."""
     path, tab = idctab
     rng = np.random.default_rng(8)
@@ -184,7 +161,7 @@ def test_tables_without_a_positive_node_do_not_drop_out(
     write_d2im(tables[:2], tmp_path / "a_d2i.fits")
     write_npol(tables[2:], tmp_path / "a_npl.fits", idctab=tab, filters=F606W)
     files = {"D2IMFILE": tmp_path / "a_d2i.fits", "NPOLFILE": tmp_path / "a_npl.fits"}
-    assert worst_mas(monkeypatch, tmp_path, path, pixels, tables, **files) < 0.1
+    assert worst_mas(tmp_path, path, pixels, tables, **files) < 0.1
     for read, given in (
         (read_d2im(files["D2IMFILE"]), tables[:2]),
         (read_npol(files["NPOLFILE"], tab), tables[2:]),
@@ -195,7 +172,7 @@ def test_tables_without_a_positive_node_do_not_drop_out(
             assert_allclose(back.values, table.values, atol=1e-8)
 
 
-def test_without_padding_they_would(monkeypatch, tmp_path, idctab, pixels) -> None:
+def test_without_padding_they_would(tmp_path, idctab, pixels) -> None:
     """The trap is real: the same file less its padding leaves stwcs without the correction."""
     path, _ = idctab
     tables = [LookupTable(c, np.full((2, *SHAPE), -0.2)) for c in CHIPS]
@@ -207,45 +184,41 @@ def test_without_padding_they_would(monkeypatch, tmp_path, idctab, pixels) -> No
     plain = sky(tmp_path, path, *pixels)
     shift = {}
     for name in ("padded", "bare"):
-        theirs = sky_with(
-            monkeypatch, tmp_path, path, *pixels, D2IMFILE=tmp_path / f"{name}_d2i.fits"
-        )
+        theirs = sky(tmp_path, path, *pixels, D2IMFILE=tmp_path / f"{name}_d2i.fits")
         shift[name] = [separation_mas(theirs[c], plain[c]) for c in CHIPS]
     assert np.min(shift["padded"]) > 12  # 0.28 px
     assert np.max(shift["bare"]) == 0.0
 
 
-def test_one_chip_alone(monkeypatch, tmp_path, idctab, pixels) -> None:
+def test_one_chip_alone(tmp_path, idctab, pixels) -> None:
     path, tab = idctab
     tables = [rough(1, 0.2, 1), rough(1, 0.05, 2, "F606W")]
     write_d2im(tables[:1], tmp_path / "a_d2i.fits")
     write_npol(tables[1:], tmp_path / "a_npl.fits", idctab=tab, filters=F606W)
     files = {"D2IMFILE": tmp_path / "a_d2i.fits", "NPOLFILE": tmp_path / "a_npl.fits"}
-    assert worst_mas(monkeypatch, tmp_path, path, pixels, tables, **files) < 0.1
+    assert worst_mas(tmp_path, path, pixels, tables, **files) < 0.1
 
 
-def test_real_files_are_read_as_stwcs_uses_them(
-    monkeypatch, tmp_path, data_dir, idctab, pixels
-) -> None:
+def test_real_files_are_read_as_stwcs_uses_them(tmp_path, data_dir, idctab, pixels) -> None:
     """No CRPIX, no CRVAL: our reading of them is that of the installed astropy."""
     folder = data_dir / "hst_reference"
     path, tab = idctab
     files = {"D2IMFILE": folder / "02c1450oj_d2i.fits", "NPOLFILE": folder / "02c14514j_npl.fits"}
     tables = [*read_d2im(files["D2IMFILE"]), *read_npol(files["NPOLFILE"], tab)]
     assert {t.first for t in tables} == {(64.0, 64.0)}
-    assert worst_mas(monkeypatch, tmp_path, path, pixels, tables, **files) < 0.1
+    assert worst_mas(tmp_path, path, pixels, tables, **files) < 0.1
     # written anew with a registration they mean the same
     write_d2im(tables[:2], tmp_path / "new_d2i.fits")
     write_npol(tables[2:], tmp_path / "new_npl.fits", idctab=tab, filters=F606W)
     files = {"D2IMFILE": tmp_path / "new_d2i.fits", "NPOLFILE": tmp_path / "new_npl.fits"}
-    assert worst_mas(monkeypatch, tmp_path, path, pixels, tables, **files) < 0.1
+    assert worst_mas(tmp_path, path, pixels, tables, **files) < 0.1
 
 
-def test_swapped_chips_would_be_seen(monkeypatch, tmp_path, idctab, pixels) -> None:
+def test_swapped_chips_would_be_seen(tmp_path, idctab, pixels) -> None:
     path, _ = idctab
     tables = [rough(c, 0.2, 1) for c in CHIPS]
     swapped = [LookupTable(3 - t.chip, t.values) for t in tables]
     file: LookupFile = write_d2im(swapped, tmp_path / "a_d2i.fits")
     write_lookup_file(file, tmp_path / "b_d2i.fits")
-    worst = worst_mas(monkeypatch, tmp_path, path, pixels, tables, D2IMFILE=tmp_path / "b_d2i.fits")
+    worst = worst_mas(tmp_path, path, pixels, tables, D2IMFILE=tmp_path / "b_d2i.fits")
     assert worst > 10

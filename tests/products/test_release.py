@@ -16,7 +16,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.views import reference_gauge
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products import idctab_from_solution, lint_idctab, read_idctab
-from bayesdist.products.idctab_build import idctab_from_solutions
 from bayesdist.products.orientation import Orientation
 from bayesdist.products.orientation_idctab import orientation_from_idctab
 from bayesdist.products.oriented import oriented
@@ -92,6 +91,27 @@ def release(tmp_path_factory, solutions, orientation, tables) -> Release:
 # -- stwcs as the judge ---------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Sky:
+    """What our model makes of pixels, on the sky that stwcs has for a pointing."""
+
+    solution: StandIn
+    filter: str
+    orientation: Orientation
+    tables: tuple[LookupTable, ...]
+    pointing: Pointing
+
+    def at(self, x, y, chip: int, *, tables: bool = True) -> np.ndarray:
+        turned = oriented(self.solution, self.orientation)
+        epoch = self.pointing.epoch
+        [centre] = turned.model.predict(turned.mean, 2048.0, 1024.0, epoch=epoch, chip=2)
+        v2v3 = self.orientation.v2v3[0] + centre[0], self.orientation.v2v3[1] - centre[1]
+        if tables:
+            x, y = corrected(self.tables, x, y, chip=chip, filter=self.filter)
+        plane = turned.model.predict(turned.mean, x, y, epoch=epoch, chip=chip)
+        return to_sky(plane - centre, self.pointing, v2v3)
+
+
 @pytest.mark.parametrize(
     ("date", "period"),
     [("2003-01-01", "pre"), ("2008-07-01", "pre"), ("2010-01-01", "post"), ("2014-01-01", "post")],
@@ -101,25 +121,18 @@ def test_stwcs_sees_the_sky_of_our_model(
 ) -> None:
     """IDCTAB, drift, D2IMFILE and NPOLFILE against the fitted model, nothing left free: 0.1 mas."""
     pytest.importorskip("stwcs")
-    turned = oriented(solutions["F606W"], orientation)
     pointing = Pointing(date, (5.66, -72.07), 57.3, 1.0000187)
+    ours = Sky(solutions["F606W"], "F606W", orientation, tables, pointing)
     wcs = corrected_by_stwcs(
         tmp_path, "one", pointing, idctab=release.idctabs[period], d2im=release.d2im,
         npol=release.npol["F606W"],
     )  # fmt: skip
-    centre = turned.model.predict(turned.mean, 2048.0, 1024.0, epoch=pointing.epoch, chip=2)[0]
-    v2v3 = (orientation.v2v3[0] + centre[0], orientation.v2v3[1] - centre[1])
     x, y = random_pixels((4096, 2048), 300)
     for chip in (1, 2):
-        x1, y1 = corrected(tables, x, y, chip=chip, filter="F606W")
-        plane = turned.model.predict(turned.mean, x1, y1, epoch=pointing.epoch, chip=chip)
-        ours = to_sky(plane - centre, pointing, v2v3)
         theirs = wcs[chip].all_pix2world(np.stack([x, y], axis=1), 1)
-        assert separation_mas(ours, theirs).max() < 0.1
+        assert separation_mas(ours.at(x, y, chip), theirs).max() < 0.1
         # the tables are in it: without them the sky is elsewhere
-        bare = turned.model.predict(turned.mean, x, y, epoch=pointing.epoch, chip=chip)
-        without = to_sky(bare - centre, pointing, v2v3)
-        assert separation_mas(without, theirs).max() > 2
+        assert separation_mas(ours.at(x, y, chip, tables=False), theirs).max() > 2
 
 
 def test_the_other_filter_has_its_own_sky(
@@ -127,21 +140,16 @@ def test_the_other_filter_has_its_own_sky(
 ) -> None:
     """F814W has another scale and another table; the chip offset follows its own solution."""
     pytest.importorskip("stwcs")
-    turned = oriented(solutions["F814W"], orientation)
     pointing = Pointing("2006-07-01", (80.2, -69.5), 211.0, 0.99995, ("CLEAR1L", "F814W"))
+    ours = Sky(solutions["F814W"], "F814W", orientation, tables, pointing)
     wcs = corrected_by_stwcs(
         tmp_path, "two", pointing, idctab=release.idctabs["pre"], d2im=release.d2im,
         npol=release.npol["F814W"],
     )  # fmt: skip
-    centre = turned.model.predict(turned.mean, 2048.0, 1024.0, epoch=pointing.epoch, chip=2)[0]
-    v2v3 = (orientation.v2v3[0] + centre[0], orientation.v2v3[1] - centre[1])
     x, y = random_pixels((4096, 2048), 200)
     for chip in (1, 2):
-        x1, y1 = corrected(tables, x, y, chip=chip, filter="F814W")
-        plane = turned.model.predict(turned.mean, x1, y1, epoch=pointing.epoch, chip=chip)
-        ours = to_sky(plane - centre, pointing, v2v3)
         theirs = wcs[chip].all_pix2world(np.stack([x, y], axis=1), 1)
-        assert separation_mas(ours, theirs).max() < 0.1
+        assert separation_mas(ours.at(x, y, chip), theirs).max() < 0.1
 
 
 # -- what the files hold --------------------------------------------------------------------------
@@ -212,7 +220,7 @@ def test_sigma_of_inverse_rows(solutions, orientation) -> None:
     base = storable(turned, years=(2002.2, 2009.4))
 
     def rows(solution):
-        made = idctab_from_solutions({"F606W": solution}, **ACS, scale_arcsec=0.05)
+        made = idctab_from_solution({"F606W": solution}, **ACS, scale_arcsec=0.05, inverse=True)
         names = [n for n in made.columns if n[0] == "C"]
         place = made.row(1, "F606W", "INVERSE")
         return (np.array([[t[n][place] for n in names] for t in (made.rows, made.sigma)]), names)
@@ -247,8 +255,8 @@ def test_covariance_over_filters_by_steps(solutions) -> None:
             )  # fmt: skip
         first = storable(oriented(a, o), years=(2002.2, 2009.4), limit_mas=9.0)
         second = storable(oriented(b, o), years=(2002.2, 2009.4), like=first, limit_mas=9.0)
-        return idctab_from_solutions(
-            {"F606W": first, "F814W": second}, **ACS, scale_arcsec=0.05, inverse=False
+        return idctab_from_solution(
+            {"F606W": first, "F814W": second}, **ACS, scale_arcsec=0.05
         ).covariance, o
 
     rng = np.random.default_rng(6)
@@ -286,7 +294,7 @@ def test_the_gauge_of_the_fit_is_not_in_the_file(solutions) -> None:
     for solution in (base, reference_gauge(away, 2)):
         o = orientation_from_idctab(solution, reference, **names, scale_arcsec=0.05)
         stored = storable(oriented(solution, o), years=(2009.4, 2015.0), segment=1)
-        made = idctab_from_solutions({"F606W": stored}, **ACS, scale_arcsec=0.05, inverse=False)
+        made = idctab_from_solution({"F606W": stored}, **ACS, scale_arcsec=0.05)
         covariances.append(made.covariance)
     a, b = covariances
     assert_allclose(a["VALUE"], b["VALUE"], rtol=1e-11)
@@ -338,7 +346,7 @@ def test_draws_and_convergence_come_through(solutions) -> None:
     o = orientation_from_idctab(sampled, reference_of(base), epoch=2004.5, reference_drift=False)
     stored = storable(oriented(sampled, o), years=(2009.5, 2015.0), segment=1)
     assert kind_of(stored) == "posterior"
-    header = idctab_from_solutions({"F606W": stored}, **ACS, scale_arcsec=0.05).header
+    header = idctab_from_solution({"F606W": stored}, **ACS, scale_arcsec=0.05).header
     assert header["BDCONV"] == "NO" and "Laplace" in str(header["COMMENT"])
     plain = storable(oriented(base, o), years=(2009.5, 2015.0), segment=1)
     assert kind_of(plain) == "least squares"
@@ -390,16 +398,18 @@ def test_solutions_that_do_not_go_into_one_table_are_refused(solutions, orientat
     moved[base.model.tdd_slice(1).start] *= 1.01
     other = replace(base, mean=moved)
     with pytest.raises(InputError, match="drifts otherwise than the first one"):
-        idctab_from_solutions({"F606W": base, "F814W": other}, **ACS)
+        idctab_from_solution({"F606W": base, "F814W": other}, **ACS)
     with pytest.raises(InputError, match="stands twice"):
-        idctab_from_solutions({"F606W": base, ("F606W", "CLEAR2L"): base}, **ACS)
+        idctab_from_solution({"F606W": base, ("F606W", "CLEAR2L"): base}, **ACS)
+    with pytest.raises(InputError, match="filters are given twice"):
+        idctab_from_solution({"F606W": base}, **ACS, filters=("F606W", "CLEAR2L"))
     with pytest.raises(InputError, match="no filter is given"):
-        idctab_from_solutions({}, **ACS)
+        idctab_from_solution({}, **ACS)
     chips = (base.model.chips[1],)
     n = 2 * base.model.n_terms
     single = StandIn(replace(base.model, chips=chips, time=None), base.mean[:n], np.eye(n))
     with pytest.raises(InputError, match="another order or other chips"):
-        idctab_from_solutions({"F606W": base, "F814W": single}, **ACS)
+        idctab_from_solution({"F606W": base, "F814W": single}, **ACS)
     # the very same drift is no difference
-    same = idctab_from_solutions({"F606W": base, "F814W": replace(base)}, **ACS, inverse=False)
+    same = idctab_from_solution({"F606W": base, "F814W": replace(base)}, **ACS)
     assert len(same.rows) == 4

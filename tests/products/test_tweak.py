@@ -22,6 +22,7 @@ from bayesdist.simulate.acs.tables import detector_tables, filter_tables
 
 from .acs_offline import Pointing, plane_matrix
 from .acs_offline import corrected as corrected_by_stwcs
+from .stwcs_offline import gnomonic
 from .test_release import reference_of, solution_of
 
 CENTRE = (80.8, -69.49836)
@@ -63,12 +64,7 @@ def observe(
     rng: np.random.Generator,
 ) -> Exposure:
     """Pixels of sky positions [deg]: the plane at CRVAL, and Newton's method back through it."""
-    ra, dec = np.deg2rad(sky).T
-    ra0, dec0 = np.deg2rad(pointing.crval)
-    d = np.sin(dec) * np.sin(dec0) + np.cos(dec) * np.cos(dec0) * np.cos(ra - ra0)
-    xi = np.cos(dec) * np.sin(ra - ra0) / d
-    eta = (np.sin(dec) * np.cos(dec0) - np.cos(dec) * np.sin(dec0) * np.cos(ra - ra0)) / d
-    plane = 3600 * np.rad2deg(np.stack([xi, eta], axis=1))
+    plane = gnomonic(sky, pointing.crval)
     o, model, epoch = truth.orientation, truth.model, pointing.epoch
     centre = model.predict(truth.mean, 2048.0, 1024.0, epoch=epoch, chip=2)[0]
     v2v3 = (o.v2v3[0] + centre[0], o.v2v3[1] - centre[1])

@@ -6,39 +6,76 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from bayesdist.app.campaign.inputs import cuts_of
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.soundness import (
+    input_doubts,
+    refuse_unsound,
+    segment_counts,
+    shear_doubts,
+)
 from bayesdist.app.campaign.stages import rehearse_campaign
 
 __all__ = ["campaign_lines"]
 
-ONE_ROLL = 2.0  # degrees: roll angles within this say the same
-
 
 def campaign_lines(session: CampaignSession) -> Iterator[str]:
     """Inputs, dates and roll angles of a campaign, as lines of text."""
+    refuse_unsound(session)
     rehearse_campaign(session)
     inputs, config = session.inputs, session.config
     log, catalog = inputs.log, inputs.catalog
     epochs, rolls = log.values("epoch"), log.values("pa_v3")
-    n = sum(len(one) for one in inputs.lists)
-    yield f"exposures    {len(log.names)} in {', '.join(log.filters)}, {n} detections"
+    yield f"exposures    {len(log.names)} in {', '.join(log.filters)}"
+    yield f"detections   {_detections(session)}"
     yield f"catalogue    {len(catalog)} of {inputs.n_catalog} stars, in {catalog.unit}"
     yield f"epochs       {epochs.min():.2f} to {epochs.max():.2f}"
     factors = log.values("vafactor")
-    yield f"VAFACTOR     {factors.min():.7f} to {factors.max():.7f}"
-    if np.isfinite(rolls).all():
-        yield f"PA_V3        {rolls.min():.1f} to {rolls.max():.1f} degrees"
-        # half a turn says nothing new of a shear
-        spread = np.abs(np.exp(2j * np.radians(rolls)).mean())
-        if spread > np.cos(2 * np.radians(ONE_ROLL)):
-            yield (
-                "WARNING: all exposures have one roll angle (or half a turn apart): a shear of the "
-                "catalogue cannot be told from one of the detector"
-            )
+    how = ", of the Earth alone" if session.block.aberration == "earth" else ""
+    yield f"VAFACTOR     {factors.min():.7f} to {factors.max():.7f}{how}"
+    yield f"PA_V3        {_rolls(rolls)}"
     time = config.time()
     if time is not None:
-        edges = [-np.inf, *time.breaks, np.inf]
-        counts = np.histogram(epochs, edges)[0]
+        counts = segment_counts(epochs, time)
         yield f"segments     {', '.join(str(k) for k in counts)} exposures"
     chips = ", ".join(chip.name for chip in config.chips())
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
+    for number, names in _without(session).items():
+        yield f"chip {number}       no detections that pass the cuts in {', '.join(names)}"
+    for text in [*input_doubts(session), *shear_doubts(rolls, "PA_V3")]:
+        yield f"WARNING      {text[0].upper() + text[1:]}"
+
+
+def _detections(session: CampaignSession) -> str:
+    """How many there are, and how many the cuts leave."""
+    cuts = cuts_of(session.block)
+    total = passed = 0
+    reasons: dict[str, int] = {}
+    for one in session.inputs.lists:
+        good, rejected = cuts.passed(one)
+        total, passed = total + len(one), passed + int(good.sum())
+        for reason, count in rejected.items():
+            reasons[reason] = reasons.get(reason, 0) + count
+    left = "".join(f", {count} {reason}" for reason, count in reasons.items())
+    return f"{total}: {passed} pass the cuts{left}"
+
+
+def _rolls(rolls: np.ndarray) -> str:
+    known = rolls[np.isfinite(rolls)]
+    if not len(known):
+        return "not known; roll angles will be those of the matches"
+    text = f"{known.min():.1f} to {known.max():.1f} degrees"
+    missing = len(rolls) - len(known)
+    return text + (f", not known of {missing} exposures" if missing else "")
+
+
+def _without(session: CampaignSession) -> dict[int, list[str]]:
+    """Exposures that have nothing on a chip, by its number."""
+    cuts = cuts_of(session.block)
+    out: dict[int, list[str]] = {}
+    for one in session.inputs.lists:
+        seen = set(one.chip[cuts.passed(one)[0]].tolist())
+        for chip in session.config.chips():
+            if chip.number not in seen:
+                out.setdefault(chip.number, []).append(one.exposure)
+    return out

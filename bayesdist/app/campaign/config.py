@@ -30,8 +30,9 @@ class CampaignBlock(Section):
 
 
 class TablesBlock(Section):
-    """Look-up tables that are fitted with the polynomial."""
+    """Look-up tables that are fitted: the detector's, or the filter's over those of a detector."""
 
+    detector: str | None = None
     method: Literal["field", "binned", "none"] = "field"
     step: tuple[PositiveFloat, PositiveFloat] = (64.0, 64.0)
     rounds: Annotated[int, Field(ge=1)] = 8

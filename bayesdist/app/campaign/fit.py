@@ -9,6 +9,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bayesdist.app.campaign.gap import gap_priors, with_gap
 from bayesdist.app.campaign.session import HIERARCHY, CampaignSession
 from bayesdist.app.campaign.tables import fit_tables, tables_summary
 from bayesdist.app.session import ERROR_COLUMNS, write_table
@@ -20,6 +21,7 @@ from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.series import Series
 from bayesdist.infer.views import LinearTerms, View, lines, reference_gauge, without_frames
+from bayesdist.model import Chip
 
 __all__ = ["run_campaign_fit"]
 
@@ -27,7 +29,8 @@ Float = NDArray[np.float64]
 
 log = logging.getLogger("bayesdist")
 
-SERIES = ("A_2", "A_3", "B_2", "B_3")
+SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
+FIXED = ("A_1", "B_1", "A_3")  # by the gauge, on the reference chip
 
 
 def run_campaign_fit(session: CampaignSession) -> None:
@@ -40,13 +43,16 @@ def run_campaign_fit(session: CampaignSession) -> None:
         "clip_abs": session.config.fit.clip_abs,
     }
     number = session.reference_chip
-    drifting = replace(session.plain_model, time=session.config.time())
+    asked = session.config.time()
+    drifting = with_gap(replace(session.plain_model, time=asked))
     model = replace(held_in_reference(matches, drifting, number), chip_deviations=True)
     shards = load(model, matches, session.config.resources())
+    pixel = (session.scale_arcsec or session.unit_arcsec) / session.unit_arcsec
     joint = fit_hierarchical(
         shards,
         model,
-        pixel=(session.scale_arcsec or session.unit_arcsec) / session.unit_arcsec,
+        priors=gap_priors(model, asked, pixel),
+        pixel=pixel,
         seed=session.config.sampler.seed,
         **options,
     )
@@ -56,6 +62,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
         session.run / HIERARCHY,
         "",
         {
+            "kinds": np.array([kind.encode() for kind in joint.scatter.kinds]),
             "tau_draws": joint.tau_draws,
             "prior_centre": joint.priors.centre,
             "prior_precision": joint.priors.precision,
@@ -63,7 +70,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
     )
     session.fit_changed()
     alone = fit_exposures(matches, session.plain_model, chip=number, skip=True, **options)
-    session.keep_terms(_series(alone))
+    session.keep_terms(_series(alone, model.chips[0]))
     summarise_fit(session, joint.fit)
     view = reference_gauge(without_frames(joint), number)
     session.run.summarise(
@@ -91,11 +98,10 @@ def _fit_errors(session: CampaignSession) -> None:
     session.errors_changed()
 
 
-def _series(alone: ExposureSolutions) -> Series:
-    """Scales and rotations of all chips, without those that the gauge fixes."""
-    labels = [label for label in alone.labels if label.split(".")[-1] in SERIES]
-    spread = dict(zip(alone.labels, np.ptp(alone.values, axis=0), strict=True))
-    labels = [label for label in labels if spread[label] > 1e-12]
+def _series(alone: ExposureSolutions, reference: Chip) -> Series:
+    """Linear terms of all chips, and the constant in v, without those that the gauge fixes."""
+    fixed = {f"{prefix}{term}" for prefix in ("", f"{reference.name}.") for term in FIXED}
+    labels = [s for s in alone.labels if s.split(".")[-1] in SERIES and s not in fixed]
     epoch, values, cov = alone.series(*labels)
     return Series(epoch, values, cov, tuple(labels), alone.names, source="exposures")
 
@@ -112,7 +118,7 @@ def _gauge(view: View) -> dict[str, object]:
     assert gauge is not None
     return {
         "chip": gauge.chip,
-        "fixed": ["A_1", "B_1", "A_3"],
+        "fixed": list(FIXED),
         "epoch": gauge.epoch,
         "rotation": gauge.rotation,
         "sigma_rotation": gauge.sigma_rotation,

@@ -49,6 +49,11 @@ class Inputs:
     log: ExposureLog
     lists: tuple[StarList, ...]
 
+    @property
+    def filter(self) -> str:
+        """The one filter of the exposures."""
+        return self.log.filters[0]
+
 
 def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
     """Read catalogue, exposures and star lists.

@@ -8,9 +8,20 @@ import numpy as np
 
 from bayesdist.app.campaign.inputs import cuts_of, start_of
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.soundness import input_doubts, refuse_few, shear_doubts
 from bayesdist.app.session import write_table
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import match_campaign, neutralise_aberration, write_partitioned
+from bayesdist.data import (
+    MatchTable,
+    StarCuts,
+    StarList,
+    match_campaign,
+    neutralise_aberration,
+    write_partitioned,
+)
+from bayesdist.data.match_doubts import match_doubts
+from bayesdist.errors import InputError
+from bayesdist.model import Chip
 
 __all__ = ["run_match"]
 
@@ -19,19 +30,30 @@ log = logging.getLogger("bayesdist")
 
 def run_match(session: CampaignSession) -> None:
     block, run, inputs = session.block, session.run, session.inputs
+    cuts = cuts_of(block)
     found = match_campaign(
-        inputs.lists,
+        _gauge_first(inputs.lists, cuts, session.reference_chip),
         inputs.log,
         inputs.catalog,
         start_of(session.base / block.start, session.unit_arcsec, block.filter),
-        cuts=cuts_of(block),
+        cuts=cuts,
         radius=block.radius,
-        need_all_chips=True,
+        skip=True,
     )
+    _refuse_bare(found.table, session.config.chips(), inputs.catalog.source)
+    left = inputs.log.select(names=found.table.exposure_names)
+    if found.left_out:
+        refuse_few(left.values("epoch"), session.config.time())
     summary = found.summary()
     order = [list(inputs.log.names).index(name) for name in summary["exposure"]]
     for name in ("vafactor", "pa_v3"):
         summary[name] = inputs.log.values(name)[order]
+    warnings = [
+        *match_doubts(found, inputs.log),
+        *input_doubts(session),
+        # as the stars show them, for the log need not have them
+        *shear_doubts(np.asarray(summary["rotation"]), "of the matches"),
+    ]
     write_table(summary, run / "matching.ecsv")
     for stale in part_files(run / PAIRS):
         stale.unlink()
@@ -41,16 +63,18 @@ def run_match(session: CampaignSession) -> None:
     run.summarise(
         matching={
             "n_exposures": len(found.reports),
-            "n_detections": int(summary["detected"].sum()),
+            "n_detections": sum(len(one) for one in inputs.lists),
             "n_pairs": len(found.table),
             "n_catalog": inputs.n_catalog,
             "n_catalog_used": len(inputs.catalog),
+            "left_out": dict(found.left_out),
             "completeness": {
                 "median": float(np.median(summary["completeness"])),
                 "least": float(np.min(summary["completeness"])),
             },
             "false_share": false,
             "radius": [float(summary["radius_min"].min()), float(summary["radius_max"].max())],
+            "warnings": warnings,
         }
     )
     log.info(
@@ -61,3 +85,30 @@ def run_match(session: CampaignSession) -> None:
         float(np.median(summary["completeness"])),
         false,
     )
+    for text in warnings:
+        log.warning("match: WARNING: %s", text)
+
+
+def _gauge_first(lists: tuple[StarList, ...], cuts: StarCuts, chip: int) -> tuple[StarList, ...]:
+    """The lists, led by one with enough stars on the reference chip.
+
+    The first exposure's stars there define the gauge of the joint fit.  The order stays where the
+    first list has at least half of what the others have.
+    """
+    counts = np.array([int((one.chip[cuts.passed(one)[0]] == chip).sum()) for one in lists])
+    usual = np.median(counts[counts > 0]) if counts.any() else 0.0
+    if counts[0] >= 0.5 * usual:
+        return lists
+    first = int(np.argmax(counts >= usual))
+    return (lists[first], *lists[:first], *lists[first + 1 :])
+
+
+def _refuse_bare(pairs: MatchTable, chips: tuple[Chip, ...], where: str) -> None:
+    """Refuse pairs that leave a chip without any."""
+    for chip in chips:
+        if chip.number not in pairs.chip_numbers:
+            raise InputError(
+                f"no detection on chip {chip.name} is matched in any exposure",
+                where=where,
+                do="widen the cuts, or drop its [[chip]] block",
+            )

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.assess.solution import Solution
 from bayesdist.infer.views import reference_gauge, without_frames
+from bayesdist.model import LookupTable
 from bayesdist.products import (
     Period,
     lint_idctab,
@@ -18,11 +21,11 @@ from bayesdist.products import (
     write_release,
 )
 
-__all__ = ["release"]
+__all__ = ["release", "write_files"]
 
 
 def release(session: CampaignSession, solution: Solution) -> list[dict[str, Any]]:
-    """Write IDCTABs, D2IMFILE and NPOLFILE, and say what was written.
+    """Write IDCTABs, D2IMFILE and NPOLFILE of one run into its folder, and say what was written.
 
     Parameters
     ----------
@@ -34,30 +37,63 @@ def release(session: CampaignSession, solution: Solution) -> list[dict[str, Any]
     list of dict
         Entries of summary.json.
     """
+    return write_files(session, session.run.path, {session.inputs.filter: solution}, session.tables)
+
+
+def write_files(
+    session: CampaignSession,
+    folder: Path,
+    solutions: Mapping[str, Solution],
+    tables: Sequence[LookupTable],
+    history: Sequence[str] = (),
+) -> list[dict[str, Any]]:
+    """Write the files of one filter or several, as the configuration of one run says.
+
+    Parameters
+    ----------
+    session : CampaignSession
+        Whose [products.release] it is.
+    folder : Path
+    solutions : mapping of filter to Solution
+        The session's own first: V2 and V3 lie as the reference says of it.
+    tables : sequence of LookupTable
+        The detector's, and those of filters.
+    history : sequence of str
+        Lines for HISTORY of all files.
+
+    Returns
+    -------
+    list of dict
+        One entry for each file: path, kind, findings, and of an IDCTAB period and lost.
+    """
     block = session.config.products.release
     assert block is not None
-    filter = session.block.filter or session.inputs.log.filters[0]
     number = session.reference_chip
-    view = reference_gauge(without_frames(solution), number)
-    time = view.model.time
+    views = {
+        filter: reference_gauge(without_frames(solution), number)
+        for filter, solution in solutions.items()
+    }
+    first = next(iter(views.values()))
+    time = first.model.time
     orientation = orientation_from_idctab(
-        view,
+        first,
         read_idctab(session.base / block.reference),
         chip=number,
         epoch=None if time is None else time.epoch0[0],
         scale_arcsec=block.scale_arcsec,
     )
     written = write_release(
-        session.run.path,
+        folder,
         block.name,
-        {filter: view},
+        views,
         orientation,
         [Period(**one.model_dump()) for one in block.period],
-        tables=session.tables,
+        tables=tables,
         instrument=block.instrument,
         detector=block.detector,
         scale_arcsec=block.scale_arcsec,
         limit_mas=block.limit_mas,
+        history=history,
     )
     out: list[dict[str, Any]] = []
     for period, path in written.idctabs.items():

@@ -16,6 +16,7 @@ __all__ = ["run_series"]
 log = logging.getLogger("bayesdist")
 
 PREDICTIONS = 25  # epochs at which the drift is tabulated
+MOST_SWEEPS = 6000  # chips that scatter nearly alike make slow chains
 FEWEST = 8  # exposures below which nothing is said of time
 
 
@@ -25,8 +26,8 @@ def run_series(session: CampaignSession) -> None:
     if time is None or len(series.names) < FEWEST:
         return
     seed = session.config.sampler.seed
-    course = Course("lines", time.breaks, reference=time.epoch0) if time.breaks else Course("line")
-    posterior = fit_series(series, course, seed=seed)
+    course = Course("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
+    posterior = fit_series(series, course, seed=seed, max_sweeps=MOST_SWEEPS)
     write_table(_exposures(series, posterior), session.run / "series.ecsv")
     write_table(_predictions(posterior), session.run / "drift.ecsv")
     verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
@@ -56,15 +57,7 @@ def run_series(session: CampaignSession) -> None:
 
 def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
     """Which course one term takes, by held-out exposures."""
-    one = Series(
-        series.epoch,
-        series.values[:, [k]],
-        series.cov[:, [k]][:, :, [k]],
-        (series.coefficients[k],),
-        series.names,
-        source=series.source,
-    )
-    verdict = describe(one, breaks=breaks, seed=seed)
+    verdict = describe(series.only(series.coefficients[k]), breaks=breaks, seed=seed)
     return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
 
 

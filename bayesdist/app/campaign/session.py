@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from bayesdist.app.campaign.config import CampaignBlock
 from bayesdist.app.campaign.inputs import Inputs, read_inputs
+from bayesdist.app.campaign.systematics import systematics_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
+from bayesdist.app.systematics import Systematics
 from bayesdist.assess import LocalTerm
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
 from bayesdist.infer import GaussianPriors, Matches
@@ -29,8 +31,6 @@ __all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession", "session_of"]
 Float = NDArray[np.float64]
 
 TABLES, HIERARCHY, TERMS = "tables.h5", "hierarchy.h5", "exposure_terms.h5"
-TERMS_OF = {"A_2": ("u", 1, 0), "A_3": ("u", 0, 1), "B_2": ("v", 1, 0), "B_3": ("v", 0, 1)}
-LEAST_RATIO = 0.5  # of the errors of rates, joint over alone, below which the joint is doubted
 _AGAIN = "run the stage 'fit' again"
 
 
@@ -170,35 +170,15 @@ class CampaignSession(Session):
         return GaussianPriors(arrays["prior_centre"], arrays["prior_precision"])
 
     @property
-    def doubts(self) -> list[str]:
-        """Rates that the joint fit takes for much better known than the exposures alone show.
+    def scatter(self) -> tuple[tuple[str, ...], Float]:
+        """Kinds of deviation of the exposures, and draws (n, k) of their scatter."""
+        arrays = read_arrays(self.run / HIERARCHY, "", do=_AGAIN)
+        return tuple(str(t, "utf-8") for t in arrays["kinds"]), arrays["tau_draws"]
 
-        It takes the scatter of an exposure for that of all its chips, so that their distance says
-        what the scale of each does; a chip that scatters by itself breaks this.
-        """
-        found = self.run.summary
-        time = self.model.time
-        alone = {
-            (row["term"], row["segment"]): row["sigma_beta"]
-            for row in found.get("time_dependence", {}).get("lines", [])
-        }
-        chips = {chip.number: chip.name for chip in self.model.chips}
-        drifting = () if time is None else time.terms
-        found_doubtful: dict[str, float] = {}
-        for row in found.get("lines", []):
-            term = f"{chips[row['chip']]}.{row['term']}"
-            known = alone.get((term, row["segment"]))
-            if TERMS_OF.get(row["term"]) in drifting and known is not None:
-                ratio = row["sigma_beta"] / known
-                if ratio < LEAST_RATIO:
-                    found_doubtful[term] = min(ratio, found_doubtful.get(term, ratio))
-        if not found_doubtful:
-            return []
-        return [
-            f"the rates of {', '.join(found_doubtful)} have errors in the joint fit down to "
-            f"{min(found_doubtful.values()):.2g} of those from the exposures alone (see "
-            "time_dependence): a chip that scatters by itself makes the former too small"
-        ]
+    @cached_property
+    def systematics(self) -> Systematics:
+        """The posterior with the errors of the catalogue, and what a new exposure adds."""
+        return systematics_of(self)
 
     @cached_property
     def terms(self) -> Series:
@@ -224,7 +204,7 @@ class CampaignSession(Session):
     def fit_changed(self) -> None:
         """Forget what rests on the fit."""
         self.errors_changed()
-        for name in ("fit", "model", "priors", "terms"):
+        for name in ("fit", "model", "priors", "terms", "systematics"):
             self.__dict__.pop(name, None)
 
     def forget(self) -> None:

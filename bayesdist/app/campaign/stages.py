@@ -25,7 +25,7 @@ def _assess(session: CampaignSession) -> None:
 
 def _export(session: CampaignSession) -> None:
     asked = session.config.products.release is not None
-    run_export(session, release(session, session.posterior) if asked else [])
+    run_export(session, release(session, session.solution) if asked else [])
 
 
 CAMPAIGN_STAGES: dict[str, Callable[[Any], None]] = {

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.data import MatchTable
-from bayesdist.infer import fit_by_magnitude
-from bayesdist.infer.nodes import TableFit, fit_with_tables, pixel_jacobian
-from bayesdist.model import corrected
+from bayesdist.infer import LinearFit, fit_by_magnitude
+from bayesdist.infer.nodes import Round, TableFit, fit_with_tables, pixel_jacobian
+from bayesdist.infer.nodes.table_fit import held_sigma
+from bayesdist.model import LookupTable, corrected
 
 __all__ = ["fit_tables", "tables_summary"]
 
@@ -20,66 +23,115 @@ Float = NDArray[np.float64]
 
 log = logging.getLogger("bayesdist")
 
+ROUGH = 1  # rounds of the tables from whose residuals the errors of the stars are taken
+
 
 def fit_tables(session: CampaignSession) -> TableFit | None:
-    """Fit the tables that are asked for and keep them; None where none are."""
-    block = session.config.tables
-    session.keep_tables(())
+    """Fit the tables that are asked for and keep them; None where none are fitted.
+
+    They are the detector's, unless these are taken from another run: then they are the filter's.
+    """
+    block, base = session.config.tables, session.base
+    held = held_tables(block, session.config.chips(), base)
+    if any(table.sigma is None for table in held):
+        log.warning("fit: WARNING: the held tables have no errors, and none are counted")
+    session.keep_tables(held)
     if block.method == "none":
+        if held:
+            fit, _, _ = fit_by_magnitude(session.raw_matches, session.plain_model)
+            session.keep_tables(held, _held_errors(session, fit, held))
         return None
-    pairs = session.pairs
-    _, with_errors, _ = fit_by_magnitude(pairs, session.plain_model)
-    assert isinstance(with_errors, MatchTable)
     found = fit_with_tables(
-        with_errors,
+        _with_errors(session, held),
         session.plain_model,
+        base=session.inputs.filter,
+        detector=held,
         method=block.method,
         step=block.step,
         rounds=block.rounds,
-        report=lambda one: log.info(
-            "fit: tables, round %d: moved %.2g px, residuals %.4f px",
-            one.number,
-            one.moved,
-            one.rms,
-        ),
+        report=_say,
     )
-    session.keep_tables(found.tables, _table_errors(session, found))
+    part = found.part()
+    if part.posteriors:
+        errors = _on_the_grid(session, lambda x, y, chip: found.table_sigma(x, y, chip=chip))
+    else:
+        errors = _held_errors(session, part.fit, held) if held else {}
+    session.keep_tables(found.tables, errors)
     return found
 
 
-def _table_errors(session: CampaignSession, found: TableFit) -> dict[int, Float]:
-    """Errors (ny, nx, 2) of positions by those of the tables, on the grid of the assessment."""
-    part, grid = found.part(), session.config.assess.grid
-    sizes = {chip.number: chip.size for chip in session.plain_model.chips}
-    out = {}
-    for posterior in part.posteriors:
-        number = posterior.table.chip
-        x, y = mesh(*grid_pixels(sizes[number], grid))
-        px, py = corrected(found.tables, x, y, chip=number)
-        J = pixel_jacobian(part.fit.model, part.fit.mean, px, py, chip=number)
-        variance = posterior.position_sigma(x, y, refitted=True) ** 2
-        total = np.einsum("nab,nb->na", J**2, variance)
-        out[number] = np.sqrt(total).reshape(grid[1], grid[0], 2)
+def _with_errors(session: CampaignSession, held: tuple[LookupTable, ...]) -> MatchTable:
+    """Pairs with errors by magnitude, free of the pattern that the tables are to describe.
+
+    The scatter of the residuals before any table is twice that of the stars: with errors from
+    there the tables would be smoothed too much, and their own errors twice too large.
+    """
+    pairs, model = session.pairs, session.plain_model
+    _, rough_errors, _ = fit_by_magnitude(pairs, model)
+    assert isinstance(rough_errors, MatchTable)
+    rough = fit_with_tables(
+        rough_errors,
+        model,
+        base=session.inputs.filter,
+        detector=held,
+        method=session.config.tables.method,
+        step=session.config.tables.step,
+        rounds=ROUGH,
+    )
+    _, _, errors = fit_by_magnitude(rough.corrected(pairs), model)
+    return pairs.with_errors_by_magnitude(errors)
+
+
+def _say(one: Round) -> None:
+    log.info(
+        "fit: tables, round %d: moved %.2g px, residuals %.4f px", one.number, one.moved, one.rms
+    )
+
+
+def _on_the_grid(session, sigma) -> dict[int, Float]:  # type: ignore[no-untyped-def]
+    """Errors (ny, nx, 2) of positions on the grid of the assessment, by chip."""
+    grid, out = session.config.assess.grid, {}
+    for chip in session.plain_model.chips:
+        x, y = mesh(*grid_pixels(chip.size, grid))
+        out[chip.number] = sigma(x, y, chip.number).reshape(grid[1], grid[0], 2)
     return out
+
+
+def _held_errors(
+    session: CampaignSession, fit: LinearFit, held: tuple[LookupTable, ...]
+) -> dict[int, Float]:
+    """Errors of positions by those of held tables alone."""
+
+    def sigma(x: Float, y: Float, chip: int) -> Float:
+        px, py = corrected(held, x, y, chip=chip)
+        J = pixel_jacobian(fit.model, fit.mean, px, py, chip=chip)
+        return np.sqrt(np.einsum("nab,nb->na", J**2, held_sigma(held, x, y, chip=chip) ** 2))
+
+    return _on_the_grid(session, sigma)
 
 
 def tables_summary(session: CampaignSession, found: TableFit | None) -> dict[str, object]:
     """What summary.json says of the tables."""
-    if found is None:
-        return {"method": "none"}
-    return {
+    out: dict[str, object] = {
         "method": session.config.tables.method,
-        "converged": found.converged,
-        "rms_before": found.progress[0].rms,
-        "rms_after": found.progress[-1].rms,
-        "chips": [
-            {
-                "chip": table.chip,
-                "nodes": list(table.shape),
-                "rms": float(np.sqrt((table.values**2).mean())),
-                "largest": float(np.hypot(*table.values).max()),
-                "sigma_median": None if table.sigma is None else float(np.median(table.sigma)),
-            }
-            for table in found.tables
-        ],
+        "detector": session.config.tables.detector,
+        "chips": [_row(table) for table in session.tables],
+    }
+    if found is not None:
+        out |= {
+            "converged": found.converged,
+            "rms_before": found.progress[0].rms,
+            "rms_after": found.progress[-1].rms,
+        }
+    return out
+
+
+def _row(table: LookupTable) -> Mapping[str, object]:
+    return {
+        "chip": table.chip,
+        "filter": table.filter or None,
+        "nodes": list(table.shape),
+        "rms": float(np.sqrt((table.values**2).mean())),
+        "largest": float(np.hypot(*table.values).max()),
+        "sigma_median": None if table.sigma is None else float(np.median(table.sigma)),
     }

@@ -42,7 +42,7 @@ LEAST_CHI2, MOST_CHI2 = 0.67, 1.5
 
 def run_assess(session: Session) -> None:
     config, run = session.config, session.run
-    solution, grid, epoch = session.posterior, config.assess.grid, session.epoch
+    solution, grid, epoch = session.solution, config.assess.grid, session.epoch
     places = [{"grid": grid, "epoch": epoch, "chip": c.number} for c in solution.model.chips]
     formal = [uncertainty_map(session.fit, **place) for place in places]
     maps = [uncertainty_map(solution, **place) for place in places]
@@ -55,7 +55,7 @@ def run_assess(session: Session) -> None:
     warnings = posterior_warnings(session)
     for text in warnings:
         log.warning("assess: WARNING: %s", text)
-    budget = budget_of(session, solution)
+    budget = budget_of(session)
     several = len(budget.chips) > 1
     table = Table(rows=budget.rows_by_chip() if several else budget.rows())
     for name in ("u", "v", "radial"):
@@ -63,7 +63,7 @@ def run_assess(session: Session) -> None:
     table.meta = {"epoch": epoch, "grid": list(grid), "statistic": "rms over the grid"}
     table.meta |= state | labelled(session)
     write_table(table, run / "budget.ecsv")
-    margins = margins_of(session, config.requirements(), solution)
+    margins = margins_of(session, config.requirements())
     write_margins(session, margins)
     run.summarise(
         map=_map_summary(maps, formal),
@@ -114,10 +114,15 @@ def _misfit_row(m: Misfit) -> dict[str, Any]:
     return row if m.chip is None else row | {"chip": m.chip.number}
 
 
-def _assessment(session: Session, solution: Solution, n_draws: int | None) -> dict[str, Any]:
+def _assessment(session: Session, solution: Solution | None, n_draws: int | None) -> dict[str, Any]:
     """What a budget and margins have in common."""
     config = session.config
-    return {
+    what: dict[str, Any] = {"solution": solution}
+    if solution is None:
+        known = session.systematics
+        solution = known.solution
+        what = {"solution": solution, "fields": known.fields, "aligned": known.aligned}
+    return what | {
         "terms": config.user_terms(),
         "local": session.local_terms,
         "grid": config.assess.grid,
@@ -128,22 +133,28 @@ def _assessment(session: Session, solution: Solution, n_draws: int | None) -> di
     }
 
 
-def budget_of(session: Session, solution: Solution, n_draws: int | None = None) -> DetectorBudget:
-    return detector_budget(solution, **_assessment(session, solution, n_draws))
+def budget_of(
+    session: Session, solution: Solution | None = None, n_draws: int | None = None
+) -> DetectorBudget:
+    """The budget of the session's solution with all that is known of its errors.
+
+    Another solution is assessed by itself.
+    """
+    return detector_budget(**_assessment(session, solution, n_draws))
 
 
 def margins_of(
     session: Session,
     requirements: tuple[Requirement, ...],
-    solution: Solution,
+    solution: Solution | None = None,
     n_draws: int | None = None,
 ) -> tuple[Margin, ...]:
-    """Margins of a solution against requirements; as many draws as configured by default."""
+    """Margins of a solution, as in `budget_of`; as many draws as configured by default."""
     doubt = ""
     if n_draws is None and session.misfit.significant:
         doubt = session.misfit.sentence
     return check_requirements(
-        solution, requirements, doubt=doubt, **_assessment(session, solution, n_draws)
+        requirements=requirements, doubt=doubt, **_assessment(session, solution, n_draws)
     )
 
 

@@ -31,10 +31,10 @@ def run_export(session: Session, written: Sequence[dict[str, Any]] = ()) -> None
     config, run = session.config, session.run
     products: list[dict[str, Any]] = [*written]
     if config.products.sip is not None:
-        for chip in session.posterior.model.chips:
-            several = len(session.posterior.model.chips) > 1
+        for chip in session.solution.model.chips:
+            several = len(session.solution.model.chips) > 1
             path = run / (f"sip_{chip.number}.hdr" if several else "sip.hdr")
-            header = sip_of(session, session.posterior, chip.number)
+            header = sip_of(session, session.solution, chip.number)
             write_sip(header, path)
             findings = lint_sip(read_sip(path), size=chip.size)
             products.append(
@@ -51,7 +51,7 @@ def run_export(session: Session, written: Sequence[dict[str, Any]] = ()) -> None
     idc = config.products.idctab
     if idc is not None:
         path = run / f"{idc.instrument}_{idc.detector}_idc.fits".lower()
-        write_idctab(idctab_of(session, session.posterior), path)
+        write_idctab(idctab_of(session, session.solution), path)
         findings = lint_idctab(read_idctab(path))
         products.append(
             {

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from bayesdist.app.campaign.report import campaign_results
+from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import as_json
 from bayesdist.app.session import Session
 from bayesdist.app.stages.assess import (
@@ -65,10 +68,10 @@ def run_report(session: Session) -> None:
         fit=fit,
         posterior=posterior,
         chips=_chip_results(session),
-        coefficients=coefficient_table(fit, posterior),
-        budget=budget_of(session, posterior),
+        coefficients=coefficient_table(fit, session.solution),
+        budget=budget_of(session),
         # the requirements that were judged last, be it by `assess` or by `validate`
-        margins=margins_of(session, judged_requirements(run), posterior),
+        margins=margins_of(session, judged_requirements(run)),
         products=products,
         warnings=tuple(posterior_warnings(session)),
         magnitude_errors=session.magnitude_errors,
@@ -77,6 +80,8 @@ def run_report(session: Session) -> None:
             k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")
         },
     )
+    if isinstance(session, CampaignSession):
+        inputs = replace(inputs, campaign=campaign_results(session))
     figures = all_figures(inputs)
     names = [f"{name}.png" for name in figures]
     for stale in set(run.summary.get("figures", [])) - set(names):
@@ -91,7 +96,7 @@ def run_report(session: Session) -> None:
 def _chip_results(session: Session) -> tuple[ChipResults, ...]:
     from bayesdist.report.context import ChipResults
 
-    fit, posterior, epoch = session.fit, session.posterior, session.epoch
+    fit, posterior, epoch = session.fit, session.solution, session.epoch
     out = []
     for chip, place, sums in zip(
         posterior.model.chips,

@@ -44,7 +44,8 @@ def run_sample(session: Session) -> None:
     matches = session.matches
     table = matches if isinstance(matches, MatchTable) else None
     save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
-    session.__dict__.pop("stars", None)
+    for name in ("stars", "systematics"):
+        session.__dict__.pop(name, None)
     session.__dict__["posterior"] = posterior
     write_star_files(matches, session.fit, posterior, run / FOLDER)
     c, i = posterior.convergence, posterior.sampler

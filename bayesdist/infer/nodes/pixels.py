@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.errors import DegenerateError, InputError
-from bayesdist.model import DistortionModel, Groups, PolynomialBasis
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.stars import errors_of, groups_of
+from bayesdist.model import DistortionModel, Groups
 
 __all__ = ["PixelShifts", "Solved", "pixel_jacobian", "pixel_shifts"]
 
@@ -88,23 +88,9 @@ def _evaluated(
         basis = model.basis(model.chips[groups.chip[g]].number)
         phi = basis.evaluate(x[rows], y[rows])
         position[rows] = phi @ effective[g].T
-        # the derivative of a polynomial is one of lower order in the same basis
-        for k, D in enumerate(_derivatives(basis)):
-            slope[rows, :, k] = phi @ (effective[g] @ D.T).T
+        for axis, D in enumerate(basis.derivatives):
+            slope[rows, :, axis] = phi @ (D @ effective[g].T)
     return position, slope
-
-
-def _derivatives(basis: PolynomialBasis) -> tuple[Float, Float]:
-    """Matrices (K, K) from the coefficients of a polynomial to those of its derivatives."""
-    n, terms = basis.order, basis.terms
-    of_one = np.zeros((n + 1, n + 1))  # column i holds P_i' in Legendre polynomials
-    for i in range(1, n + 1):
-        of_one[:i, i] = legendre.legder(np.eye(n + 1)[i])[:i]
-    i, j = np.array(terms).T
-    half_x, half_y = basis.half_size
-    by_x = of_one[np.ix_(i, i)] * (j[:, None] == j) / half_x
-    by_y = of_one[np.ix_(j, j)] * (i[:, None] == i) / half_y
-    return by_x, by_y
 
 
 def pixel_shifts(solution: Solved, matches: MatchTable) -> PixelShifts:
@@ -130,33 +116,24 @@ def pixel_shifts(solution: Solved, matches: MatchTable) -> PixelShifts:
     DegenerateError
         Where the polynomial folds over: its Jacobian is singular at a star.
     """
-    model = solution.model
-    if matches.sigma_u is None or matches.sigma_v is None:
-        raise InputError(
-            "the matches carry no errors",
-            do="give sigma columns, a number, or sigma = 'by_magnitude'",
-        )
-    if matches.unit != model.unit:
-        raise InputError(f"the matches are in {matches.unit} and the model is in {model.unit}")
-    numbers = np.asarray(matches.chip_numbers)[matches.chip]
-    groups = model.groups(
-        len(matches), epoch=matches.epoch, exposure=matches.exposure, chip=numbers
-    )
-    fitted, J = _evaluated(model, solution.mean, groups, matches.x, matches.y)
+    sigma_u, sigma_v = errors_of(matches)
+    groups = groups_of(solution.model, matches)
+    fitted, J = _evaluated(solution.model, solution.mean, groups, matches.x, matches.y)
     det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
     folded = np.abs(det) <= FOLDED * (J**2).sum(axis=(1, 2))
     if folded.any():
         k = int(np.argmax(folded))
+        number = matches.chip_numbers[matches.chip[k]]
         raise DegenerateError(
             "the polynomial maps neighbouring pixels to one place",
-            where=f"pixel ({matches.x[k]:.1f}, {matches.y[k]:.1f}) of chip {numbers[k]}",
+            where=f"pixel ({matches.x[k]:.1f}, {matches.y[k]:.1f}) of chip {number}",
             do="check the match, or give a lower order",
         )
     inverse = np.empty_like(J)
     inverse[:, 0, 0], inverse[:, 1, 1] = J[:, 1, 1] / det, J[:, 0, 0] / det
     inverse[:, 0, 1], inverse[:, 1, 0] = -J[:, 0, 1] / det, -J[:, 1, 0] / det
     residual = np.stack([matches.u, matches.v], axis=1) - fitted
-    errors = np.stack([matches.sigma_u, matches.sigma_v], axis=1)
+    variance = np.stack([sigma_u, sigma_v], axis=1) ** 2
     return PixelShifts(
-        np.einsum("nab,nb->na", inverse, residual), np.einsum("nab,nb->na", inverse**2, errors**2)
+        np.einsum("nab,nb->na", inverse, residual), np.einsum("nab,nb->na", inverse**2, variance)
     )

@@ -20,6 +20,7 @@ Float = NDArray[np.float64]
 
 SAMPLE = 200_000  # stars that the mixture's three numbers are estimated from
 STEPS = 200
+WIDER = 3.0  # least standard deviation of false matches over that of true ones
 SETTLED = 1e-3  # relative change of the expected number of false matches
 
 
@@ -72,8 +73,11 @@ def fitted_trust(residual: Float, variance: Float) -> Trust:
         p = _true(some, var, f, j2, out2)
         false = float((1 - p).sum())
         f = (false + a) / (len(some) + a + b)
-        out2 = (0.5 * float((r2 * (1 - p)).sum()) + rate) / (false + OUTLIER_SHAPE)
         j2, _ = jitter_variance(some, var, p, 0.0)
+        out2 = (0.5 * float((r2 * (1 - p)).sum()) + rate) / (false + OUTLIER_SHAPE)
+        # where the quoted errors are too large, or the pattern is still in the residuals, a second
+        # Gaussian of about the same width fits the bulk better, and nearly all would be false
+        out2 = max(out2, WIDER**2 * (scale2 + j2))
         if abs(false - before) < SETTLED * (1.0 + false):
             break
         before = false

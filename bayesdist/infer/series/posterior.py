@@ -59,7 +59,7 @@ class SeriesPosterior:
         """Breaks, shape (n, B); one row where they are given."""
         if not self.course.find:
             return self.design.given_breaks()
-        return self.raw.breaks.reshape(-1, self.course.find)
+        return self.raw.breaks.reshape(self.raw.fraction.size, self.course.find)
 
     @property
     def reference(self) -> Float:

@@ -37,21 +37,31 @@ class Change:
         return np.sqrt(np.diag(self.cov))
 
     @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which of them (k,) can differ: the slope of a step cannot."""
+        return self.sigma > 0
+
+    @property
     def significance(self) -> Float:
-        """Value over sigma of each, shape (k,)."""
-        return self.value / self.sigma
+        """Value over sigma of each, shape (k,); 0 for what cannot differ."""
+        return np.where(self.free, self.value / np.where(self.free, self.sigma, 1.0), 0.0)
 
     @property
     def chi2(self) -> float:
-        """Of all together against no difference, with k degrees of freedom."""
-        unit = self.sigma
-        scaled = self.cov / unit[:, None] / unit
-        return float(self.significance @ np.linalg.solve(scaled, self.significance))
+        """Of all that can differ together, against no difference."""
+        some = np.flatnonzero(self.free)
+        unit = self.sigma[some]
+        scaled = self.cov[np.ix_(some, some)] / np.outer(unit, unit)
+        return float(self.significance[some] @ np.linalg.solve(scaled, self.significance[some]))
 
     @property
     def p_value(self) -> float:
-        """Probability of so large a chi-square where nothing differs."""
-        return float(chi_squared.sf(self.chi2, len(self.value)))
+        """Probability of so large a chi-square where nothing differs.
+
+        Of a Gaussian: with few exposures the posterior has heavier tails, and this is too small.
+        """
+        n = int(self.free.sum())
+        return float(chi_squared.sf(self.chi2, n)) if n else 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ ROLL = np.radians(0.003)
 ORBIT = 7.5  # km/s
 INCLINATION = np.radians(28.5)
 
-# Angle from the U axis of the reference gauge (along X of WFC2) to V2
+# Angle from V2 to the U axis of the reference gauge (along X of WFC2)
 TO_V2 = -2.234
 MUCH = 10.0  # times the usual deviation: an outlying exposure
 OWN = 0.25  # of the deviations that the chips share: those of WFC1 by itself

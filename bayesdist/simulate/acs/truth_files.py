@@ -89,8 +89,7 @@ def read_truth(folder: Path, log: ExposureLog) -> AcsTruth:
         settings = dict(theta.meta["settings"])
         names = tuple(str(name) for name in frames["exposure"])
         exposure = np.asarray(found["exposure"]).astype(str)
-        starts = np.flatnonzero(np.append(True, exposure[1:] != exposure[:-1]))
-        ends = np.append(starts[1:], len(exposure))
+        rows = [exposure == name for name in names]
         return AcsTruth(
             model=model,
             theta={f: np.array(theta[f]) for f in theta.colnames if f not in ("name", "unit")},
@@ -108,8 +107,8 @@ def read_truth(folder: Path, log: ExposureLog) -> AcsTruth:
                 zero_point=np.array(frames["zero_point"]),
             ),
             detections=tuple(
-                DetectionTruth(np.array(found["star"][a:b]), np.array(found["blended"][a:b], bool))
-                for a, b in zip(starts, ends, strict=True)
+                DetectionTruth(np.array(found["star"][r]), np.array(found["blended"][r], bool))
+                for r in rows
             ),
             settings=settings,
         )

@@ -1,0 +1,156 @@
+"""What a run takes over from that of the reference filter: the detector's tables, and its drift."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bayesdist.app.campaign.config import TablesBlock
+from bayesdist.app.campaign.gap import with_gap
+from bayesdist.app.campaign.table_file import read_tables
+from bayesdist.errors import InputError
+from bayesdist.infer import GaussianPriors, Posterior, load_posterior
+from bayesdist.infer.shared_drift import drift_priors
+from bayesdist.model import Chip, DistortionModel, LookupTable
+from bayesdist.products import read_d2im
+
+if TYPE_CHECKING:
+    from bayesdist.app.config import Config
+
+__all__ = ["FREE", "held_tables", "rate_priors", "reference_files", "rehearse_references"]
+
+FREE = "free"  # rates that no other run says anything of
+TABLES, POSTERIOR = "tables.h5", "posterior.nc"
+
+
+def reference_files(block: TablesBlock, rates: str, base: Path) -> list[Path]:
+    """Files of other runs that a run goes by.
+
+    Parameters
+    ----------
+    block : TablesBlock
+    rates : str
+        `model.tdd.rates`.
+    base : Path
+        What the configuration's paths are relative to.
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run.
+    """
+    out = []
+    if block.detector is not None:
+        out.append(_tables_file(base / block.detector))
+    if rates != FREE:
+        out.append(_file_of_run(base / rates, POSTERIOR, "model.tdd.rates"))
+    return out
+
+
+def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
+    """The detector's tables that a run holds; none where it has none to hold.
+
+    Parameters
+    ----------
+    block : TablesBlock
+    chips : tuple of Chip
+        All of which must have a table.
+    base : Path
+
+    Raises
+    ------
+    InputError
+        For a run without tables, a file that is no D2IMFILE, and a chip without table.
+    """
+    if block.detector is None:
+        return ()
+    path = _tables_file(base / block.detector)
+    if path.name == TABLES:
+        found = read_tables(path, do="run its stage 'fit' again").tables
+        tables = tuple(table for table in found if not table.filter)
+    else:
+        tables = read_d2im(path)
+    have = {table.chip for table in tables}
+    missing = [chip.name for chip in chips if chip.number not in have]
+    if missing:
+        raise InputError(
+            f"there is no table of the detector for chip {missing[0]}",
+            where=str(path),
+            do="name the run or the D2IMFILE of this detector in tables.detector",
+        )
+    numbers = {chip.number for chip in chips}
+    ours = (table for table in tables if table.chip in numbers)
+    return tuple(sorted(ours, key=lambda table: table.chip))
+
+
+def rate_priors(
+    rates: str, model: DistortionModel, *, chip: int, base: Path
+) -> GaussianPriors | None:
+    """Priors on the drift of a model from the posterior of another run; None where it is free.
+
+    Parameters
+    ----------
+    rates : str
+        `model.tdd.rates`.
+    model : DistortionModel
+    chip : int
+        Number of the reference chip.
+    base : Path
+
+    Raises
+    ------
+    InputError
+        For a folder that is no finished run, a run that has not converged, and one of other chips,
+        units, drifting terms, or reference dates.
+    """
+    if rates == FREE:
+        return None
+    path = _file_of_run(base / rates, POSTERIOR, "model.tdd.rates")
+    posterior: Posterior = load_posterior(path)
+    if not posterior.convergence.converged:
+        raise InputError(
+            f"the run has not converged ({'; '.join(posterior.convergence.reasons)})",
+            where=str(path.parent),
+            do="resume it with more steps before its rates are used",
+        )
+    try:
+        named = drift_priors(posterior, model, chip=chip)
+    except InputError as error:
+        raise InputError(error.cause, where=str(path.parent), do=error.do) from error
+    return GaussianPriors.of(model, named)
+
+
+def rehearse_references(config: Config, unit: str, base: Path) -> None:
+    """Read all that a run takes over from others; nothing is fitted.
+
+    Parameters
+    ----------
+    config : Config
+    unit : str
+        Of the catalogue.
+    base : Path
+
+    Raises
+    ------
+    InputError
+        As `held_tables` and `rate_priors`.
+    """
+    chips, tdd = config.chips(), config.model.tdd
+    held_tables(config.tables, chips, base)
+    if tdd is not None:
+        model = with_gap(DistortionModel(config.model.order, chips, unit, config.time()))
+        rate_priors(tdd.rates, model, chip=chips[0].number, base=base)
+
+
+def _tables_file(path: Path) -> Path:
+    return path if path.is_file() else _file_of_run(path, TABLES, "tables.detector")
+
+
+def _file_of_run(folder: Path, name: str, key: str) -> Path:
+    if not (folder / name).exists():
+        raise InputError(
+            f"has no {name}" if folder.is_dir() else "is not there",
+            where=str(folder),
+            do=f"name a finished run in {key}",
+        )
+    return folder / name

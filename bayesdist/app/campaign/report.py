@@ -1,0 +1,236 @@
+"""What the report shows of a campaign, put together from its session."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from bayesdist.app.campaign.inputs import cuts_of
+from bayesdist.app.campaign.overlap import overlap_test
+from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.rundir import as_json
+from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
+from bayesdist.data import MatchTable, read_catalog, with_centroid_errors
+from bayesdist.data.motions import motion_error_line
+from bayesdist.infer import fit_linear
+from bayesdist.infer.nodes import pixel_shifts
+from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
+from bayesdist.model import corrected
+
+if TYPE_CHECKING:
+    from bayesdist.report.campaign import (
+        CampaignResults,
+        CatalogStars,
+        ChipResiduals,
+        Detections,
+        Footprints,
+        LinearSeries,
+    )
+
+__all__ = ["campaign_results"]
+
+Float = NDArray[np.float64]
+
+DRAWN = 20_000  # markers in a figure: more only hide each other
+CELL = 64.0  # pixels: the nodes of ACS ISR 2015-06
+IN_CELL = 20  # stars that a cell should have at the median
+WIDEST = 8  # cells of this many times the size, however few stars there are
+
+
+def campaign_results(session: CampaignSession) -> CampaignResults:
+    """What a campaign adds to the report of its run.
+
+    Parameters
+    ----------
+    session : CampaignSession
+        Of a run that has been assessed.
+
+    Returns
+    -------
+    CampaignResults
+    """
+    from bayesdist.report.campaign import CampaignResults  # figures take seconds to import
+
+    run = session.run
+    matching = Table.read(run / "matching.ecsv")
+    return CampaignResults(
+        summary=dict(run.summary),
+        config=as_json(session.config.model_dump(exclude_none=True)),
+        filter=session.block.filter or session.inputs.log.filters[0],
+        matching=matching,
+        chips=tuple(session.posterior.model.chips),
+        unit=session.posterior.model.unit,
+        catalog=_catalog_stars(session, matching),
+        centroids=session.magnitude_errors,
+        detections=_detections(session),
+        footprints=_footprints(session),
+        residuals=_residuals(session),
+        tables=session.tables,
+        series=_series(session, matching),
+        overlap=overlap_test(session),
+        doubts=tuple(session.doubts),
+    )
+
+
+def _some(n: int, most: int) -> slice:
+    """Evenly spread rows, at most that many: lists come in the order of the field, or in none."""
+    return slice(None, None, max(1, -(-n // most)))
+
+
+def _catalog_stars(session: CampaignSession, matching: Table) -> CatalogStars | None:
+    from bayesdist.report.campaign import CatalogStars
+
+    catalog = read_catalog(session.base / session.block.catalog)
+    if catalog.mag is None or (catalog.sigma_u is None and catalog.sigma_pm_u is None):
+        return None
+    shift = float(np.nan_to_num(np.nanmedian(np.asarray(matching["zero_point"], float))))
+    rows = _some(len(catalog), DRAWN // 2)
+    limit, sigma, motion = None, None, None
+    if catalog.sigma_u is not None and catalog.sigma_v is not None:
+        sigma = np.hypot(catalog.sigma_u, catalog.sigma_v)[rows]
+    if catalog.sigma_pm_u is not None and catalog.sigma_pm_v is not None:
+        motion = np.maximum(catalog.sigma_pm_u, catalog.sigma_pm_v)[rows]
+        if session.block.motions == "reliable":
+            line = motion_error_line(catalog)
+            limit = (line.mag - shift, line.sigma)
+    return CatalogStars(
+        mag=catalog.mag[rows] - shift,
+        sigma=sigma,
+        sigma_motion=motion,
+        limit=limit,
+        unit=catalog.unit,
+        n_used=len(session.inputs.catalog),
+    )
+
+
+def _detections(session: CampaignSession) -> Detections | None:
+    """Quality against magnitude, of some detections of every exposure."""
+    from bayesdist.report.campaign import Detections
+
+    lists, cuts = session.inputs.lists, cuts_of(session.block)
+    if any(one.mag is None or one.q is None for one in lists):
+        return None
+    passed = [cuts.passed(one)[0] for one in lists]
+    n_total = sum(len(one) for one in lists)
+    every = max(1, -(-n_total // DRAWN))
+    mag, q, kept = (
+        np.concatenate([np.asarray(a)[::every] for a in columns])
+        for columns in ([one.mag for one in lists], [one.q for one in lists], passed)
+    )
+    edges = () if cuts.mag is None else cuts.mag
+    return Detections(
+        mag=mag,
+        q=q,
+        kept=kept.astype(bool),
+        n_total=n_total,
+        n_kept=int(sum(p.sum() for p in passed)),
+        mag_cuts=(*edges, *(() if cuts.saturation is None else (cuts.saturation,))),
+        q_max=session.block.q_max,
+    )
+
+
+def _footprints(session: CampaignSession) -> Footprints:
+    from bayesdist.report.campaign import Footprints
+
+    model, theta, catalog = session.posterior.model, session.posterior.mean, session.inputs.catalog
+    outlines, epochs = [], []
+    for name in model.exposures:
+        exposure = session.inputs.log[name]
+        for chip in model.chips:
+            x, y = _outline(chip.size)
+            place = {"exposure": name, "chip": chip.number}
+            when = exposure.epoch if model.time is not None else None
+            outlines.append(model.predict(theta, x, y, epoch=when, **place))
+            epochs.append(exposure.epoch)
+    rows = _some(len(catalog), DRAWN // 2)
+    return Footprints(
+        catalog.u[rows], catalog.v[rows], tuple(outlines), np.array(epochs), catalog.unit
+    )
+
+
+def _outline(size: tuple[float, float]) -> tuple[Float, Float]:
+    """Pixels once around a chip: its edges are not straight on the sky."""
+    nx, ny = size
+    t = np.linspace(0, 1, 9)
+    x = 0.5 + nx * np.concatenate([t, 1 + 0 * t, 1 - t, 0 * t])
+    y = 0.5 + ny * np.concatenate([0 * t, t, 1 + 0 * t, 1 - t])
+    return x, y
+
+
+# matrices here are small: more BLAS threads only get in each other's way
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
+    """Pairs of each chip without the tables and with them, along the detector's axes."""
+    from bayesdist.report.campaign import ChipResiduals
+
+    pairs, moved, model = session.pairs, session.matches, session.plain_model
+    assert isinstance(moved, MatchTable)
+    errors, farthest = session.magnitude_errors, session.config.fit.clip_abs
+    numbers = np.asarray(pairs.chip_numbers)[pairs.chip]
+    plain = pairs if errors is None else with_centroid_errors(pairs, errors)
+    if any(table.filter for table in session.tables):  # those of the detector are not of this run
+        detector = [table for table in session.tables if not table.filter]
+        x, y = corrected(detector, pairs.x, pairs.y, chip=numbers)
+        plain = on_the_chips(with_columns(plain, x=x, y=y), model)
+    left = []
+    for table in (plain, moved) if session.tables else (plain,):
+        # errors are those of the centroids: beside what the tables take out, chi-square is no guide
+        fit = fit_linear(table, model, clip_chi2=np.inf, clip_abs=farthest)
+        left.append(pixel_shifts(fit, table).shift)
+    good = np.all([np.hypot(*r.T) < (farthest or np.inf) for r in left], axis=0)
+    out = []
+    for chip in model.chips:
+        here = good & (numbers == chip.number)
+        bins = _cells(chip.size, int(here.sum()))
+        binned = [_binned(pairs, r, here, bins, chip.size) for r in left]
+        rows = _some(int(here.sum()), DRAWN // (2 * len(model.chips)))
+        points = [r[here][rows] for r in left]
+        again = (points[-1], binned[-1]) if session.tables else (None, None)
+        out.append(ChipResiduals(chip, points[0], again[0], binned[0], again[1]))
+    return tuple(out)
+
+
+def _cells(size: tuple[float, float], n: int) -> tuple[int, int]:
+    """Cells of a chip along x and y: of the tables' size, or wider where stars are few."""
+    for k in (1, 2, 4, WIDEST):
+        nx, ny = (max(1, round(s / (k * CELL))) for s in size)
+        if n >= IN_CELL * nx * ny:
+            break
+    return nx, ny
+
+
+def _binned(
+    pairs: MatchTable,
+    residual: Float,
+    rows: NDArray[np.bool_],
+    bins: tuple[int, int],
+    size: tuple[float, float],
+) -> BinnedResiduals:
+    x, y = (np.clip(a[rows], 0.5, n + 0.5) for a, n in zip((pairs.x, pairs.y), size, strict=True))
+    return binned_residuals(x, y, *residual[rows].T, bins=bins, size=size)
+
+
+def _series(session: CampaignSession, matching: Table) -> LinearSeries | None:
+    from bayesdist.report.campaign import LinearSeries
+
+    time, run = session.model.time, session.run
+    if time is None or "time_dependence" not in run.summary:
+        return None
+    exposures = Table.read(run / "series.ecsv")
+    place = {str(name): k for k, name in enumerate(matching["exposure"])}
+    order = [place[str(name)] for name in exposures["exposure"]]
+    vafactor, pa_v3 = (
+        np.asarray(np.ma.filled(np.ma.asarray(matching[name]), np.nan), float)[order]
+        for name in ("vafactor", "pa_v3")
+    )
+    return LinearSeries(
+        exposures=exposures,
+        drift=Table.read(run / "drift.ecsv"),
+        vafactor=vafactor,
+        pa_v3=pa_v3,
+        breaks=tuple(time.breaks),
+    )

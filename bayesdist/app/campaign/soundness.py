@@ -1,0 +1,254 @@
+"""Does what a campaign begins with go together, and what can it not tell?"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.campaign.config import ReleaseBlock
+from bayesdist.app.campaign.inputs import cuts_of
+from bayesdist.data import StarList
+from bayesdist.data.campaign_faults import check_campaign
+from bayesdist.errors import ConfigError, DegenerateError, InputError
+from bayesdist.infer.catalogue_shear import one_roll_angle
+from bayesdist.model import Chip, TimeDependence
+
+if TYPE_CHECKING:
+    from bayesdist.app.campaign.session import CampaignSession
+
+__all__ = [
+    "input_doubts",
+    "refuse_few",
+    "refuse_unsound",
+    "segment_counts",
+    "segment_text",
+    "shear_doubts",
+]
+
+Float = NDArray[np.float64]
+
+FEWEST = 3  # exposures: two of them differ, but do not scatter
+SAME_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
+LINEAR_KINDS = 3  # drifting terms from which on scale and both shears drift
+OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
+EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
+STILL = 1.0  # years over which stars may stand still
+
+
+def refuse_unsound(session: CampaignSession) -> None:
+    """Refuse exposures, lists and catalogue that a run could not use; nothing is matched.
+
+    Raises
+    ------
+    InputError
+        For chips that only one side knows, detections off their chip, lists that stand twice, a
+        catalogue without errors, and cuts that leave nothing in any exposure.
+    DegenerateError
+        For too few exposures, and for segments of the drift without exposures or with one epoch.
+    ConfigError
+        For periods of the release outside the segment that they are to hold.
+    """
+    inputs, config = session.inputs, session.config
+    _refuse_chips(inputs.lists, config.chips())
+    check_campaign(inputs.lists, inputs.log, inputs.catalog)
+    if inputs.catalog.sigma_u is None:
+        raise InputError(
+            "has no errors of the positions",
+            where=inputs.catalog.source,
+            do="give the columns sigma_u and sigma_v",
+        )
+    _refuse_cuts(session)
+    refuse_few(inputs.log.values("epoch"), config.time())
+    _refuse_periods(config.products.release, config.time())
+
+
+def input_doubts(session: CampaignSession) -> list[str]:
+    """What a campaign will not be able to tell, or takes on trust, each as a clause."""
+    log, catalog = session.inputs.log, session.inputs.catalog
+    out = []
+    epochs = log.values("epoch")
+    span = float(np.ptp(epochs))
+    if catalog.pm_u is None and span > STILL:
+        out.append(
+            f"the catalogue has no proper motions, and the exposures span {span:.1f} years: "
+            "whatever the stars move is taken for an error"
+        )
+    elif catalog.sigma_pm_u is None and catalog.pm_u is not None and span > STILL:
+        out.append(
+            "the catalogue has no errors of the proper motions: its positions count as equally "
+            "good at all epochs"
+        )
+    asked = {"assess.epoch": session.config.assess.epoch} | {
+        f"requirement {one.name!r}": one.epoch for one in session.config.requirements()
+    }
+    for where, epoch in asked.items():
+        if epoch is not None and not epochs.min() - span <= epoch <= epochs.max() + span:
+            out.append(
+                f"{where} asks for {epoch:g}, and the exposures are from {epochs.min():.2f} to "
+                f"{epochs.max():.2f}: the drift is extrapolated by more than they span"
+            )
+    if session.block.aberration == "earth":
+        out.append(
+            "VAFACTOR was computed from the motion of the Earth: that of the telescope about it, "
+            "up to 2.5e-5, is in the scales of the exposures"
+        )
+    return out
+
+
+def shear_doubts(rolls: Float, of: str) -> list[str]:
+    """Whether exposures at these roll angles, in degrees, leave a shear of the catalogue open."""
+    known = np.asarray(rolls, float)
+    known = known[np.isfinite(known)]
+    if not len(known) or not one_roll_angle(np.radians(known)):
+        return []
+    return [
+        f"all exposures have one roll angle, or angles half a turn apart ({of}): a shear of the "
+        "catalogue is degenerate with one of the detector (A_2 - B_3, A_3 + B_2)"
+    ]
+
+
+def segment_counts(epochs: Float, time: TimeDependence) -> list[int]:
+    """Exposures in each segment of the drift."""
+    edges = [-np.inf, *time.breaks, np.inf]
+    return [int(((epochs >= a) & (epochs < b)).sum()) for a, b in pairwise(edges)]
+
+
+def segment_text(time: TimeDependence, number: int) -> str:
+    """A segment of the drift, by its number from 0, and its dates."""
+    edges = [None, *time.breaks, None]
+    first, last = edges[number], edges[number + 1]
+    dates = [
+        "" if first is None else f"from {first:g}",
+        "" if last is None else f"to {last:g}",
+    ]
+    return f"segment {number + 1} of the drift ({' '.join(d for d in dates if d) or 'all dates'})"
+
+
+def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
+    """Refuse exposures at these epochs (E,) that cannot carry the scatter or the drift.
+
+    Raises
+    ------
+    DegenerateError
+        Naming the segment and its dates.
+    """
+    n = len(epochs)
+    if n < FEWEST:
+        few = "one exposure tells" if n == 1 else f"{n} exposures tell"
+        raise DegenerateError(
+            f"{few} neither how exposures scatter nor how they drift",
+            where="campaign.exposures",
+            do=f"give at least {FEWEST}, or calibrate matched stars ([data] in place of "
+            "[campaign], model.frames = 'shift_rotation')",
+        )
+    if time is None:
+        return
+    edges = [-np.inf, *time.breaks, np.inf]
+    for k, (a, b) in enumerate(pairwise(edges)):
+        inside = epochs[(epochs >= a) & (epochs < b)]
+        fault = ""
+        if not len(inside):
+            fault = f"holds no exposure: they are from {epochs.min():.2f} to {epochs.max():.2f}"
+        elif np.ptp(inside) < SAME_DAY:
+            which = "exposure" if len(inside) == 1 else "epoch"
+            fault = f"holds one {which} only, at {inside[0]:.2f}: its rate is not determined"
+        if fault:
+            raise DegenerateError(
+                f"{segment_text(time, k)} {fault}",
+                where="model.tdd",
+                do="drop [model.tdd]"
+                if time.n_segments == 1
+                else "correct or drop model.tdd.breaks, or give exposures in that segment",
+            )
+    if len(time.terms) >= LINEAR_KINDS and n <= 2 * time.n_segments:
+        lines = "a line" if time.n_segments == 1 else f"{time.n_segments} lines"
+        raise DegenerateError(
+            f"{n} exposures have no scatter about {lines}, as [model.tdd] asks for",
+            where="model.tdd",
+            do="give more exposures, drop a break, or drop [model.tdd]",
+        )
+
+
+def _refuse_periods(release: ReleaseBlock | None, time: TimeDependence | None) -> None:
+    edges = [-np.inf, *(() if time is None else time.breaks), np.inf]
+    for k, period in enumerate(() if release is None else release.period):
+        where = f"products.release.period[{k + 1}]"
+        if period.segment > len(edges) - 2:
+            raise ConfigError(
+                f"segment {period.segment} is asked for, and the drift has segments 0 to "
+                f"{len(edges) - 2}",
+                where=where,
+                do="correct it, or give model.tdd.breaks",
+            )
+        first, last = edges[period.segment], edges[period.segment + 1]
+        if time is not None and not (period.years[0] < last and period.years[1] > first):
+            raise ConfigError(
+                f"{period.years[0]:g} to {period.years[1]:g} lies outside "
+                f"{segment_text(time, period.segment)}",
+                where=where,
+                do=f"correct the years, or segment = {period.segment} (counted from 0)",
+            )
+
+
+def _refuse_chips(lists: tuple[StarList, ...], chips: tuple[Chip, ...]) -> None:
+    known = {chip.number: chip for chip in chips}
+    if not known:
+        return
+    seen: set[int] = set()
+    for one in lists:
+        where = f"{one.source}, exposure {one.exposure}"
+        for number in one.chips:
+            rows = one.chip == number
+            if number not in known:
+                raise InputError(
+                    f"{int(rows.sum())} detections are on chip {number}, which no [[chip]] block "
+                    "describes",
+                    where=where,
+                    do=f"add a block, or leave them out (known: {', '.join(map(str, known))})",
+                )
+            _refuse_off_chip(one.x[rows], one.y[rows], known[number], where)
+        seen.update(one.chips)
+    empty = [chip.name for chip in chips if chip.number not in seen]
+    if empty:
+        raise InputError(
+            f"no exposure has a detection on chip {', '.join(empty)}",
+            where="campaign.lists",
+            do="drop its [[chip]] block, or correct the lists' column 'chip'",
+        )
+
+
+def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
+    low, (right, top) = 1.0 - EDGE, (size + EDGE for size in chip.size)
+    off = (x < low) | (x > right) | (y < low) | (y > top)
+    if off.mean() > OFF_CHIP:
+        raise InputError(
+            f"{off.mean():.0%} of the detections on chip {chip.name} lie outside its "
+            f"{chip.size[0]:g} x {chip.size[1]:g} pixels (x {x.min():.0f} to {x.max():.0f}, "
+            f"y {y.min():.0f} to {y.max():.0f})",
+            where=where,
+            do="check whether x and y are swapped or are pixels of a mosaic, and [[chip]].size",
+        )
+
+
+def _refuse_cuts(session: CampaignSession) -> None:
+    """Refuse cuts that leave nothing anywhere; single exposures are left out when they match."""
+    cuts = cuts_of(session.block)
+    total: dict[str, int] = {}
+    n = 0
+    for one in session.inputs.lists:
+        good, rejected = cuts.passed(one)
+        if good.any():
+            return
+        n += len(one)
+        for reason, count in rejected.items():
+            total[reason] = total.get(reason, 0) + count
+    counts = ", ".join(f"{count} {reason}" for reason, count in total.items())
+    n_lists = len(session.inputs.lists)
+    raise InputError(
+        f"the cuts leave none of {n} detections in {n_lists} exposures ({counts})",
+        where="campaign",
+        do="widen mag, saturation or q_max, or correct the columns that they go by",
+    )

@@ -1,0 +1,92 @@
+"""tables.h5: the look-up tables of a run, and their errors on the grid of the assessment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.model import LookupTable
+
+__all__ = ["KeptTables", "read_tables", "write_tables"]
+
+Float = NDArray[np.float64]
+
+ERRORS = "position_sigma"
+
+
+@dataclass(frozen=True, eq=False)
+class KeptTables:
+    """What a run keeps of its look-up tables.
+
+    Parameters
+    ----------
+    tables : tuple of LookupTable
+        The detector's first.
+    position_sigma : mapping of int to ndarray, shape (ny, nx, 2)
+        By chip: errors of positions by those of all tables, in the unit of u, v.
+    """
+
+    tables: tuple[LookupTable, ...] = ()
+    position_sigma: Mapping[int, Float] = field(default_factory=dict)
+
+
+def write_tables(
+    path: Path, tables: Sequence[LookupTable], position_sigma: Mapping[int, Float] | None = None
+) -> None:
+    """Write the file; without tables there is none."""
+    if not tables:
+        path.unlink(missing_ok=True)
+        return
+    arrays: dict[str, Any] = {
+        f"{chip}.{ERRORS}": sigma for chip, sigma in (position_sigma or {}).items()
+    }
+    for table in tables:
+        of = f"{table.chip}.{table.filter}." if table.filter else f"{table.chip}."
+        arrays |= {
+            f"{of}values": table.values,
+            f"{of}first": np.array(table.first),
+            f"{of}step": np.array(table.step),
+        }
+        if table.sigma is not None:
+            arrays[f"{of}sigma"] = table.sigma
+    write_arrays(path, "", arrays)
+
+
+def read_tables(path: Path, *, do: str) -> KeptTables:
+    """Read what `write_tables` wrote; nothing where there is no file.
+
+    Raises
+    ------
+    InputError
+        For a damaged file, with `do` as the advice.
+    """
+    if not path.exists():
+        return KeptTables()
+    arrays = read_arrays(path, "", do=do)
+    of_all = [name.removesuffix("values") for name in arrays if name.endswith(".values")]
+    tables = []
+    # the detector's before those of filters, and chips by their numbers
+    for of in sorted(of_all, key=lambda of: (of.count(".") > 1, of)):
+        chip, _, filter = of.removesuffix(".").partition(".")
+        tables.append(
+            LookupTable(
+                int(chip),
+                arrays[f"{of}values"],
+                filter,
+                tuple(arrays[f"{of}first"]),
+                tuple(arrays[f"{of}step"]),
+                arrays.get(f"{of}sigma"),
+            )
+        )
+    errors = {
+        int(name.partition(".")[0]): values
+        for name, values in arrays.items()
+        if name.endswith(f".{ERRORS}")
+    }
+    return KeptTables(tuple(tables), errors)

@@ -1,0 +1,301 @@
+"""`bayesdist release`: one set of files from the finished runs of several filters."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
+from bayesdist.app.campaign.release import write_files
+from bayesdist.app.campaign.session import CampaignSession, session_of
+from bayesdist.app.rundir import RunDirectory, versions, write_json
+from bayesdist.app.screen import table_text
+from bayesdist.app.session import write_table
+from bayesdist.app.stages import require
+from bayesdist.assess.solution import Solution
+from bayesdist.errors import InputError
+from bayesdist.infer.shared_drift import with_drift_of
+from bayesdist.model import LookupTable
+
+__all__ = ["release_runs"]
+
+SCHEMA = 1
+PRINTED = ("filter", "chip", "term", "at_edge", "sigma_at_edge")
+
+
+def release_runs(
+    runs: Sequence[str | Path], output: str | Path, *, force: bool = False, command: str = ""
+) -> str:
+    """Write IDCTABs, D2IMFILE and NPOLFILEs of several filters into a new folder.
+
+    Parameters
+    ----------
+    runs : sequence of path
+        Finished runs of campaigns, one for each filter.  The first is that of the reference filter:
+        its [products.release] says what is written, its drift is stored, and its tables are the
+        detector's.
+    output : path
+        New or empty folder.  It appears with all files in it, or not at all.
+    force : bool
+        Also runs that have not converged; the files then say so.
+    command : str
+        For the record.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For runs that are not finished or do not go together, for one that has not converged unless
+        forced, and a folder that is in use.
+    """
+    with ExitStack() as stack:
+        sessions: dict[str, CampaignSession] = {}
+        for path in runs:
+            session = stack.enter_context(closing(_opened(path)))
+            filter = session.inputs.filter
+            if filter in sessions:
+                raise InputError(
+                    f"is of filter {filter}, as {sessions[filter].run.path} is",
+                    where=str(path),
+                    do="give one run for each filter",
+                )
+            sessions[filter] = session
+        _require_alike(sessions)
+        doubts = _doubts(sessions, force=force)
+        solutions = _solutions(sessions)
+        comparison, why_not = _compared(sessions)
+        notes = [*doubts, *_notes(sessions, comparison)]
+        table = comparison_table(
+            {name: session.solution for name, session in sessions.items()},
+            comparison,
+            chip=next(iter(sessions.values())).reference_chip,
+        )
+        if comparison is None:
+            table.meta["drift"] = {"verdict": why_not}
+        with _whole_folder(Path(output)) as folder:
+            files = write_files(
+                next(iter(sessions.values())), folder, solutions, _tables(sessions), notes
+            )
+            write_table(table, folder / "filters.ecsv")
+            write_json(
+                folder / "release.json",
+                {
+                    "schema": SCHEMA,
+                    "command": command,
+                    "versions": versions(),
+                    "runs": {name: str(one.run.path) for name, one in sessions.items()},
+                    "converged": not doubts,
+                    "drift": table.meta["drift"],
+                    "products": files,
+                },
+            )
+    rows = [dict(zip(table.colnames, row, strict=True)) for row in table]
+    return _text(Path(output), files, rows, str(table["at_edge"].unit), why_not or None, comparison)
+
+
+def _opened(path: str | Path) -> CampaignSession:
+    """The session of a finished run of a campaign."""
+    session = session_of(RunDirectory.open(path))
+    if not isinstance(session, CampaignSession):
+        raise InputError(
+            "is no run of a campaign", where=str(path), do="give runs that began with star lists"
+        )
+    require(session, "release", ("match", "fit", "sample"))
+    return session
+
+
+# -- whether the runs go together -----------------------------------------------------------------
+
+
+def _require_alike(sessions: Mapping[str, CampaignSession]) -> None:
+    first, *others = sessions.values()
+    if first.config.products.release is None:
+        raise InputError(
+            "has no [products.release], and the first run says what is released",
+            where=str(first.run.path),
+            do="put the run of the reference filter first",
+        )
+    mine = _structure(first)
+    for session in others:
+        for what, theirs in _structure(session).items():
+            if theirs != mine[what]:
+                raise InputError(
+                    f"the {what} are not those of {first.run.path}"
+                    + (f": {theirs} and {mine[what]}" if what != "chips" else ""),
+                    where=str(session.run.path),
+                    do="run both filters with one structure",
+                )
+        if not _same_detector(first, session):
+            raise InputError(
+                f"the detector's tables are not those of {first.run.path}",
+                where=str(session.run.path),
+                do="name that run in tables.detector and run this filter again",
+            )
+
+
+def _structure(session: CampaignSession) -> dict[str, Any]:
+    """What files of several filters must have in common, in words that take a plural."""
+    model, time = session.posterior.model, session.posterior.model.time
+    return {
+        "chips": model.chips,
+        "orders": model.order,
+        "units": model.unit,
+        "pixel scales": session.config.detector.scale_mas,
+        "drifting terms": None if time is None else time.terms,
+        "reference dates (RDATE)": None if time is None else time.epoch0,
+        "breaks": None if time is None else time.breaks,
+    }
+
+
+def _same_detector(a: CampaignSession, b: CampaignSession) -> bool:
+    """Whether two runs corrected the pixels alike, as far as a D2IMFILE holds it."""
+    mine, theirs = (
+        {t.chip: (t.first, t.step, t.values.astype(np.float32)) for t in one.tables if not t.filter}
+        for one in (a, b)
+    )
+    return mine.keys() == theirs.keys() and all(
+        mine[c][:2] == theirs[c][:2] and np.array_equal(mine[c][2], theirs[c][2]) for c in mine
+    )
+
+
+def _doubts(sessions: Mapping[str, CampaignSession], *, force: bool) -> list[str]:
+    """What has not converged, as sentences."""
+    out = []
+    for name, session in sessions.items():
+        convergence = session.posterior.convergence
+        if not convergence.converged:
+            why = "; ".join(convergence.reasons)
+            if not force:
+                raise InputError(
+                    f"the run of {name} has not converged ({why})",
+                    where=str(session.run.path),
+                    do="resume it with more steps, or release it all the same with --force",
+                )
+            out.append(f"NOT CONVERGED: the run of {name} ({why}).")
+    return out
+
+
+# -- what is released -----------------------------------------------------------------------------
+
+
+def _solutions(sessions: Mapping[str, CampaignSession]) -> dict[str, Solution]:
+    """The reference filter's solution, and the others with its drift."""
+    (first, reference), *others = sessions.items()
+    out: dict[str, Solution] = {first: reference.solution}
+    for name, session in others:
+        solution: Solution = session.solution
+        if solution.model.time is not None:
+            solution = with_drift_of(solution, reference.solution, chip=reference.reference_chip)
+        out[name] = solution
+    return out
+
+
+def _tables(sessions: Mapping[str, CampaignSession]) -> list[LookupTable]:
+    """The detector's tables, once, and those of the filters."""
+    first = next(iter(sessions.values()))
+    out = [table for table in first.tables if not table.filter]
+    return out + [t for session in sessions.values() for t in session.tables if t.filter]
+
+
+def _compared(sessions: Mapping[str, CampaignSession]) -> tuple[FilterComparison | None, str]:
+    """The comparison of the filters, or why there is none."""
+    if len(sessions) < 2:
+        return None, "not compared: there is one filter"
+    first = next(iter(sessions.values()))
+    try:
+        found = compare_filters(
+            {name: one.terms for name, one in sessions.items()},
+            first.posterior.model.time,
+            seed=first.config.sampler.seed,
+        )
+    except InputError as error:  # too few exposures, or nothing that drifts
+        return None, f"not compared: {error.cause}"
+    return found, ""
+
+
+def _notes(
+    sessions: Mapping[str, CampaignSession], comparison: FilterComparison | None
+) -> list[str]:
+    """Lines for HISTORY."""
+    if len(sessions) < 2:
+        return []
+    first = next(iter(sessions))
+    out = [f"Filters {', '.join(sessions)}; the drift is that of {first}."]
+    if comparison is not None:
+        said = comparison.sentence
+        out.append(f"Tested on the exposures: {said}.")
+    return out
+
+
+@contextmanager
+def _whole_folder(path: Path) -> Iterator[Path]:
+    """A folder that takes its name when the block succeeds, and else is removed.
+
+    Raises
+    ------
+    InputError
+        For a folder that holds something, or that cannot be made.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(
+            "the folder holds other files" if path.is_dir() else "is a file, not a folder",
+            where=str(path),
+            do="choose a new folder: a release is never overwritten",
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+    except OSError as error:
+        raise InputError(
+            f"the folder cannot be made ({error.strerror})",
+            where=str(path),
+            do="choose one that you may write to",
+        ) from error
+    try:
+        yield temporary
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o777 & ~mask)  # a temporary folder is its owner's alone
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+# -- what is printed ------------------------------------------------------------------------------
+
+
+def _text(
+    output: Path,
+    files: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
+    unit: str,
+    why_not: str | None,
+    comparison: FilterComparison | None,
+) -> str:
+    lines = [table_text([{"file": str(output / f["path"]), "kind": f["kind"]} for f in files])]
+    for file in files:
+        lines += [f"  {file['path']}: {text}" for text in file["findings"]]
+    different = [row for row in rows if row["filter"] != rows[0]["filter"]]
+    if different:
+        reference = rows[0]["filter"]
+        lines += ["", f"Against {reference}, at half the chip ({unit}), the drift taken out:"]
+        lines.append(table_text([{k: _plain(row[k]) for k in PRINTED} for row in different]))
+    lines += ["", f"Drift: {comparison.sentence if comparison else why_not}"]
+    if comparison is not None and not comparison.alike:
+        lines.append("WARNING: the files hold one drift for all filters")
+    return "\n".join(lines)
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value

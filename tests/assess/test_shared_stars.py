@@ -1,0 +1,160 @@
+"""Budgets against truths: catalogues made anew, and exposures that no fit has seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from bayesdist.assess.detector_budget import detector_budget
+from bayesdist.assess.field_terms import CatalogueTerm, ExposureScatter
+from bayesdist.assess.fields import draw_errors
+from bayesdist.infer import fit_linear
+from bayesdist.infer.hierarchy import fit_hierarchical
+from bayesdist.infer.star_errors import star_covariance, with_star_errors
+from tests.infer.small_campaign import campaign, campaign_truth
+from tests.infer.support import UNCLIPPED
+
+NUMBERS = (1, 2)
+
+
+def aligned(found, true, by=slice(None)):
+    """Differences (n, N, 2) less the best shift and rotation of some of the stars, from scratch."""
+    A = np.zeros((len(true), 2, 3))
+    A[:, 0, 0] = A[:, 1, 1] = 1.0
+    A[:, 0, 2], A[:, 1, 2] = -true[:, 1], true[:, 0]
+    rest = found - true
+    rigid, *_ = np.linalg.lstsq(A[by].reshape(-1, 3), rest[:, by].reshape(len(rest), -1).T)
+    return rest - np.moveaxis(A @ rigid, -1, 0)
+
+
+def evenly(n, rng):
+    """Stars all over both chips: chip, x, y."""
+    return np.repeat(NUMBERS, n), rng.uniform(1, 4096, 2 * n), rng.uniform(1, 2048, 2 * n)
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def test_the_budget_is_the_scatter_over_catalogues():
+    """From the beginning, 150 times: catalogue, motions, centroids, fit, positions on a grid."""
+    rng = np.random.default_rng(6)
+    n_stars, n_exposures = 100, 6
+    model, matches, theta = campaign(
+        6, n_exposures, n_stars, order=2, time=False, frames="shift_rotation"
+    )
+    model = replace(model, gauge="first", held=(0.0, 0.0, 0.0))
+    theta = np.concatenate([theta[: model.n_distortion], theta[-3 * (n_exposures - 1) :]])
+    # every star is in every exposure, within 100 pixels of one place, so that errors add up
+    code = np.tile(np.arange(n_stars), n_exposures)
+    xy = rng.uniform(150, 1900, (n_stars, 2))[code] + rng.uniform(-100, 100, (len(code), 2))
+    xy[:, 0] *= 2
+    chip = rng.integers(2, size=n_stars)[code]
+    exposure = np.repeat(np.arange(n_exposures), n_stars)
+    epoch = np.linspace(2002.5, 2006.8, n_exposures)[exposure]
+    years = epoch - 2004.0
+    centroid, position, motion = 0.01, 0.02, 0.01
+    quoted = np.sqrt(centroid**2 + position**2 + (motion * years) ** 2)
+    true = model.predict(theta, *xy.T, exposure=exposure, chip=np.array(NUMBERS)[chip])
+
+    def fitted(error):
+        table = matches._with(
+            x=xy[:, 0],
+            y=xy[:, 1],
+            u=true[:, 0] + error[:, 0],
+            v=true[:, 1] + error[:, 1],
+            exposure=exposure,
+            chip=chip,
+            epoch=epoch,
+            sigma_u=quoted,
+            sigma_v=quoted,
+            star=code,
+        )
+        return table, fit_linear(table, model, **UNCLIPPED)
+
+    table, fit = fitted(np.zeros((len(code), 2)))
+    stars = star_covariance(
+        fit, table, position, position, motion_u=motion, motion_v=motion, epoch0=2004.0
+    )
+    options = {"aligned": True, "grid": (9, 5), "n_draws": 4000}
+    solution, term = with_star_errors(fit, stars), CatalogueTerm(fit, stars.total)
+    budget = detector_budget(solution, fields=[term], rng=np.random.default_rng(1), **options)
+    rows = {row["name"]: row for row in budget.rows()}
+    naive = detector_budget(fit, rng=np.random.default_rng(1), **options).rows()[-1]
+
+    # points of the budget, and behind them stars that cover the chips evenly
+    pixels = [
+        (budget.chips[0].x, budget.chips[0].y),
+        ((np.arange(32) + 0.5) * 128, (np.arange(16) + 0.5) * 128),
+    ]
+    points, cover = (np.stack(np.meshgrid(*xy)).reshape(2, -1) for xy in pixels)
+    chips = np.concatenate([np.repeat(NUMBERS, p.shape[1]) for p in (points, cover)])
+    x, y = np.concatenate([points, points, cover, cover], axis=1)
+    n = 2 * points.shape[1]
+    found = {"all": [], "catalogue": []}
+    for _ in range(150):
+        shared = position * rng.standard_normal((n_stars, 2))[code]
+        shared += years[:, None] * motion * rng.standard_normal((n_stars, 2))[code]
+        for name, noise in (("all", centroid), ("catalogue", 0.0)):
+            _, one = fitted(shared + noise * rng.standard_normal(shared.shape))
+            found[name].append(model.predict(one.mean, x, y, chip=chips))
+    expected = model.predict(fit.mean, x, y, chip=chips)
+    rms = {
+        name: np.sqrt(np.mean(aligned(np.array(f), expected, slice(n, None))[:, :n] ** 2, (0, 1)))
+        for name, f in found.items()
+    }
+    for axis, name in enumerate("uv"):
+        # some 12 free numbers, 150 times: 2 to 3 per cent
+        assert rms["all"][axis] == pytest.approx(rows["total"][name], rel=0.08)
+        assert rms["catalogue"][axis] == pytest.approx(rows[term.name][name], rel=0.08)
+        assert rms["all"][axis] > 1.1 * naive[name]
+
+
+@pytest.mark.slow
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def test_positions_in_exposures_that_no_fit_has_seen(full):
+    """|error| <= q sigma as often as a normal number, after shift and rotation were fitted.
+
+    Coefficients and scatter from 20 exposures; new ones drawn with the true scatter.  What its
+    positions have in common is one fit and one tau, so that truths are counted, not positions.
+    """
+    rng = np.random.default_rng(8)
+    n_truths, n_new = (60 if full else 12), 12
+    inside = {0.68: [], 0.95: []}
+    squares, without = [], []
+    for seed in range(n_truths):
+        model, matches, theta = campaign(100 + seed, 20, 150, order=2, time=False)
+        fit = fit_hierarchical(matches, model, n_tau=64)
+        term = ExposureScatter(model, fit.mean, fit.scatter.kinds, fit.tau_draws)
+        chip, x, y = evenly(150, rng)
+        drawn = draw_errors(fit, 1000, rng, fields=[term], aligned=True)
+        points = {c: (x[chip == c], y[chip == c]) for c in NUMBERS}
+        fields = drawn.at(points)
+        sigma = np.concatenate([np.stack(f.sigma("model"), axis=1) for f in fields])
+        alone = np.concatenate([np.stack(f.sigma("coefficients"), axis=1) for f in fields])
+        predicted = model.predict(fit.mean, x, y, chip=chip)
+        new = np.tile(theta, (n_new, 1))
+        for k in range(n_new):  # an exposure that the fit has not seen, at its own roll and place
+            other = campaign_truth(model, rng)
+            new[k, model.frame_slice(3)] = other[model.frame_slice(3)]
+        seen = model.predict(new, x, y, chip=chip, exposure=3)
+        for k in range(n_new):
+            # its observer turns and shifts it onto the positions that the calibration predicts
+            turn, shift = model.frame(new[k], 3)
+            angle = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+            back = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            seen[k] = (seen[k] - model.origin - shift) @ back.T
+        error = aligned(seen, predicted)
+        squares.append(np.mean((error / sigma) ** 2))
+        without.append(np.mean((error / alone) ** 2))
+        for p, q in ((0.68, 0.9945), (0.95, 1.95996)):
+            inside[p].append(np.mean(np.abs(error) <= q * sigma))
+    for p, found in inside.items():
+        spread = np.std(found, ddof=1) / np.sqrt(n_truths)
+        assert np.mean(found) == pytest.approx(p, abs=3.5 * spread + 0.01)
+        assert spread < 0.04
+    # tau from 20 exposures is uncertain, which widens what is predicted by 2 / 18 at the most
+    spread = np.std(squares, ddof=1) / np.sqrt(n_truths)
+    assert 1 - 2 / 18 - 3.5 * spread < np.mean(squares) < 1 + 3.5 * spread
+    assert spread < 0.15
+    assert np.mean(without) > 5

@@ -1,0 +1,29 @@
+"""Campaigns that all tests of this package look at, each simulated and calibrated once."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.campaign.measures import Outcome, outcome
+from tests.campaign.support import ISR, LOOSE, MATERN, PUBLISHED_SIZE, Setting, over_seeds
+
+# how many seeds; what takes longest begins
+FULL = {PUBLISHED_SIZE: 1, ISR: 4, MATERN: 20, LOOSE: 12}
+REDUCED = {MATERN: 2, LOOSE: 1}
+
+
+@pytest.fixture(scope="package")
+def campaigns(full: bool) -> dict[Setting, list[Outcome]]:
+    jobs = [(s, seed + 1) for s, n in (FULL if full else REDUCED).items() for seed in range(n)]
+    out: dict[Setting, list[Outcome]] = {}
+    for (setting, _), found in zip(jobs, over_seeds(outcome, jobs), strict=True):
+        out.setdefault(setting, []).append(found)
+    return out
+
+
+@pytest.fixture(params=[MATERN, ISR], ids=lambda setting: setting.pattern)
+def runs(request: pytest.FixtureRequest, campaigns) -> list[Outcome]:
+    """Outcomes for one kind of pattern."""
+    if request.param not in campaigns:
+        pytest.skip("tables at 64 pixels take a minute for a seed: set BAYESDIST_FULL=1")
+    return campaigns[request.param]

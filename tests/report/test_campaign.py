@@ -1,0 +1,338 @@
+"""What the report shows of a campaign: its numbers are those of the run's files."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lxml import html as lxml_html
+
+from bayesdist.model import Chip
+from bayesdist.report import all_figures, drawn
+from bayesdist.report.campaign import PARTS, campaign_checks, campaign_figures, campaign_tables
+from bayesdist.report.campaign.published import LINES, published_lines
+from bayesdist.report.campaign.residuals import binned_of, largest_cell, rms_of_cells
+from bayesdist.report.campaign.series import _band, course_of
+from bayesdist.report.figures import mosaic_of, plan_of_campaign
+from bayesdist.report.html import render_report
+from bayesdist.simulate.acs.distortion import DRIFT
+
+from . import campaigns
+from .test_html import parsed, words
+
+MOST_MARKERS = 20_000
+
+
+@pytest.fixture(scope="module")
+def run():
+    return campaigns.campaign_input()
+
+
+@pytest.fixture(scope="module")
+def plan(run):
+    return plan_of_campaign(run)
+
+
+@pytest.fixture(scope="module")
+def figures(run):
+    return all_figures(run)
+
+
+@pytest.fixture(scope="module")
+def page(run, figures):
+    return render_report(run, drawn(figures))
+
+
+def number_in(text: str) -> float:
+    """The number that a cell shows."""
+    return float(text.replace("−", "-").split("\u202f")[0])
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+
+def test_every_figure_of_the_plan_is_drawn_and_placed(plan, figures, page):
+    assert set(plan) <= set(figures)
+    assert {one.part for one in plan.values()} == set(PARTS)
+    tree = lxml_html.fromstring(page)
+    section = tree.get_element_by_id("campaign")
+    shown = [f.get("id") for f in section.xpath(".//figure")]
+    assert shown == [f"figure-{name}" for name in plan]
+    for image in section.xpath(".//figure/img"):
+        png = base64.b64decode(image.get("src").split(",", 1)[1], validate=True)
+        assert png.startswith(b"\x89PNG") and png.endswith(b"IEND\xaeB`\x82")
+        assert len(image.get("alt")) > 20
+    every = tree.xpath("//figure/@id")
+    assert sorted(every) == sorted(f"figure-{name}" for name in figures)
+
+
+def test_the_page_is_well_formed_and_its_links_lead_somewhere(page):
+    parsed(page)
+    tree = lxml_html.fromstring(page)
+    ids = set(tree.xpath("//@id"))
+    assert {h[1:] for h in tree.xpath("//nav//a/@href")} <= ids
+    sections = tree.xpath("//section/@id")
+    assert sections.index("campaign") == sections.index("data") + 1
+    assert not re.search(r"\b(nan|None|inf)\b", words(page), re.IGNORECASE)
+
+
+def test_residuals_along_u_and_v_are_not_averaged_over_rolls(figures):
+    assert "residual_vectors" not in figures
+
+
+def test_no_figure_has_more_markers_than_a_reader_can_tell_apart(plan, figures):
+    for name in plan:
+        n = sum(len(line.get_xdata()) for ax in figures[name].axes for line in ax.get_lines())
+        assert n <= MOST_MARKERS, name
+
+
+# -- captions against summary.json ----------------------------------------------------------------
+
+
+def test_captions_say_the_numbers_of_the_summary(run, plan):
+    found = run.campaign.summary
+    matching, tables = found["matching"], found["tables"]
+    text = plan["matching"].caption.text
+    assert f"{100 * matching['completeness']['median']:.1f}" in text
+    assert f"{100 * matching['completeness']['least']:.1f}" in text
+    assert "3.2\u202f×\u202f10⁻⁵" in text and "43\u202f210" in text
+    text = plan["table_residuals"].caption.text
+    assert f"from {tables['rms_before']:.4f}" in text and f"to {tables['rms_after']:.4f}" in text
+    assert "4\u202f964 of 5\u202f390" in plan["catalogue_errors"].caption.text
+    assert "51\u202f234 of 98\u202f765" in plan["fit_quality"].caption.text
+    for row in tables["chips"]:
+        assert f"{row['sigma_median']:.3g}" in plan["table_errors"].caption.text
+
+
+def test_maps_of_residuals_tell_the_pattern_from_noise(run, plan):
+    without, with_tables = (
+        binned_of(run.campaign.residuals, which) for which in ("without", "with")
+    )
+    mean, noise = rms_of_cells(*without)
+    assert mean > 5 * noise
+    mean, noise = rms_of_cells(*with_tables)
+    n = 2 * sum(b.count.size for b in with_tables)
+    assert abs((mean / noise) ** 2 - 1) < 5 * np.sqrt(2 / n)  # chi-square of n cells
+    for which, binned in (("without", without), ("with", with_tables)):
+        text = plan[f"residuals_{which}_tables"].caption.text
+        assert f"{largest_cell(*binned):.3g}" in text
+
+
+def test_the_overlap_shows_what_the_old_files_leave(run, plan):
+    test = run.campaign.overlap
+    sigma = 0.001 / 0.05  # pixels on each axis
+    n = test.n_stars
+    rms = np.sqrt(np.mean(test.new.rms**2))
+    assert abs(rms / sigma - 1) < 4 / np.sqrt(4 * n)
+    assert np.sqrt(np.mean(test.old.rms**2)) > 1.5 * sigma
+    assert test.new.scale == pytest.approx(1 / 1.00003, abs=1e-5)
+    assert abs(test.new.rotation) == pytest.approx(1.2, abs=1e-4)
+    assert f"{rms:.3g}" in plan["overlap"].caption.text
+
+
+# -- tables against summary.json ------------------------------------------------------------------
+
+
+def lines_of(run, term):
+    for table in campaign_tables(run.campaign)["time"]:
+        if table.caption.startswith(f"{term} "):
+            return table
+    raise AssertionError(term)
+
+
+@pytest.mark.parametrize("term", ["A_2", "B_2", "B_1"])
+def test_rows_of_the_lines_are_those_of_the_summary(run, term):
+    table = lines_of(run, term)
+    factor = 1e3 if term == "B_1" else 1e6
+    numbers = {c.name: c.number for c in run.campaign.chips}
+    joint = {
+        (r["chip"], r["epoch0"]): r for r in run.campaign.summary["lines"] if r["term"] == term
+    }
+    alone = {(r["term"], r["epoch0"]): r for r in run.campaign.summary["time_dependence"]["lines"]}
+    seen = 0
+    for chip, rdate, source, *cells in table.rows:
+        if source == "joint fit":
+            row = joint[numbers[chip], float(rdate)]
+        elif source == "exposures, then line":
+            row = alone[f"{chip}.{term}", float(rdate)]
+        else:
+            continue
+        seen += 1
+        alpha, sigma_alpha, beta, sigma_beta = (number_in(cell) for cell in cells)
+        assert alpha == pytest.approx(row["alpha"], abs=0.06 * row["sigma_alpha"])
+        assert sigma_alpha == pytest.approx(factor * row["sigma_alpha"], rel=5e-3)
+        assert beta == pytest.approx(factor * row["beta"], abs=0.06 * factor * row["sigma_beta"])
+        assert sigma_beta == pytest.approx(factor * row["sigma_beta"], rel=5e-3)
+    assert seen == 2 * len(joint)
+
+
+def test_what_the_gauge_fixes_is_no_row(run):
+    captions = [t.caption for t in campaign_tables(run.campaign)["time"]]
+    assert not any(c.startswith("A_1") for c in captions)
+
+
+def test_published_lines_are_those_that_the_simulation_starts_from(run):
+    """Tables 1 to 3, copied twice from the report."""
+    names = {"A_2": ("u", 1, 0), "B_2": ("v", 1, 0), "B_3": ("v", 0, 1)}
+    for term, key in names.items():
+        for one in LINES[term]:
+            values = DRIFT[key][int(one.chip[-1])]
+            s = 0 if one.rdate == 2004.5 else 2
+            assert (one.alpha, one.beta) == values[s : s + 2]
+    assert any("ACS ISR" in row[2] for row in lines_of(run, "A_2").rows)
+
+
+def test_published_lines_stand_beside_acs_in_f606w_only():
+    config = {"products": {"release": {"instrument": "ACS", "detector": "WFC"}}}
+    other = {"products": {"release": {"instrument": "WFC3", "detector": "UVIS"}}}
+    assert published_lines(config, "F606W", ("WFC1", "WFC2"))
+    assert not published_lines(config, "F814W", ("WFC1", "WFC2"))
+    assert not published_lines(other, "F606W", ("WFC1", "WFC2"))
+    assert not published_lines(config, "F606W", ("CCD1",))
+
+
+def test_files_and_their_dates(run):
+    (table,) = campaign_tables(run.campaign)["release"]
+    assert [row[0] for row in table.rows] == ["acs_pre_idc.fits", "acs_d2i.fits"]
+    assert table.rows[0][2] == "2002 to 2009.4" and number_in(table.rows[0][3]) == 0.012
+
+
+# -- linear terms ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("label", ["WFC1.A_2", "WFC1.B_1"])
+def test_vafactor_takes_the_aberration_out_of_the_scatter(label):
+    series = campaigns.linear_series()
+    course = course_of(series, campaigns.lines_alone(), label)
+    scatter, n = campaigns.unit_of(label), campaigns.N
+    assert abs(course.rms / scatter - 1) < 4 / np.sqrt(2 * n)
+    aberration = campaigns.ALPHA[label] * np.std(series.vafactor)
+    expected = np.hypot(aberration, scatter)
+    assert course.rms_raw == pytest.approx(expected, rel=0.25)
+    # without the drift the exposures of a segment lie about one value
+    flat = course.value - course.drift
+    for s in (0, 1):
+        mean = flat[series.segment == s].mean()
+        assert abs(mean - course.alpha[s]) < 4 * scatter / np.sqrt(n / 2)
+
+
+def test_bands_are_exact_between_the_dates_of_the_file():
+    """The error of a line is known everywhere once three dates of its segment are."""
+    series = campaigns.linear_series()
+    for s, t in ((0, [2002.5, 2006.1, 2009.4]), (1, [2009.4, 2011.7, 2014.4])):
+        for label in campaigns.LABELS:
+            sigma = campaigns.line_sigma(label, t, s)
+            np.testing.assert_allclose(_band(series, f"sigma_{label}", s, np.array(t)), sigma)
+            new = np.hypot(sigma, campaigns.unit_of(label))
+            np.testing.assert_allclose(_band(series, f"sigma_new_{label}", s, np.array(t)), new)
+
+
+def test_outlying_exposures_are_marked_and_do_not_count():
+    series = campaigns.linear_series()
+    series.exposures["WFC2.A_2"][7] += 1e-3
+    course = course_of(series, campaigns.lines_alone(), "WFC2.A_2")
+    assert course.rms < 1.5 * campaigns.SCATTER
+    with_it = course_of(
+        replace(series, exposures=_believed(series.exposures)), campaigns.lines_alone(), "WFC2.A_2"
+    )
+    assert with_it.rms > 10 * campaigns.SCATTER
+
+
+def _believed(table):
+    out = table.copy()
+    out["outlier_probability"] = 0.0
+    return out
+
+
+# -- other campaigns ------------------------------------------------------------------------------
+
+
+def test_tables_of_a_filter_have_figures_of_their_own(run):
+    chips = run.campaign.chips
+    both = tuple(campaigns.pattern(c.number, f) for f in ("", "F814W") for c in chips)
+    plan = campaign_figures(replace(run.campaign, tables=both), mosaic_of(run))
+    assert {"table_nodes", "table_nodes_F814W", "table_errors_F814W"} <= set(plan)
+    assert "detector's tables alone" in plan["residuals_without_tables"].caption.title
+    for name in ("table_nodes_F814W", "table_errors_F814W"):
+        assert plan[name].draw().axes
+
+
+def test_a_campaign_without_tables_drift_and_overlap(run):
+    bare = {k: v for k, v in run.campaign.summary.items() if k in ("matching", "gauge", "scatter")}
+    one = run.campaign.residuals
+    plain = tuple(replace(c, with_tables=None, binned_with=None) for c in one)
+    less = replace(
+        run.campaign, summary=bare | {"tables": {"method": "none"}}, tables=(), residuals=plain,
+        series=None, overlap=None, catalog=None, detections=None,
+    )  # fmt: skip
+    small = replace(run, campaign=less)
+    figures = {name: one.draw() for name, one in plan_of_campaign(small).items()}
+    page = render_report(small, drawn(figures))
+    parsed(page)
+    shown = lxml_html.fromstring(page).get_element_by_id("campaign").xpath(".//figure/@id")
+    assert shown == [f"figure-{n}" for n in ("matching", "footprints", "residuals_without_tables")]
+
+
+def test_series_without_rolls_are_drawn_against_time_only(run):
+    series = run.campaign.series
+    bare = replace(series, pa_v3=np.full(len(series.pa_v3), np.nan))
+    plan = campaign_figures(replace(run.campaign, series=bare), mosaic_of(run))
+    assert len(plan["series_A_2"].draw().axes) == 6  # three states of two chips
+    assert "PA_V3" not in plan["series_A_2"].caption.text
+
+
+def test_many_chips_have_several_figures(run):
+    series = run.campaign.series
+    table = series.exposures.copy()
+    for column in ("WFC2.A_2", "sigma_WFC2.A_2"):
+        table[column.replace("WFC2", "WFC3")] = table[column]
+    drift = series.drift.copy()
+    for column in ("sigma_WFC2.A_2", "sigma_new_WFC2.A_2"):
+        drift[column.replace("WFC2", "WFC3")] = drift[column]
+    lines = [*campaigns.lines_alone()]
+    lines += [r | {"term": "WFC3.A_2"} for r in lines if r["term"] == "WFC2.A_2"]
+    time = run.campaign.summary["time_dependence"] | {"lines": lines}
+    more = replace(
+        run.campaign,
+        series=replace(series, exposures=table, drift=drift),
+        summary=run.campaign.summary | {"time_dependence": time},
+        chips=(*run.campaign.chips, Chip(3, "WFC3", campaigns.SIZE, (1.0, 1.0))),
+    )
+    plan = campaign_figures(more, mosaic_of(run))
+    assert plan["series_A_2_2"].draw().axes
+
+
+# -- status ---------------------------------------------------------------------------------------
+
+
+def levels(campaign):
+    return {c.name: c.level for c in campaign_checks(campaign)}
+
+
+def test_a_good_campaign_passes(run):
+    assert set(levels(run.campaign).values()) <= {"pass", "note"}
+
+
+@pytest.mark.parametrize(
+    ("section", "changes", "name"),
+    [
+        ("matching", {"completeness": {"median": 0.9, "least": 0.3}}, "completeness"),
+        ("matching", {"false_share": 0.1}, "false pairs"),
+        ("matching", {"left_out": {"e001": "no match"}}, "left out"),
+        ("tables", {"converged": False}, "tables converged"),
+        ("time_dependence", {"converged": False}, "Series"),
+    ],
+)
+def test_what_went_wrong_is_on_top(run, section, changes, name):
+    found = run.campaign.summary
+    bad = replace(run.campaign, summary=found | {section: found[section] | changes})
+    warned = [n for n, level in levels(bad).items() if level == "warn"]
+    assert len(warned) == 1 and name in warned[0]
+
+
+def test_doubts_are_on_top(run):
+    checks = campaign_checks(replace(run.campaign, doubts=("the rates are doubtful",)))
+    assert checks[-1].level == "warn" and checks[-1].value == "The rates are doubtful"
