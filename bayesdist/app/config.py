@@ -66,6 +66,7 @@ class Tdd(Section):
     epoch0: float | list[float]
     terms: list[tuple[Literal["u", "v"], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]]
     breaks: list[float] = Field(default_factory=list)
+    rates: str = "free"
 
 
 class ModelBlock(Section):
@@ -227,6 +228,10 @@ class Config(Section):
             )
         if self.campaign is None and self.products.release is not None:
             raise ValueError("products.release is of a [campaign]; ask for sip or idctab")
+        if self.campaign is None and self.tables.detector is not None:
+            raise ValueError("tables.detector is of a [campaign]; leave it out")
+        if self.campaign is None and self.model.tdd is not None and self.model.tdd.rates != "free":
+            raise ValueError("model.tdd.rates is of a [campaign]; give [[prior]] blocks")
         if self.campaign is not None and self.model.frames != "none":
             raise ValueError("a [campaign] has frames of its own; leave model.frames out")
         if self.campaign is not None and len(self.chip) == 0:

@@ -395,7 +395,7 @@ class RunDirectory:
 
 def _named(config: Config, base: Path) -> Path | list[Path]:
     if config.campaign is not None:
-        return campaign_files(config.campaign, config.products.release, base)
+        return campaign_files(config, base)
     assert config.data is not None
     names = config.data.matches
     return base / names if isinstance(names, str) else [base / name for name in names]

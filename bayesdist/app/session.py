@@ -146,6 +146,10 @@ class Session:
         named = {p.parameter: (p.mean, p.sigma) for p in self.config.prior}
         return GaussianPriors.of(self.model, named)
 
+    def settled(self, posterior: Posterior) -> Posterior:
+        """The posterior as the stages that follow take it."""
+        return posterior
+
     @cached_property
     def linear(self) -> tuple[LinearFit, MagnitudeErrors | None]:
         """The linear fit that the configuration asks for, made now; nothing is written."""

@@ -9,7 +9,8 @@ and a joint fit that does not know this believes in each star as if it were a ne
 detector.  The scatter tau is estimated with everything else.
 
 How the distance between chips goes with scale and shear is left open: it is no ruler, as it may
-drift by itself, and no measurement of its own (see `CAUTION`).
+drift by itself, and no measurement of its own (see `CAUTION`); where the chips lie is settled
+afterwards (see `Settling`).
 
 One linear fit with a wide prior on the deviations is enough.  Its normal equations tell what the
 data alone say of them; tau, and what follows from any tau for all parameters, is then algebra (see
@@ -33,6 +34,7 @@ from bayesdist.infer.linear import Clip, LinearFit, fit_linear
 from bayesdist.infer.normal import least_squares
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.scatter import Scatter
+from bayesdist.infer.settling import Settling
 from bayesdist.infer.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.views import reference_gauge
 from bayesdist.model import DistortionModel
@@ -69,6 +71,8 @@ class HierarchicalFit:
         Draws of tau from its posterior.
     others : GaussianPriors
         The priors that were given.
+    settling : Settling
+        What was done, in `fit` too, to the shifts of single chips.
     outlying : tuple of str
         Exposures whose deviations are far beyond the scatter of the others.  They are fitted with a
         wide prior, and tau is not theirs.
@@ -78,6 +82,7 @@ class HierarchicalFit:
     scatter: Scatter
     tau_draws: Float
     others: GaussianPriors
+    settling: Settling
     outlying: tuple[str, ...] = ()
 
     @property
@@ -126,7 +131,9 @@ class HierarchicalFit:
     @cached_property
     def _means(self) -> Float:
         """Mean of theta for each draw of tau, shape (n, D)."""
-        return np.stack([self.scatter.posterior(tau)[0] for tau in self.tau_draws])
+        return self.settling.mean(
+            np.stack([self.scatter.posterior(tau)[0] for tau in self.tau_draws])
+        )
 
     @cached_property
     def mean(self) -> Float:
@@ -153,7 +160,7 @@ class HierarchicalFit:
             rows = which == t
             mean, factor = self.scatter.posterior(self.tau_draws[t])
             theta[rows] = mean + factor.colour(theta[rows])
-        return np.asarray(rng.permutation(theta))
+        return np.asarray(rng.permutation(self.settling.draws(theta, self.tau_draws[which], rng)))
 
     def deviations(self, exposure: str) -> dict[str, tuple[float, float]]:
         """Mean and standard deviation of the deviations of one exposure.
@@ -331,8 +338,14 @@ def fit_hierarchical(
         fit = fit_linear(
             shards, model, priors=_with_deviations(others, index, precision), **options
         )
+        settling = Settling.of(model, kinds, equations.groups, others.precision > 0, outlying)
+    fit = replace(
+        fit,
+        mean=settling.mean(fit.mean),
+        cov=settling.covariance(fit.cov, _root_mean_square(tau_draws)),
+    )
     names_of = tuple(model.exposures[e] for e in np.flatnonzero(outlying))
-    return HierarchicalFit(fit, scatter, tau_draws, others, names_of)
+    return HierarchicalFit(fit, scatter, tau_draws, others, settling, names_of)
 
 
 def _outlying(scatter: Scatter, member: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -51,7 +51,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
     joint = fit_hierarchical(
         shards,
         model,
-        priors=gap_priors(model, asked, pixel),
+        priors=session.rate_priors(model) or gap_priors(model, asked, pixel),
         pixel=pixel,
         seed=session.config.sampler.seed,
         **options,
@@ -66,6 +66,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
             "tau_draws": joint.tau_draws,
             "prior_centre": joint.priors.centre,
             "prior_precision": joint.priors.precision,
+            **joint.settling.to_arrays(),
         },
     )
     session.fit_changed()

@@ -9,6 +9,7 @@ from astropy.table import Table
 
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.session import write_table
+from bayesdist.errors import DegenerateError
 from bayesdist.infer.series import Course, Series, SeriesPosterior, describe, fit_series
 
 __all__ = ["run_series"]
@@ -27,7 +28,13 @@ def run_series(session: CampaignSession) -> None:
         return
     seed = session.config.sampler.seed
     course = Course("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
-    posterior = fit_series(series, course, seed=seed, max_sweeps=MOST_SWEEPS)
+    try:
+        posterior = fit_series(series, course, seed=seed, max_sweeps=MOST_SWEEPS)
+    except DegenerateError as error:
+        if session.free_rates:
+            raise
+        log.info("assess: no drift from these exposures alone: %s", error.cause)
+        return
     write_table(_exposures(series, posterior), session.run / "series.ecsv")
     write_table(_predictions(posterior), session.run / "drift.ecsv")
     verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.config import CampaignBlock
 from bayesdist.app.campaign.inputs import Inputs, read_inputs
+from bayesdist.app.campaign.reference import FREE, rate_priors
 from bayesdist.app.campaign.systematics import systematics_of
+from bayesdist.app.campaign.table_file import KeptTables, read_tables, write_tables
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
 from bayesdist.assess import LocalTerm
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
-from bayesdist.infer import GaussianPriors, Matches
+from bayesdist.infer import GaussianPriors, Matches, Posterior
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
 from bayesdist.infer.series import Series
+from bayesdist.infer.settling import Settling
 from bayesdist.model import DistortionModel, LookupTable, corrected
 
 __all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession", "session_of"]
@@ -71,55 +73,25 @@ class CampaignSession(Session):
         return read_matches(self.run / PAIRS, unit=self.inputs.catalog.unit)
 
     @cached_property
-    def _kept_tables(self) -> dict[str, Any]:
-        path = self.run / TABLES
-        return read_arrays(path, "", do=_AGAIN) if path.exists() else {}
+    def _kept_tables(self) -> KeptTables:
+        return read_tables(self.run / TABLES, do=_AGAIN)
 
-    @cached_property
+    @property
     def tables(self) -> tuple[LookupTable, ...]:
-        """Look-up tables of an earlier stage."""
-        arrays = self._kept_tables
-        chips = sorted({int(name.split(".")[0]) for name in arrays})
-        return tuple(
-            LookupTable(
-                chip,
-                arrays[f"{chip}.values"],
-                first=tuple(arrays[f"{chip}.first"]),
-                step=tuple(arrays[f"{chip}.step"]),
-                sigma=arrays.get(f"{chip}.sigma"),
-            )
-            for chip in chips
-        )
+        """Look-up tables of an earlier stage: the detector's, and those of the filter."""
+        return self._kept_tables.tables
 
     @property
     def local_terms(self) -> tuple[LocalTerm, ...]:
         """What the errors of the tables leave of the position, after the polynomial."""
-        sigma = {
-            int(name.split(".")[0]): values
-            for name, values in self._kept_tables.items()
-            if name.endswith(".position_sigma")
-        }
+        sigma = self._kept_tables.position_sigma
         return (LocalTerm("look-up tables", sigma),) if sigma else ()
 
     def keep_tables(
         self, tables: tuple[LookupTable, ...], position_sigma: Mapping[int, Float] | None = None
     ) -> None:
         """Write tables, and their error on the grid of the assessment, for the other stages."""
-        arrays: dict[str, Any] = {
-            f"{chip}.position_sigma": sigma for chip, sigma in (position_sigma or {}).items()
-        }
-        for table in tables:
-            arrays |= {
-                f"{table.chip}.values": table.values,
-                f"{table.chip}.first": np.array(table.first),
-                f"{table.chip}.step": np.array(table.step),
-            }
-            if table.sigma is not None:
-                arrays[f"{table.chip}.sigma"] = table.sigma
-        if arrays:
-            write_arrays(self.run / TABLES, "", arrays)
-        else:
-            (self.run / TABLES).unlink(missing_ok=True)
+        write_tables(self.run / TABLES, tables, position_sigma)
         self.forget()
 
     @cached_property
@@ -129,7 +101,7 @@ class CampaignSession(Session):
         if not self.tables:
             return pairs
         numbers = np.asarray(pairs.chip_numbers)[pairs.chip]
-        x, y = corrected(self.tables, pairs.x, pairs.y, chip=numbers)
+        x, y = corrected(self.tables, pairs.x, pairs.y, chip=numbers, filter=self.inputs.filter)
         return on_the_chips(with_columns(pairs, x=x, y=y), self.plain_model)
 
     @cached_property
@@ -170,10 +142,24 @@ class CampaignSession(Session):
         return GaussianPriors(arrays["prior_centre"], arrays["prior_precision"])
 
     @property
+    def doubts(self) -> list[str]:
+        """What the matching found odd, and what the campaign cannot tell."""
+        return list(self.run.summary.get("matching", {}).get("warnings", []))
+
+    @property
     def scatter(self) -> tuple[tuple[str, ...], Float]:
         """Kinds of deviation of the exposures, and draws (n, k) of their scatter."""
         arrays = read_arrays(self.run / HIERARCHY, "", do=_AGAIN)
         return tuple(str(t, "utf-8") for t in arrays["kinds"]), arrays["tau_draws"]
+
+    def settled(self, posterior: Posterior) -> Posterior:
+        """The draws with the chips where the exposures have them on average."""
+        settling = Settling.from_arrays(read_arrays(self.run / HIERARCHY, "", do=_AGAIN))
+        _, tau = self.scatter
+        rng = self.rng("sample")
+        some = tau[rng.integers(len(tau), size=len(posterior.flat))]
+        theta = settling.draws(posterior.flat, some, rng).reshape(posterior.theta.shape)
+        return replace(posterior, theta=theta)
 
     @cached_property
     def systematics(self) -> Systematics:
@@ -201,6 +187,20 @@ class CampaignSession(Session):
             arrays[key] = np.array([text.encode() for text in texts])
         write_arrays(self.run / TERMS, "", arrays)
 
+    def rate_priors(self, model: DistortionModel) -> GaussianPriors | None:
+        """Priors on the drift, where it is taken from the run of another filter."""
+        return rate_priors(self._rates, model, chip=self.reference_chip, base=self.base)
+
+    @property
+    def free_rates(self) -> bool:
+        """Whether the drift is that of this run's own exposures."""
+        return self._rates == FREE
+
+    @property
+    def _rates(self) -> str:
+        tdd = self.config.model.tdd
+        return FREE if tdd is None else tdd.rates
+
     def fit_changed(self) -> None:
         """Forget what rests on the fit."""
         self.errors_changed()
@@ -210,7 +210,7 @@ class CampaignSession(Session):
     def forget(self) -> None:
         """Forget what rests on pairs, tables and errors."""
         self.fit_changed()
-        for name in ("pairs", "_kept_tables", "tables", "raw_matches", "plain_model"):
+        for name in ("pairs", "_kept_tables", "raw_matches", "plain_model"):
             self.__dict__.pop(name, None)
 
 

@@ -7,10 +7,11 @@ from typing import Any
 
 from bayesdist.app.campaign.fit import run_campaign_fit
 from bayesdist.app.campaign.matching import run_match
+from bayesdist.app.campaign.reference import rehearse_references
 from bayesdist.app.campaign.release import release
 from bayesdist.app.campaign.series import run_series
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.chips import check_chips
+from bayesdist.app.campaign.soundness import refuse_unsound
 from bayesdist.app.stages.assess import run_assess
 from bayesdist.app.stages.export import run_export
 from bayesdist.products import read_idctab
@@ -44,8 +45,8 @@ def rehearse_campaign(session: CampaignSession) -> None:
     BayesdistError
         For inputs that cannot be read or do not go together.
     """
-    chips = sorted({int(n) for one in session.inputs.lists for n in set(one.chip.tolist())})
-    check_chips(session.config.chips(), chips)
+    refuse_unsound(session)
     read_idctab(session.base / session.block.start)
+    rehearse_references(session.config, session.inputs.catalog.unit, session.base)
     if session.config.products.release is not None:
         read_idctab(session.base / session.config.products.release.reference)

@@ -39,6 +39,7 @@ def run_sample(session: Session) -> None:
         method=s.method,
         second_stage=s.second_stage,
     )
+    posterior = session.settled(posterior)
     record = run.record
     provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
     matches = session.matches

@@ -1,0 +1,189 @@
+"""Where a chip lies, from exposures in which it moves by itself.
+
+The constant terms of a chip and the shifts of the chip in every exposure are seen only as their
+sums, which the data tell very well.  A fit that is to learn nothing of other parameters from these
+shifts gives them a wide prior (see `hierarchy`), and leaves the constants as open as that prior.
+Then what the constants are is settled here: the mean of the sums over the exposures, with the error
+that the scatter of the shifts gives a mean,
+
+    c -> c + G s + d      s -> s - X (G s + d)      d ~ N(0, tau^2 (X^T X)^-1)
+
+with G the least-squares regression of the shifts s on X: ones, and the steps where the drift has
+breaks.  No predicted position of any exposure changes by this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.model import DistortionModel, Groups
+
+__all__ = ["Settling"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+AXES = ("u", "v")
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """One axis of one chip.
+
+    Parameters
+    ----------
+    kind : int
+        Of its shifts, among the kinds of deviation.
+    constants : ndarray of int, shape (p,)
+        Where theta holds the constant term and its steps.
+    shifts : ndarray of int, shape (E,)
+        Where theta holds the shifts.
+    design : ndarray, shape (E, p)
+        X.
+    used : ndarray of bool, shape (E,)
+        Exposures whose shifts scatter by tau.
+    """
+
+    kind: int
+    constants: Int
+    shifts: Int
+    design: Float
+    used: NDArray[np.bool_]
+
+    @property
+    def inverse(self) -> Float:
+        """(X^T X)^-1, shape (p, p)."""
+        some = self.design[self.used]
+        return np.asarray(np.linalg.inv(some.T @ some))
+
+    def moved(self, theta: Float, d: Float) -> None:
+        """Settle parameters (..., D) in place, with given errors (..., p) of the constants."""
+        shifts = theta[..., self.shifts]
+        step = shifts[..., self.used] @ self.design[self.used] @ self.inverse + d
+        theta[..., self.constants] += step
+        theta[..., self.shifts] -= step @ self.design.T
+
+    def covariance(self, n: int, tau: float) -> Float:
+        """Of what d does to theta, shape (n, n)."""
+        by = np.zeros((n, len(self.constants)))
+        by[self.constants] = np.eye(len(self.constants))
+        by[self.shifts] = -self.design
+        return tau**2 * by @ self.inverse @ by.T
+
+
+@dataclass(frozen=True, eq=False)
+class Settling:
+    """The step from shifts with a wide prior to constants that are means.
+
+    Parameters
+    ----------
+    places : tuple
+        One for each axis of every chip but the first.
+    """
+
+    places: tuple[_Place, ...]
+
+    @classmethod
+    def of(
+        cls,
+        model: DistortionModel,
+        kinds: Sequence[str],
+        groups: Groups,
+        held: NDArray[np.bool_],
+        outlying: NDArray[np.bool_],
+    ) -> Settling:
+        """For the shifts of single chips among the kinds of deviation.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        kinds : sequence of str
+        groups : Groups
+            Of the data: which exposure has stars on which chip, and its epoch.
+        held : ndarray of bool, shape (D,)
+            Parameters with a prior of their own.
+        outlying : ndarray of bool, shape (E,)
+            Exposures that went wrong.
+        """
+        names = {name: k for k, name in enumerate(model.names)}
+        places = []
+        for code, chip in enumerate(model.chips):
+            seen = np.zeros(len(model.exposures), bool)
+            epoch = np.zeros(len(model.exposures))
+            here = groups.chip == code
+            seen[groups.exposure[here]] = True
+            epoch[groups.exposure[here]] = groups.epoch[here]
+            for a, axis in enumerate(AXES):
+                kind = f"{chip.name}.shift_{axis}"
+                if kind not in kinds:
+                    continue
+                at, X = [model.coefficient_slice(chip.number, a).start], [np.ones(len(seen))]
+                if model.time is not None and (axis, 0, 0) in model.time.terms:
+                    weights = model.time.weights(epoch)
+                    first = model.tdd_slice(chip.number).start
+                    first += model.time.terms.index((axis, 0, 0)) * model.time.n_values
+                    free = ~held[first : first + model.time.n_values]
+                    at += (first + np.flatnonzero(free)).tolist()
+                    X += list(weights.T[free])
+                shifts = [names[f"{e}.{kind}"] for e in model.exposures]
+                used = seen & ~outlying
+                design = np.stack(X, axis=1)
+                if np.linalg.matrix_rank(design[used]) == len(at):
+                    places.append(
+                        _Place(
+                            list(kinds).index(kind), np.array(at), np.array(shifts), design, used
+                        )
+                    )
+        return cls(tuple(places))
+
+    def mean(self, theta: Float) -> Float:
+        """Parameters (..., D), settled without an error of the constants."""
+        out = np.array(theta, float)
+        for place in self.places:
+            place.moved(out, np.zeros(len(place.constants)))
+        return out
+
+    def covariance(self, cov: Float, tau: Float) -> Float:
+        """Covariance (D, D) of settled parameters, where the scatter is tau (k,)."""
+        out = self.mean(self.mean(np.asarray(cov)).T)
+        for place in self.places:
+            out += place.covariance(len(out), float(tau[place.kind]))
+        return np.asarray((out + out.T) / 2)
+
+    def draws(self, theta: Float, tau: Float, rng: np.random.Generator) -> Float:
+        """Draws (n, D), settled with an error each; their scatter is tau (n, k)."""
+        out = np.array(theta, float)
+        for place in self.places:
+            root = np.linalg.cholesky(place.inverse)
+            z = rng.standard_normal((len(out), len(place.constants)))
+            place.moved(out, tau[:, [place.kind]] * z @ root.T)
+        return out
+
+    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+        """As arrays by name, for a file."""
+        return {
+            f"settling.{k}.{name}": np.asarray(getattr(place, name))
+            for k, place in enumerate(self.places)
+            for name in ("kind", "constants", "shifts", "design", "used")
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Settling:
+        """What `to_arrays` gave, other arrays beside it."""
+        places: list[_Place] = []
+        while f"settling.{len(places)}.kind" in arrays:
+            of = f"settling.{len(places)}."
+            places.append(
+                _Place(
+                    int(arrays[of + "kind"]),  # type: ignore[call-overload]
+                    arrays[of + "constants"].astype(np.int64),
+                    arrays[of + "shifts"].astype(np.int64),
+                    arrays[of + "design"].astype(float),
+                    arrays[of + "used"].astype(bool),
+                )
+            )
+        return cls(tuple(places))
