@@ -77,7 +77,7 @@ def release_runs(
         comparison, why_not = _compared(sessions)
         notes = [*doubts, *_notes(sessions, comparison)]
         table = comparison_table(
-            {name: session.solution for name, session in sessions.items()},
+            solutions,
             comparison,
             chip=next(iter(sessions.values())).reference_chip,
         )
@@ -196,7 +196,9 @@ def _solutions(sessions: Mapping[str, CampaignSession]) -> dict[str, Solution]:
     for name, session in others:
         solution: Solution = session.solution
         if solution.model.time is not None:
-            solution = with_drift_of(solution, reference.solution, chip=reference.reference_chip)
+            solution = with_drift_of(
+                solution, reference.solution, chip=reference.reference_chip, formal=session.fit
+            )
         out[name] = solution
     return out
 

@@ -48,7 +48,6 @@ SCALE = 1e-4  # of the prior on tau: what velocity aberration does to the scale 
 # shear over again, and taken as independent they would halve the error of a drift.  At four times
 # their scatter they take 3 % off it.
 CAUTION = 4.0
-ROUNDS = 5  # of looking for exposures that went wrong
 MOST_OUTLYING = 0.2  # of the exposures: beyond, they are the rule
 LEAST_DETERMINED = 0.5  # deviations of a kind that the data must determine, out of E
 
@@ -349,17 +348,21 @@ def fit_hierarchical(
 
 
 def _outlying(scatter: Scatter, member: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which exposures went wrong, with tau from the others."""
-    found = scatter.outlying(scatter.robust, member)
-    for _ in range(ROUNDS):
-        # most of the exposures are what is called normal
-        if found.mean() > MOST_OUTLYING:
-            return np.zeros_like(found)
-        before, some = found, scatter.loosened(found[member])
-        found = some.outlying(np.exp(some.mode()), member)
-        if (found == before).all():
-            break
-    return found
+    """Which exposures (E,) went wrong: one after the other, the worst first, tau from the rest.
+
+    None are named where they are more than a fifth: then they are the rule.
+    """
+    n = int(member.max()) + 1
+    found = np.zeros(n, bool)
+    while found.sum() <= MOST_OUTLYING * n:
+        some = scatter.loosened(found[member])
+        odds = some.odds(np.exp(some.mode()), member)
+        odds[found] = -np.inf
+        worst = int(np.argmax(odds))
+        if odds[worst] <= 0:
+            return found
+        found[worst] = True
+    return np.zeros(n, bool)
 
 
 def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> None:

@@ -143,27 +143,33 @@ class Scatter:
             out[k] = max(spread, 0.1 * float(np.median(sigma[self.kind == k])))
         return np.minimum(out, self.scale)
 
-    def outlying(self, tau: Float, member: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which groups of deviations scatter much more than the others.
+    def odds(self, tau: Float, member: NDArray[np.int64]) -> Float:
+        """How much better "it went wrong" explains the deviations of each group.
 
         Parameters
         ----------
         tau : ndarray, shape (k,)
+            Of all that are not loose.
         member : ndarray of int, shape (m,)
             Group (exposure) of each deviation, from 0.
 
         Returns
         -------
-        ndarray of bool, shape (n,)
-            Where "ten times tau" explains the deviations better than tau does, by what all others
-            leave of the group, with odds of 1 to 49 against it beforehand.
+        ndarray, shape (n,)
+            Log odds of ten times the scatter against the scatter, 1 to 49 beforehand, by what all
+            others leave of the group.  The scatter is that of the others: a group that went wrong
+            raises tau, and would excuse itself.
         """
         precision = self.precision(tau)
         mean, factor = self._moments(precision)
-        out = np.zeros(int(member.max()) + 1, bool)
+        squares = (mean**2 + factor.variances())[self.index]
+        tight, k = ~self.loose, len(self.kinds)
+        total = np.bincount(self.kind[tight], squares[tight], k)
+        count = np.bincount(self.kind[tight], minlength=k)
+        out = np.empty(int(member.max()) + 1)
         for group in range(len(out)):
             own = np.flatnonzero(member == group)
-            at = self.index[own]
+            at, kind = self.index[own], self.kind[own]
             columns = np.zeros((len(at), len(self.about)))
             columns[np.arange(len(at)), at] = 1.0
             cov = factor.solve(columns)[:, at]
@@ -171,16 +177,19 @@ class Scatter:
             # what the data, and through them the other groups, say of this one
             information = inverse - np.diag(precision[own])
             pull = inverse @ mean[at]
+            mine = np.where(tight[own], squares[own], 0.0)
+            others = np.maximum(count[kind] - tight[own], 1)
+            scatter = np.sqrt(np.maximum(total[kind] - mine, 0.0) / others)
             evidence = []
-            for factor_tau in (1.0, OUTLYING):
-                T = (factor_tau * tau[self.kind[own]]) ** -2.0
+            for times in (1.0, OUTLYING):
+                T = np.maximum(times * scatter, SMALLEST * self.scale[kind]) ** -2.0
                 L = np.linalg.cholesky(information + np.diag(T))
                 half = np.linalg.solve(L, pull)
                 evidence.append(
                     0.5 * half @ half - np.log(np.diag(L)).sum() + 0.5 * np.log(T).sum()
                 )
-            odds = np.log(OUTLYING_FRACTION / (1 - OUTLYING_FRACTION))
-            out[group] = evidence[1] - evidence[0] + odds > 0
+            prior = np.log(OUTLYING_FRACTION / (1 - OUTLYING_FRACTION))
+            out[group] = evidence[1] - evidence[0] + prior
         return out
 
     def loosened(self, loose: NDArray[np.bool_]) -> Scatter:

@@ -66,7 +66,9 @@ class SharedDrift(Derived):
         return theta
 
 
-def with_drift_of(solution: Solution, reference: Solution, *, chip: int = 2) -> SharedDrift:
+def with_drift_of(
+    solution: Solution, reference: Solution, *, chip: int = 2, formal: Solution | None = None
+) -> SharedDrift:
     """Give a solution the drift of another one, and the polynomials that go with it.
 
     Parameters
@@ -76,6 +78,9 @@ def with_drift_of(solution: Solution, reference: Solution, *, chip: int = 2) -> 
     reference : Solution
     chip : int
         Number of the reference chip.
+    formal : Solution, optional
+        Whose covariance tells how the polynomials go with the drift: the linear fit of a posterior,
+        as that of a few thousand draws is noisy.  The solution's own by default.
 
     Returns
     -------
@@ -107,15 +112,17 @@ def with_drift_of(solution: Solution, reference: Solution, *, chip: int = 2) -> 
         raise DegenerateError(
             "the solution's drift has no error", where="model.tdd", do="fit it, or give it a prior"
         )
-    scaled = cov[k:, k:] / np.outer(sigma, sigma)
-    gain = np.linalg.solve(scaled, (cov[:k, k:] / sigma).T).T / sigma
+    exact = cov if formal is None else np.asarray(without_frames(formal).cov, float)
+    scaled = exact[k:, k:] / np.outer(sigma, sigma)
+    gain = np.linalg.solve(scaled, (exact[:k, k:] / sigma).T).T / sigma
     drift = matrix @ np.asarray(there.mean, float)
     spread = matrix @ np.asarray(there.cov, float) @ matrix.T
     mean = np.array(own.mean, float)
     mean[:k] += gain @ (drift - mean[k:])
     mean[k:] = drift
     total = np.empty_like(cov)
-    total[:k, :k] = cov[:k, :k] + gain @ (spread - cov[k:, k:]) @ gain.T
+    cross = gain @ cov[k:, :k]
+    total[:k, :k] = cov[:k, :k] - cross - cross.T + gain @ (spread + cov[k:, k:]) @ gain.T
     total[:k, k:] = gain @ spread
     total[k:, :k] = total[:k, k:].T
     total[k:, k:] = spread

@@ -27,6 +27,8 @@ __all__ = ["Lost", "Stored", "storable"]
 Float = NDArray[np.float64]
 Term = tuple[str, int, int]
 
+NEGLIGIBLE = 1e-3  # mas: what is held at zero by a prior, or by the gauge, is not worth a word
+
 
 @dataclass(frozen=True)
 class Lost:
@@ -204,8 +206,9 @@ def _lost(
                 reach *= (max(n + 0.5 - ref, ref - 0.5) / (n / 2)) ** power
             lever = factor * span * reach
             rate = rates.get(term, 0.0) - stored.get(term, 0.0)
-            if rate or term not in stored:
-                sigma = lever * sigmas.get(term, 0.0)
+            # a drift that was taken over is the stored one, in every draw
+            sigma = lever * sigmas.get(term, 0.0) if rate or term not in stored else 0.0
+            if max(lever * abs(rate), sigma) > NEGLIGIBLE and (rate or term not in stored):
                 out.append(Lost(chip.name, term, lever * abs(rate), sigma, years))
     return tuple(out)
 

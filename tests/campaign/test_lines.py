@@ -86,7 +86,7 @@ def test_both_ways_agree(campaigns, capsys):
                 print(f"  {kind} {term}: {np.median(ratio[:, t, ..., k], axis=0).ravel().round(2)}")
     assert rms(apart) < band(INDEPENDENT * len(found))[1]
     assert np.abs(apart).max() < norm.isf(CHANCE / 2 / apart.size)
-    # jointly the gap between the chips is a ruler of the scale along y: B_3 is known better
+    # jointly the terms of higher order are common to all exposures: lines are known no worse
     assert np.median(ratio, axis=0).max() < 1.3
 
 
@@ -96,8 +96,7 @@ def test_drifts_are_known_no_better_than_exposures_scatter(campaigns, setting, c
 
     An exposure's deviation of B_2 is twice shear_cross, where A_3 is the gauge, and nothing tells
     it from the drift.  The gap between the chips is turned by the shear as the chips are; a fit
-    that takes it for an independent measure of the roll angle is too sure of the drift.  (B_3 is
-    another matter: the gap measures scale less shear_plus, and it does not drift.)
+    that takes it for an independent measure of the roll angle is too sure of the drift.
     """
     ratios = []
     for one in campaigns[setting]:

@@ -23,7 +23,7 @@ import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 
 from bayesdist import errors
 from bayesdist.data import matches as matches_module
@@ -300,6 +300,8 @@ def test_task_that_kills_every_worker_ends_with_an_error(there, cluster):
     finally:
         cluster.scheduler.allowed_failures = before
     # all three were gone for a moment; now that they are back, so are the shards
+    with Client(cluster) as client:
+        client.wait_for_workers(3, timeout=60)
     assert isinstance(there.sum(first_u), float)
 
 

@@ -16,6 +16,7 @@ from bayesdist.infer.hierarchy import fit_hierarchical, held_in_reference
 from bayesdist.infer.scatter import Scatter
 from bayesdist.infer.views import in_exposure, lines, reference_gauge
 from bayesdist.model import FRAME_KINDS
+from bayesdist.model.frames import CHIP_DEVIATIONS
 
 from .small_campaign import LINEAR, Truth, campaign, campaign_model, true_lines
 from .support import UNCLIPPED, columns_of, residual_of
@@ -319,6 +320,18 @@ def test_exposures_that_went_wrong_are_named_and_do_no_harm():
     assert stats.chi2(len(FREE)).sf(d @ np.linalg.solve(a.cov, d)) > 1e-3
     mean, sigma = found.deviations("j004")["scale"]
     assert mean == pytest.approx(theta[model.names.index("j004.scale")], abs=5 * sigma)
+    # not only gross ones, and two of few: everything of ten times the usual size
+    rng = np.random.default_rng(3)
+    for seed in (18, 19, 20):
+        wrong = {
+            f"{e}.{kind}": 10 * t * rng.standard_normal()
+            for e in ("j003", "j009")
+            for kind, t in zip(
+                (*KINDS, *(f"WFC1.{d}" for d in CHIP_DEVIATIONS)), (*TAU, *OWN), strict=True
+            )
+        }
+        few = fit_hierarchical(*campaign(seed, 16, 400, own=OWN, wrong=wrong)[1::-1])
+        assert few.outlying == ("j003", "j009")
     # with three quarters of them wrong, there is no telling who went wrong
     wrong = {f"j{k:03d}.scale": 3e-4 * (-1) ** k for k in range(2, 25)}
     spread = fit_hierarchical(*campaign(16, 30, 200, own=OWN, wrong=wrong)[1::-1])

@@ -10,6 +10,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.gap import gap_priors, with_gap
+from bayesdist.app.campaign.lines import FIXED, summarise_lines
 from bayesdist.app.campaign.session import HIERARCHY, CampaignSession
 from bayesdist.app.campaign.tables import fit_tables, tables_summary
 from bayesdist.app.session import ERROR_COLUMNS, write_table
@@ -20,7 +21,6 @@ from bayesdist.infer.checkpoints import write_arrays
 from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.series import Series
-from bayesdist.infer.views import LinearTerms, View, lines, reference_gauge, without_frames
 from bayesdist.model import Chip
 
 __all__ = ["run_campaign_fit"]
@@ -30,7 +30,6 @@ Float = NDArray[np.float64]
 log = logging.getLogger("bayesdist")
 
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
-FIXED = ("A_1", "B_1", "A_3")  # by the gauge, on the reference chip
 
 
 def run_campaign_fit(session: CampaignSession) -> None:
@@ -73,12 +72,10 @@ def run_campaign_fit(session: CampaignSession) -> None:
     alone = fit_exposures(matches, session.plain_model, chip=number, skip=True, **options)
     session.keep_terms(_series(alone, model.chips[0]))
     summarise_fit(session, joint.fit)
-    view = reference_gauge(without_frames(joint), number)
+    summarise_lines(session, joint)
     session.run.summarise(
         tables=tables_summary(session, tables),
         scatter={name: _scatter(joint, name) for name in joint.tau},
-        gauge=_gauge(view),
-        lines=_lines(view),
         exposures_skipped=dict(alone.skipped),
         exposures_outlying=list(joint.outlying),
     )
@@ -112,45 +109,3 @@ def _series(alone: ExposureSolutions, reference: Chip) -> Series:
 
 def _scatter(joint: HierarchicalFit, name: str) -> dict[str, object]:
     return {"value": joint.tau[name], "interval_68": list(joint.tau_interval(0.68)[name])}
-
-
-def _gauge(view: View) -> dict[str, object]:
-    gauge = view.gauge
-    assert gauge is not None
-    return {
-        "chip": gauge.chip,
-        "fixed": list(FIXED),
-        "epoch": gauge.epoch,
-        "rotation": gauge.rotation,
-        "sigma_rotation": gauge.sigma_rotation,
-        "shift": list(gauge.shift),
-        "sigma_shift": list(gauge.sigma_shift),
-    }
-
-
-def _lines(view: View) -> list[dict[str, object]]:
-    """alpha and beta of the joint fit in the reference gauge, as Tables 1 to 3 of the report."""
-    time = view.model.time
-    if time is None:
-        return []
-    return [
-        {"segment": s, "chip": chip.number, "epoch0": time.epoch0[s]} | row
-        for s in range(time.n_segments)
-        for chip in view.model.chips
-        for row in _rows(lines(view, s, chip=chip.number))
-    ]
-
-
-def _rows(found: LinearTerms) -> list[dict[str, object]]:
-    values = dict(zip(found.labels, zip(found.values, found.sigma, strict=True), strict=True))
-    names = dict.fromkeys(label.split(".")[0] for label in found.labels)
-    return [
-        {
-            "term": name,
-            "alpha": float(values[f"{name}.alpha"][0]),
-            "sigma_alpha": float(values[f"{name}.alpha"][1]),
-            "beta": float(values[f"{name}.beta"][0]),
-            "sigma_beta": float(values[f"{name}.beta"][1]),
-        }
-        for name in names
-    ]

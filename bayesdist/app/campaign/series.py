@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 
 import numpy as np
 from astropy.table import Table
@@ -37,6 +38,9 @@ def run_series(session: CampaignSession) -> None:
         return
     write_table(_exposures(series, posterior), session.run / "series.ecsv")
     write_table(_predictions(posterior), session.run / "drift.ecsv")
+    outlying = [
+        name for name, p in zip(series.names, posterior.outlier_probability, strict=True) if p > 0.5
+    ]
     verdicts = [_verdict(series, k, time.breaks, seed) for k in range(len(series.coefficients))]
     session.run.summarise(
         time_dependence={
@@ -49,17 +53,25 @@ def run_series(session: CampaignSession) -> None:
                     strict=True,
                 )
             ),
-            "outlying_exposures": [
-                name
-                for name, p in zip(series.names, posterior.outlier_probability, strict=True)
-                if p > 0.5
-            ],
+            "outlying_exposures": outlying,
+            "warnings": list(_doubts(session, outlying)),
             "breaks": _changes(posterior),
             "verdicts": verdicts,
         }
     )
     for row in verdicts:
         log.info("assess: %s: %s", row["term"], row["claim"])
+
+
+def _doubts(session: CampaignSession, outlying: list[str]) -> Iterator[str]:
+    """Where the exposures alone and the joint fit do not say the same."""
+    known = session.run.summary.get("exposures_outlying", [])
+    missed = [name for name in outlying if name not in known]
+    if missed:
+        yield (
+            f"{', '.join(missed)}, each fitted alone, {'lie' if len(missed) > 1 else 'lies'} off "
+            "the course of the others, and the joint fit counts them as scatter"
+        )
 
 
 def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:

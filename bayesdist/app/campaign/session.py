@@ -143,8 +143,10 @@ class CampaignSession(Session):
 
     @property
     def doubts(self) -> list[str]:
-        """What the matching found odd, and what the campaign cannot tell."""
-        return list(self.run.summary.get("matching", {}).get("warnings", []))
+        """What the stages found odd, and what the campaign cannot tell."""
+        found = self.run.summary
+        parts = ("matching", "tables", "time_dependence")
+        return [text for part in parts for text in found.get(part, {}).get("warnings", [])]
 
     @property
     def scatter(self) -> tuple[tuple[str, ...], Float]:

@@ -61,7 +61,7 @@ def refuse_unsound(session: CampaignSession) -> None:
             do="give the columns sigma_u and sigma_v",
         )
     _refuse_cuts(session)
-    refuse_few(inputs.log.values("epoch"), config.time())
+    refuse_few(inputs.log.values("epoch"), config.time() if session.free_rates else None)
     _refuse_periods(config.products.release, config.time())
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bayesdist.app.campaign.fit import run_campaign_fit
+from bayesdist.app.campaign.lines import summarise_lines
 from bayesdist.app.campaign.matching import run_match
 from bayesdist.app.campaign.reference import rehearse_references
 from bayesdist.app.campaign.release import release
@@ -21,6 +22,7 @@ __all__ = ["CAMPAIGN_STAGES", "rehearse_campaign"]
 
 def _assess(session: CampaignSession) -> None:
     run_series(session)  # first: what it finds doubtful is among the warnings
+    summarise_lines(session, session.solution)
     run_assess(session)
 
 

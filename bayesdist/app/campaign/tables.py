@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,6 @@ def fit_tables(session: CampaignSession) -> TableFit | None:
     """
     block, base = session.config.tables, session.base
     held = held_tables(block, session.config.chips(), base)
-    if any(table.sigma is None for table in held):
-        log.warning("fit: WARNING: the held tables have no errors, and none are counted")
     session.keep_tables(held)
     if block.method == "none":
         if held:
@@ -55,7 +53,7 @@ def fit_tables(session: CampaignSession) -> TableFit | None:
     if part.posteriors:
         errors = _on_the_grid(session, lambda x, y, chip: found.table_sigma(x, y, chip=chip))
     else:
-        errors = _held_errors(session, part.fit, held) if held else {}
+        errors = _held_errors(session, part.fit, found.tables)
     session.keep_tables(found.tables, errors)
     return found
 
@@ -100,7 +98,7 @@ def _on_the_grid(session, sigma) -> dict[int, Float]:  # type: ignore[no-untyped
 def _held_errors(
     session: CampaignSession, fit: LinearFit, held: tuple[LookupTable, ...]
 ) -> dict[int, Float]:
-    """Errors of positions by those of held tables alone."""
+    """Errors of positions by those of tables that have no covariance, or are held."""
 
     def sigma(x: Float, y: Float, chip: int) -> Float:
         px, py = corrected(held, x, y, chip=chip)
@@ -110,12 +108,32 @@ def _held_errors(
     return _on_the_grid(session, sigma)
 
 
+def _doubts(session: CampaignSession, found: TableFit | None) -> Iterator[str]:
+    """What is to be known of the tables' errors, each as a clause."""
+    block = session.config.tables
+    if block.detector is not None and any(t.sigma is None for t in session.tables if not t.filter):
+        yield "the detector's tables have no errors, and none are counted"
+    if found is None:
+        return
+    if block.method == "binned":
+        yield (
+            "the tables are smoothed bins: their errors are those of the bins, without what "
+            "smoothing takes off the pattern"
+        )
+    if not found.converged:
+        yield (
+            f"the look-up tables still moved by {found.progress[-1].moved:.2g} pixels in the last "
+            f"of {len(found.progress)} rounds"
+        )
+
+
 def tables_summary(session: CampaignSession, found: TableFit | None) -> dict[str, object]:
     """What summary.json says of the tables."""
     out: dict[str, object] = {
         "method": session.config.tables.method,
         "detector": session.config.tables.detector,
         "chips": [_row(table) for table in session.tables],
+        "warnings": list(_doubts(session, found)),
     }
     if found is not None:
         out |= {

@@ -1,0 +1,65 @@
+"""Gauge and linear terms of a campaign, as Tables 1 to 3 of ACS ISR 2015-06."""
+
+from __future__ import annotations
+
+from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.infer.views import (
+    LinearTerms,
+    Solution,
+    View,
+    lines,
+    reference_gauge,
+    without_frames,
+)
+
+__all__ = ["FIXED", "summarise_lines"]
+
+FIXED = ("A_1", "B_1", "A_3")  # by the gauge, on the reference chip
+
+
+def summarise_lines(session: CampaignSession, solution: Solution) -> None:
+    """Write the gauge, and alpha and beta of each term, to summary.json."""
+    view = reference_gauge(without_frames(solution), session.reference_chip)
+    session.run.summarise(gauge=_gauge(view), lines=_lines(view))
+
+
+def _gauge(view: View) -> dict[str, object]:
+    gauge = view.gauge
+    assert gauge is not None
+    return {
+        "chip": gauge.chip,
+        "fixed": list(FIXED),
+        "epoch": gauge.epoch,
+        "rotation": gauge.rotation,
+        "sigma_rotation": gauge.sigma_rotation,
+        "shift": list(gauge.shift),
+        "sigma_shift": list(gauge.sigma_shift),
+    }
+
+
+def _lines(view: View) -> list[dict[str, object]]:
+    """alpha and beta of the joint fit in the reference gauge, as Tables 1 to 3 of the report."""
+    time = view.model.time
+    if time is None:
+        return []
+    return [
+        {"segment": s, "chip": chip.number, "epoch0": time.epoch0[s]} | row
+        for s in range(time.n_segments)
+        for chip in view.model.chips
+        for row in _rows(lines(view, s, chip=chip.number))
+    ]
+
+
+def _rows(found: LinearTerms) -> list[dict[str, object]]:
+    values = dict(zip(found.labels, zip(found.values, found.sigma, strict=True), strict=True))
+    names = dict.fromkeys(label.split(".")[0] for label in found.labels)
+    return [
+        {
+            "term": name,
+            "alpha": float(values[f"{name}.alpha"][0]),
+            "sigma_alpha": float(values[f"{name}.alpha"][1]),
+            "beta": float(values[f"{name}.beta"][0]),
+            "sigma_beta": float(values[f"{name}.beta"][1]),
+        }
+        for name in names
+    ]
