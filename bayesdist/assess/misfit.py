@@ -56,9 +56,11 @@ class Misfit:
     def sentence(self) -> str:
         """What it means, as a clause."""
         part = "the detector" if self.chip is None else f"chip {self.chip.name}"
+        # tails underflow: no probability is zero
+        p = "p < 1e-300" if self.p_value < 1e-300 else f"p = {self.p_value:.1g}"
         return (
             f"the residuals hold structure that the model does not describe ({self.structure:.2g} "
-            f"{self.unit} rms in {self.partition} of {part}, p = {self.p_value:.1g}), so "
+            f"{self.unit} rms in {self.partition} of {part}, {p}), so "
             "that errors are larger than the posterior says"
         )
 

@@ -17,16 +17,26 @@ from bayesdist.products.release import Period, Release, write_release
 from bayesdist.products.siaf import Aperture, read_aperture
 from bayesdist.products.sip import SipHeader
 from bayesdist.products.sip_build import sip_from_solution
+from bayesdist.products.sip_implied import Implied, implied_values
 from bayesdist.products.sip_inverse import worst_closure
 from bayesdist.products.sip_lint import lint_sip
 from bayesdist.products.sip_read import read_sip
+from bayesdist.products.sip_rotate import (
+    coefficient_map,
+    pixel_matrix,
+    rotated_sip,
+    rotated_solution,
+)
 from bayesdist.products.sip_write import sip_header, write_sip
 from bayesdist.products.storable import Lost, Stored, storable
+from bayesdist.products.wise_lint import lint_wise_band
+from bayesdist.products.wise_meta import WiseBand, read_wise_meta
 
 __all__ = [
     "Aperture",
     "Finding",
     "IdcTab",
+    "Implied",
     "LookupFile",
     "Lost",
     "Orientation",
@@ -35,23 +45,31 @@ __all__ = [
     "Release",
     "SipHeader",
     "Stored",
+    "WiseBand",
+    "coefficient_map",
     "describe",
     "describe_idctab",
     "describe_lookup_file",
     "describe_sip",
     "idctab_from_solution",
+    "implied_values",
     "lint_idctab",
     "lint_lookup_file",
     "lint_sip",
+    "lint_wise_band",
     "orientation_from_aperture",
     "orientation_from_idctab",
     "oriented",
+    "pixel_matrix",
     "read_aperture",
     "read_d2im",
     "read_idctab",
     "read_lookup_file",
     "read_npol",
     "read_sip",
+    "read_wise_meta",
+    "rotated_sip",
+    "rotated_solution",
     "sip_from_solution",
     "sip_header",
     "storable",

@@ -18,13 +18,24 @@ from bayesdist.products.lint import LEVELS, Finding
 from bayesdist.products.lookup_file import AXES, LookupFile
 from bayesdist.products.lookup_lint import lint_lookup_file
 from bayesdist.products.sip import SipHeader
+from bayesdist.products.sip_inverse import worst_closure
 from bayesdist.products.sip_lint import lint_sip
 from bayesdist.products.sip_read import holds_sip, read_sip
+from bayesdist.products.wise_lint import lint_wise_band
+from bayesdist.products.wise_meta import WiseBand, holds_wise_meta, read_wise_meta
 
-__all__ = ["UNDERSTOOD", "describe", "describe_idctab", "describe_lookup_file", "describe_sip"]
+__all__ = [
+    "UNDERSTOOD",
+    "describe",
+    "describe_idctab",
+    "describe_lookup_file",
+    "describe_sip",
+    "describe_wise_meta",
+]
 
 UNDERSTOOD = (
-    "an IDCTAB, a D2IMFILE or NPOLFILE, or a FITS file or text file of cards with SIP keywords"
+    "an IDCTAB, a D2IMFILE or NPOLFILE, or a FITS file or text file of cards with SIP keywords, "
+    "or WISE meta-data"
 )
 
 _SCHEMES = {
@@ -44,7 +55,8 @@ def describe(path: str | os.PathLike[str]) -> str:
     Parameters
     ----------
     path : path-like
-        An IDCTAB, a D2IMFILE or NPOLFILE, or a FITS file or text header with SIP keywords.
+        An IDCTAB, a D2IMFILE or NPOLFILE, a FITS file or text header with SIP keywords, or a WISE
+        meta-data file.
 
     Returns
     -------
@@ -68,6 +80,8 @@ def describe(path: str | os.PathLike[str]) -> str:
         return describe_lookup_file(LookupFile(blocks, name))
     if holds_sip(path):  # also of a header without its data, which is no whole FITS file
         return describe_sip(read_sip(path), name)
+    if holds_wise_meta(path):
+        return describe_wise_meta(read_wise_meta(path), name)
     if damaged is not None and _looks_like_fits(path):
         raise damaged
     raise InputError("is of no kind that is understood here", where=name, do=f"give {UNDERSTOOD}")
@@ -211,12 +225,47 @@ def describe_sip(sip: SipHeader, name: str = "SIP header") -> str:
     if sip.inverse_order is not None:
         stated = "not stated" if sip.closure is None else f"{sip.closure:.3g} px"
         lines.append(f"  inverse   AP_ORDER {sip.inverse_order[0]}, worst closure {stated}")
+    return "\n".join([*lines, *_all_terms(sip), "", *_finding_text(lint_sip(sip))])
+
+
+def describe_wise_meta(bands: Iterable[WiseBand], name: str = "WISE meta-data") -> str:
+    """Text of a WISE meta-data file: its bands, each with what contradicts what.
+
+    Parameters
+    ----------
+    bands : iterable of WiseBand
+    name : str
+        What to call it.
+
+    Returns
+    -------
+    str
+    """
+    bands = tuple(bands)
+    lines = [f"{name}: WISE meta-data, {', '.join(f'W{one.band}' for one in bands)}"]
+    for one in bands:
+        sip = one.sip
+        lines += ["", f"W{one.band}: {sip.size[0]} x {sip.size[1]} px, A_ORDER {sip.order[0]}, "
+                  f"B_ORDER {sip.order[1]}, SKEW {one.skew:g} rad"]  # fmt: skip
+        lines += [
+            f"  {prefix}_DMAX    {one.printed[f'{prefix}_DMAX']} px"
+            for prefix in "AB"
+            if f"{prefix}_DMAX" in one.printed
+        ]
+        if sip.has_inverse:
+            lines.append(f"  closure   {worst_closure(sip, sip.size):.2g} px at worst")
+        lines += [*_all_terms(sip), "", *_finding_text(lint_wise_band(one))]
+    return "\n".join(lines)
+
+
+def _all_terms(sip: SipHeader) -> list[str]:
+    lines = []
     for prefix, terms, sigma in (
         ("A", sip.a, sip.sigma_a), ("B", sip.b, sip.sigma_b), ("AP", sip.ap, {}), ("BP", sip.bp, {})
     ):  # fmt: skip
         if terms:
             lines += ["", *_term_lines(prefix, terms, sigma)]
-    return "\n".join([*lines, "", *_finding_text(lint_sip(sip))])
+    return lines
 
 
 def _term_lines(

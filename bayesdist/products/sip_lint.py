@@ -9,17 +9,36 @@ import numpy as np
 
 from bayesdist.products.bivariate import largest_magnitude
 from bayesdist.products.indices import sip_keyword
-from bayesdist.products.lint import Finding, repeated_values
+from bayesdist.products.lint import Finding
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
+from bayesdist.products.sip_families import (
+    EDGE,
+    families,
+    forward_is_used,
+    half_unit,
+    inverse_is_used,
+    offset_ranges,
+    repeated_names,
+    values_by_keyword,
+    with_coefficient,
+)
+from bayesdist.products.sip_implied import implied_values, with_error
 from bayesdist.products.sip_inverse import worst_closure
 
 __all__ = ["lint_sip"]
+
 
 # Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
 _CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
 # How much a stated value may differ from the measured one: headers print three decimals.
 _DMAX_ABSOLUTE, _DMAX_RELATIVE = 1e-3, 1e-3
 _CLOSURE_RELATIVE = 1e-2
+# One wrong coefficient is to blame where its right value leaves this part of the closure at most.
+_EXPLAINED = 0.2
+# Suspects that are named beside the first one.
+_WORTH_NAMING = 0.05
+# How far two numbers of one size may differ that are the same but for a slip.
+_SAME_SIZE = 0.05
 
 
 def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Finding, ...]:
@@ -49,23 +68,9 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
                 "note", "NAXIS", "the image size is not known: A_DMAX and AP, BP are not checked"
             )
         )
-    elif _used(sip):
+    elif forward_is_used(sip):
         findings += [*_dmax(sip, size), *_inverse(sip, size)]
     return tuple(findings)
-
-
-def _used(sip: SipHeader) -> bool:
-    return min(sip.order) >= SIP_ORDERS[0]
-
-
-def _families(sip: SipHeader) -> list[tuple[str, int, dict[tuple[int, int], float]]]:
-    out = [("A", sip.order[0], dict(sip.a)), ("B", sip.order[1], dict(sip.b))]
-    if sip.inverse_order is not None:
-        out += [
-            ("AP", sip.inverse_order[0], dict(sip.ap)),
-            ("BP", sip.inverse_order[1], dict(sip.bp)),
-        ]
-    return out
 
 
 def _frame(sip: SipHeader) -> Iterator[Finding]:
@@ -86,7 +91,7 @@ def _frame(sip: SipHeader) -> Iterator[Finding]:
 
 def _orders(sip: SipHeader) -> Iterator[Finding]:
     low, high = SIP_ORDERS
-    for prefix, order, terms in _families(sip):
+    for prefix, order, terms in families(sip):
         where = f"{prefix}_ORDER"
         if order < low:
             yield Finding(
@@ -107,7 +112,7 @@ def _low_terms(sip: SipHeader, size: tuple[int, int] | None) -> Iterator[Finding
         low = {k: c for k, c in terms.items() if sum(k) < 2 and c != 0}
         named += [sip_keyword(prefix, *k) for k in low]
         if size is not None and low:
-            worst.append(largest_magnitude(low, *_ranges(sip, size)))
+            worst.append(largest_magnitude(low, *offset_ranges(sip, size)))
     if named:
         extent = f" (up to {max(worst):.4g} px)" if worst else ""
         yield Finding(
@@ -117,27 +122,32 @@ def _low_terms(sip: SipHeader, size: tuple[int, int] | None) -> Iterator[Finding
 
 
 def _repeated(sip: SipHeader) -> Iterator[Finding]:
-    families = _families(sip)
-    for both in (families[:2], families[2:]):
-        values = {sip_keyword(p, *k): c for p, _, terms in both for k, c in terms.items()}
-        for names in repeated_values(values):
-            yield Finding(
-                "warning", ", ".join(names), f"the same value, {abs(values[names[0]]):.7g}: "
-                "one may have been copied over the other",
-            )  # fmt: skip
-
-
-def _ranges(sip: SipHeader, size: tuple[int, int]) -> list[tuple[float, float]]:
-    return [(1 - ref, n - ref) for n, ref in zip(size, sip.crpix, strict=True)]
+    values = values_by_keyword(sip)
+    for names in repeated_names(sip):
+        yield Finding(
+            "warning", ", ".join(names), f"the same value, {abs(values[names[0]]):.7g}: "
+            "one may have been copied over the other",
+        )  # fmt: skip
 
 
 def _dmax(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
-    for prefix, order, terms in _families(sip)[:2]:
+    for prefix, order, terms in families(sip)[:2]:
         stated = sip.dmax["AB".index(prefix)]
-        true = largest_magnitude(terms, *_ranges(sip, size), order)
+        true = largest_magnitude(terms, *offset_ranges(sip, size), order)
         if stated is None:
             yield Finding("note", f"{prefix}_DMAX", f"is not stated; the maximum is {true:.4g} px")
-        elif abs(stated - true) > _DMAX_ABSOLUTE + _DMAX_RELATIVE * true:
+            continue
+        if abs(stated - true) <= _DMAX_ABSOLUTE + _DMAX_RELATIVE * true:
+            continue
+        to_edges = largest_magnitude(terms, *offset_ranges(sip, size, EDGE), order)
+        if abs(stated - to_edges) <= half_unit(sip) * (1 + 1e-9):
+            yield Finding(
+                "note",
+                f"{prefix}_DMAX",
+                f"says {stated:.4g} px, which is the maximum to the edges of the outermost pixels; "
+                f"over their centres it is {true:.4g} px",
+            )
+        else:
             yield Finding(
                 "warning",
                 f"{prefix}_DMAX",
@@ -149,7 +159,7 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
     if sip.inverse_order is None:
         yield Finding("note", "AP_ORDER", "there is no inverse: programs must iterate")
         return
-    if min(sip.inverse_order) < SIP_ORDERS[0]:
+    if not inverse_is_used(sip):
         return
     closure = worst_closure(sip, size)
     mirrored = replace(
@@ -164,15 +174,46 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
             where,
             f"index order: p and q are exchanged against A and B (closure {closure:.3g} px)",
         )
-    elif closure > _CLOSURE_BAD:
-        yield Finding(
-            "error", where, f"they miss the inverse of A, B by up to {closure:.3g} px: "
-            "a coefficient of one or the other is wrong",
-        )  # fmt: skip
     elif closure > _CLOSURE_GOOD:
-        advice = "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
-        yield Finding("warning", where, f"they leave up to {closure:.3g} px; {advice}")
+        accused = list(_accused(sip, size, closure))
+        yield from accused
+        if closure > _CLOSURE_BAD:
+            yield Finding(
+                "error", where, f"they miss the inverse of A, B by up to {closure:.3g} px: "
+                "a coefficient of one or the other is wrong",
+            )  # fmt: skip
+        elif not accused:
+            advice = (
+                "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
+            )
+            yield Finding("warning", where, f"they leave up to {closure:.3g} px; {advice}")
     if sip.closure is not None and closure > sip.closure * (1 + _CLOSURE_RELATIVE) + 1e-9:
         yield Finding(
             "error", "BDCLOS", f"states {sip.closure:.3g} px, and AP, BP leave {closure:.3g} px"
         )
+
+
+def _accused(sip: SipHeader, size: tuple[int, int], closure: float) -> Iterator[Finding]:
+    """The coefficient that is wrong, where its right value alone makes A, B and AP, BP agree."""
+    suspects = implied_values(sip, size)
+    first = suspects[0]
+    left = worst_closure(with_coefficient(sip, first.keyword, first.value), size)
+    if left > _EXPLAINED * closure:
+        return
+    low, high = first.interval
+    message = (
+        f"is {first.printed:.7g}, and {' and '.join(first.sources)} imply {with_error(first)} "
+        f"(95 %: {low:.7g} to {high:.7g}; closure then {left:.2g} px)"
+    )
+    if abs(first.printed + first.value) < _SAME_SIZE * abs(first.value):
+        message += "; the sign is wrong"
+    for names in repeated_names(sip):
+        if first.keyword in names:
+            others = " and ".join(n for n in names if n != first.keyword)
+            message += f"; what stands there is the value of {others}"
+    rivals = [one for one in suspects[1:] if one.probability > _WORTH_NAMING]
+    for one in rivals:
+        message += f"; or {one.keyword} should be {with_error(one)}"
+    if rivals:
+        message += "; these numbers alone do not tell which"
+    yield Finding("error", first.keyword, message)

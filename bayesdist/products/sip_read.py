@@ -18,7 +18,16 @@ from bayesdist.products.cards import card_images
 from bayesdist.products.indices import sip_powers
 from bayesdist.products.sip import SipHeader
 
-__all__ = ["CD_KEYWORDS", "LINEAR_KEYWORDS", "cd_matrix", "holds_sip", "image_size", "read_sip"]
+__all__ = [
+    "CD_KEYWORDS",
+    "LINEAR_KEYWORDS",
+    "cd_matrix",
+    "holds_sip",
+    "image_size",
+    "parsed",
+    "read_sip",
+    "readable",
+]
 
 CD_KEYWORDS = ("CD1_1", "CD1_2", "CD2_1", "CD2_2")
 # What stands for a CD matrix in other headers.
@@ -49,8 +58,8 @@ def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> S
     InputError
         When the file cannot be read.
     """
-    with _readable(path) as where:
-        return _parsed(_header(content_of(path), ext, where), where)
+    with readable(path) as where:
+        return parsed(_header(content_of(path), ext, where), where)
 
 
 def holds_sip(path: str | os.PathLike[str]) -> bool:
@@ -62,7 +71,7 @@ def holds_sip(path: str | os.PathLike[str]) -> bool:
         When the file cannot be read.
     """
     try:
-        with _readable(path) as where:
+        with readable(path) as where:
             return "A_ORDER" in _header(content_of(path), None, where)
     except FormatError:
         return False
@@ -72,7 +81,7 @@ def holds_sip(path: str | os.PathLike[str]) -> bool:
 
 
 @contextmanager
-def _readable(path: str | os.PathLike[str]) -> Iterator[str]:
+def readable(path: str | os.PathLike[str]) -> Iterator[str]:
     """The file's name in errors; what astropy raises inside becomes a FormatError."""
     where = str(path)
     try:
@@ -116,7 +125,7 @@ def _chosen(hdus: fits.HDUList, ext: int | str | None, where: str) -> fits.Heade
 # -- from a header to the noun -------------------------------------------------------------------
 
 
-def _parsed(header: fits.Header, where: str) -> SipHeader:
+def parsed(header: fits.Header, where: str) -> SipHeader:
     if "A_ORDER" not in header:
         raise FormatError(
             "there is no A_ORDER", where=where, do="give a header with SIP keywords, or its HDU"

@@ -86,12 +86,28 @@ def _histogram(inputs: ReportInput) -> Caption:
 def _binned(inputs: ReportInput) -> Caption:
     filled = sum(int((np.asarray(c.binned.count) > 0).sum()) for c in inputs.chips)
     significant = sum(int(significant_cells(c.binned).sum()) for c in inputs.chips)
+    chance = CHANCE * filled
+    axes, which, cannot = "", "", "the polynomial cannot follow"
+    if inputs.fit.model.frames not in ("none", "shift"):  # they turn u and v
+        axes = (
+            ", along the axes of the polynomials, before the exposures' frames turn them: what"
+            " belongs to the detector adds up however exposures are rolled"
+        )
+    if inputs.campaign is not None:
+        which = (
+            " These are the residuals of the joint fit, with all tables, in the cells of the test"
+            " for structure (see the status)."
+        )
+        if inputs.campaign.tables:
+            cannot = "neither tables nor polynomial follow"
+            if significant < chance / 2:
+                which += " They are fewer than by chance, as the tables follow these very stars."
     return Caption(
         "Binned residuals",
-        "Mean residual of each cell; dark arrows differ from zero by more than 2 σ."
-        f" {significant} of {filled} cells do, and chance alone would give {CHANCE * filled:.0f}:"
-        " neighbouring dark arrows that point the same way would be structure that the polynomial"
-        " cannot follow.",
+        f"Mean residual of each cell{axes}; dark arrows differ from zero by more than 2 σ."
+        f" {significant} of {filled} cells do, and chance alone would give {chance:.0f}:"
+        " neighbouring dark arrows that point the same way would be structure that"
+        f" {cannot}.{which}",
         f"Map of binned residual vectors; {significant} of {filled} cells are significant.",
     )
 

@@ -198,6 +198,11 @@ class ReportInput:
         return f" of {chip.name}" if self.several else ""
 
     @property
+    def held(self) -> frozenset[str]:
+        """Parameters that a prior holds: they are no measurements."""
+        return frozenset(() if self.campaign is None else self.campaign.held)
+
+    @property
     def scale_mas(self) -> float | None:
         """Size of a pixel in mas, where the configuration gives it."""
         value = self.config.get("detector", {}).get("scale_mas")

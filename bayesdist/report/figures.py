@@ -25,7 +25,7 @@ from bayesdist.report.residuals import (
     residuals_by_magnitude,
 )
 from bayesdist.report.style import figure_style
-from bayesdist.report.traces import traces
+from bayesdist.report.traces import slowest_parameters, traces
 from bayesdist.report.uncertainty import formal_uncertainty, uncertainty_radius
 from bayesdist.report.vectors import residual_vectors, vector_flow
 
@@ -57,15 +57,15 @@ def all_figures(inputs: ReportInput) -> dict[str, Figure]:
     out["residual_histogram"] = residual_histogram(stars.residual, mixture_curves(inputs), **drawn)
     chips, mosaic = inputs.chips, mosaic_of(inputs)
     out |= {name: one.draw() for name, one in plan_of_campaign(inputs).items()}
-    if inputs.campaign is None:  # rolled exposures: u and v have no fixed direction on the detector
-        out["residual_vectors"] = residual_vectors(
-            *(c.binned for c in chips), unit=inputs.unit, mosaic=mosaic
-        )
+    out["residual_vectors"] = residual_vectors(
+        *(c.binned for c in chips), unit=inputs.unit, mosaic=mosaic
+    )
     if inputs.posterior is not None:
         if inputs.posterior.hyper:
             out["outliers_corner"] = corner_outliers(inputs.posterior)
         out["coefficients_corner"] = corner_coefficients(inputs.posterior, inputs.fit)
-        out["traces"] = traces(inputs.posterior)
+        slowest = slowest_parameters(inputs.posterior, without=inputs.held)
+        out["traces"] = traces(inputs.posterior, slowest)
     maps = [m for c in chips for m in c.maps]
     out["distortion"] = vector_flow(*(c.displacement for c in chips), mosaic=mosaic)
     out["distortion_non_linear"] = vector_flow(*(c.non_linear for c in chips), mosaic=mosaic)

@@ -8,11 +8,21 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["MISSING", "broken_name", "count", "interval", "number", "percent", "rounded"]
+__all__ = [
+    "MISSING",
+    "broken_name",
+    "count",
+    "interval",
+    "number",
+    "percent",
+    "probability",
+    "rounded",
+]
 
 MISSING = "–"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
+_LEAST_P = 1e-300  # tails of distributions underflow not far below
 _MAX_DECIMALS = 10  # beyond this a fixed-point number is harder to read than a power of ten
 
 
@@ -109,6 +119,14 @@ def percent(value: Any, digits: int = 3) -> str:
     """A fraction in percent."""
     x = _finite(value)
     return MISSING if x is None else f"{number(100 * x, digits)}\u202f%"
+
+
+def probability(p: Any) -> str:
+    """A probability of chance with its sign; below what a double tells from zero, a bound."""
+    x = _finite(p)
+    if x is not None and 0 <= x < _LEAST_P:
+        return f"p < 10{str(round(math.log10(_LEAST_P))).translate(_SUPERSCRIPTS)}"
+    return f"p = {number(p, 2)}"
 
 
 def broken_name(name: str, width: int = 10) -> str:

@@ -235,9 +235,15 @@ def _accuracy_sentence(inputs: ReportInput) -> str:
         f" {with_mas(median, inputs.unit, inputs.scale_mas)} at the median"
         f" place and at most {with_mas(best.radius_max, inputs.unit, inputs.scale_mas)},"
         f" at pixel ({x:.0f}, {y:.0f}){inputs.on_chip(worst.chip)}"
+        f"{', shift and rotation included' if inputs.fit.model.n_frame else ''}"
     )
     if inputs.budget is None:
         return f"{text}."
     total = inputs.budget.rows()[-1]["radial"]
     with_budget = with_mas(total, inputs.budget.unit, inputs.scale_mas)
-    return f"{text}; with all terms of the budget the rms over the detector is {with_budget}."
+    whom = (
+        ""
+        if inputs.campaign is None
+        else " for a new exposure whose shift and rotation are fitted by whoever uses it"
+    )
+    return f"{text}; with all terms of the budget the rms over the detector is {with_budget}{whom}."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,13 +25,17 @@ Float = NDArray[np.float64]
 _TRACE_POINTS = 2_000  # draws that stand as points in a trace
 
 
-def slowest_parameters(posterior: Posterior, n: int = 4) -> tuple[str, ...]:
+def slowest_parameters(
+    posterior: Posterior, n: int = 4, *, without: Collection[str] = ()
+) -> tuple[str, ...]:
     """The parameters of theta with the fewest effective draws: the worst that the chains offer.
 
     Parameters
     ----------
     posterior : Posterior
     n : int
+    without : collection of str
+        Parameters that are passed over.
 
     Returns
     -------
@@ -41,7 +45,7 @@ def slowest_parameters(posterior: Posterior, n: int = 4) -> tuple[str, ...]:
     known = dict(zip(posterior.convergence.names, posterior.convergence.ess_bulk, strict=True))
     ess = np.array([known.get(name, np.inf) for name in names], float)
     order = np.argsort(np.where(np.isfinite(ess), ess, -np.inf), kind="stable")
-    return tuple(names[k] for k in order[:n])
+    return tuple(names[k] for k in order if names[k] not in without)[:n]
 
 
 def traces(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:

@@ -10,17 +10,23 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.model import Chip
+from bayesdist.app.campaign.report import held_parameters
+from bayesdist.assess import Misfit
+from bayesdist.infer import GaussianPriors, fit_linear
+from bayesdist.model import Chip, TimeDependence
 from bayesdist.report import all_figures, drawn
 from bayesdist.report.campaign import PARTS, campaign_checks, campaign_figures, campaign_tables
 from bayesdist.report.campaign.published import LINES, published_lines
 from bayesdist.report.campaign.residuals import binned_of, largest_cell, rms_of_cells
 from bayesdist.report.campaign.series import _band, course_of
+from bayesdist.report.captions import caption
 from bayesdist.report.figures import mosaic_of, plan_of_campaign
 from bayesdist.report.html import render_report
+from bayesdist.report.tables import coefficient_tables, fit_tables
 from bayesdist.simulate.acs.distortion import DRIFT
 
 from . import campaigns
+from .runs import simulated, wise_model
 from .test_html import parsed, words
 
 MOST_MARKERS = 20_000
@@ -79,8 +85,13 @@ def test_the_page_is_well_formed_and_its_links_lead_somewhere(page):
     assert not re.search(r"\b(nan|None|inf)\b", words(page), re.IGNORECASE)
 
 
-def test_residuals_along_u_and_v_are_not_averaged_over_rolls(figures):
-    assert "residual_vectors" not in figures
+def test_binned_residuals_of_rolled_exposures_say_along_which_axes(run, figures):
+    assert "residual_vectors" in figures
+    text = caption("residual_vectors", run).text
+    assert "cells of the test for structure" in text
+    assert "axes of the polynomials" not in text  # frames that only shift turn nothing
+    turning = replace(run.fit, model=replace(run.fit.model, frames="shift_rotation"))
+    assert "axes of the polynomials" in caption("residual_vectors", replace(run, fit=turning)).text
 
 
 def test_no_figure_has_more_markers_than_a_reader_can_tell_apart(plan, figures):
@@ -336,3 +347,121 @@ def test_what_went_wrong_is_on_top(run, section, changes, name):
 def test_doubts_are_on_top(run):
     checks = campaign_checks(replace(run.campaign, doubts=("the rates are doubtful",)))
     assert checks[-1].level == "warn" and checks[-1].value == "The rates are doubtful"
+
+
+def row_of_structure(campaign):
+    (row,) = [c for c in campaign_checks(campaign) if "Structure" in c.name]
+    return row
+
+
+def test_what_the_banner_warns_of_has_a_row(run):
+    """The verdict of the row is that of the warning, and doubts of another kind say so."""
+    first, second = (c.chip for c in run.chips)
+    for p, level in ((1.0, "pass"), (2e-4, "pass"), (1e-5, "warn"), (0.0, "warn")):
+        found = (Misfit(p, "cells", 0.0021, "pix", first), Misfit(1, "rows", 0, "pix", second))
+        campaign = replace(run.campaign, misfits=found)
+        row = row_of_structure(campaign)
+        assert row.level == level
+        assert row.value.startswith("0.0021\u202fpix rms in cells of WFC1, p ")
+        assert campaign_checks(campaign)[-1].name == "Other doubts"
+    assert row.value.endswith("p < 10⁻³⁰⁰")
+
+
+def test_no_structure_is_no_length(run):
+    chip = run.chips[0].chip
+    campaign = replace(run.campaign, misfits=(Misfit(1.0, "rows", 0.0, "pix", chip),))
+    assert row_of_structure(campaign).value == "none, p = 1.0"
+
+
+# -- what is no measurement -----------------------------------------------------------------------
+
+
+def time_rows(run):
+    (table,) = [t for t in coefficient_tables(run) if t.caption.startswith("Time dependence")]
+    return [row[0] for row in table.rows], table.note
+
+
+def test_held_parameters_are_no_rows(run):
+    before, note = time_rows(run)
+    assert "Held" not in note
+    rate = next(name for name in before if name.startswith("WFC2.tdd"))
+    held = replace(run, campaign=replace(run.campaign, held=(rate,)))
+    after, note = time_rows(held)
+    assert [name for name in before if name != rate] == after
+    assert f"{rate.rpartition('.')[0]} (rate)" in note
+    (fit, *_) = fit_tables(held)
+    assert "1 of them held" in dict(fit.rows)["Parameters"]
+
+
+def test_a_prior_holds_what_the_data_do_not_narrow():
+    """Stars narrow a prior as wide as their own errors, and not one of a thousandth of them."""
+    table, model = simulated(2000), wise_model()
+    free = fit_linear(table, model)
+    sigma = dict(zip(model.names, free.sigma, strict=True))
+    wide, narrow, frame = "u_2_0", "tdd.u_1_0.rate", "frame1.shift_u"
+    priors = GaussianPriors.of(
+        model,
+        {wide: (0.0, sigma[wide]), narrow: (0.0, 1e-3 * sigma[narrow]),
+         frame: (0.0, 1e-3 * sigma[frame])},
+    )  # fmt: skip
+    assert held_parameters(fit_linear(table, model, priors=priors), priors) == (narrow,)
+    assert held_parameters(free, GaussianPriors.none(model)) == ()
+
+
+def test_the_terms_that_were_asked_for_are_named(run):
+    time = TimeDependence((("u", 1, 0), ("u", 0, 0)), (2009.0, 2011.0), (2010.0,))
+    model = replace(run.fit.model, time=time)
+    every = [p.name for p in model.parameters if p.kind == "tdd" and (p.i, p.j) == (0, 0)]
+    held = tuple(n for n in every if n.startswith("WFC1") or ".rate" in n)
+    config = run.config | {"model": {"tdd": {"terms": [["u", 1, 0]]}}}
+    gap = replace(
+        run,
+        config=config,
+        fit=replace(run.fit, model=model),
+        campaign=replace(run.campaign, held=held),
+    )
+    text = dict(fit_tables(gap)[0].rows)["Time-dependent terms"]
+    assert text == "u_1_0; besides, the constants of WFC2 may step at 2010.00"
+    still = replace(gap, campaign=replace(run.campaign, held=tuple(every)))
+    assert dict(fit_tables(still)[0].rows)["Time-dependent terms"] == "u_1_0"
+
+
+def test_small_ratios_are_shown_by_the_million(run):
+    (table,) = [t for t in coefficient_tables(run) if t.caption.startswith("Time dependence")]
+    units = {row[0]: row[-1] for row in table.rows}
+    assert {u for n, u in units.items() if "shift" in n} == {"pix"}
+    name = next(n for n in units if "shift" in n)
+    bare = run.coefficients.copy()
+    k = list(bare["name"]).index(name)
+    for column in ("value", "sigma", "mean", "sd", "lo68", "hi68", "lo95", "hi95"):
+        bare[column][k] *= 1e-7
+    bare["unit"][k] = ""
+    value, sigma = bare["value"][k], bare["sigma"][k]
+    (table,) = [
+        t
+        for t in coefficient_tables(replace(run, coefficients=bare))
+        if t.caption.startswith("Time dependence")
+    ]
+    (row,) = [row for row in table.rows if row[0] == name]
+    assert row[-1] == "10⁻⁶"
+    assert abs(1e-6 * number_in(row[1]) - value) < 0.06 * sigma
+    assert number_in(row[2]) == pytest.approx(1e6 * sigma, rel=0.05)
+
+
+# -- gauges ---------------------------------------------------------------------------------------
+
+
+def test_every_table_says_in_which_system_it_is(run, page):
+    text = words(page)
+    for table in campaign_tables(run.campaign)["time"]:
+        if "TIME − RDATE" in table.caption:
+            assert "in the system of WFC2" in table.caption
+    for table in coefficient_tables(run):
+        assert "in the fit's own gauge" in table.caption
+    assert "A_1, B_1, A_3 of WFC2 are zero in it" in text
+    assert "a new exposure whose shift and rotation are fitted" in text
+
+
+def test_two_errors_side_by_side_are_explained_once(run):
+    notes = [t.note for t in campaign_tables(run.campaign)["time"]]
+    assert sum("two σ of this run may differ" in note for note in notes) == 1

@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bayesdist.report.numerals import MISSING, count, interval, number, percent, rounded
+from bayesdist.report.numerals import (
+    MISSING,
+    count,
+    interval,
+    number,
+    percent,
+    probability,
+    rounded,
+)
 from bayesdist.report.scales import display_scale, with_mas
 
 ANGLES = {"deg": u.deg, "arcsec": u.arcsec, "mas": u.mas, "µas": u.uas}
@@ -69,3 +77,14 @@ def test_infinite_diagnostics_are_shown_as_such():
 
 def test_counts_are_grouped_in_threes():
     assert count(11213542) == "11\u202f213\u202f542"  # pairs of WISE W2
+
+
+@pytest.mark.parametrize("p", [0.0, 5e-324, 1e-301])
+def test_no_probability_is_said_to_be_zero(p):
+    assert probability(p) == "p < 10⁻³⁰⁰"
+
+
+def test_probabilities_that_a_double_holds_are_said():
+    assert probability(0.0123) == "p = 0.012"
+    assert probability(1e-300) == "p = 1.0\u202f×\u202f10⁻³⁰⁰"
+    assert MISSING in probability(float("nan"))

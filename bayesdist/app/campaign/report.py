@@ -16,7 +16,7 @@ from bayesdist.app.rundir import as_json
 from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
 from bayesdist.data import MatchTable, read_catalog, with_centroid_errors
 from bayesdist.data.motions import motion_error_line
-from bayesdist.infer import fit_linear
+from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.infer.nodes import pixel_shifts
 from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
 from bayesdist.model import corrected
@@ -31,13 +31,14 @@ if TYPE_CHECKING:
         LinearSeries,
     )
 
-__all__ = ["campaign_results"]
+__all__ = ["campaign_results", "held_parameters"]
 
 Float = NDArray[np.float64]
 
 DRAWN = 20_000  # markers in a figure: more only hide each other
 CELL = 64.0  # pixels: the nodes of ACS ISR 2015-06
 IN_CELL = 20  # stars that a cell should have at the median
+HELD = 0.99  # of the prior's sigma: what narrows it by less is no measurement
 WIDEST = 8  # cells of this many times the size, however few stars there are
 
 
@@ -73,6 +74,31 @@ def campaign_results(session: CampaignSession) -> CampaignResults:
         series=_series(session, matching),
         overlap=overlap_test(session),
         doubts=tuple(session.doubts),
+        misfits=session.misfits,
+        held=held_parameters(session.fit, session.priors),
+    )
+
+
+def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
+    """Coefficients and rates of which the data say nothing beside what a prior does.
+
+    The deviations of single exposures are not among them: their prior is what was found.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    priors : GaussianPriors
+        As the fit had them.
+
+    Returns
+    -------
+    tuple of str
+    """
+    share = fit.sigma * np.sqrt(priors.precision)
+    return tuple(
+        p.name
+        for p, known in zip(fit.model.parameters, share, strict=True)
+        if p.kind != "frame" and known > HELD
     )
 
 

@@ -1,4 +1,4 @@
-"""The words under each figure of a campaign: what one sees, and with which numbers."""
+"""The words under the figures of matching and tables: what one sees, with which numbers."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.report.campaign.alignment import IN_CELL, largest_vector
 from bayesdist.report.campaign.context import CampaignResults
 from bayesdist.report.campaign.residuals import binned_of, largest_cell, rms_of_cells
-from bayesdist.report.campaign.series import TermCourse
-from bayesdist.report.campaign.words import name_of_term
+from bayesdist.report.campaign.words import size_of
 from bayesdist.report.caption import Caption
 from bayesdist.report.numerals import count, number, percent
-from bayesdist.report.scales import display_scale
 
 if TYPE_CHECKING:
     from bayesdist.model import LookupTable
@@ -26,23 +23,15 @@ __all__ = [
     "caption_of_matching",
     "caption_of_node_errors",
     "caption_of_nodes",
-    "caption_of_overlap",
     "caption_of_quality",
     "caption_of_residuals",
-    "caption_of_series",
 ]
-
-FALLS = 1.2  # scatter before VAFACTOR over that after it, above which the aberration is seen
-
-
-def _pix(value: float, unit: str = "pix", digits: int = 3) -> str:
-    return display_scale(unit, value).text(value, digits)
-
 
 # -- catalogue and matching -----------------------------------------------------------------------
 
 
 def caption_of_catalogue(r: CampaignResults) -> Caption:
+    """Errors of catalogue and detections; `CampaignResults.catalog` must be there."""
     c, found = r.catalog, r.section("matching")
     assert c is not None
     n = int(found["n_catalog"])
@@ -53,7 +42,8 @@ def caption_of_catalogue(r: CampaignResults) -> Caption:
         best = float(np.hypot(r.centroids.sigma_u, r.centroids.sigma_v).min())
         text += (
             " Blue: scatter of the residuals by magnitude; line: error of a single detection, which"
-            f" is that scatter with the catalogue's part taken out; at best {_pix(best, r.unit)}."
+            " is that scatter with the catalogue's part taken out; at best"
+            f" {size_of(best, r.unit)}."
         )
     if c.limit is not None:
         text += (
@@ -72,6 +62,7 @@ def caption_of_catalogue(r: CampaignResults) -> Caption:
 
 
 def caption_of_quality(r: CampaignResults) -> Caption:
+    """Quality of the fit and the cuts; `CampaignResults.detections` must be there."""
     d = r.detections
     assert d is not None
     text = (
@@ -95,6 +86,7 @@ def caption_of_quality(r: CampaignResults) -> Caption:
 
 
 def caption_of_matching(r: CampaignResults) -> Caption:
+    """Completeness, false pairs and number of pairs."""
     m = r.section("matching")
     completeness = m["completeness"]
     return Caption(
@@ -104,12 +96,13 @@ def caption_of_matching(r: CampaignResults) -> Caption:
         f" {percent(completeness['least'])} at least. Middle: share of the pairs that is expected"
         f" to be false, {number(m['false_share'], 2)} over all. Bottom: pairs,"
         f" {count(m['n_pairs'])} in {count(m['n_exposures'])} exposures. Search radii were"
-        f" {number(m['radius'][0])} to {_pix(m['radius'][1], r.unit)}.",
+        f" {number(m['radius'][0])} to {size_of(m['radius'][1], r.unit)}.",
         "Completeness, share of false pairs and number of pairs of each exposure against its date.",
     )
 
 
 def caption_of_footprints(r: CampaignResults) -> Caption:
+    """Where the exposures lie; `CampaignResults.footprints` must be there."""
     f = r.footprints
     assert f is not None
     n = len(f.outlines) // len(r.chips)
@@ -128,6 +121,7 @@ def caption_of_footprints(r: CampaignResults) -> Caption:
 
 
 def caption_of_residuals(r: CampaignResults) -> Caption:
+    """Clouds of residuals without tables and with them."""
     t = r.section("tables")
     drawn = sum(len(c.without) for c in r.residuals)
     text = (
@@ -136,7 +130,7 @@ def caption_of_residuals(r: CampaignResults) -> Caption:
         " structure that no polynomial follows."
     )
     if "rms_before" in t:
-        before, after = (_pix(float(t[f"rms_{when}"])) for when in ("before", "after"))
+        before, after = (size_of(float(t[f"rms_{when}"])) for when in ("before", "after"))
         text += f" The tables bring the rms of an axis from {before} to {after}."
     text += (
         f" Histograms: full lines x, dotted y. {count(drawn)} stars are drawn, each with both"
@@ -155,15 +149,16 @@ def _base(r: CampaignResults) -> str:
 
 
 def caption_of_map(r: CampaignResults, which: str) -> Caption:
+    """Mean residuals of the cells, 'without' the tables or 'with' them."""
     binned = binned_of(r.residuals, which)
     mean, noise = rms_of_cells(*binned)
     cell = r.residuals[0].chip.size[0] / len(binned[0].x)
     largest = largest_cell(*binned)
     text = (
         f"Mean residual of each cell of {cell:.0f} pixels, along the axes of the detector; light"
-        f" arrows differ from zero by less than 2 σ. The largest is {_pix(largest)}; the rms of an"
-        f" axis over the cells is {_pix(mean)}, where the scatter inside the cells alone would give"
-        f" {_pix(noise)}."
+        f" arrows differ from zero by less than 2 σ. The largest is {size_of(largest)}; the rms of"
+        f" an axis over the cells is {size_of(mean)}, where the scatter inside the cells alone"
+        f" would give {size_of(noise)}."
     )
     if which == "without":
         text += " What stands out repeats in all exposures."
@@ -174,28 +169,30 @@ def caption_of_map(r: CampaignResults, which: str) -> Caption:
             text += " It is less, because the tables follow these very stars."
         text += " The scale is that of the figure before."
         title = "Residuals over the detector, with the tables"
-    return Caption(title, text, f"Map of residual vectors; the largest is {_pix(largest)}.")
+    return Caption(title, text, f"Map of residual vectors; the largest is {size_of(largest)}.")
 
 
 def caption_of_nodes(r: CampaignResults, tables: Sequence[LookupTable], filter: str) -> Caption:
+    """Shifts at the nodes of the tables of a filter; '' is the detector."""
     parts = []
     for t in tables:
         ny, nx = t.shape
         rms = float(np.sqrt((t.values**2).mean()))
-        parts.append(f"{r.chip_name(t.chip)}: {nx} × {ny}, rms of an axis {_pix(rms)}")
+        parts.append(f"{r.chip_name(t.chip)}: {nx} × {ny}, rms of an axis {size_of(rms)}")
     whose = f"filter {filter}, applied second" if filter else "the detector, applied first"
     largest = max(float(np.hypot(*t.values).max()) for t in tables)
     return Caption(
         f"Look-up tables of {filter or 'the detector'}",
         f"What the tables of {whose}, add to the pixels of a star, at every node"
-        f" ({'; '.join(parts)}). The largest shift is {_pix(largest)}.",
-        f"Map of the shifts at the nodes; the largest is {_pix(largest)}.",
+        f" ({'; '.join(parts)}). The largest shift is {size_of(largest)}.",
+        f"Map of the shifts at the nodes; the largest is {size_of(largest)}.",
     )
 
 
 def caption_of_node_errors(
     r: CampaignResults, tables: Sequence[LookupTable], filter: str
 ) -> Caption:
+    """Errors of the nodes of the tables of a filter; '' is the detector."""
     rows = r.section("tables").get("chips", ())
     known = {(row["chip"], row.get("filter") or ""): row for row in rows}
     parts, worst = [], 0.0
@@ -204,95 +201,11 @@ def caption_of_node_errors(
             continue
         row = known.get((t.chip, filter), {})
         median = row.get("sigma_median") or float(np.median(t.sigma))
-        parts.append(f"{r.chip_name(t.chip)} {_pix(median)}")
+        parts.append(f"{r.chip_name(t.chip)} {size_of(median)}")
         worst = max(worst, float(t.sigma.max()))
     return Caption(
         f"Errors of the look-up tables{' of ' + filter if filter else ''}",
         f"Standard error of every node along x and along y; at the median {', '.join(parts)}, at"
-        f" worst {_pix(worst)}, where stars are few or the edge leaves a node without neighbours.",
+        f" worst {size_of(worst)}.",
         f"Maps of the errors of the nodes; the median is {', '.join(parts)}.",
-    )
-
-
-# -- time -----------------------------------------------------------------------------------------
-
-
-def caption_of_series(
-    r: CampaignResults, term: str, courses: Sequence[TermCourse], *, first: bool
-) -> Caption:
-    series, found = r.series, r.section("time_dependence")
-    assert series is not None
-    unit = r.unit if courses[0].is_constant else ""
-
-    def size(value: float | None) -> str:
-        if value is None or not np.isfinite(value):
-            return "unknown"
-        return _pix(value, unit) if unit else number(value, 2)
-
-    def each(texts: Sequence[str]) -> str:
-        one = zip(courses, texts, strict=True)
-        return "; ".join(f"{c.chip} {text}" if c.chip else text for c, text in one)
-
-    rms = each([f"from {size(c.rms_raw)} to {size(c.rms)}" for c in courses])
-    own = each([size(found.get("scatter", {}).get(c.label)) for c in courses])
-    verdicts = {row["term"]: row["claim"] for row in found.get("verdicts", ())}
-    falls = all(c.rms_raw > FALLS * c.rms for c in courses)
-    text = _how_to_read(np.isfinite(series.pa_v3).any()) if first else "As the figure before."
-    text += (
-        f" With VAFACTOR the scatter about the lines {'falls' if falls else 'hardly changes'}:"
-        f" {rms}. Beyond the formal errors the exposures scatter by {own}."
-    )
-    if all(c.label in verdicts for c in courses):
-        text += f" What held-out exposures support: {each([verdicts[c.label] for c in courses])}."
-    off = int(series.outlying.sum())
-    text += f" Crosses mark {count(off)} outlying exposures." if off else " No exposure lies off."
-    if not found.get("converged", True):
-        text += " The sampler of the lines did not reach its targets: bands are provisional."
-    return Caption(
-        f"{name_of_term(term)} against time",
-        text,
-        f"{name_of_term(term)} against time and roll angle; scatter about the lines {rms}.",
-    )
-
-
-def _how_to_read(with_roll: bool) -> str:
-    places = ", left against time and right against PA_V3" if with_roll else ""
-    return (
-        f"Each exposure fitted by itself, with formal errors{places}. Top: as measured. Middle:"
-        " VAFACTOR applied, with the line of each segment, its 68 % band and the wider one of a"
-        " new exposure. Bottom: rate times time since the reference date taken out; steps between"
-        " segments stay."
-    )
-
-
-# -- release --------------------------------------------------------------------------------------
-
-
-def caption_of_overlap(r: CampaignResults) -> Caption:
-    t = r.overlap
-    assert t is not None
-    a, b = t.names
-    days = abs(t.epochs[1] - t.epochs[0])
-    rolls = ""
-    if np.isfinite(t.pa_v3).all():
-        rolls = f" and PA_V3 {t.pa_v3[0]:.0f}° and {t.pa_v3[1]:.0f}°"
-    old, new = (float(np.sqrt(np.mean(x.rms**2))) for x in (t.old, t.new))
-    text = (
-        f"{a} and {b} ({t.epochs[0]:.2f} and {t.epochs[1]:.2f}, {days:.1f} years apart{rolls}):"
-        f" {count(t.n_stars)} shared stars, corrected for distortion and brought onto each other by"
-        " shift, rotation and scale; mean of what is left in each cell of"
-        f" {IN_CELL} stars or more. Left: through the known distortion that the matching started"
-        " from; right: through tables, polynomial and drift of this run, without anything fitted"
-        f" to these two exposures. Largest cell {_pix(largest_vector(t.binned_old))} and"
-        f" {_pix(largest_vector(t.binned_new))}; rms of an axis over the stars"
-        f" {_pix(old)} and {_pix(new)}."
-    )
-    if t.with_motions:
-        text += " The catalogue's proper motions between the two dates are taken out."
-    text += f" Pixels of {t.pixel_mas:g} mas; both panels have one scale."
-    return Caption(
-        "Two exposures laid on each other",
-        text,
-        "Residual vectors between two exposures, with a pattern on the left and little on the"
-        f" right: rms {_pix(old)} and {_pix(new)}.",
     )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from bayesdist.assess import BinnedResiduals
+    from bayesdist.assess import BinnedResiduals, Misfit
     from bayesdist.assess.alignment import Alignment
     from bayesdist.data import MagnitudeErrors
     from bayesdist.model import Chip, LookupTable
@@ -238,6 +238,10 @@ class CampaignResults:
     series : LinearSeries or None
     overlap : OverlapTest or None
     doubts : tuple of str
+    misfits : tuple of Misfit
+        Structure that the joint fit leaves in the residuals of each chip.
+    held : tuple of str
+        Parameters of which nothing is known but their prior.
     """
 
     summary: Mapping[str, Any]
@@ -255,6 +259,8 @@ class CampaignResults:
     series: LinearSeries | None = None
     overlap: OverlapTest | None = None
     doubts: tuple[str, ...] = ()
+    misfits: tuple[Misfit, ...] = ()
+    held: tuple[str, ...] = ()
 
     def section(self, name: str) -> Mapping[str, Any]:
         """A part of summary.json; empty where there is none."""

@@ -16,10 +16,8 @@ from bayesdist.report.campaign.captions import (
     caption_of_matching,
     caption_of_node_errors,
     caption_of_nodes,
-    caption_of_overlap,
     caption_of_quality,
     caption_of_residuals,
-    caption_of_series,
 )
 from bayesdist.report.campaign.catalogue import catalogue_errors, fit_quality
 from bayesdist.report.campaign.context import CampaignResults, ChipResiduals
@@ -27,6 +25,7 @@ from bayesdist.report.campaign.matching import footprints, matching_by_exposure
 from bayesdist.report.campaign.residuals import residual_map, table_residuals
 from bayesdist.report.campaign.series import ABREAST, course_of, series_figure, terms_of
 from bayesdist.report.campaign.tables import node_errors, node_vectors
+from bayesdist.report.campaign.timecaptions import caption_of_overlap, caption_of_series
 from bayesdist.report.caption import Caption
 from bayesdist.report.mosaic import Mosaic
 

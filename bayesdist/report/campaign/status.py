@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bayesdist.assess.misfit import SIGNIFICANT, worst_misfit
 from bayesdist.report.campaign.context import CampaignResults
 from bayesdist.report.context import Check
-from bayesdist.report.numerals import count, percent
+from bayesdist.report.numerals import count, number, percent, probability
+from bayesdist.report.scales import display_scale
 
 __all__ = ["campaign_checks"]
 
@@ -17,7 +19,7 @@ def _level(good: bool) -> str:
 
 
 def campaign_checks(r: CampaignResults) -> tuple[Check, ...]:
-    """Criteria of matching, tables, series and doubts.
+    """Criteria of matching, tables, series, residuals and doubts.
 
     Parameters
     ----------
@@ -44,10 +46,9 @@ def campaign_checks(r: CampaignResults) -> tuple[Check, ...]:
             _level(false <= _FALSE),
         ),
     ]
-    for key, name in (("left_out", "exposures left out"), ("warnings", "doubts")):
-        if m.get(key):
-            found = "; ".join(m[key])  # names of the exposures, or sentences
-            out.append(Check(f"Matching: {name}", found, "none", "warn"))
+    if m.get("left_out"):
+        names = "; ".join(m["left_out"])
+        out.append(Check("Matching: exposures left out", names, "none", "warn"))
     if "converged" in tables:
         good = bool(tables["converged"])
         out.append(Check("Look-up tables converged", "yes" if good else "NO", "yes", _level(good)))
@@ -66,12 +67,28 @@ def campaign_checks(r: CampaignResults) -> tuple[Check, ...]:
         out.append(
             Check("Exposures that could not be fitted alone", ", ".join(skipped), "none", "warn")
         )
+    if r.misfits:
+        out.append(_structure(r))
     out.append(
         Check(
-            "Doubts",
+            "Other doubts" if r.misfits else "Doubts",
             "none" if not r.doubts else "; ".join(d[0].upper() + d[1:] for d in r.doubts),
             "none",
             _level(not r.doubts),
         )
     )
     return tuple(out)
+
+
+def _structure(r: CampaignResults) -> Check:
+    """Whether the joint fit leaves structure in the residuals: what the banner warns of."""
+    worst = worst_misfit(r.misfits)
+    chip = "" if worst.chip is None else f" of {worst.chip.name}"
+    size = display_scale(worst.unit, worst.structure).text(worst.structure, 2)
+    found = f"{size} rms in {worst.partition}{chip}" if worst.structure > 0 else "none"
+    return Check(
+        "Structure in the residuals of the joint fit, beyond noise",
+        f"{found}, {probability(worst.p_value)}",
+        f"p at least {number(SIGNIFICANT, 1)}",
+        _level(not worst.significant),
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.report.context import ReportInput
+from bayesdist.report.gauge import gauge_mark, gauge_of_maps, gauge_of_new_exposure
 from bayesdist.report.numerals import MISSING, interval, number, rounded
 from bayesdist.report.scales import with_mas
 from bayesdist.report.tables.text import TextTable, marked
@@ -30,7 +31,7 @@ def map_table(inputs: ReportInput) -> TextTable:
     when = "" if first.epoch is None else f", epoch {first.epoch:.2f}"
     which = "each chip" if inputs.several else f"chip {first.chip}"
     return TextTable(
-        f"Uncertainty of the position, 1 σ, {which}{when}",
+        f"Uncertainty of the position, 1 σ, {which}{when}{gauge_mark(inputs)}",
         (
             "Chip, solution" if inputs.several else "Solution",
             "Largest σ u",
@@ -40,6 +41,7 @@ def map_table(inputs: ReportInput) -> TextTable:
             "At pixel",
         ),
         tuple(rows),
+        note=gauge_of_maps(inputs),
     )
 
 
@@ -70,7 +72,7 @@ def budget_table(inputs: ReportInput) -> TextTable | None:
         words=tuple(range(len(heads) - 3)),
         note="The parts of the model are correlated and enter the total jointly, by draws;"
         " independent terms are added in quadrature. The total therefore need not be the root of"
-        " the sum of squares.",
+        f" the sum of squares. {gauge_of_new_exposure(inputs)}".rstrip(),
     )
 
 
@@ -107,5 +109,5 @@ def margin_table(inputs: ReportInput) -> TextTable | None:
         tuple(out),
         words=(0, 1, 6, 7),
         note="Margin: the limit minus the value that the statistic stays under with the probability"
-        " asked for.",
+        f" asked for. {gauge_of_new_exposure(inputs)}".rstrip(),
     )

@@ -8,33 +8,69 @@ from typing import Any
 import numpy as np
 
 from bayesdist.report.context import ReportInput
+from bayesdist.report.gauge import gauge_mark, gauge_note
 from bayesdist.report.numerals import MISSING, interval, number, rounded
 from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, marked
 
 __all__ = ["coefficient_tables"]
 
+_SMALL = 1e-3  # below it a number without a unit is shown in 10^-6
+
 
 def coefficient_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
-    """Legendre coefficients, then monomial ones, then time dependence and frames."""
+    """Legendre coefficients, then time dependence and frames, then monomial coefficients."""
     kinds = {p.name: p.kind for p in inputs.fit.model.parameters}
     rows = list(inputs.coefficients)
-    polynomial = [r for r in rows if kinds.get(str(r["name"])) == "polynomial"]
-    others = [r for r in rows if kinds.get(str(r["name"])) in ("tdd", "frame")]
-    out = [
-        _parameter_table(
-            inputs,
-            f"Legendre coefficients [{inputs.unit}]: formal error beside posterior error",
-            polynomial,
-            with_unit=False,
-        )
-    ]
+    mark, held = gauge_mark(inputs), inputs.held
+    groups = []
+    for names in (("polynomial",), ("tdd", "frame")):
+        every = [r for r in rows if kinds.get(str(r["name"])) in names]
+        free = [r for r in every if str(r["name"]) not in held]
+        groups.append((free, [str(r["name"]) for r in every if str(r["name"]) in held]))
+    (polynomial, fixed), (others, fixed_others) = groups
+    legendre = _parameter_table(
+        inputs,
+        f"Legendre coefficients [{inputs.unit}]{mark}: formal error beside posterior error",
+        polynomial,
+        with_unit=False,
+    )
+    out = [replace(legendre, note=_notes(gauge_note(inputs), _held_note(fixed)))]
     if others:
         table = _parameter_table(
-            inputs, "Time dependence and exposure frames", others[:MOST_ROWS], with_unit=True
+            inputs,
+            f"Time dependence and exposure frames{mark}",
+            others[:MOST_ROWS],
+            with_unit=True,
         )
-        out.append(replace(table, note=further(len(others))))
+        out.append(replace(table, note=_notes(_held_note(fixed_others), further(len(others)))))
     out += [_monomial_table(inputs, chip.number) for chip in inputs.fit.model.chips]
     return tuple(out)
+
+
+def _notes(*sentences: str) -> str:
+    return " ".join(s for s in sentences if s)
+
+
+def _held_note(names: list[str]) -> str:
+    """Parameters that are no measurements, those of one term together."""
+    if not names:
+        return ""
+    terms: dict[str, list[str]] = {}
+    for name in names:
+        term, _, kind = name.rpartition(".")
+        terms.setdefault(term, []).append(kind)
+    texts = [f"{term} ({', '.join(kinds)})" if term else kinds[0] for term, kinds in terms.items()]
+    return (
+        "Held, and therefore not shown: a prior alone says what these parameters are, and the data"
+        f" add nothing to it: {'; '.join(texts)}."
+    )
+
+
+def _readable(row: Any) -> tuple[float, str]:
+    """Factor and unit in which a parameter is shown: small ratios and angles by the million."""
+    unit = str(row["unit"] or "")
+    largest = max(abs(float(row["value"])), float(row["sigma"]))
+    return (1e6, "10⁻⁶") if not unit and largest < _SMALL else (1.0, unit or "none")
 
 
 def _parameter_table(
@@ -42,32 +78,34 @@ def _parameter_table(
 ) -> TextTable:
     known = set(inputs.coefficients.colnames)
 
-    def cell(row: Any, key: str) -> Any:
-        return row[key] if key in known else None
+    def cell(row: Any, key: str, factor: float = 1.0) -> Any:
+        value = row[key] if key in known else None
+        return value if value is None or value is np.ma.masked else factor * value
 
     out = []
     for r in rows:
-        sigma, sd = cell(r, "sigma"), cell(r, "sd")
+        factor, unit = _readable(r) if with_unit else (1.0, "")
+        sigma, sd = cell(r, "sigma", factor), cell(r, "sd", factor)
         ratio = None
         if number(sigma) != MISSING and number(sd) != MISSING and float(sigma) > 0:
             ratio = float(sd) / float(sigma)
         sampled = (
-            rounded(cell(r, "mean"), sd),
+            rounded(cell(r, "mean", factor), sd),
             number(sd, 2),
             number(ratio),
-            interval(cell(r, "lo68"), cell(r, "hi68"), sd),
-            interval(cell(r, "lo95"), cell(r, "hi95"), sd),
+            interval(cell(r, "lo68", factor), cell(r, "hi68", factor), sd),
+            interval(cell(r, "lo95", factor), cell(r, "hi95", factor), sd),
         )
         rhat = cell(r, "rhat")
         out.append(
             (
                 str(r["name"]),
-                rounded(cell(r, "value"), sigma),
+                rounded(cell(r, "value", factor), sigma),
                 number(sigma, 2),
                 *(marked(inputs, c) for c in sampled),
                 number(rhat, 4),
                 number(cell(r, "ess_bulk"), 3),
-                *((str(cell(r, "unit") or "none"),) if with_unit else ()),
+                *((unit,) if with_unit else ()),
             )
         )
     heads = (
@@ -90,6 +128,7 @@ def _monomial_table(inputs: ReportInput, chip: int) -> TextTable:
     """Coefficients of (x - xref)^i (y - yref)^j with the errors that carry over."""
     model = inputs.fit.model
     basis = model.basis(chip)
+    gauge = gauge_note(inputs) if chip == model.chips[0].number else ""
     name = model.chips[model.chip_code(chip)].name if inputs.several else chip
     cells = []
     for axis in (0, 1):
@@ -113,9 +152,12 @@ def _monomial_table(inputs: ReportInput, chip: int) -> TextTable:
     x, y = basis.reference_pixel
     return TextTable(
         f"Monomial coefficients, chip {name}: of (x − {x:g})^i (y − {y:g})^j"
-        f" [{inputs.unit}/pix^(i + j)]",
+        f" [{inputs.unit}/pix^(i + j)]{gauge_mark(inputs)}",
         ("Axis", "i", "j", "Least squares", "Formal σ", "Posterior mean", "sd"),
         tuple(rows),
-        note="Monomial coefficients are strongly correlated: their errors must not be combined as"
-        " if they were independent. The covariance stands in the products.",
+        note=_notes(
+            "Monomial coefficients are strongly correlated: their errors must not be combined as"
+            " if they were independent. The covariance stands in the products.",
+            gauge,
+        ),
     )

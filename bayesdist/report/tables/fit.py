@@ -23,9 +23,7 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
         "Parameters": f"{count(model.n_params)} ({count(model.n_polynomial)} polynomial)",
         "Chips": ", ".join(c.name or str(c.number) for c in model.chips),
         "Frame of each exposure": model.frames,
-        "Time-dependent terms": ", ".join(f"{a}_{i}_{j}" for a, i, j in model.time.terms)
-        if model.time
-        else "none",
+        "Time-dependent terms": _drifting(inputs),
         "Chi-square / degrees of freedom": f"{number(fit.chi2, 6)} / {count(fit.dof)} ="
         f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",
         "rms of u": with_mas(fit.rms_u, inputs.unit, mas),
@@ -42,6 +40,8 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
             if values.size:
                 s = residual_statistics(values * scale.factor)
                 rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
+    if inputs.held:
+        pairs["Parameters"] += f", {count(len(inputs.held))} of them held by a prior"
     return (
         listing("Linear fit", pairs),
         TextTable(
@@ -51,6 +51,30 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
             note=f"From {inputs.sample}." if inputs.sample else "",
         ),
     )
+
+
+def _drifting(inputs: ReportInput) -> str:
+    """Terms whose drift was asked for, and which constants may step beside them."""
+    model = inputs.fit.model
+    time = model.time
+    if time is None:
+        return "none"
+    drift = inputs.setting("model", "tdd", {})
+    asked = [tuple(term) for term in drift.get("terms", time.terms)]
+    text = ", ".join(f"{a}_{i}_{j}" for a, i, j in asked)
+    steps = {
+        p.chip
+        for p in model.parameters
+        if p.kind == "tdd"
+        and (p.i, p.j) == (0, 0)
+        and (p.axis, p.i, p.j) not in asked
+        and p.name not in inputs.held
+    }
+    if not steps:
+        return text
+    chips = ", ".join(c.name for c in model.chips if c.number in steps)
+    breaks = ", ".join(f"{b:.2f}" for b in time.breaks)
+    return f"{text}; besides, the constants of {chips} may step at {breaks}"
 
 
 def _chips_of_stars(inputs: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:

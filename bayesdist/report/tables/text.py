@@ -42,8 +42,10 @@ def marked(inputs: ReportInput, text: str) -> str:
 
 
 def listing(caption: str, pairs: Mapping[str, str], note: str = "") -> TextTable:
+    """A plain list of names and values."""
     return TextTable(caption, ("", ""), tuple(pairs.items()), words=(0, 1), note=note)
 
 
 def further(n: int) -> str:
+    """How many of n rows the page leaves to the files; empty where it shows all."""
     return "" if n <= MOST_ROWS else f"{n - MOST_ROWS} more rows are in the run's tables."

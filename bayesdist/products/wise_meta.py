@@ -1,0 +1,152 @@
+"""Reading of the distortion entries of WISE meta-data: WSDC D-T033, Appendix B."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from astropy.io import fits
+
+from bayesdist.errors import FormatError
+from bayesdist.products.blocks import content_of
+from bayesdist.products.sip import SipHeader
+from bayesdist.products.sip_read import parsed, readable
+
+__all__ = ["WiseBand", "holds_wise_meta", "read_wise_meta"]
+
+_ENTRY = re.compile(r"\S*distort_(?:skew|(?:a|b|ap|bp)_)\S*")
+_ENTRY_LINE = re.compile(r"\S*distort_(\S+)\s+(\d+)\s+(\S+)\s+([ir])\s+(\S+)\s*(.*)")
+_KEYWORD = re.compile(r"SKEW|[AB]P?_(?:ORDER|\d_\d)|[AB]_DMAX")
+# Columns and rows of the arrays, and arcseconds in a pixel: those of W4 are twice as wide.
+_WISE = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
+
+
+@dataclass(frozen=True, eq=False)
+class WiseBand:
+    """The distortion entries of one band in a WISE meta-data file.
+
+    Parameters
+    ----------
+    band : int
+    sip : SipHeader
+        The reference pixel is the middle of the array.  The file says nothing of the sky: CRVAL is
+        zero, and CD has the nominal scale.
+    skew : float
+        Of the CD matrix, radians.
+    printed : mapping of str to str
+        Numbers as they stand in the file, by keyword.
+    comments : mapping of str to str
+    """
+
+    band: int
+    sip: SipHeader
+    skew: float
+    printed: Mapping[str, str]
+    comments: Mapping[str, str]
+
+
+def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
+    """Read the distortion entries of a WISE meta-data file.
+
+    The layout is that of WSDC D-T033 ("WISE IOC Distortion Calibration"), Appendix B: name, band,
+    keyword, type, value, comment.  Entries of other kinds are passed over.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    tuple of WiseBand
+        In the order of the bands.
+
+    Raises
+    ------
+    FormatError
+        When there is no such entry, or one is broken, contradicts itself, comes twice or is
+        missing.
+    InputError
+        When the file cannot be read.
+    """
+    with readable(path) as where:
+        lines = content_of(path).decode("ascii").splitlines()
+    entries: dict[int, dict[str, tuple[str, str]]] = {}
+    for number, line in enumerate(lines, start=1):
+        if _ENTRY.match(line):
+            band, keyword, value, comment = _entry(line, f"{where}, line {number}")
+            if keyword in entries.setdefault(band, {}):
+                raise FormatError(
+                    f"{keyword} of band {band} comes a second time",
+                    where=f"{where}, line {number}",
+                    do="remove one",
+                )
+            entries[band][keyword] = value, comment
+    if not entries:
+        raise FormatError(
+            "there are no distortion entries", where=where, do="give a WISE meta-data file"
+        )
+    return tuple(_wise_band(band, entries[band], where) for band in sorted(entries))
+
+
+def holds_wise_meta(path: str | os.PathLike[str]) -> bool:
+    """Whether a file holds distortion entries of WISE meta-data, right or wrong.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    """
+    try:
+        with readable(path):
+            lines = content_of(path).decode("ascii").splitlines()
+    except FormatError:
+        return False
+    return any(_ENTRY.match(line) for line in lines)
+
+
+def _entry(line: str, where: str) -> tuple[int, str, str, str]:
+    """Band, keyword, value as printed and comment of one line."""
+    match = _ENTRY_LINE.fullmatch(line.rstrip())
+    if match is None:
+        raise FormatError(
+            "is not name, band, keyword, type, value, comment", where=where, do="correct the line"
+        )
+    name, band, keyword, _, value, comment = match.groups()
+    if name.upper() != keyword:
+        raise FormatError(
+            f"the name says {name.upper()} and the keyword {keyword}", where=where, do="correct one"
+        )
+    if not _KEYWORD.fullmatch(keyword):
+        raise FormatError(f"{keyword} is no keyword of SIP", where=where, do="correct the keyword")
+    if int(band) not in _WISE:
+        raise FormatError(f"band {band} is none of 1 to 4", where=where, do="correct the band")
+    return int(band), keyword, value, " ".join(comment.split())
+
+
+def _wise_band(band: int, entries: dict[str, tuple[str, str]], where: str) -> WiseBand:
+    where = f"{where}, band {band}"
+    header = fits.Header()
+    for keyword, (value, _) in entries.items():
+        try:
+            header[keyword] = int(value) if keyword.endswith("_ORDER") else float(value)
+        except ValueError:
+            raise FormatError(
+                f"value {value!r} is no finite number",
+                where=f"{where}, keyword {keyword}",
+                do="correct the value",
+            ) from None
+    side, scale = _WISE[band]
+    for axis, ctype in enumerate(("RA---TAN-SIP", "DEC--TAN-SIP"), start=1):
+        header[f"CTYPE{axis}"] = ctype
+        header[f"CRPIX{axis}"] = (side + 1) / 2
+        header[f"CD{axis}_{axis}"] = (-1) ** axis * scale / 3600
+        header[("IMAGEW", "IMAGEH")[axis - 1]] = side
+    return WiseBand(
+        band,
+        parsed(header, where),
+        float(header.get("SKEW", 0.0)),
+        {keyword: value for keyword, (value, _) in entries.items()},
+        {keyword: comment for keyword, (_, comment) in entries.items()},
+    )
