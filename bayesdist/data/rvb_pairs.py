@@ -1,0 +1,191 @@
+"""RvB pairs of one band: the matches, their colours, and the selection by colour.
+
+WSDC D-T033, section 3, takes candidates by colour, "the magnitude difference between the shortest
+and longest wavelengths detected": stars are blue, and a colour needs two bands, which favours the
+bright.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+
+__all__ = ["RvbPairs", "bluest", "colour_between", "colour_of"]
+
+Float = NDArray[np.float64]
+
+NO_COLOUR = "no colour"
+COLOUR = "colour"
+
+
+@dataclass(frozen=True, eq=False)
+class RvbPairs:
+    """Pairs of one band.
+
+    Parameters
+    ----------
+    matches : MatchTable
+        x, y the detection, u, v the reference star as a detector without distortion would see it;
+        the band is the filter, the frame the exposure.
+    colour : ndarray, shape (N,), or None
+        Magnitudes; NaN where fewer than two bands have one.  None where the file has no magnitudes.
+    """
+
+    matches: MatchTable
+    colour: Float | None = None
+
+    def __post_init__(self) -> None:
+        if self.colour is not None and np.shape(self.colour) != (len(self.matches),):
+            raise InputError(
+                f"colour has shape {np.shape(self.colour)}, but there are {len(self)} pairs",
+                where=", ".join(self.matches.sources),
+                do="give one colour for each pair",
+            )
+
+    def __len__(self) -> int:
+        return len(self.matches)
+
+    @property
+    def band(self) -> str:
+        """Name of the band."""
+        return self.matches.filter_names[0]
+
+    def select(self, which: ArrayLike, *, reason: str | None = None) -> RvbPairs:
+        """Some of the pairs, as `MatchTable.select`."""
+        matches = self.matches.select(which, reason=reason)
+        which = np.asarray(which)
+        return RvbPairs(matches, None if self.colour is None else self.colour[which])
+
+    @staticmethod
+    def concatenate(several: Sequence[RvbPairs]) -> RvbPairs:
+        """All pairs of several sets, in their order.
+
+        Raises
+        ------
+        InputError
+            For sets of different bands, sets of which only some have colours, and as
+            `MatchTable.concatenate`.
+        """
+        bands = list(dict.fromkeys(one.band for one in several))
+        if len(bands) > 1:
+            raise InputError(
+                f"the sets are of bands {', '.join(bands)}", do="join those of one band"
+            )
+        matches = MatchTable.concatenate([one.matches for one in several])
+        colours = [one.colour for one in several if one.colour is not None]
+        if colours and len(colours) < len(several):
+            raise InputError(
+                "only some of the sets have colours",
+                where=", ".join(matches.sources),
+                do="give all of them the same columns",
+            )
+        return RvbPairs(matches, np.concatenate(colours) if colours else None)
+
+
+def colour_of(magnitudes: ArrayLike) -> Float:
+    """Magnitude of the shortest wavelength detected minus that of the longest.
+
+    Parameters
+    ----------
+    magnitudes : array_like, shape (B, N)
+        By rising wavelength; NaN where a source is not detected.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        NaN where fewer than two bands have a magnitude.  Colours of sources that are detected in
+        different bands are different colours: W1 - W2 of one stands beside W1 - W4 of another.
+    """
+    magnitudes = np.asarray(magnitudes, float)
+    detected = np.isfinite(magnitudes)
+    first = detected.argmax(axis=0)
+    last = len(magnitudes) - 1 - detected[::-1].argmax(axis=0)
+    column = np.arange(magnitudes.shape[1])
+    colour = magnitudes[first, column] - magnitudes[last, column]
+    return np.where(detected.sum(axis=0) >= 2, colour, np.nan)
+
+
+def colour_between(pairs: RvbPairs, low: float, high: float) -> RvbPairs:
+    """Pairs with a colour from `low` to `high`, both included.
+
+    Parameters
+    ----------
+    pairs : RvbPairs
+    low, high : float
+        Magnitudes; -inf and inf demand a colour of any value.
+
+    Returns
+    -------
+    RvbPairs
+        The others are counted as 'no colour' and 'colour'.
+
+    Raises
+    ------
+    InputError
+        Without colours, for limits that are no range, and when no pair is left.
+    """
+    if not low <= high:
+        raise InputError(f"colours from {low:g} to {high:g} are asked for", do="give a range")
+    colour = _colours(pairs)
+    known = ~np.isnan(colour)
+    return _kept(pairs, known, known & (colour >= low) & (colour <= high))
+
+
+def bluest(pairs: RvbPairs, n: int) -> RvbPairs:
+    """The pairs of smallest colour in each frame.
+
+    Parameters
+    ----------
+    pairs : RvbPairs
+        Whole frames: of a part of a frame these would be the bluest of the part.
+    n : int
+        How many of each frame at most; of equal colours the earlier row comes first.
+
+    Returns
+    -------
+    RvbPairs
+        In the order of the rows; the others are counted as 'no colour' and 'colour'.
+
+    Raises
+    ------
+    InputError
+        Without colours, for less than one, and when no pair is left.
+    """
+    if n < 1:
+        raise InputError(f"the {n} bluest of each frame are asked for", do="ask for one or more")
+    colour = _colours(pairs)
+    frame = pairs.matches.exposure
+    order = np.lexsort((colour, frame))  # stable, NaN last within a frame
+    first = np.searchsorted(frame[order], frame[order])
+    rank = np.empty(len(pairs), np.int64)
+    rank[order] = np.arange(len(pairs)) - first
+    known = ~np.isnan(colour)
+    return _kept(pairs, known, known & (rank < n))
+
+
+def _colours(pairs: RvbPairs) -> Float:
+    if pairs.colour is None:
+        raise InputError(
+            "has no magnitudes in several bands, hence no colours",
+            where=", ".join(pairs.matches.sources),
+            do="name mag_w1 and others in the option 'columns', or do not select by colour",
+        )
+    return pairs.colour
+
+
+def _kept(pairs: RvbPairs, known: NDArray[np.bool_], kept: NDArray[np.bool_]) -> RvbPairs:
+    """Pairs that are kept; those without a colour are counted by themselves."""
+    if not kept.any():
+        raise InputError(
+            f"no pair of {len(pairs)} is left by the selection by colour, "
+            f"{int((~known).sum())} have no colour",
+            where=", ".join(pairs.matches.sources),
+            do="widen the limits",
+        )
+    return pairs.select(known, reason=NO_COLOUR).select(kept[known], reason=COLOUR)

@@ -1,0 +1,265 @@
+"""Models of several periods from one pass over the data (WSDC D-T033, Appendix C).
+
+The normal equations of the periods add up to those of all data, so that the model of each period,
+the combined one and all that is to be known of their differences come from these sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from astropy.time import Time
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from bayesdist.data import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer.identify import require_full_rank
+from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.normal import NormalEquations, least_squares
+from bayesdist.infer.period_changes import PeriodComparison
+from bayesdist.infer.shards import Matches
+from bayesdist.infer.stars import prepare
+from bayesdist.model import DistortionModel
+
+__all__ = ["PeriodSums", "compare_periods", "mjd_periods", "period_sums"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodSums:
+    """All that the pairs of one period say: sums, which add over pieces of the data.
+
+    Parameters
+    ----------
+    equations : NormalEquations
+        About the mean of the fit of all data, with the pairs that it uses.
+    squares : NormalEquations or None
+        The same with squared weights, where extra weights make the sandwich necessary.
+    n : int
+        Pairs used.
+    """
+
+    equations: NormalEquations
+    squares: NormalEquations | None
+    n: int
+
+    def __add__(self, other: PeriodSums) -> PeriodSums:
+        squares = None
+        if self.squares is not None and other.squares is not None:
+            squares = self.squares + other.squares
+        return PeriodSums(self.equations + other.equations, squares, self.n + other.n)
+
+
+def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
+    """Periods of some days about Modified Julian Dates, for `period_sums`.
+
+    Parameters
+    ----------
+    centres : sequence of float
+    days : float
+        Length of each.
+
+    Returns
+    -------
+    dict of str to tuple of float
+        Decimal years, by the centres' dates.
+
+    Raises
+    ------
+    InputError
+        For a length that is not positive.
+    """
+    if not days > 0:
+        raise InputError(f"periods of {days:g} days are asked for", do="give a positive length")
+    # the time scale of the epochs that a file gives as Modified Julian Dates
+    edges = np.asarray(centres, float)[:, None] + np.array([-days / 2, days / 2])
+    years = np.asarray(Time(edges, format="mjd", scale="tt").decimalyear, float)
+    return {
+        f"{centre:.10g}": (float(start), float(stop))
+        for centre, (start, stop) in zip(centres, years, strict=True)
+    }
+
+
+def period_sums(
+    fit: LinearFit,
+    matches: Matches,
+    periods: Mapping[str, tuple[float, float]],
+    *,
+    radial_weight: float = 1.0,
+) -> dict[str, PeriodSums]:
+    """Sums over the pairs of each period: one pass over the data, piece by piece.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        Of all data: its model, and its rule for leaving pairs out, which is then one for all.
+    matches : MatchTable or PartitionedMatches
+        With errors and epochs.
+    periods : mapping of str to tuple of float
+        First epoch of each period, and the epoch at which it is over, in decimal years.  Pairs
+        outside all of them are not used.
+    radial_weight : float
+        As the fit's.
+
+    Returns
+    -------
+    dict of str to PeriodSums
+
+    Raises
+    ------
+    InputError
+        Without epochs, for periods that overlap, and for a period without pairs.
+    """
+    where = ", ".join(matches.sources)
+    if not matches.has_epoch:
+        raise InputError(
+            "periods need an epoch for every pair", where=where, do="map column 'epoch'"
+        )
+    _check_periods(periods)
+    _check_model(fit.model)
+    sums: dict[str, PeriodSums] = {}
+    for piece in matches.pieces():
+        table = piece.read()
+        assert table.epoch is not None
+        for name, (start, stop) in periods.items():
+            inside = (table.epoch >= start) & (table.epoch < stop)
+            if not inside.any():
+                continue
+            part = _sums_of(fit, table.select(inside), radial_weight)
+            sums[name] = sums[name] + part if name in sums else part
+    for name, (start, stop) in periods.items():
+        if name not in sums:
+            raise InputError(
+                f"period {name} ({start:g} to {stop:g}) has no pairs",
+                where=where,
+                do="correct the period or leave it out",
+            )
+    return {name: sums[name] for name in periods}
+
+
+def _sums_of(fit: LinearFit, matches: MatchTable, radial_weight: float) -> PeriodSums:
+    stars, _ = prepare(fit.model, matches)
+    rule = (fit.clip.theta, fit.clip.chi2_limit, fit.clip.abs_limit, radial_weight)
+    equations = least_squares(stars, fit.mean, *rule)
+    squares = least_squares(stars, fit.mean, *rule, 2) if radial_weight != 1.0 else None
+    return PeriodSums(equations, squares, int(equations.scalars[0]))
+
+
+def _check_periods(periods: Mapping[str, tuple[float, float]]) -> None:
+    if len(periods) < 2:
+        raise InputError(
+            f"{len(periods)} periods are given", do="give two or more: a change needs a before"
+        )
+    ordered = sorted(periods.items(), key=lambda one: one[1])
+    for name, (start, stop) in ordered:
+        if not start < stop:
+            raise InputError(f"period {name} goes from {start:g} to {stop:g}", do="turn it round")
+    for (first, before), (second, after) in pairwise(ordered):
+        if after[0] < before[1]:
+            raise InputError(
+                f"periods {first} and {second} overlap",
+                do="let each begin where the one before it is over, or later",
+            )
+
+
+def _check_model(model: DistortionModel) -> None:
+    if model.n_frame or model.time is not None:
+        raise InputError(
+            "periods are compared by polynomials alone, and the model has "
+            + ("frames of exposures" if model.n_frame else "time-dependent terms"),
+            where="model",
+            do="set frames to 'none' (refer the pairs to common solutions first) and drop the "
+            "time-dependent terms",
+        )
+
+
+def compare_periods(
+    fit: LinearFit, sums: Mapping[str, PeriodSums], *, rescale: bool = True
+) -> PeriodComparison:
+    """The model of each period, and how they differ from the combined one.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        That `period_sums` was given.
+    sums : mapping of str to PeriodSums
+        Two or more periods.  Together they are the combined data set, of which `fit` need not be
+        the fit: where pairs lie outside all periods it is not.
+    rescale : bool
+        Whether all errors are multiplied by one factor, the root of chi-square per degree of
+        freedom about the models of the periods.  Without it, quoted errors that are too small make
+        a change of noise.
+
+    Returns
+    -------
+    PeriodComparison
+        Residual structure that is the same in all periods cancels in the differences as far as
+        the periods cover the array alike.
+
+    Raises
+    ------
+    InputError
+        For less than two periods, and for a model with frames or time dependence.
+    DegenerateError
+        When a period does not determine the model, naming the parameters.
+    """
+    if len(sums) < 2:
+        raise InputError(f"{len(sums)} periods are given", do="give two or more")
+    model = fit.model
+    _check_model(model)
+    rights: list[Float] = []
+    steps: list[Float] = []
+    covs: list[Float] = []
+    normals: list[Float] = []
+    for one in sums.values():
+        arrow, right = one.equations.assemble(model, fit.mean)
+        require_full_rank(arrow, model, one.equations.groups)
+        normal = arrow.dense()
+        inverse = _inverse(normal)
+        rights.append(right)
+        steps.append(inverse @ right)
+        if one.squares is not None:
+            meat, _ = one.squares.assemble(model, fit.mean)
+            covs.append(inverse @ meat.dense() @ inverse)
+        else:
+            covs.append(inverse)
+        normals.append(normal)
+    all_inverse = _inverse(np.sum(normals, axis=0))
+    shares = np.array([all_inverse @ normal for normal in normals])
+    scale = _error_scale(sums.values(), rights, steps) if rescale else 1.0
+    return PeriodComparison(
+        model=model,
+        names=tuple(sums),
+        means=fit.mean + np.array(steps),
+        covs=np.array(covs) * scale**2,
+        shares=shares,
+        counts=tuple(one.n for one in sums.values()),
+        error_scale=scale,
+    )
+
+
+def _inverse(normal: Float) -> Float:
+    """Inverse of a normal matrix, scaled to unit diagonal on the way."""
+    scale = np.sqrt(np.diag(normal))
+    unit = cho_solve(cho_factor(normal / np.outer(scale, scale)), np.eye(len(normal)))
+    return np.asarray(unit / np.outer(scale, scale))
+
+
+def _error_scale(
+    sums: Collection[PeriodSums], rights: Sequence[Float], steps: Sequence[Float]
+) -> float:
+    """Root of chi-square per degree of freedom, of all periods about their own models."""
+    chi2, dof = 0.0, 0
+    for one, right, step in zip(sums, rights, steps, strict=True):
+        chi2 += float(one.equations.scalars[2])
+        dof += 2 * one.n
+        if one.squares is None:
+            # with extra weights chi-square stays that about the fit of all data
+            chi2 -= float(right @ step)
+            dof -= len(step)
+    return float(np.sqrt(chi2 / dof))
