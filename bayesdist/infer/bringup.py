@@ -1,0 +1,380 @@
+"""The bring-up of a calibration: match, fit, match again, until the corners are there too.
+
+WSDC D-T033, sections 2 and 3: with a distortion that is hardly known, pairs are found near the
+centre only; each fit brings more of the detector within reach.  What keeps the loop from following
+false pairs: a place on the detector counts only where more pairs are found than chance gives, pairs
+elsewhere are left out, and the polynomial's order rises as the place does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import poisson
+
+from bayesdist.data.frame_stars import FrameStars, pairs_in_frames
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.rvb_accept import RadialLimit
+from bayesdist.errors import InputError
+from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.model import Chip, DistortionModel
+
+__all__ = ["BringUp", "Round", "bring_up"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+FIRST_ORDER = 2  # of the first fit; each round may take one order more
+GROWS = 0.01  # share of the bins by which the coverage must rise to count as growing
+SETTLED = 0.005  # of the radius in the centre: how far the model may still move
+RARE = 1e-3
+DISPLACED = 10.0  # radii in the corners
+GRID = 17  # points on each axis where models are compared
+OF_THE_BEST = 0.5  # a bin has at least this share of the pairs that good bins have
+_DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+
+
+@dataclass(frozen=True)
+class Round:
+    """One match and the fit to it.
+
+    Parameters
+    ----------
+    order : int
+        Of the fit.
+    acceptance : RadialLimit
+    n_pairs : int
+        All pairs.
+    n_believed : int
+        Those in covered bins, which were fitted.
+    n_false : float
+        False ones that are to be expected among those believed, from what displaced detections
+        find.
+    coverage : float
+        Share of the detector's bins, of those with detections, that have enough more pairs than
+        chance gives.
+    rms : float
+        Of the residuals that the fit kept, one axis.
+    moved : float
+        Largest change of the model over the detector.
+    """
+
+    order: int
+    acceptance: RadialLimit
+    n_pairs: int
+    n_believed: int
+    n_false: float
+    coverage: float
+    rms: float
+    moved: float
+
+
+@dataclass(frozen=True, eq=False)
+class BringUp:
+    """How a calibration came about.
+
+    Parameters
+    ----------
+    rounds : tuple of Round
+    fit : LinearFit
+        Of the last round.
+    matches : MatchTable
+        The believed pairs of the last round; exposures are the frames.
+    index, reference_index : ndarray of int, shape (n_believed,)
+        Rows of the believed pairs in the two lists.
+    covered : ndarray of bool, shape (bins, bins)
+        Which bins [iy, ix] of the detector are covered in the last round.
+    settled : bool
+        Whether the last fit moved no more.
+    """
+
+    rounds: tuple[Round, ...]
+    fit: LinearFit
+    matches: MatchTable
+    index: Int
+    reference_index: Int
+    covered: Bool
+    settled: bool
+
+    @property
+    def sentence(self) -> str:
+        """How it ended."""
+        first, last = self.rounds[0], self.rounds[-1]
+        end = "settled" if self.settled else "has NOT settled"
+        out = (
+            f"The calibration {end} in {len(self.rounds)} rounds: coverage went from "
+            f"{100 * first.coverage:.0f} % to {100 * last.coverage:.0f} % of the detector, "
+            f"{last.n_believed} pairs with {last.rms:.3g} {self.fit.model.unit} rms, some "
+            f"{last.n_false:.0f} of them false."
+        )
+        if last.coverage < 1.0:
+            out += (
+                f" {(~self.covered).sum()} of {self.covered.size} bins are not covered: "
+                "there it is a guess."
+            )
+        return out
+
+
+def bring_up(
+    detections: FrameStars,
+    reference: FrameStars,
+    model: DistortionModel,
+    start: Float | None = None,
+    *,
+    acceptance: RadialLimit,
+    bins: int = 12,
+    radial_weight: float = 1.0,
+    clip_chi2: float = 25.0,
+    clip_abs: float | None = 2.0,
+    max_rounds: int = 30,
+) -> BringUp:
+    """Match and fit in turn until the whole detector is covered and nothing moves.
+
+    As long as the coverage grows, pairs are accepted within a radius that is larger in the corners;
+    then within the radius of the centre everywhere, with even weights.
+
+    Parameters
+    ----------
+    detections : FrameStars
+        On the detector.
+    reference : FrameStars
+        Undistorted positions in the frames.
+    model : DistortionModel
+        One chip, without frames and time dependence.
+    start : ndarray, shape (n_params,), optional
+        First guess; by default none: the detections' pixels are taken for undistorted positions.
+    acceptance : RadialLimit
+        Of the first rounds.  The radius in the centre must allow for the offset there.
+    bins : int
+        On each axis, for the coverage.
+    radial_weight, clip_chi2, clip_abs
+        As `fit_linear`; the extra weight in the corners ends with the larger radius there.
+    max_rounds : int
+
+    Returns
+    -------
+    BringUp
+        Look at `settled`: False where `max_rounds` did not suffice.
+
+    Raises
+    ------
+    InputError
+        For a model of several chips or with frames, a start of another length, a detection outside
+        the detector, or when nowhere on the detector more pairs are found than chance gives.
+    DegenerateError
+        As `fit_linear`, when in the end too little of the detector is covered.
+    """
+    if len(model.chips) > 1 or model.n_frame or model.time is not None:
+        raise InputError(
+            "a calibration is brought up on one chip, without frames and time dependence",
+            where="model",
+            do="select one chip",
+        )
+    if start is not None and np.shape(start) != (model.n_params,):
+        raise InputError(
+            f"the start has shape {np.shape(start)}, and the model {model.n_params} parameters",
+            where="start",
+            do="give the parameters of this model",
+        )
+    field = _Field(detections, reference, model, bins)
+    theta = None if start is None else np.asarray(start, float)
+    rounds: list[Round] = []
+    rule, weight, order, settled = acceptance, radial_weight, min(FIRST_ORDER, model.order), False
+    while True:
+        found = field.match(theta, rule, len(rounds) + 1)
+        matches = field.table(found)
+        options: dict[str, Any] = {
+            "clip_chi2": clip_chi2,
+            "clip_abs": clip_abs,
+            "radial_weight": weight,
+        }
+        # the last fit is that of the model itself, which refuses pairs that cover too little
+        last = settled or len(rounds) + 1 >= max_rounds
+        order = model.order if last else order
+        fit = fit_linear(matches, model, **options) if last else None
+        now = _partial_fit(matches, model, order, options) if fit is None else fit
+        moved = field.distance(theta, _in_model(now, model))
+        theta = _in_model(now, model)
+        rounds.append(
+            Round(
+                order=order,
+                acceptance=rule,
+                n_pairs=found.n_pairs,
+                n_believed=len(found.index),
+                n_false=found.n_false,
+                coverage=found.coverage,
+                rms=float(np.hypot(now.rms_u, now.rms_v) / np.sqrt(2)),
+                moved=moved,
+            )
+        )
+        still = moved < SETTLED * acceptance.centre
+        if fit is not None:
+            covered = found.covered.reshape(bins, bins)
+            return BringUp(
+                tuple(rounds), fit, matches, found.index, found.partner, covered, settled and still
+            )
+        grew = len(rounds) < 2 or found.coverage > rounds[-2].coverage + GROWS
+        if order == model.order and not grew:
+            settled = rule.corner == rule.centre and still
+            rule, weight = RadialLimit(acceptance.centre, acceptance.centre), 1.0
+        order = min(order + 1, model.order)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Pairs in covered bins: their rows in both lists, and what else was found."""
+
+    index: Int
+    partner: Int
+    n_pairs: int
+    n_false: float
+    covered: Bool
+    coverage: float
+
+
+class _Field:
+    """The two lists, and the bins of the detector."""
+
+    def __init__(
+        self, detections: FrameStars, reference: FrameStars, model: DistortionModel, bins: int
+    ) -> None:
+        self.detections, self.reference, self.model, self.bins = detections, reference, model, bins
+        size = model.chips[0].size
+        out = np.zeros(len(detections), bool)
+        for z, n in zip((detections.x, detections.y), size, strict=True):
+            out |= (z < 0.5) | (z > n + 0.5)
+        if out.any():
+            k = int(np.argmax(out))
+            raise InputError(
+                f"detection {k + 1} lies at pixel ({detections.x[k]:.2f}, {detections.y[k]:.2f}), "
+                f"outside the {size[0]:g} x {size[1]:g} detector",
+                where="detections",
+                do="correct the detector's size or drop the row",
+            )
+        ix, iy = (
+            np.clip(((z - 0.5) / n * bins).astype(np.int64), 0, bins - 1)
+            for z, n in zip((detections.x, detections.y), size, strict=True)
+        )
+        self.code = iy * bins + ix
+        self.size = size
+        x, y = (g.ravel() for g in np.meshgrid(*(np.linspace(1.0, n, GRID) for n in size)))
+        self.grid = FrameStars(x, y, np.ones(len(x)), np.zeros(len(x), np.int64))
+
+    def positions(self, theta: Float | None, stars: FrameStars) -> Float:
+        """Undistorted positions (N, 2); None stands for no distortion."""
+        return stars.points if theta is None else self.model.predict(theta, stars.x, stars.y)
+
+    def distance(self, before: Float | None, now: Float) -> float:
+        """Largest difference over the detector."""
+        step = self.positions(now, self.grid) - self.positions(before, self.grid)
+        return float(np.hypot(*step.T).max())
+
+    def match(self, theta: Float | None, rule: RadialLimit, number: int) -> _Found:
+        """Pairs where more are found than chance gives."""
+        stars, n_bins = self.detections, self.bins**2
+        position = self.positions(theta, stars)
+        radius = rule.at(stars.x, stars.y, self.size)
+        index, partner = pairs_in_frames(position, stars.frame, self.reference, radius)
+        # displaced by more than the detector is distorted, detections find strangers only
+        chance = np.zeros(n_bins)
+        for direction in _DIRECTIONS:
+            moved = position + DISPLACED * rule.corner * np.array(direction)
+            strangers, _ = pairs_in_frames(moved, stars.frame, self.reference, radius)
+            chance += np.bincount(self.code[strangers], minlength=n_bins) / len(_DIRECTIONS)
+        count = np.bincount(self.code[index], minlength=n_bins)
+        there = np.bincount(self.code, minlength=n_bins)
+        covered = _covered(count, there, chance)
+        good = covered[self.code[index]]
+        if not good.any():
+            raise InputError(
+                f"{len(index)} pairs are found in round {number} where chance gives "
+                f"{chance.sum():.0f}, and no place on the detector stands out",
+                where="bring-up",
+                do="check orientation, offset and scale of the frames, or give another start or "
+                "a larger radius",
+            )
+        n, n_chance = int(there[covered].sum()), float(chance[covered].sum())
+        return _Found(
+            index=index[good],
+            partner=partner[good],
+            n_pairs=len(index),
+            # only a detection without its own partner takes a stranger
+            n_false=n_chance * (n - int(good.sum())) / (n - n_chance),
+            covered=covered,
+            coverage=float(covered.sum() / (there > 0).sum()),
+        )
+
+    def table(self, found: _Found) -> MatchTable:
+        """The pairs as matches."""
+        stars, others = self.detections, self.reference
+        sigma = np.hypot(stars.sigma[found.index], others.sigma[found.partner])
+        frames, exposure = np.unique(stars.frame[found.index], return_inverse=True)
+        return MatchTable.of_distinct_rows(  # no detection has two partners
+            x=stars.x[found.index],
+            y=stars.y[found.index],
+            u=others.x[found.partner],
+            v=others.y[found.partner],
+            sigma_u=sigma,
+            sigma_v=sigma,
+            unit=self.model.unit,
+            exposure=exposure,
+            exposure_names=tuple(str(f) for f in frames),
+            chip_numbers=(self.model.chips[0].number,),
+            sources=("bring-up",),
+        )
+
+
+def _covered(count: Int, there: Int, chance: Float) -> Bool:
+    """Bins in which more detections have a partner than chance gives, and not much fewer than best.
+
+    Parameters
+    ----------
+    count, there : ndarray of int, shape (n_bins,)
+        Pairs, and detections.
+    chance : ndarray, shape (n_bins,)
+        Pairs of displaced detections.
+    """
+    has = there > 0
+    expected = np.maximum(chance, there * (chance.sum() / there.sum()))
+    # so rare that in all bins together chance does it once in a thousand times
+    clear = poisson.sf(count - 1, expected) < RARE / has.sum()
+    share = np.divide(count - expected, there, out=np.zeros(len(there)), where=has)
+    if not clear.any():
+        return np.zeros(len(there), bool)
+    return np.asarray(clear & (share > OF_THE_BEST * np.quantile(share[clear], 0.9)))
+
+
+def _partial_fit(
+    matches: MatchTable, model: DistortionModel, order: int, options: dict[str, Any]
+) -> LinearFit:
+    """Fit of the part of the detector that has pairs, as if it were a detector of its own."""
+    low = [max(0.0, np.floor(z.min() - 0.5)) for z in (matches.x, matches.y)]
+    high = [np.ceil(z.max() + 0.5) - 1.0 for z in (matches.x, matches.y)]
+    chip = model.chips[0]
+    part = Chip(
+        chip.number,
+        chip.name,
+        (float(high[0] - low[0]), float(high[1] - low[1])),
+        (chip.reference_pixel[0] - low[0], chip.reference_pixel[1] - low[1]),
+    )
+    moved = replace(matches, x=matches.x - low[0], y=matches.y - low[1])
+    return fit_linear(moved, replace(model, order=order, chips=(part,)), **options)
+
+
+def _in_model(fit: LinearFit, model: DistortionModel) -> Float:
+    """Parameters of a fit of part of the detector, in those of the model."""
+    if fit.model == model:
+        return fit.mean
+    basis, part = model.basis(), fit.model.basis()
+    theta = np.zeros(model.n_params)
+    for axis in (0, 1):
+        monomial = np.zeros(basis.n_terms)
+        monomial[: part.n_terms] = part.to_monomials(
+            fit.mean[fit.model.coefficient_slice(None, axis)]
+        )
+        theta[model.coefficient_slice(None, axis)] = basis.from_monomials(monomial)
+    return theta
