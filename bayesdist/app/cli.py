@@ -7,7 +7,6 @@ import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from pathlib import Path
 
 from bayesdist.app.screen import start_logging
 from bayesdist.errors import BayesdistError
@@ -124,9 +123,14 @@ def _parser() -> argparse.ArgumentParser:
         return sub
 
     sub = kind("wise", _simulate_wise, "matched stars of WISE and 2MASS, with a configuration")
-    sub.add_argument("--band", default="W2")
-    sub.add_argument("--stars", type=int, default=6000, metavar="N")
-    sub.add_argument("--fraction", type=float, default=0.03, help="share of false matches")
+    bands = ["W1", "W2", "W3", "W4"]
+    sub.add_argument("--bands", nargs="+", default=bands, metavar="W1", help="all by default")
+    sub.add_argument("--pairs", type=int, metavar="N", help="of each band; as published by default")
+    sub.add_argument("--false-share", type=float, default=0.03, metavar="F")
+    sub.add_argument("--partition-pattern", action="store_true", help="blocks in the residuals")
+    sub.add_argument("--stars", type=int, metavar="N", help="one small table of one band instead")
+    sub.add_argument("--band", metavar="W2", help="of the small table")
+    sub.add_argument("--fraction", type=float, help="of false matches in the small table")
 
     sub = kind("acs", _simulate_acs, "star lists, catalogue and log of the 47 Tuc campaign")
     sub.add_argument("--exposures", type=int, default=110, metavar="N", help="in F606W")
@@ -239,31 +243,9 @@ def _simulate_acs(options: argparse.Namespace) -> None:
 
 
 def _simulate_wise(options: argparse.Namespace) -> None:
-    import numpy as np
+    from bayesdist.app.simulate_wise import simulate_wise_pairs
 
-    from bayesdist.app.demo import simulation_config, write_simulation
-    from bayesdist.errors import InputError
-    from bayesdist.simulate import simulate_wise
-
-    if options.stars < 1 or not 0 <= options.fraction < 1:
-        raise InputError(
-            "a simulation needs stars, and true matches among them",
-            do="give --stars 1 or more and --fraction in [0, 1)",
-        )
-    folder = Path(options.output)
-    if (folder / "config.toml").exists() and not options.force:
-        raise InputError(
-            "the folder holds a configuration", where=str(folder), do="replace it by --force"
-        )
-    matches, truth = simulate_wise(
-        options.stars,
-        band=options.band,
-        fraction=options.fraction,
-        rng=np.random.default_rng(options.seed),
-    )
-    write_simulation(folder, matches, truth, simulation_config(options.band))
-    print(f"{len(matches)} pairs, {int(truth.false.sum())} of them false: {folder / 'stars.ecsv'}")
-    print(f"calibrate them:  bayesdist run {folder / 'config.toml'} -o {folder / 'run'}")
+    print(simulate_wise_pairs(options))
 
 
 def _init(options: argparse.Namespace) -> None:

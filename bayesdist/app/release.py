@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.campaign.filter_figures import draw_filters
 from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.campaign.release import write_files
 from bayesdist.app.campaign.session import CampaignSession, session_of
@@ -88,6 +89,7 @@ def release_runs(
                 next(iter(sessions.values())), folder, solutions, _tables(sessions), notes
             )
             write_table(table, folder / "filters.ecsv")
+            figures = draw_filters(folder, sessions, solutions)
             write_json(
                 folder / "release.json",
                 {
@@ -98,6 +100,7 @@ def release_runs(
                     "converged": not doubts,
                     "drift": table.meta["drift"],
                     "products": files,
+                    "figures": list(figures),
                 },
             )
     rows = [dict(zip(table.colnames, row, strict=True)) for row in table]

@@ -12,17 +12,16 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.data.pieces import even_edges
 from bayesdist.data.writing import write_partitioned
 from bayesdist.simulate.matches import Truth
-from bayesdist.simulate.wise import simulate_wise
+from bayesdist.simulate.wise import SAMPLE_SIZES, simulate_wise
 
-__all__ = ["W2_PAIRS", "simulate_wise_partitioned"]
+__all__ = ["simulate_wise_partitioned"]
 
-W2_PAIRS = 11_213_542  # pairs of the W2 calibration, WSDC D-T033, section 4
 CHUNK = 1_000_000  # pairs in memory at a time
 
 
 def simulate_wise_partitioned(
     folder: str | os.PathLike[str],
-    n: int = W2_PAIRS,
+    n: int = SAMPLE_SIZES["W2"],
     *,
     band: str = "W2",
     rng: np.random.Generator,

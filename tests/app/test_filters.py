@@ -183,7 +183,8 @@ def test_a_filter_without_exposures_before_a_break(folder, runs, tmp_path):
 def test_one_set_of_files(release):
     assert sorted(p.name for p in release.path.iterdir()) == [
         *("acs_wfc_d2i.fits", "acs_wfc_f814w_npl.fits", "acs_wfc_post_idc.fits"),
-        *("acs_wfc_pre_idc.fits", "filters.ecsv", "release.json"),
+        *("acs_wfc_pre_idc.fits", "filters.ecsv"),
+        *("filters_A_2.png", "filters_B_2.png", "filters_B_3.png", "release.json"),
     ]
     for period in ("pre", "post"):
         tab = read_idctab(release.path / f"acs_wfc_{period}_idc.fits")

@@ -1,7 +1,7 @@
-"""The WISE solution against the numbers printed in the report that it comes from.
+"""The WISE solutions against the numbers printed in the report that they come from.
 
 Source: WSDC D-T033, "WISE IOC Distortion Calibration", Appendix B (current SIP coefficients for
-ops), band W2, and section 4 (vector-flow diagrams).
+ops) and section 4 (vector-flow diagrams); most closely of band W2.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from scipy import stats
 
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear
+from bayesdist.model import polynomial_terms
 from bayesdist.simulate import simulate_wise, wise_solution
+from bayesdist.simulate.wise import WISE_COEFFICIENTS
 
 # fmt: off
 # AP_p_q and BP_p_q of W2 as printed: (p, q): (AP, BP)
@@ -103,6 +105,88 @@ def test_closure_would_show_a_wrong_sign(pixels):
     for key, (ap, bp) in INVERSE.items():
         for wrong in ((-ap, bp), (ap, -bp)):
             assert closure(INVERSE | {key: wrong}, dx, dy, correction).max() > 0.01
+
+
+# band: where the outermost pixels that the printed DMAX belongs to lie, A_DMAX, B_DMAX, longest
+PRINTED = {
+    "W1": (507.5, 2.046, 1.066, 2.931),
+    "W2": (507.5, 2.083, 1.089, 3.048),
+    "W3": (507.5, 2.095, 1.300, 3.004),
+    "W4": (254.0, 0.971, 0.582, 1.435),
+}
+
+
+def field(band, reach):
+    """Correction over a grid within +-reach pixels of the centre, (N, 2)."""
+    model, theta = wise_solution(band)
+    centre = np.array(model.chips[0].reference_pixel)
+    steps = np.linspace(-reach, reach, 201)
+    offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    return model.predict(theta, *(offset + centre).T) - offset - centre
+
+
+@pytest.mark.parametrize("band", PRINTED)
+def test_every_band_has_the_printed_extent(band):
+    reach, a_dmax, b_dmax, longest = PRINTED[band]
+    correction = field(band, reach)
+    np.testing.assert_allclose(np.abs(correction).max(axis=0), [a_dmax, b_dmax], atol=0.0005)
+    model, theta = wise_solution(band)
+    assert model.chips[0].size == ((508.0, 508.0) if band == "W4" else (1016.0, 1016.0))
+    centre = np.array(model.chips[0].reference_pixel)
+    vectors = correction - (model.predict(theta, *centre[:, None])[0] - centre)
+    assert np.hypot(*vectors.T).max() == pytest.approx(longest, rel=0.005)
+
+
+def test_the_misprint_of_w1_would_show():
+    """Printed as B_0_2 is B_1_1; with it the correction on y reaches 2 px, and 1.066 is printed."""
+    reach, _, b_dmax, _ = PRINTED["W1"]
+    (_, b) = WISE_COEFFICIENTS["W1"]
+    terms = polynomial_terms(4)
+    y = np.linspace(-reach, reach, 201)
+    off = (b[terms.index((1, 1))] - b[terms.index((0, 2))]) * y**2
+    # of the grid, x runs fastest
+    printed = field("W1", reach)[:, 1] + np.repeat(off, 201)
+    assert np.abs(printed).max() > 1.8 * b_dmax
+
+
+# BP_p_q of W1 as printed, and AP_p_q, both in the order of polynomial_terms(4)
+# fmt: off
+W1_INVERSE = (
+    (-7.233219e-01, 7.777227e-04, 1.261763e-04, 1.636841e-06, -1.342059e-06, 7.795772e-06,
+     -2.759976e-09, 1.107923e-10, -1.159637e-09, 2.696271e-10,
+     -1.804259e-12, 4.712913e-13, -1.580363e-12, 6.084245e-13, 6.665114e-13),
+    (7.930997e-02, 2.484437e-04, -3.239962e-04, 6.524476e-08, 3.542573e-06, -1.163635e-06,
+     6.293886e-11, 2.734704e-10, 4.895069e-10, 3.198763e-09,
+     -8.708176e-13, -7.164364e-13, 2.664114e-13, -1.423222e-12, 8.509823e-13),
+)
+# fmt: on
+
+
+def test_the_mended_value_of_w1_is_what_the_printed_inverse_implies():
+    """B_0_2 of W1 by least squares from the closure of the fifteen printed BP alone."""
+    reach = PRINTED["W1"][0]
+    steps = np.linspace(-reach, reach, 41)
+    dx, dy = (g.ravel() for g in np.meshgrid(steps, steps))
+    U, V = np.column_stack([dx, dy]).T + field_at("W1", dx, dy).T
+
+    def closure(change):
+        moved = V + change * dy**2
+        bp = sum(
+            c * U**i * moved**j
+            for (i, j), c in zip(polynomial_terms(4), W1_INVERSE[1], strict=True)
+        )
+        return moved + bp - dy
+
+    slope = (closure(1e-9) - closure(-1e-9)) / 2e-9
+    change = -(slope @ closure(0.0)) / (slope @ slope)
+    assert abs(change) < 1e-9  # 0.1 % of the value: 0.0003 px in a corner
+
+
+def field_at(band, dx, dy):
+    """Correction at offsets from the centre."""
+    model, theta = wise_solution(band)
+    cx, cy = model.chips[0].reference_pixel
+    return model.predict(theta, dx + cx, dy + cy) - np.column_stack([dx + cx, dy + cy])
 
 
 def test_unknown_bands_are_refused():

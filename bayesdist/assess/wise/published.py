@@ -1,0 +1,151 @@
+"""The residual tables printed in WSDC D-T033, and how much of them is noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+
+import numpy as np
+
+from bayesdist.assess.wise.rows import STATISTICS
+from bayesdist.errors import InputError
+
+__all__ = [
+    "TABLE_5_1",
+    "TABLE_5_2",
+    "TABLE_5_3",
+    "TABLE_C_1",
+    "PrintedRow",
+    "noise_of_bins",
+    "printed_rows",
+]
+
+# columns: mean, sigma, min, max, median, 1 %, 99 %
+TABLE_5_1 = """
+W1/X 0.002070 0.01949 -0.08298 0.06435 0.002512 -0.04942 0.04579
+W1/Y -0.009074 0.01159 -0.04935 0.04348 -0.00373 -0.03837 0.0251
+W1/radial 0.10500 0.01133 0.08822 0.1532 0.1024 0.08905 0.1389
+W2/X 0.002548 0.01679 -0.05003 0.03995 0.003702 -0.03939 0.03376
+W2/Y 0.01571 0.008914 -0.00831 0.09537 0.01525 -0.003964 0.04101
+W2/radial 0.1153 0.008315 0.1003 0.1602 0.1141 0.1023 0.1402
+W3/X 0.001249 0.01608 -0.07536 0.06285 0.000749 -0.04667 0.03709
+W3/Y 0.003491 0.008846 -0.02428 0.05594 0.003343 -0.01592 0.02558
+W3/radial 0.2993 0.01451 0.2736 0.3576 0.2971 0.2765 0.3421
+W4/X -0.003836 0.0236 -0.07924 0.07422 -0.004239 -0.05865 0.04831
+W4/Y 0.000638 0.02276 -0.07615 0.08211 0.001318 -0.05045 0.05234
+W4/radial 0.4832 0.0156 0.4345 0.5377 0.4829 0.4487 0.5187
+"""
+
+TABLE_5_2 = """
+W2-W1/X 0.00052 0.03326 -0.1078 0.09478 0.000037 -0.09063 0.08506
+W2-W1/Y 0.05974 0.03211 -0.04772 0.1874 0.05815 -0.01593 0.1630
+W3-W1/X -0.003054 0.04556 -0.2649 0.1186 -0.000803 -0.1474 0.08938
+W3-W1/Y 0.02614 0.03602 -0.1187 0.2176 0.02591 -0.05655 0.1174
+W4-W1/X -0.03016 0.1339 -0.4757 0.4248 -0.03325 -0.3536 0.2691
+W4-W1/Y 0.01859 0.1267 -0.3999 0.4230 0.1710 -0.2721 0.3172
+W3-W2/X -0.003574 0.04361 -0.2090 0.1282 0.000165 -0.1413 0.08150
+W3-W2/Y -0.03360 0.03034 -0.1408 0.04692 -0.03316 -0.1147 0.02745
+W4-W2/X -0.03068 0.1339 -0.4978 0.3718 -0.03169 -0.3679 0.2731
+W4-W2/Y -0.04080 0.1273 -0.4553 0.3888 -0.03699 -0.3401 0.2463
+W4-W3/X -0.02711 0.1257 -0.4398 0.3993 -0.02883 -0.3322 0.2591
+W4-W3/Y -0.007193 0.1258 -0.4086 0.4141 -0.005563 -0.2878 0.2811
+"""
+
+TABLE_5_3 = """
+W1/X 0.0 0.2073 -1.111 1.111 0.0 -0.5059 0.5059
+W1/Y 0.0 0.0388 -0.1982 0.1982 0.0 -0.1005 0.1005
+W2/X 0.0 0.06531 -0.2474 0.2474 0.0 -0.1471 0.1471
+W2/Y 0.0 0.03467 -0.2851 0.2851 0.0 -0.08801 0.08801
+W3/X 0.0 0.06256 -0.3801 0.3801 0.0 -0.1546 0.1546
+W3/Y 0.0 0.03440 -0.2206 0.2206 0.0 -0.0829 0.0829
+W4/X 0.0 0.1811 -0.8310 0.8310 0.0 -0.4249 0.4249
+W4/Y 0.0 0.1764 -0.8766 0.8766 0.0 -0.4102 0.4102
+"""
+
+TABLE_C_1 = """
+25-Day/X 0.00016 0.03644 -0.08390 0.09606 -0.00066 -0.06650 0.08068
+JD212.5/X 0.00245 0.03778 -0.09498 0.10607 0.00102 -0.07175 0.08426
+JD412.5/X -0.00256 0.03630 -0.09234 0.09361 -0.00368 -0.07417 0.07788
+25-Day/Y 0.00060 0.01559 -0.05461 0.08401 0.00003 -0.03432 0.04386
+JD212.5/Y -0.00393 0.01653 -0.05701 0.09080 -0.00429 -0.03883 0.04397
+JD412.5/Y 0.00544 0.01675 -0.04477 0.07794 0.00426 -0.03108 0.04950
+"""
+
+
+@dataclass(frozen=True)
+class PrintedRow:
+    """A row as printed.
+
+    Parameters
+    ----------
+    label : str
+    value : mapping of str to float
+        By the names in `STATISTICS`.
+    rounding : mapping of str to float
+        Half a unit of the last digit printed.
+    """
+
+    label: str
+    value: Mapping[str, float]
+    rounding: Mapping[str, float]
+
+
+def printed_rows(text: str) -> dict[str, PrintedRow]:
+    """Rows of a printed table, by label.
+
+    Parameters
+    ----------
+    text : str
+        One row on a line: the label, then seven numbers in the order of `STATISTICS`.
+
+    Returns
+    -------
+    dict of str to PrintedRow
+
+    Raises
+    ------
+    InputError
+        For a row that has not seven numbers.
+    """
+    out = {}
+    for k, line in enumerate(text.strip().splitlines(), 1):
+        label, *numbers = line.split()
+        try:
+            decimals = [Decimal(number) for number in numbers]
+        except ArithmeticError:
+            decimals = []
+        if len(decimals) != len(STATISTICS) or not all(d.is_finite() for d in decimals):
+            raise InputError(
+                f"a row of statistics is a label and {len(STATISTICS)} numbers, not {line!r}",
+                where=f"row {k}",
+            )
+        value = {n: float(d) for n, d in zip(STATISTICS, decimals, strict=True)}
+        half = {
+            n: float(Decimal((0, (5,), int(d.as_tuple().exponent) - 1)))
+            for n, d in zip(STATISTICS, decimals, strict=True)
+        }
+        out[label] = PrintedRow(label, value, half)
+    return out
+
+
+def noise_of_bins(mean_length: float, n_pairs: float, n_bins: int = 31 * 31) -> float:
+    """Noise that means of bins must hold, from the mean length of single residuals.
+
+    A residual of normal errors s on each axis has the mean length sqrt(pi / 2) s, which the radial
+    rows of Table 5-1 give; a bin's mean has the noise s / sqrt(pairs in the bin).
+
+    Parameters
+    ----------
+    mean_length : float
+        Mean of a radial row.
+    n_pairs : float
+        Pairs of the band (section 4 gives them), evenly over the bins.
+    n_bins : int
+
+    Returns
+    -------
+    float
+        Of each axis, in the unit of `mean_length`.
+    """
+    return float(mean_length / np.sqrt(np.pi / 2) / np.sqrt(n_pairs / n_bins))

@@ -1,0 +1,96 @@
+"""Linear terms of several filters with the common drift taken out: Figures 25 and 26."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
+
+__all__ = ["FilterTerm", "filters_figure"]
+
+Float = NDArray[np.float64]
+
+MARKERS = "os^Dvp"
+
+
+@dataclass(frozen=True, eq=False)
+class FilterTerm:
+    """A linear term of one filter on one chip, without its drift.
+
+    Parameters
+    ----------
+    filter, chip : str
+    epoch, value, sigma : ndarray, shape (E,)
+        Of the exposures; values per pixel.
+    alpha, sigma_alpha : ndarray, shape (S,)
+        The released value of each segment at its reference date, and its error.
+    """
+
+    filter: str
+    chip: str
+    epoch: Float
+    value: Float
+    sigma: Float
+    alpha: Float
+    sigma_alpha: Float
+
+
+def filters_figure(term: str, courses: Sequence[FilterTerm], breaks: Sequence[float]) -> Figure:
+    """One panel for each chip: points are exposures, lines the released values.
+
+    Parameters
+    ----------
+    term : str
+        As 'A_2'.
+    courses : sequence of FilterTerm
+        Of all chips and filters, the reference filter first.
+    breaks : sequence of float
+        Dates between which the released values hold.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    by_chip: Mapping[str, list[FilterTerm]] = {
+        chip: [c for c in courses if c.chip == chip]
+        for chip in dict.fromkeys(c.chip for c in courses)
+    }
+    filters = list(dict.fromkeys(c.filter for c in courses))
+    with figure_style():
+        fig = new_figure(WIDTH, 0.7 + 2.2 * len(by_chip))
+        panels = fig.subplots(len(by_chip), 1, sharex=True, squeeze=False)[:, 0]
+        for ax, (chip, mine) in zip(panels, by_chip.items(), strict=True):
+            reference = round(float(mine[0].alpha[0]), 5)
+            for one in mine:
+                k = filters.index(one.filter)
+                color = CYCLE[k % len(CYCLE)]
+                ax.errorbar(
+                    one.epoch, 1e6 * (one.value - reference), 1e6 * one.sigma,
+                    fmt=MARKERS[k % len(MARKERS)], ms=3, mec="none", elinewidth=0.6,
+                    color=color, alpha=0.8, label=one.filter,
+                )  # fmt: skip
+                edges = (one.epoch.min() - 0.3, *breaks, one.epoch.max() + 0.3)
+                for s, (level, error) in enumerate(zip(one.alpha, one.sigma_alpha, strict=True)):
+                    low, high = sorted((edges[s], edges[s + 1]))
+                    y = 1e6 * (level - reference)
+                    ax.plot((low, high), (y, y), color=color, lw=1.0)
+                    ax.fill_between(
+                        (low, high), y - 1e6 * error, y + 1e6 * error,
+                        color=color, alpha=0.2, lw=0,
+                    )  # fmt: skip
+            for date in breaks:
+                ax.axvline(date, color=INK, lw=0.6, ls=":")
+            sign = "−" if reference >= 0 else "+"
+            ax.set_ylabel(f"${term}$ {sign} {abs(reference):.10g} [10⁻⁶]")
+            ax.set_title(f"{chip}, drift taken out" if chip else "drift taken out")
+            ax.grid(True, lw=0.4, color="#E3E8ED")
+            ax.set_axisbelow(True)
+        panels[-1].set_xlabel("epoch [yr]")
+        handles, labels = panels[0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    return fig
