@@ -222,7 +222,8 @@ def test_offsets_between_filters_are_the_true_ones(release):
 def plane(sessions, folder):
     """Both solutions as they are released, turned into the plane of the IDCTAB."""
     first, other = (sessions[name].solution for name in FILTERS)
-    released = {"F606W": first, "F814W": with_drift_of(other, first)}
+    formal = sessions["F814W"].fit
+    released = {"F606W": first, "F814W": with_drift_of(other, first, formal=formal)}
     views = {name: reference_gauge(without_frames(one), 2) for name, one in released.items()}
     orientation = orientation_from_idctab(
         views["F606W"],
