@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import poisson
 
-from bayesdist.data.frame_stars import FrameStars, pairs_in_frames
+from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError
+from bayesdist.infer.bringup_pairs import Field
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.model import Chip, DistortionModel
 
@@ -31,11 +31,6 @@ Bool = NDArray[np.bool_]
 FIRST_ORDER = 2  # of the first fit; each round may take one order more
 GROWS = 0.01  # share of the bins by which the coverage must rise to count as growing
 SETTLED = 0.005  # of the radius in the centre: how far the model may still move
-RARE = 1e-3
-DISPLACED = 10.0  # radii in the corners
-GRID = 17  # points on each axis where models are compared
-OF_THE_BEST = 0.5  # a bin has at least this share of the pairs that good bins have
-_DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
 @dataclass(frozen=True)
@@ -180,7 +175,7 @@ def bring_up(
             where="start",
             do="give the parameters of this model",
         )
-    field = _Field(detections, reference, model, bins)
+    field = Field(detections, reference, model, bins)
     theta = None if start is None else np.asarray(start, float)
     rounds: list[Round] = []
     rule, weight, order, settled = acceptance, radial_weight, min(FIRST_ORDER, model.order), False
@@ -222,130 +217,6 @@ def bring_up(
             settled = rule.corner == rule.centre and still
             rule, weight = RadialLimit(acceptance.centre, acceptance.centre), 1.0
         order = min(order + 1, model.order)
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """Pairs in covered bins: their rows in both lists, and what else was found."""
-
-    index: Int
-    partner: Int
-    n_pairs: int
-    n_false: float
-    covered: Bool
-    coverage: float
-
-
-class _Field:
-    """The two lists, and the bins of the detector."""
-
-    def __init__(
-        self, detections: FrameStars, reference: FrameStars, model: DistortionModel, bins: int
-    ) -> None:
-        self.detections, self.reference, self.model, self.bins = detections, reference, model, bins
-        size = model.chips[0].size
-        out = np.zeros(len(detections), bool)
-        for z, n in zip((detections.x, detections.y), size, strict=True):
-            out |= (z < 0.5) | (z > n + 0.5)
-        if out.any():
-            k = int(np.argmax(out))
-            raise InputError(
-                f"detection {k + 1} lies at pixel ({detections.x[k]:.2f}, {detections.y[k]:.2f}), "
-                f"outside the {size[0]:g} x {size[1]:g} detector",
-                where="detections",
-                do="correct the detector's size or drop the row",
-            )
-        ix, iy = (
-            np.clip(((z - 0.5) / n * bins).astype(np.int64), 0, bins - 1)
-            for z, n in zip((detections.x, detections.y), size, strict=True)
-        )
-        self.code = iy * bins + ix
-        self.size = size
-        x, y = (g.ravel() for g in np.meshgrid(*(np.linspace(1.0, n, GRID) for n in size)))
-        self.grid = FrameStars(x, y, np.ones(len(x)), np.zeros(len(x), np.int64))
-
-    def positions(self, theta: Float | None, stars: FrameStars) -> Float:
-        """Undistorted positions (N, 2); None stands for no distortion."""
-        return stars.points if theta is None else self.model.predict(theta, stars.x, stars.y)
-
-    def distance(self, before: Float | None, now: Float) -> float:
-        """Largest difference over the detector."""
-        step = self.positions(now, self.grid) - self.positions(before, self.grid)
-        return float(np.hypot(*step.T).max())
-
-    def match(self, theta: Float | None, rule: RadialLimit, number: int) -> _Found:
-        """Pairs where more are found than chance gives."""
-        stars, n_bins = self.detections, self.bins**2
-        position = self.positions(theta, stars)
-        radius = rule.at(stars.x, stars.y, self.size)
-        index, partner = pairs_in_frames(position, stars.frame, self.reference, radius)
-        # displaced by more than the detector is distorted, detections find strangers only
-        chance = np.zeros(n_bins)
-        for direction in _DIRECTIONS:
-            moved = position + DISPLACED * rule.corner * np.array(direction)
-            strangers, _ = pairs_in_frames(moved, stars.frame, self.reference, radius)
-            chance += np.bincount(self.code[strangers], minlength=n_bins) / len(_DIRECTIONS)
-        count = np.bincount(self.code[index], minlength=n_bins)
-        there = np.bincount(self.code, minlength=n_bins)
-        covered = _covered(count, there, chance)
-        good = covered[self.code[index]]
-        if not good.any():
-            raise InputError(
-                f"{len(index)} pairs are found in round {number} where chance gives "
-                f"{chance.sum():.0f}, and no place on the detector stands out",
-                where="bring-up",
-                do="check orientation, offset and scale of the frames, or give another start or "
-                "a larger radius",
-            )
-        n, n_chance = int(there[covered].sum()), float(chance[covered].sum())
-        return _Found(
-            index=index[good],
-            partner=partner[good],
-            n_pairs=len(index),
-            # only a detection without its own partner takes a stranger
-            n_false=n_chance * (n - int(good.sum())) / (n - n_chance),
-            covered=covered,
-            coverage=float(covered.sum() / (there > 0).sum()),
-        )
-
-    def table(self, found: _Found) -> MatchTable:
-        """The pairs as matches."""
-        stars, others = self.detections, self.reference
-        sigma = np.hypot(stars.sigma[found.index], others.sigma[found.partner])
-        frames, exposure = np.unique(stars.frame[found.index], return_inverse=True)
-        return MatchTable.of_distinct_rows(  # no detection has two partners
-            x=stars.x[found.index],
-            y=stars.y[found.index],
-            u=others.x[found.partner],
-            v=others.y[found.partner],
-            sigma_u=sigma,
-            sigma_v=sigma,
-            unit=self.model.unit,
-            exposure=exposure,
-            exposure_names=tuple(str(f) for f in frames),
-            chip_numbers=(self.model.chips[0].number,),
-            sources=("bring-up",),
-        )
-
-
-def _covered(count: Int, there: Int, chance: Float) -> Bool:
-    """Bins in which more detections have a partner than chance gives, and not much fewer than best.
-
-    Parameters
-    ----------
-    count, there : ndarray of int, shape (n_bins,)
-        Pairs, and detections.
-    chance : ndarray, shape (n_bins,)
-        Pairs of displaced detections.
-    """
-    has = there > 0
-    expected = np.maximum(chance, there * (chance.sum() / there.sum()))
-    # so rare that in all bins together chance does it once in a thousand times
-    clear = poisson.sf(count - 1, expected) < RARE / has.sum()
-    share = np.divide(count - expected, there, out=np.zeros(len(there)), where=has)
-    if not clear.any():
-        return np.zeros(len(there), bool)
-    return np.asarray(clear & (share > OF_THE_BEST * np.quantile(share[clear], 0.9)))
 
 
 def _partial_fit(
