@@ -2,86 +2,30 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.field_terms import FieldTerm
-from bayesdist.assess.fields import MODEL, ErrorFields, draw_errors
-from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
-from bayesdist.assess.names import require_known
+from bayesdist.assess.grid import DEFAULT_GRID
+from bayesdist.assess.position_errors import Judged, Place, PositionErrors, position_errors
+from bayesdist.assess.remedy import Remedy, find_remedy
+from bayesdist.assess.requirement import Requirement
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.statistics import STATISTICS, field_statistic
-from bayesdist.assess.terms import LocalTerm, UserTerm, combined_sigma
-from bayesdist.assess.units import UNITS, convert, pixel_scale_of
+from bayesdist.assess.terms import LocalTerm, UserTerm
+from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.assess.verdict import counting_error, effective_draws, verdict_of
+from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
-from bayesdist.model import Chip
+from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["Margin", "Requirement", "check_requirements"]
+__all__ = ["Margin", "Requirement", "check_requirements", "judged_places"]
 
 Float = NDArray[np.float64]
-Case = tuple[float | None, tuple[Chip, ...]]
 
-# Grid points times draws whose errors are held at once: two axes of them are 8 MB.
-BLOCK = 500_000
-
-
-@dataclass(frozen=True)
-class Requirement:
-    """A limit on a statistic of the position error over the detector, which is all of its chips.
-
-    Parameters
-    ----------
-    name : str
-    statistic : str
-        One of `STATISTICS`.
-    limit : float
-        Positive, in `unit`.
-    unit : str
-        'pix', 'arcsec', 'mas' or 'deg'.
-    probability : float
-        With which the statistic must be at or under the limit, between 0 and 1.
-    epoch : float, optional
-        Decimal years.
-    chip : int, optional
-        Number of the one chip that is judged; all chips together by default.
-
-    Raises
-    ------
-    InputError
-        For an unknown statistic or unit, or a limit or probability out of range.
-    """
-
-    name: str
-    statistic: str
-    limit: float
-    unit: str = "pix"
-    probability: float = 0.95
-    epoch: float | None = None
-    chip: int | None = None
-
-    def __post_init__(self) -> None:
-        require_known(self.statistic, STATISTICS, "statistic", where=self.where)
-        require_known(self.unit, UNITS, "unit", where=self.where)
-        if not (math.isfinite(self.limit) and self.limit > 0):
-            raise InputError(
-                f"the limit is {self.limit}", where=self.where, do="give a positive number"
-            )
-        if not 0 < self.probability < 1:
-            raise InputError(
-                f"the probability is {self.probability}",
-                where=self.where,
-                do="give a number between 0 and 1, without the ends",
-            )
-
-    @property
-    def where(self) -> str:
-        """How messages name it."""
-        return f"requirement {self.name!r}"
+EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +53,16 @@ class Margin:
     unit : str
         The requirement's.
     epoch : float or None
-        At which it was judged.
+        At which it was judged; of a range of epochs the worst one.
     n_effective : float
         Independent draws that the draws are worth.
     draws : ndarray, shape (n,)
-        The statistic of every draw.
+        The statistic of every draw; over a range of epochs the largest.
+    worst : Place
+        Where the error is largest, at that epoch; its size in `unit`.
+    remedy : Remedy or None
+        The term that would have to shrink, and how far, for the requirement to be met; None where
+        it is met, and where there is doubt about all numbers.
     """
 
     requirement: Requirement
@@ -128,6 +77,13 @@ class Margin:
     epoch: float | None
     n_effective: float
     draws: Float
+    worst: Place
+    remedy: Remedy | None = None
+
+    @property
+    def percent(self) -> float:
+        """The margin in percent of the limit."""
+        return 100.0 * self.margin / self.requirement.limit
 
 
 def check_requirements(
@@ -138,6 +94,7 @@ def check_requirements(
     fields: Sequence[FieldTerm] = (),
     aligned: bool = False,
     local: Sequence[LocalTerm] = (),
+    centroid: MagnitudeErrors | None = None,
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     chip: int | None = None,
@@ -160,6 +117,10 @@ def check_requirements(
     The field is that of all chips: the same grid on each of them, so that each has the same weight.
     A draw of the solution and an offset are common to all chips.
 
+    Of a relative error the statistic is that of the differences between two places, over all pairs
+    of points.  Over a range of epochs the draws of everything are the same throughout, and that of
+    the statistic is the largest over nine epochs and the breaks between them.
+
     Parameters
     ----------
     solution : LinearFit or Posterior
@@ -171,6 +132,8 @@ def check_requirements(
         over all chips, also where one is judged.  The user's terms stay as they are given.
     local : sequence of LocalTerm
         Measured beside the solution, on this grid.
+    centroid : MagnitudeErrors, optional
+        Errors of centroids, in the unit of the solution: for requirements that name a magnitude.
     grid : tuple of int
         Points on x and y.
     epoch : float, optional
@@ -196,56 +159,115 @@ def check_requirements(
     ------
     InputError
         For a requirement without an epoch where the model depends on time, units that need a pixel
-        scale that is not known, an unknown chip, a bad grid, or fewer than two draws.
+        scale that is not known, an unknown chip, a bad grid, a region without points of the grid, a
+        magnitude without errors by magnitude, or fewer than two draws.
     """
     unit = solution.model.unit
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution, chip)
-    epochs = [r.epoch if r.epoch is not None else epoch for r in requirements]
-    for r, t in zip(requirements, epochs, strict=True):
+    for r in requirements:
         convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
-        if t is None and solution.model.time is not None:
-            raise InputError(
-                "the model depends on time and no epoch is given",
-                where=r.where,
-                do="give the requirement an epoch, or set assess.epoch",
-            )
-    systematic = combined_sigma(terms, "systematic", unit, pixel_scale)
-    random = combined_sigma(terms, "random", unit, pixel_scale)
+    for t in terms:
+        t.sigma(unit, pixel_scale)
     if not requirements:
         return ()
-
-    # a field of the error is that of some chips at an epoch
-    cases = [
-        (t, _chips_of(r, solution, chip, t)) for r, t in zip(requirements, epochs, strict=True)
-    ]
-    added = [term for term in fields if term.without is None]
-    drawn = draw_errors(solution, n_draws, rng, fields=added, aligned=aligned)
-    offsets = rng.normal(size=(n_draws, 2)) * systematic
-    statistics: dict[tuple[Case, str], Float] = {}
-    for case in dict.fromkeys(cases):
-        names = {r.statistic for r, c in zip(requirements, cases, strict=True) if c == case}
-        epoch, chips = case
-        points = {one.number: mesh(*grid_pixels(one.size, grid)) for one in chips}
-        errors = drawn.at(points, epoch=epoch)
-        everywhere = np.concatenate([_at_points(f, random, local, grid) for f in errors])
-        for name, values in _statistics(errors, sorted(names), offsets, everywhere, rng).items():
-            statistics[case, name] = values
+    cases = [judged_places(r, solution.model, epoch=epoch, chip=chip) for r in requirements]
+    errors = position_errors(
+        solution,
+        terms=terms,
+        fields=[term for term in fields if term.without is None],
+        aligned=aligned,
+        local=local,
+        centroid=centroid,
+        grid=grid,
+        n_draws=n_draws,
+        rng=rng,
+        pixel_scale=pixel_scale,
+    )
+    wanted: dict[Judged, set[str]] = {}
+    for r, case in zip(requirements, cases, strict=True):
+        for judged in case:
+            wanted.setdefault(judged, set()).add(r.statistic)
+    found = {}
+    for judged, names in wanted.items():
+        owner = next(r for r, case in zip(requirements, cases, strict=True) if judged in case)
+        try:
+            found[judged] = errors.statistics(judged, sorted(names))
+        except InputError as error:  # of its region, separation or magnitude
+            raise InputError(
+                error.cause, where=f"{owner.where}, {error.where}", do=error.do
+            ) from None
 
     doubt = _doubt(solution, converged) or doubt
     n_effective = effective_draws(solution, n_draws)
     margins = []
     for r, case in zip(requirements, cases, strict=True):
-        draws = statistics[case, r.statistic] * convert(1.0, unit, r.unit, pixel_scale)
-        margins.append(_margin(r, case[0], draws, n_effective, doubt))
+        factor = convert(1.0, unit, r.unit, pixel_scale)
+        draws = [factor * found[judged][r.statistic] for judged in case]
+        margins.append(_margin(r, case, draws, errors, factor, n_effective, doubt))
     return tuple(margins)
 
 
+def judged_places(
+    requirement: Requirement,
+    model: DistortionModel,
+    *,
+    epoch: float | None = None,
+    chip: int | None = None,
+) -> tuple[Judged, ...]:
+    """Where and when a requirement is judged: one for each epoch.
+
+    Parameters
+    ----------
+    requirement : Requirement
+    model : DistortionModel
+    epoch, chip
+        For a requirement that names none.
+
+    Returns
+    -------
+    tuple of Judged
+
+    Raises
+    ------
+    InputError
+        For an unknown chip, a missing epoch, a range of epochs where nothing depends on time, and a
+        polygon that is not said to lie on one of several chips.
+    """
+    r = requirement
+    epochs: list[float | None] = [r.epoch if r.epoch is not None else epoch]
+    if r.epochs is not None:
+        if model.time is None:
+            raise InputError(
+                "it names a range of epochs, and the model does not depend on time",
+                where=r.where,
+                do="leave epochs out, or give the model time-dependent terms",
+            )
+        first, last = r.epochs
+        inner = [b for b in model.time.breaks if first < b < last]
+        # a break belongs to what follows it: just before it the earlier drift has run longest
+        before = [np.nextafter(b, first) for b in inner]
+        epochs = sorted({*np.linspace(first, last, EPOCHS).tolist(), *inner, *before})
+    elif epochs[0] is None and model.time is not None:
+        raise InputError(
+            "the model depends on time and no epoch is given",
+            where=r.where,
+            do="give the requirement an epoch, or set assess.epoch",
+        )
+    chips = _chips_of(r, model, chip, epochs[0])
+    if not isinstance(r.region, str) and len(chips) > 1:
+        raise InputError(
+            "a polygon lies on one chip, and all chips are judged",
+            where=r.where,
+            do=f"name its chip, one of {', '.join(str(c.number) for c in chips)}",
+        )
+    return tuple(Judged(chips, t, r.region, r.relative, r.separation, r.magnitude) for t in epochs)
+
+
 def _chips_of(
-    requirement: Requirement, solution: Solution, chip: int | None, epoch: float | None
+    requirement: Requirement, model: DistortionModel, chip: int | None, epoch: float | None
 ) -> tuple[Chip, ...]:
     """The chips whose field is judged."""
-    model = solution.model
     number = chip if requirement.chip is None else requirement.chip
     if requirement.chip is not None and number not in [c.number for c in model.chips]:
         raise InputError(
@@ -257,42 +279,6 @@ def _chips_of(
     if number is None:
         return model.chips
     return (place_of(model, epoch=epoch, chip=number).chip,)
-
-
-def _at_points(
-    fields: ErrorFields,
-    random: tuple[float, float],
-    local: Sequence[LocalTerm],
-    grid: tuple[int, int],
-) -> Float:
-    """Standard deviations (N, 2) of what is independent at the points of a chip's grid."""
-    variance = np.tile(np.square(random), (fields.x.size, 1))
-    for term in local:
-        found = term.on(fields.chip, (grid[1], grid[0]))
-        variance += np.column_stack([sigma.ravel() ** 2 for sigma in found])
-    return np.sqrt(variance)
-
-
-def _statistics(
-    fields: Sequence[ErrorFields],
-    names: Sequence[str],
-    offsets: Float,
-    random: Float,
-    rng: np.random.Generator,
-) -> dict[str, Float]:
-    """Each statistic of each draw's field over all chips, by blocks of draws."""
-    n_draws = fields[0].n_draws
-    out = {name: np.empty(n_draws) for name in names}
-    step = max(1, BLOCK // sum(f.x.size for f in fields))
-    for start in range(0, n_draws, step):
-        rows = slice(start, start + step)
-        error = np.concatenate([f.field(MODEL, rows) for f in fields], axis=1)
-        error += offsets[rows, None, :]
-        if random.any():
-            error += rng.normal(size=error.shape) * random
-        for name in names:
-            out[name][rows] = field_statistic(name, error)
-    return out
 
 
 def _doubt(solution: Solution, converged: bool | None) -> str:
@@ -307,14 +293,27 @@ def _doubt(solution: Solution, converged: bool | None) -> str:
 
 
 def _margin(
-    requirement: Requirement, epoch: float | None, draws: Float, n_effective: float, doubt: str
+    requirement: Requirement,
+    case: Sequence[Judged],
+    by_epoch: Sequence[Float],
+    errors: PositionErrors,
+    factor: float,
+    n_effective: float,
+    doubt: str,
 ) -> Margin:
     asked = requirement.probability
+    draws = np.max(by_epoch, axis=0)
+    worst_epoch = case[int(np.argmax([np.quantile(d, asked) for d in by_epoch]))]
     met = float(np.mean(draws <= requirement.limit))
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
     # the empirical quantile without interpolation, so that its side of the limit agrees with `met`
     reached = np.quantile(draws, asked, method="inverted_cdf")
     verdict, reason = verdict_of(met, n_effective, asked)
+    axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""
+    place = errors.worst(worst_epoch, axis)
+    remedy = None
+    if verdict != "met" and not doubt:
+        remedy = find_remedy(errors, requirement, worst_epoch, factor)
     return Margin(
         requirement=requirement,
         value=float(median),
@@ -325,7 +324,9 @@ def _margin(
         verdict="undecided" if doubt else verdict,
         reason=doubt or reason,
         unit=requirement.unit,
-        epoch=epoch,
+        epoch=worst_epoch.epoch,
         n_effective=n_effective,
         draws=draws,
+        worst=replace(place, rms=factor * place.rms),
+        remedy=remedy,
     )

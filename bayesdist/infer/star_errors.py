@@ -14,7 +14,6 @@ for a proper motion.  The fit has already counted the diagonal part, sum_i inste
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,11 +21,11 @@ from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.infer.recoloured import Recoloured
 from bayesdist.infer.stars import Stars, prepare
-from bayesdist.infer.views import Derived, Solution
-from bayesdist.model import DistortionModel
+from bayesdist.infer.views import Solution
 
-__all__ = ["StarCovariance", "WithStarErrors", "star_covariance", "with_star_errors"]
+__all__ = ["StarCovariance", "star_covariance", "with_star_errors"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -56,65 +55,7 @@ class StarCovariance:
         return self.total - self.counted
 
 
-@dataclass(frozen=True, eq=False)
-class WithStarErrors(Derived):
-    """A solution with the correlated error of the catalogue in its covariance and its draws.
-
-    Parameters
-    ----------
-    source : Solution
-    stars : StarCovariance
-    """
-
-    source: Solution
-    stars: StarCovariance
-
-    @property
-    def model(self) -> DistortionModel:
-        """The distortion model."""
-        return self.source.model
-
-    @property
-    def unit(self) -> str:
-        """Unit of u and v."""
-        return self.model.unit
-
-    @property
-    def mean(self) -> Float:
-        """That of the source."""
-        return self.source.mean
-
-    @cached_property
-    def cov(self) -> Float:
-        """Covariance of the source and what the catalogue adds to it, shape (D, D)."""
-        return np.asarray(self.source.cov) + self.stars.extra
-
-    @property
-    def sigma(self) -> Float:
-        """Standard deviation of each parameter."""
-        return np.asarray(np.sqrt(np.diag(self.cov)))
-
-    @cached_property
-    def _recolour(self) -> Float:
-        """Matrix that gives deviations of the source the larger covariance."""
-        before = np.asarray(self.source.cov)
-        scale = np.sqrt(np.diag(before))
-        unit = np.outer(scale, scale)
-        roots = [np.linalg.cholesky(c / unit) * scale[:, None] for c in (before, self.cov)]
-        return np.asarray(np.linalg.solve(roots[0].T, roots[1].T).T)
-
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors (n, D): draws of the source, spread to the larger covariance.
-
-        A sum with independent noise would not do: the difference of the covariances may have
-        negative eigenvalues, where errors that a fit takes for independent cancel.
-        """
-        mean = np.asarray(self.mean)
-        theta = np.asarray(self.source.draws(n, rng), float)
-        return np.asarray(mean + (theta - mean) @ self._recolour.T)
-
-
-def with_star_errors(solution: Solution, stars: StarCovariance) -> WithStarErrors:
+def with_star_errors(solution: Solution, stars: StarCovariance) -> Recoloured:
     """A solution whose covariance and draws know that a star has one error.
 
     Parameters
@@ -125,9 +66,9 @@ def with_star_errors(solution: Solution, stars: StarCovariance) -> WithStarError
 
     Returns
     -------
-    WithStarErrors
+    Recoloured
     """
-    return WithStarErrors(solution, stars)
+    return Recoloured(solution, np.asarray(solution.cov) + stars.extra)
 
 
 # a second BLAS thread gains little here and loses much on a machine that has other work

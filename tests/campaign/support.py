@@ -23,8 +23,9 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.data import MatchTable
 from bayesdist.infer.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
+from bayesdist.infer.recoloured import Recoloured
 from bayesdist.infer.series import Series
-from bayesdist.infer.star_errors import WithStarErrors, star_covariance, with_star_errors
+from bayesdist.infer.star_errors import star_covariance, with_star_errors
 from bayesdist.model import LookupTable
 from bayesdist.simulate.acs import AcsCampaign, acs_model, read_acs
 from bayesdist.simulate.acs.pointings import OWN
@@ -105,7 +106,7 @@ class Calibrated:
         What it was made from.
     session : CampaignSession
     tables : TableFit or None
-    bare, joint : HierarchicalFit and WithStarErrors
+    bare, joint : HierarchicalFit and Recoloured
         All exposures jointly; without and with the correlated errors of the catalogue.
     terms : Series
         Linear terms of every exposure alone.
@@ -115,7 +116,7 @@ class Calibrated:
     session: CampaignSession
     tables: TableFit | None
     bare: HierarchicalFit
-    joint: WithStarErrors
+    joint: Recoloured
     terms: Series
 
 
@@ -201,7 +202,7 @@ def _results_of(*names: str) -> Iterator[dict[str, Any]]:
         yield made
 
 
-def _with_catalogue(bare: HierarchicalFit, session: CampaignSession) -> WithStarErrors:
+def _with_catalogue(bare: HierarchicalFit, session: CampaignSession) -> Recoloured:
     """The joint fit with the errors that a star of the catalogue has in all exposures."""
     catalog, matches = session.inputs.catalog, session.matches
     assert isinstance(matches, MatchTable)

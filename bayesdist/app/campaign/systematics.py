@@ -17,6 +17,7 @@ from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.recoloured import recolouring
 from bayesdist.infer.star_errors import StarCovariance, star_covariance
 
 if TYPE_CHECKING:
@@ -154,9 +155,6 @@ def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovarianc
     formal = np.asarray(fit.cov, float)
     wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
     before = wider * formal
-    scale = np.sqrt(np.diag(before))
-    unit = np.outer(scale, scale)
-    roots = [np.linalg.cholesky(c / unit) * scale[:, None] for c in (before, before + stars.extra)]
-    recolour = np.linalg.solve(roots[0].T, roots[1].T).T
+    spread = recolouring(before, before + stars.extra)
     mean = posterior.mean
-    return replace(posterior, theta=mean + (posterior.theta - mean) @ recolour.T)
+    return replace(posterior, theta=mean + (posterior.theta - mean) @ spread.T)

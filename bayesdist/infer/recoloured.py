@@ -1,0 +1,83 @@
+"""A solution with another covariance: wider by errors that its fit did not know, or narrower."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.views import Derived, Solution
+from bayesdist.model import DistortionModel
+
+__all__ = ["Recoloured", "recolouring"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recoloured(Derived):
+    """A solution whose draws are spread to another covariance; they keep their shape.
+
+    Parameters
+    ----------
+    source : Solution
+    cov : ndarray, shape (D, D)
+    """
+
+    source: Solution
+    cov: Float
+
+    @property
+    def model(self) -> DistortionModel:
+        """The distortion model."""
+        return self.source.model
+
+    @property
+    def unit(self) -> str:
+        """Unit of u and v."""
+        return self.model.unit
+
+    @property
+    def mean(self) -> Float:
+        """That of the source."""
+        return self.source.mean
+
+    @property
+    def sigma(self) -> Float:
+        """Standard deviation of each parameter."""
+        return np.asarray(np.sqrt(np.diag(self.cov)))
+
+    @cached_property
+    def _map(self) -> Float:
+        return recolouring(np.asarray(self.source.cov), self.cov)
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Parameter vectors (n, D): draws of the source, spread to this covariance.
+
+        A sum with independent noise would not do: the difference of the covariances may have
+        negative eigenvalues, where errors that a fit takes for independent cancel.
+        """
+        mean = np.asarray(self.mean)
+        theta = np.asarray(self.source.draws(n, rng), float)
+        return np.asarray(mean + (theta - mean) @ self._map.T)
+
+
+def recolouring(before: Float, after: Float) -> Float:
+    """Linear map that gives deviations of one covariance another.
+
+    Parameters
+    ----------
+    before, after : ndarray, shape (D, D)
+        Positive definite.
+
+    Returns
+    -------
+    ndarray, shape (D, D)
+        A with A before A^T = after; the identity where the two are equal.
+    """
+    scale = np.sqrt(np.diag(before))
+    unit = np.outer(scale, scale)
+    roots = [np.linalg.cholesky(c / unit) * scale[:, None] for c in (before, after)]
+    return np.asarray(np.linalg.solve(roots[0].T, roots[1].T).T)
