@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +13,14 @@ from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.fields import MODEL, ErrorFields, draw_errors
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms import LOCAL, LocalTerm, UserTerm
+from bayesdist.assess.terms import LOCAL, MEASURED, LocalTerm, UserTerm
 from bayesdist.assess.units import pixel_scale_of
+from bayesdist.assess.verdict import effective_draws
 
 __all__ = [
-    "GIVEN",
-    "MEASURED",
     "BudgetTerm",
     "ErrorBudget",
-    "budget_row",
+    "budget_rows",
     "error_budget",
     "error_budgets",
 ]
@@ -28,8 +28,7 @@ __all__ = [
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MEASURED = "measured in this run"
-GIVEN = "given by the user"
+TOTAL = "total"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,10 @@ class BudgetTerm:
     u, v : ndarray, shape (ny, nx)
         Standard deviations, in the unit of the budget.
     source : str
-        'measured in this run' or 'given by the user'.
+        'measured in this run', 'given by the user', or what the user says.
+    relative_error : float or None
+        How well the standard deviations are known themselves, relative to their size: of draws the
+        Monte-Carlo error.  None where it is not known.
     """
 
     name: str
@@ -53,6 +55,7 @@ class BudgetTerm:
     u: Float
     v: Float
     source: str
+    relative_error: float | None = None
 
     @property
     def radial(self) -> Float:
@@ -103,29 +106,53 @@ class ErrorBudget:
         """Total radial error hypot(total_u, total_v), (ny, nx)."""
         return np.hypot(self.total_u, self.total_v)
 
-    def rows(self) -> list[dict[str, str | float]]:
+    @property
+    def total(self) -> BudgetTerm:
+        """All terms together, as one."""
+        return BudgetTerm("total", TOTAL, self.total_u, self.total_v, "")
+
+    def rows(self) -> list[dict[str, Any]]:
         """The budget as a table: one row for each term, the total last.
 
         Returns
         -------
         list of dict
-            name, kind, u, v, radial (root mean squares over the grid), source.
+            name, kind, u, v, radial (root mean squares over the grid), radial_error (how well that
+            is known; None where it is not), source.
         """
-        rows = [budget_row(t.name, t.kind, t.u, t.v, t.source) for t in self.terms]
-        return [*rows, budget_row("total", "total", self.total_u, self.total_v, "")]
+        return budget_rows([*self.terms, self.total])
 
 
-def budget_row(name: str, kind: str, u: Float, v: Float, source: str) -> dict[str, str | float]:
-    """One row of a budget: root mean squares of the standard deviations u and v, any shape."""
-    mean_u, mean_v = float(np.mean(u**2)), float(np.mean(v**2))
-    return {
-        "name": name,
-        "kind": kind,
-        "u": mean_u**0.5,
-        "v": mean_v**0.5,
-        "radial": (mean_u + mean_v) ** 0.5,
-        "source": source,
-    }
+def budget_rows(terms: Sequence[BudgetTerm]) -> list[dict[str, Any]]:
+    """Rows of a budget: root mean squares of the standard deviations; the total is the last one.
+
+    The error of the total is that of the terms of which it is known: all but those that were given
+    without one.
+    """
+    rows = []
+    for t in terms:
+        mean_u, mean_v = float(np.mean(t.u**2)), float(np.mean(t.v**2))
+        radial = (mean_u + mean_v) ** 0.5
+        error = None if t.relative_error is None else t.relative_error * radial
+        rows.append(
+            {
+                "name": t.name,
+                "kind": t.kind,
+                "u": mean_u**0.5,
+                "v": mean_v**0.5,
+                "radial": radial,
+                "radial_error": error,
+                "source": t.source,
+            }
+        )
+    total = rows[-1]
+    if total["kind"] == TOTAL and total["radial"] > 0:
+        known = [
+            (r["radial"], r["radial_error"]) for r in rows[:-1] if r["radial_error"] is not None
+        ]
+        spread = sum((radial * error) ** 2 for radial, error in known) ** 0.5
+        total["radial_error"] = spread / total["radial"] if known else None
+    return rows
 
 
 def error_budget(
@@ -237,7 +264,9 @@ def error_budgets(
     }
     draws = draw_errors(solution, n_draws, rng, fields=fields, aligned=aligned)
     drawn = draws.at({c: mesh(*xy) for c, xy in grids.items()}, epoch=epoch)
-    return tuple(_budget(f, *grids[f.chip], terms, sigmas, local) for f in drawn)
+    noise = 1.0 / (2.0 * effective_draws(solution, n_draws)) ** 0.5
+    sources = {t.name: getattr(t, "source", MEASURED) for t in fields}
+    return tuple(_budget(f, *grids[f.chip], terms, sigmas, local, noise, sources) for f in drawn)
 
 
 def _budget(
@@ -247,15 +276,23 @@ def _budget(
     terms: Sequence[UserTerm],
     sigmas: Sequence[tuple[float, float]],
     local: Sequence[LocalTerm],
+    noise: float,
+    sources: Mapping[str, str],
 ) -> ErrorBudget:
     shape = (y.size, x.size)
     measured = {part: tuple(s.reshape(shape) for s in fields.sigma(part)) for part in fields.parts}
     model_u, model_v = measured.pop(MODEL)
-    entries = [BudgetTerm(n, "systematic", u, v, MEASURED) for n, (u, v) in measured.items()]
+    entries = [
+        BudgetTerm(n, "systematic", u, v, sources.get(n, MEASURED), noise)
+        for n, (u, v) in measured.items()
+    ]
     n_parts = len(entries)
-    entries += [BudgetTerm(t.name, LOCAL, *t.on(fields.chip, shape), MEASURED) for t in local]
+    entries += [
+        BudgetTerm(t.name, LOCAL, *t.on(fields.chip, shape), t.source, t.relative_error)
+        for t in local
+    ]
     for t, (su, sv) in zip(terms, sigmas, strict=True):
-        entries.append(BudgetTerm(t.name, t.kind, np.full(shape, su), np.full(shape, sv), GIVEN))
+        entries.append(BudgetTerm(t.name, t.kind, np.full(shape, su), np.full(shape, sv), t.source))
     others = entries[n_parts:]
     user_u2, user_v2 = (sum(getattr(t, axis) ** 2 for t in others) for axis in "uv")
     return ErrorBudget(

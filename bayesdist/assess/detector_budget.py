@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.budget import ErrorBudget, budget_row, error_budgets
+from bayesdist.assess.budget import ErrorBudget, budget_rows, error_budgets
 from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.grid import DEFAULT_GRID
 from bayesdist.assess.solution import Solution
@@ -52,22 +53,27 @@ class DetectorBudget:
         dominant = np.concatenate([b.dominant.ravel() for b in self.chips])
         return np.bincount(dominant, minlength=len(self.names)) / dominant.size
 
-    def rows(self) -> list[dict[str, str | float]]:
+    def rows(self) -> list[dict[str, Any]]:
         """The budget as a table: root mean squares over the grid points of all chips.
 
         Returns
         -------
         list of dict
-            name, kind, u, v, radial, source; one for each term, the total last.
+            As those of an `ErrorBudget`; one for each term, the total last.
         """
-        rows = []
-        for terms in zip(*(b.terms for b in self.chips), strict=True):
-            u, v = (np.stack([getattr(t, axis) for t in terms]) for axis in "uv")
-            rows.append(budget_row(terms[0].name, terms[0].kind, u, v, terms[0].source))
-        u, v = (np.stack([getattr(b, f"total_{axis}") for b in self.chips]) for axis in "uv")
-        return [*rows, budget_row("total", "total", u, v, "")]
+        by_term = zip(*((*b.terms, b.total) for b in self.chips), strict=True)
+        return budget_rows(
+            [
+                replace(
+                    terms[0],
+                    u=np.stack([t.u for t in terms]),
+                    v=np.stack([t.v for t in terms]),
+                )
+                for terms in by_term
+            ]
+        )
 
-    def rows_by_chip(self) -> list[dict[str, str | float]]:
+    def rows_by_chip(self) -> list[dict[str, Any]]:
         """As `rows`, followed by those of each chip alone; column chip is 'all' or its number."""
         parts = [("all", self.rows()), *((str(b.chip), b.rows()) for b in self.chips)]
         return [{"chip": chip} | row for chip, rows in parts for row in rows]

@@ -194,6 +194,22 @@ class PositionErrors:
             variance = sum(s**2 for _, s in self._added(judged, others))
         return float(np.sqrt(np.mean(variance.sum(axis=1))))
 
+    def centroid_at(self, magnitude: float) -> Float:
+        """Errors (2,) of the centroid of a star.
+
+        Raises
+        ------
+        InputError
+            Where no errors by magnitude are known.
+        """
+        if self.centroid is None:
+            raise InputError(
+                f"the error of a star of magnitude {magnitude:g} is not known",
+                where="magnitude",
+                do="give the matches magnitudes, or leave it out",
+            )
+        return np.ravel(self.centroid.at([magnitude]))
+
     # -- the draws --------------------------------------------------------------------------------
 
     def _errors(
@@ -261,13 +277,7 @@ class PositionErrors:
             ]
             out.append((False, np.concatenate(on_chips) * shrink.get(one.name, 1.0)))
         if judged.magnitude is not None:
-            if self.centroid is None:
-                raise InputError(
-                    f"the error of a star of magnitude {judged.magnitude:g} is not known",
-                    where="magnitude",
-                    do="give the matches magnitudes, or leave it out",
-                )
-            at = np.ravel(self.centroid.at([judged.magnitude]))
+            at = self.centroid_at(judged.magnitude)
             out.append((False, np.tile(at, (N, 1)) * shrink.get(CENTROID, 1.0)))
         return out
 

@@ -8,17 +8,29 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 
 from bayesdist.assess.names import require_known
 from bayesdist.assess.units import UNITS, convert
 from bayesdist.errors import InputError
 
-__all__ = ["LOCAL", "TERM_KINDS", "LocalTerm", "UserTerm", "combined_sigma"]
+__all__ = [
+    "GIVEN",
+    "LOCAL",
+    "MEASURED",
+    "TERM_KINDS",
+    "LocalTerm",
+    "UserTerm",
+    "combined_sigma",
+]
 
 Float = NDArray[np.float64]
 
 TERM_KINDS = ("random", "systematic")
 LOCAL = "local"
+
+MEASURED = "measured in this run"
+GIVEN = "given by the user"
 
 
 @dataclass(frozen=True)
@@ -34,6 +46,8 @@ class UserTerm:
         Standard deviation of each axis.
     unit : str
         'pix', 'arcsec', 'mas' or 'deg'.
+    source : str
+        Where the number comes from: 'given by the user', or a publication.
 
     Raises
     ------
@@ -46,6 +60,7 @@ class UserTerm:
     sigma_u: float
     sigma_v: float
     unit: str = "pix"
+    source: str = GIVEN
 
     def __post_init__(self) -> None:
         where = f"budget term {self.name!r}"
@@ -79,10 +94,15 @@ class LocalTerm:
     name : str
     sigma : dict of int to ndarray, shape (ny, nx, 2)
         By chip number: standard deviations of u and v on that grid, in the unit of the solution.
+    relative_error : float, optional
+        How well they are known themselves.
+    source : str
     """
 
     name: str
     sigma: dict[int, Float]
+    relative_error: float | None = None
+    source: str = MEASURED
 
     def on(self, chip: int, shape: tuple[int, int]) -> tuple[Float, Float]:
         """Standard deviations (u, v), each (ny, nx), on a chip.
@@ -100,6 +120,30 @@ class LocalTerm:
                 do="ask for the grid on which it was computed",
             )
         return found[..., 0], found[..., 1]
+
+    def at(self, chip: int, size: tuple[float, float], x: Float, y: Float) -> Float:
+        """Standard deviations (N, 2) at any pixels of a chip, interpolated on the grid.
+
+        Parameters
+        ----------
+        chip : int
+        size : tuple of float
+            Columns and rows of the chip.
+        x, y : ndarray, shape (N,)
+            FITS 1-based pixels; beyond the grid the value of its edge holds.
+
+        Raises
+        ------
+        InputError
+            For a chip without values.
+        """
+        ny, nx, _ = self.sigma[chip].shape if chip in self.sigma else (0, 0, 0)
+        self.on(chip, (ny, nx))  # refuses an unknown chip
+        axes = [np.linspace(1.0, n, k) for n, k in zip(size, (nx, ny), strict=True)]
+        points = [np.clip(a, axis[0], axis[-1]) for a, axis in zip((x, y), axes, strict=True)]
+        return np.asarray(
+            RegularGridInterpolator(axes[::-1], self.sigma[chip])(np.column_stack(points[::-1]))
+        )
 
 
 def combined_sigma(
