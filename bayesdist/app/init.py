@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesdist.app.config import parse_config
 from bayesdist.app.matches import load_matches
+from bayesdist.app.rvb_init import is_rvb, rvb_template
 from bayesdist.data import MatchTable, atomic_path
 from bayesdist.errors import InputError
 from bayesdist.infer import Matches
@@ -24,8 +25,7 @@ _TEMPLATE = """\
 
 [data]
 matches = {matches}
-# format = "auto"               # auto | table | hst1pass | matchup | astrometry.net
-# columns = {{x = "x", y = "y", u = "u", v = "v"}}  # by default they are found by their names
+{format}# columns = {{x = "x", y = "y", u = "u", v = "v"}}  # they are found by their names
 {unit_line}sigma = {sigma}
 pixel_origin = 1                # of x, y: 1 as in FITS, or 0
 
@@ -78,6 +78,10 @@ sip = {{}}                        # inverse_order, linear = "cd" | "sip", crval
 # idctab = {{instrument = "ACS", detector = "WFC"}}
 """
 
+_AUTO = """\
+# format = "auto"               # auto | table | hst1pass | matchup | astrometry.net | rvb
+"""
+
 _CENTRE = """\
 # reference_pixel = [{cx}, {cy}]  # zero point of the polynomial; the centre by default
 """
@@ -98,7 +102,7 @@ reference_pixel = [{cx}, {cy}]  # zero point of the polynomial
 """
 
 
-def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Matches:
+def init(path: str | Path, matches: str | Path, *, force: bool = False) -> int:
     """Write a commented configuration for a file of matches.
 
     Parameters
@@ -112,8 +116,8 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
 
     Returns
     -------
-    MatchTable or PartitionedMatches
-        As the configuration reads it.
+    int
+        Matches that the configuration reads.
 
     Raises
     ------
@@ -122,29 +126,35 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> Match
     path = Path(path)
     if path.exists() and not force:
         raise InputError("this file exists", where=str(path), do="replace it by --force")
+    relative = _toml(os.path.relpath(Path(matches), path.resolve().parent))
+    rvb = rvb_template(matches) if is_rvb(matches) else None
+    n, values = _of_matches(matches) if rvb is None else rvb
+    order = 4 if n >= 300 else 3 if n >= 100 else 2
+    text = _TEMPLATE.format(matches=relative, order=order, **values)
+    parse_config(text, str(path))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return n
+
+
+def _of_matches(matches: str | Path) -> tuple[int, dict[str, object]]:
+    """How many there are, and what a table of matches puts into the template."""
     table, unit_line, sigma = _read(matches)
     chips = {n: _size(*reach) for n, reach in _reach(table).items()}
     several = len(chips) > 1
     first = next(iter(chips.values()))
     name = Path(matches).stem.replace('"', "")
     blocks = [_CHIP.format(number=n, **size) for n, size in chips.items()]
-    relative = os.path.relpath(Path(matches), path.resolve().parent)
-    n = len(table)
-    text = _TEMPLATE.format(
-        matches=_toml(relative),
-        unit_line=unit_line,
-        sigma=sigma,
-        detector="\n".join(blocks) if several else _DETECTOR.format(name=name, **first),
-        reference="" if several else _CENTRE.format(**first),
-        order=4 if n >= 300 else 3 if n >= 100 else 2,
-        frames="shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
-        grid_y=max(3, round(32 * first["ny"] / first["nx"]) + 1),
-        unit=table.unit,
-    )
-    parse_config(text, str(path))
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return table
+    return len(table), {
+        "format": _AUTO,
+        "unit_line": unit_line,
+        "sigma": sigma,
+        "detector": "\n".join(blocks) if several else _DETECTOR.format(name=name, **first),
+        "reference": "" if several else _CENTRE.format(**first),
+        "frames": "shift_rotation_scale" if len(table.exposure_names) > 1 else "none",
+        "grid_y": max(3, round(32 * first["ny"] / first["nx"]) + 1),
+        "unit": table.unit,
+    }
 
 
 def _read(matches: str | Path) -> tuple[Matches, str, str]:

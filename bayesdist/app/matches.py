@@ -10,7 +10,7 @@ from bayesdist.data import input_files, open_matches, read_matches
 from bayesdist.data.parquet_files import describe_part
 from bayesdist.infer import Matches
 
-__all__ = ["IN_MEMORY", "load_matches"]
+__all__ = ["IN_MEMORY", "is_large", "load_matches"]
 
 IN_MEMORY = 1_000_000  # rows of Parquet above which they stay on disk
 
@@ -36,10 +36,14 @@ def load_matches(
     InputError
         As `read_matches`.
     """
-    if format in ("auto", "table"):
-        files = input_files(path)
-        if all(file.suffix.lower() == ".parquet" for file in files):
-            rows = sum(describe_part(file).n_rows for file in files)
-            if rows > IN_MEMORY:
-                return open_matches(path, **options)
+    if format in ("auto", "table") and is_large(path):
+        return open_matches(path, **options)
     return read_matches(path, format=format, **options)
+
+
+def is_large(path: PathLike | Sequence[PathLike]) -> bool:
+    """Whether the files are Parquet with more rows than are taken into memory."""
+    files = input_files(path)
+    if any(file.suffix.lower() != ".parquet" for file in files):
+        return False
+    return sum(describe_part(file).n_rows for file in files) > IN_MEMORY

@@ -15,6 +15,7 @@ from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.rvb import RvbInput
 from bayesdist.app.systematics import Systematics
 from bayesdist.assess import (
     SAMPLE,
@@ -28,6 +29,10 @@ from bayesdist.assess import (
     star_sample,
     star_sums,
 )
+from bayesdist.assess.centroid import centroid_scatter
+from bayesdist.assess.coverage import Coverage, coverage_of
+from bayesdist.assess.field_terms import FieldTerm
+from bayesdist.assess.majority import majority_sentence
 from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.infer import (
@@ -76,6 +81,8 @@ class Session:
         """Matches as read."""
         data = self.config.data
         assert data is not None
+        if data.format == "rvb":
+            return self._rvb.load()
         return load_matches(
             self.run.matches,
             format=data.format,
@@ -85,6 +92,19 @@ class Session:
             pixel_origin=data.pixel_origin,
             tangent_point=data.tangent_point,
         )
+
+    @cached_property
+    def _rvb(self) -> RvbInput:
+        """RvB pairs, where the configuration names such."""
+        return RvbInput(self.run)
+
+    def begun(self) -> None:
+        """Move into the run's folder what was prepared beside it: the run has begun."""
+        if "_rvb" in self.__dict__ and self._rvb.settle():
+            for name in ("raw_matches", "matches"):
+                self.__dict__.pop(name, None)
+            if self.config.compute.engine == "dask":  # workers may read the pairs again
+                self.errors_changed()
 
     @cached_property
     def magnitude_errors(self) -> MagnitudeErrors | None:
@@ -123,6 +143,8 @@ class Session:
         """Let go of the data, and of whoever holds them."""
         if "shards" in self.__dict__:
             self.__dict__.pop("shards").close()
+        if "_rvb" in self.__dict__:
+            self._rvb.close()
 
     @cached_property
     def model(self) -> DistortionModel:
@@ -186,6 +208,18 @@ class Session:
         """What is assessed, exported and shown: all errors of the parameters are in its draws."""
         return self.systematics.solution
 
+    @cached_property
+    def field_terms(self) -> tuple[FieldTerm, ...]:
+        """Errors that are fields over the detector: those of the run, then the user's."""
+        return (*self.systematics.fields, *self.config.linear_terms(self.solution))
+
+    @cached_property
+    def centroid(self) -> MagnitudeErrors | None:
+        """Errors of the centroids by magnitude, where the stars have magnitudes."""
+        unit, scale = self.posterior.model.unit, self.config.detector.scale_mas
+        held = [(t.name, *t.sigma(unit, scale)) for t in self.config.in_residuals()]
+        return centroid_scatter(self.stars, held, n_params=self.posterior.model.n_params)
+
     @property
     def doubts(self) -> list[str]:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
@@ -241,6 +275,26 @@ class Session:
     def misfit(self) -> Misfit:
         """The worst of them, its probability corrected for the number of chips."""
         return worst_misfit(self.misfits)
+
+    @property
+    def coverages(self) -> tuple[Coverage, ...]:
+        """The area of each chip that its stars cover."""
+        chips, several = self.fit.model.chips, len(self.fit.model.chips) > 1
+        return tuple(
+            coverage_of(
+                self.sums.binned[chip.number, bins["cells"]], found.corners, chip, several=several
+            )
+            for chip, bins, found in zip(
+                chips, self._partitions.values(), self.shards.survey.chips, strict=True
+            )
+        )
+
+    @property
+    def majority(self) -> str:
+        """What it means that most pairs are false; empty where they are not."""
+        posterior = self.posterior if self.run.done("sample") else None
+        quoted = self.shards.survey.reference_sigma
+        return majority_sentence(self.fit, posterior, quoted=quoted)
 
     @cached_property
     def stars(self) -> StarSample:

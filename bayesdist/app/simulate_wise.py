@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bayesdist.app.bands.stand_in import STAND_IN_TURN, write_stand_in
 from bayesdist.app.demo import simulation_config, write_simulation
 from bayesdist.app.screen import table_text
 from bayesdist.data.files import atomic_path
@@ -22,18 +23,9 @@ WISE_CONFIG = """\
 # {truth} holds what they were made from
 [data]
 matches = "{folder}"
-
-[data.columns]               # neither frame nor epoch: one distortion serves all
-x = "x"
-y = "y"
-u = "u"
-v = "v"
-sigma_u = "sigma"
-sigma_v = "sigma"
-mag = "mag"
-epoch = ""
-exposure = ""
-filter = ""
+format = "rvb"
+band = "{band}"
+columns = {{exposure = ""}}    # without the frames: one distortion serves all
 
 [detector]
 name = "{band}"
@@ -146,7 +138,13 @@ def _sets(options: argparse.Namespace) -> str:
             }
         )
         lines.append(f"bayesdist run {folder / f'{name}.toml'} -o {folder / f'run_{name}'}")
-    return f"{table_text(rows)}\n\ncalibrate them:\n  " + "\n  ".join(lines)
+    write_stand_in(folder / "optical_w2.hdr")
+    runs = " ".join(str(folder / f"run_{name}") for name in names)
+    compare = (
+        f"compare them:\n  bayesdist bands {runs} -o {folder / 'bands'} "
+        f"--optical {folder / 'optical_w2.hdr'} --turn {STAND_IN_TURN}"
+    )
+    return f"{table_text(rows)}\n\ncalibrate them:\n  " + "\n  ".join([*lines, compare])
 
 
 def _wise_config(one: WiseSet) -> str:

@@ -1,9 +1,9 @@
 """What comes in: matched positions, reference catalogues, and how these are matched.
 
-`read_matches` is the way in.  Behind it each kind of file has a module of its own, and all of them
-end in a `MatchTable`, where units, errors and row numbers have been checked.  What outgrows the
-memory is Parquet: `open_matches` leaves it on disk and gives `PartitionedMatches`, whose pieces are
-MatchTables; `write_partitioned` makes such files.
+`read_matches` is the way in, `read_rvb` that of WISE's pairs.  Behind them each kind of file has a
+module of its own, and all of them end in a `MatchTable`, where units, errors and row numbers have
+been checked.  What outgrows the memory is Parquet: `open_matches` leaves it on disk and gives
+`PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such files.
 """
 
 from bayesdist.data.aberration import velocity_aberration
@@ -29,6 +29,14 @@ from bayesdist.data.patterns import find_similarity, pattern_index
 from bayesdist.data.pieces import PIECE, Piece
 from bayesdist.data.preparing import centroid_errors, neutralise_aberration, with_centroid_errors
 from bayesdist.data.readers import FORMATS, input_files, read_matches
+from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
+from bayesdist.data.rvb_accept import RadialLimit, accept_radial
+from bayesdist.data.rvb_linear import fit_transform, linear_moments
+from bayesdist.data.rvb_pairs import RvbPairs, bluest, colour_between
+from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
+from bayesdist.data.rvb_solutions import read_solutions
+from bayesdist.data.rvb_transform import RvbTransform, rereference, transformed
+from bayesdist.data.rvb_write import write_rvb
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists, star_list_of_hst1pass
 from bayesdist.data.tangent import mean_direction, tangent_plane
 from bayesdist.data.tolerance import SearchRadius, search_radius
@@ -51,18 +59,28 @@ __all__ = [
     "MotionErrorLine",
     "PartitionedMatches",
     "Piece",
+    "RadialLimit",
     "ReferenceCatalog",
+    "RvbPairs",
+    "RvbSelection",
+    "RvbTransform",
     "SearchRadius",
+    "SelectedPairs",
     "StarCuts",
     "StarList",
+    "accept_radial",
     "atomic_path",
+    "bluest",
     "catalog_from_table",
     "centroid_errors",
+    "colour_between",
     "derive_motions",
     "exposure_of_headers",
     "find_similarity",
+    "fit_transform",
     "input_files",
     "is_leftover",
+    "linear_moments",
     "match_campaign",
     "match_table",
     "match_to_catalog",
@@ -77,15 +95,22 @@ __all__ = [
     "read_hst1pass",
     "read_matches",
     "read_matchup",
+    "read_rvb",
+    "read_solutions",
     "read_star_lists",
     "remove_leftovers",
+    "rereference",
+    "rvb_bands",
     "search_radius",
     "select_motions",
     "sha256_of",
     "star_list_of_hst1pass",
+    "stream_rvb",
     "tangent_plane",
+    "transformed",
     "velocity_aberration",
     "with_centroid_errors",
     "write_exposures",
     "write_partitioned",
+    "write_rvb",
 ]

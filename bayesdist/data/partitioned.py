@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -119,6 +119,8 @@ class PartitionedMatches:
     parts : tuple of MatchPart
     errors : MagnitudeErrors or tuple of float, optional
         Errors in place of those in the files.
+    dropped : mapping of str to int
+        Rows that were left out when the files were made, by reason.
 
     Attributes
     ----------
@@ -128,8 +130,9 @@ class PartitionedMatches:
     sources : tuple of str
         Files.
     n_rows : int
+        Of the files, and those that were left out.
     rejected : dict of str to int
-        Empty: all rows are there.
+        As `dropped`.
     tangent_point : tuple of float or None
     has_epoch, has_mag, has_sigma : bool
     """
@@ -137,6 +140,7 @@ class PartitionedMatches:
     whole: Whole
     parts: tuple[MatchPart, ...]
     errors: Errors | None = None
+    dropped: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return self.whole.n_rows
@@ -173,13 +177,13 @@ class PartitionedMatches:
 
     @property
     def n_rows(self) -> int:
-        """Rows of all files."""
-        return self.whole.n_rows
+        """Rows of all files, and those that were left out."""
+        return self.whole.n_rows + sum(self.dropped.values())
 
     @property
     def rejected(self) -> dict[str, int]:
-        """Rows left out, by reason: none."""
-        return {}
+        """Rows left out, by reason."""
+        return dict(self.dropped)
 
     @property
     def tangent_point(self) -> tuple[float, float] | None:
@@ -263,7 +267,8 @@ class PartitionedMatches:
                 columns = _columns(table).items()
                 kept.append({name: values[which].copy() for name, values in columns})
         joined = {name: np.concatenate([one[name] for one in kept]) for name in kept[0]}
-        return MatchTable.of_distinct_rows(**joined, **_shared(self.whole, len(self)))
+        counts = {"rejected": self.rejected}
+        return MatchTable.of_distinct_rows(**joined, **counts, **_shared(self.whole, self.n_rows))
 
     def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> PartitionedMatches:
         """The same stars with errors by magnitude.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from bayesdist.data.columns import Columns, match_columns
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.readers import check_sigma, refuse_missing_errors
+from bayesdist.data.rvb_array import ArrayCheck
 from bayesdist.data.rvb_files import (
     ARRAY_SIZE,
     MAGNITUDES,
@@ -30,14 +32,10 @@ from bayesdist.data.rvb_pairs import RvbPairs, colour_of
 from bayesdist.data.values import Place, SourceColumn
 from bayesdist.errors import InputError
 
-__all__ = ["read_rvb", "rvb_bands", "stream_rvb"]
+__all__ = ["chosen_band", "read_rvb", "rvb_bands", "stream_rvb"]
 
 Float = NDArray[np.float64]
 PathLike = str | os.PathLike[str]
-
-# Pairs that fill no more than a quarter of the array are those of a smaller one: by chance this
-# many lie there with a probability of 4^-50.
-_ENOUGH = 50
 
 
 def rvb_bands(
@@ -131,10 +129,9 @@ def stream_rvb(
     """
     check_sigma(sigma)
     files = open_rvb_files(path, columns)
-    band = _chosen(files, band)
+    band = chosen_band(files, band)
     size = size or ARRAY_SIZE[band]
-    n = 0
-    reach = np.zeros(2)
+    check = ArrayCheck(band, size)
     for file in files:
         for table, first, place in file.blocks(list(RVB_ALIASES)):
             which = np.ones(len(table), bool)
@@ -145,20 +142,16 @@ def stream_rvb(
                 continue
             pairs = _pairs(file, table, first, place, which, band, unit, sigma, pixel_origin)
             matches = pairs.matches
-            _refuse_outside(matches, size, band)
-            n += len(matches)
-            reach = np.maximum(reach, [matches.x.max(), matches.y.max()])
+            check.see(matches.x, matches.y, partial(_row_name, matches))
             yield pairs
     sources = ", ".join(file.source for file in files)
-    if not n:
+    if not check.n:
         raise InputError("holds no rows", where=sources, do="give a table with matched stars")
-    if n >= _ENOUGH and (reach <= np.array(size) / 2 + 0.5).all():
-        raise InputError(
-            f"all {n} pairs of {band} lie within x <= {reach[0]:.0f}, y <= {reach[1]:.0f} of an "
-            f"array of {size[0]:g} x {size[1]:g}",
-            where=sources,
-            do="check the band and the size: these are positions of a smaller array",
-        )
+    check.end(sources)
+
+
+def _row_name(matches: MatchTable, k: int) -> str:
+    return f"{matches.sources[matches.source[k]]}, row {matches.row[k] + 1}"
 
 
 def read_rvb(
@@ -184,7 +177,7 @@ def read_rvb(
     return RvbPairs.concatenate(list(stream_rvb(path, **options)))
 
 
-def _chosen(files: Sequence[RvbFile], band: str | None) -> str:
+def chosen_band(files: Sequence[RvbFile], band: str | None) -> str:
     """The band to be read."""
     sources = ", ".join(file.source for file in files)
     if band is not None:
@@ -270,19 +263,3 @@ def _magnitudes(column: SourceColumn) -> Float:
     if len(rows):  # a column of nulls alone has no type
         out[rows] = named.numbers()
     return out
-
-
-def _refuse_outside(matches: MatchTable, size: tuple[float, float], band: str) -> None:
-    """Refuse detections that the array cannot have made."""
-    for name, values, extent in (("x", matches.x, size[0]), ("y", matches.y, size[1])):
-        # half a pixel beyond the edge of the outermost: centroids may fall a little outside
-        outside = (values < 0.0) | (values > extent + 1.0)
-        if outside.any():
-            bad = int(np.argmax(outside))
-            raise InputError(
-                f"value is {values[bad]:g}, outside the {extent:g} pixels of {band}'s array, as in "
-                f"{int(outside.sum())} of {len(matches)} rows",
-                where=f"{matches.sources[matches.source[bad]]}, row {matches.row[bad] + 1}, "
-                f"column {name!r}",
-                do="check the band, the array size and pixel_origin",
-            )

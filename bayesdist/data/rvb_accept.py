@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 
-__all__ = ["RadialLimit", "accept_radial"]
+__all__ = ["CHI2", "OFFSET", "RadialLimit", "accept_radial", "radial_rows"]
 
 Float = NDArray[np.float64]
 
@@ -108,6 +108,36 @@ def accept_radial(
         For u, v in another unit, no limit at all, a chi-square limit without errors, and when no
         pair is left.
     """
+    near, likely = radial_rows(matches, size, offset=offset, chi2=chi2, expected=expected)
+    if not (near & likely).any():
+        raise InputError(
+            f"none of {len(matches)} pairs is within the radial limits",
+            where=", ".join(matches.sources),
+            do="widen the limits, or check that x, y and u, v are of one band",
+        )
+    return matches.select(near, reason=OFFSET).select(likely[near], reason=CHI2)
+
+
+def radial_rows(
+    matches: MatchTable,
+    size: tuple[float, float],
+    *,
+    offset: RadialLimit | None = None,
+    chi2: RadialLimit | None = None,
+    expected: ArrayLike | None = None,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which pairs are within the limits, as `accept_radial`.
+
+    Returns
+    -------
+    near, likely : ndarray of bool, shape (N,)
+        Within the limit on the offset, and within that on chi-square.
+
+    Raises
+    ------
+    InputError
+        As `accept_radial`; pairs need not be left.
+    """
     where = ", ".join(matches.sources)
     if matches.unit != "pix":
         raise InputError(
@@ -138,10 +168,4 @@ def accept_radial(
             )
         value = (du / matches.sigma_u) ** 2 + (dv / matches.sigma_v) ** 2
         likely = value <= chi2.at(matches.x, matches.y, size)
-    if not (near & likely).any():
-        raise InputError(
-            f"none of {len(matches)} pairs is within the radial limits",
-            where=where,
-            do="widen the limits, or check that x, y and u, v are of one band",
-        )
-    return matches.select(near, reason=OFFSET).select(likely[near], reason=CHI2)
+    return np.asarray(near), np.asarray(likely)

@@ -22,6 +22,7 @@ from bayesdist.errors import FormatError, InputError
 
 __all__ = [
     "ARRAY_SIZE",
+    "IPAC",
     "MAGNITUDES",
     "RVB_ALIASES",
     "RvbFile",
@@ -56,7 +57,7 @@ RVB_ALIASES: dict[str, tuple[str, ...]] = {
     },
 }
 
-_IPAC = (".tbl", ".ipac")
+IPAC = (".tbl", ".ipac")
 
 
 def band_name(label: object) -> str:
@@ -124,6 +125,7 @@ class RvbFile:
 def open_rvb_files(
     path: PathLike | Sequence[PathLike], columns: Mapping[str, str] | None
 ) -> list[RvbFile]:
+    columns = {{"color": "colour"}.get(key, key): name for key, name in (columns or {}).items()}
     out = []
     for file in input_files(path):
         name = file.name.lower()
@@ -153,7 +155,7 @@ def read_any_table(path: Path) -> Table:
     InputError
         As `read_table`.
     """
-    return _read_ipac(path) if path.name.lower().endswith(_IPAC) else read_table(path)
+    return _read_ipac(path) if path.name.lower().endswith(IPAC) else read_table(path)
 
 
 def _read_ipac(path: Path) -> Table:

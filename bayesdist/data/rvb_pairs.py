@@ -1,8 +1,8 @@
 """RvB pairs of one band: the matches, their colours, and the selection by colour.
 
-WSDC D-T033, section 3, takes candidates by colour, "the magnitude difference between the shortest
-and longest wavelengths detected": stars are blue, and a colour needs two bands, which favours the
-bright.
+WSDC D-T033, section 3, prefers candidates whose magnitudes differ little from the shortest to the
+longest wavelength at which they are seen: stars are blue, and a colour needs two bands, which
+favours the bright.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 
-__all__ = ["RvbPairs", "bluest", "colour_between", "colour_of"]
+__all__ = ["RvbPairs", "bluest", "bluest_rows", "colour_between", "colour_of", "colours_of"]
 
 Float = NDArray[np.float64]
 
@@ -132,7 +132,7 @@ def colour_between(pairs: RvbPairs, low: float, high: float) -> RvbPairs:
     """
     if not low <= high:
         raise InputError(f"colours from {low:g} to {high:g} are asked for", do="give a range")
-    colour = _colours(pairs)
+    colour = colours_of(pairs)
     known = ~np.isnan(colour)
     return _kept(pairs, known, known & (colour >= low) & (colour <= high))
 
@@ -159,17 +159,21 @@ def bluest(pairs: RvbPairs, n: int) -> RvbPairs:
     """
     if n < 1:
         raise InputError(f"the {n} bluest of each frame are asked for", do="ask for one or more")
-    colour = _colours(pairs)
-    frame = pairs.matches.exposure
+    colour = colours_of(pairs)
+    return _kept(pairs, ~np.isnan(colour), bluest_rows(colour, pairs.matches.exposure, n))
+
+
+def bluest_rows(colour: Float, frame: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
+    """Which rows (N,) are among the n of smallest colour of their frame; never one without."""
     order = np.lexsort((colour, frame))  # stable, NaN last within a frame
     first = np.searchsorted(frame[order], frame[order])
-    rank = np.empty(len(pairs), np.int64)
-    rank[order] = np.arange(len(pairs)) - first
-    known = ~np.isnan(colour)
-    return _kept(pairs, known, known & (rank < n))
+    rank = np.empty(len(colour), np.int64)
+    rank[order] = np.arange(len(colour)) - first
+    return np.asarray((rank < n) & ~np.isnan(colour))
 
 
-def _colours(pairs: RvbPairs) -> Float:
+def colours_of(pairs: RvbPairs) -> Float:
+    """Colours (N,) of pairs that must have them."""
     if pairs.colour is None:
         raise InputError(
             "has no magnitudes in several bands, hence no colours",

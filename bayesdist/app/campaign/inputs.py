@@ -42,12 +42,16 @@ class Inputs:
     log : ExposureLog
         Of the exposures of the filter, with VAFACTOR.
     lists : tuple of StarList
+        Of these exposures.
+    strangers : tuple of str
+        Exposures that have a list and no entry in the log file, of whatever filter: not used.
     """
 
     catalog: ReferenceCatalog
     n_catalog: int
     log: ExposureLog
     lists: tuple[StarList, ...]
+    strangers: tuple[str, ...] = ()
 
     @property
     def filter(self) -> str:
@@ -66,6 +70,7 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
     """
     catalog = read_catalog(base / block.catalog)
     log = read_exposures(base / block.exposures)
+    logged = set(log.names)
     if block.filter is not None and block.filter not in log.filters:
         raise InputError(
             f"there is no exposure in filter {block.filter!r}",
@@ -95,10 +100,11 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
             where=log.source,
             do="add the list, or take the exposure out of the log",
         )
+    strangers = dict.fromkeys(one.exposure for one in lists if one.exposure not in logged)
     n = len(catalog)
     if block.motions == "reliable" and catalog.sigma_pm_u is not None:
         catalog = select_motions(catalog)
-    return Inputs(catalog, n, log, wanted)
+    return Inputs(catalog, n, log, wanted, tuple(strangers))
 
 
 def cuts_of(block: CampaignBlock) -> StarCuts:

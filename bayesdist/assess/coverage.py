@@ -1,0 +1,148 @@
+"""Which part of a chip the stars cover; beyond it a polynomial is extrapolated.
+
+The formal and the posterior errors hold beyond it only if the model does, and no star says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.assess.regions import in_region
+from bayesdist.assess.requirement import Requirement
+from bayesdist.assess.residuals import BinnedSums
+from bayesdist.model import Chip
+
+__all__ = ["Coverage", "coverage_of"]
+
+Float = NDArray[np.float64]
+
+LEAST_GAP = 0.05  # of the area: what may be missing at the edges of any detector
+BY_CHANCE = 3.0  # times the expected gap of evenly scattered stars
+SPARSE = 0.02  # of the density where stars usually are: strays, not coverage
+NEAR = 0.03  # of the chip's longer side: a grid reaches this far beyond the outermost stars
+_FINE = (65, 65)
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """The convex area of a chip that its stars span.
+
+    Parameters
+    ----------
+    chip : Chip
+    several : bool
+        Whether the detector has other chips beside it.
+    sides : ndarray, shape (m, 3)
+        (a, b, c) with a x + b y + c the distance beyond a side of the area.
+    gap : float
+        Share of the chip's area beyond it.
+    by_chance : float
+        The gap that as many stars leave on average when they are scattered evenly.
+    """
+
+    chip: Chip
+    several: bool
+    sides: Float
+    gap: float
+    by_chance: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether so much is missing that the corners or edges are extrapolated."""
+        return self.gap > max(LEAST_GAP, BY_CHANCE * self.by_chance)
+
+    @property
+    def sentence(self) -> str:
+        """What it means, as a clause."""
+        part = f"chip {self.chip.name}" if self.several else "the detector"
+        x, y = mesh(*grid_pixels(self.chip.size, _FINE))
+        inside = self.beyond(x, y) <= 0
+        x, y = x[inside], y[inside]
+        return (
+            f"{100 * self.gap:.0f} % of {part} lies beyond the area that its stars cover (within "
+            f"x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to {y.max():.0f}): there the "
+            "polynomial is extrapolated, and its errors are not known"
+        )
+
+    def beyond(self, x: Float, y: Float) -> Float:
+        """Distance (N,) of pixels beyond the area; negative inside."""
+        return np.asarray((self.sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0))
+
+    def misses(self, requirement: Requirement, grid: tuple[int, int]) -> bool:
+        """Whether a requirement is judged where there are no stars.
+
+        Parameters
+        ----------
+        requirement : Requirement
+        grid : tuple of int
+            Points on x and y.
+
+        Returns
+        -------
+        bool
+            Only where the gap is significant.
+        """
+        if not self.significant or requirement.chip not in (None, self.chip.number):
+            return False
+        x, y = mesh(*grid_pixels(self.chip.size, grid))
+        judged = in_region(requirement.region, self.chip.size, x, y)
+        far = self.beyond(x, y) > NEAR * max(self.chip.size)
+        return bool((judged & far).any())
+
+
+def coverage_of(sums: BinnedSums, corners: Float, chip: Chip, *, several: bool = False) -> Coverage:
+    """The area of a chip that its stars cover.
+
+    It lies within the hull of all stars, and within that of the cells that hold more than strays:
+    a few false matches in the corners cover nothing.
+
+    Parameters
+    ----------
+    sums : BinnedSums
+        Of the stars used.
+    corners : ndarray, shape (m, 2)
+        Vertices of the convex hull of all stars: `ChipSurvey.corners`.
+    chip : Chip
+    several : bool
+        Whether the detector has other chips.
+
+    Returns
+    -------
+    Coverage
+
+    References
+    ----------
+    The gap that n even stars leave in a rectangle, (8/3) ln n / n of its area: Renyi & Sulanke
+    1963, Z. Wahrscheinlichkeitstheorie 2, 75.
+    """
+    count, size = sums.count, np.array(chip.size)
+    n = int(count.sum())
+    ny, nx = count.shape
+    # half of the stars have no more neighbours than this in their cells
+    ordered = np.sort(count.ravel())
+    usual = ordered[np.searchsorted(np.cumsum(ordered), n / 2)]
+    iy, ix = np.nonzero(count > max(1.0, SPARSE * usual))
+    cells = (
+        np.concatenate([np.column_stack([ix + a, iy + b]) for a in (0, 1) for b in (0, 1)])
+        * (size / [nx, ny])
+        + 0.5
+    )
+    sides = np.concatenate([_sides(cells), _sides(corners)])
+    step = [(np.arange(k) + 0.5) / k for k in _FINE]
+    x, y = mesh(*(s * length + 0.5 for s, length in zip(step, size, strict=True)))
+    beyond = (sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0) > 0
+    chance = 8 / 3 * np.log(max(n, 2)) / max(n, 2)
+    return Coverage(chip, several, sides, float(beyond.mean()), float(chance))
+
+
+def _sides(points: Float) -> Float:
+    """Sides of the convex hull; none, which bounds nothing, where there is no area."""
+    try:
+        return np.asarray(ConvexHull(points).equations)
+    except (QhullError, ValueError):
+        return np.array([[0.0, 0.0, -1.0]])

@@ -1,0 +1,57 @@
+"""Are most pairs false?  Then neither rejection nor mixture is sure of what it fits.
+
+Both take the true matches to be those that lie together.  Where false ones are the rule, a chance
+alignment, or their own mean, may be what was fitted; the posterior is then that of a wrong mode and
+says nothing of the others.  A mixture whose outliers have another shape than the false matches may
+settle where all pairs are true and their errors large: that shows in the jitter.
+"""
+
+from __future__ import annotations
+
+from bayesdist.infer import LinearFit, Posterior
+
+__all__ = ["majority_sentence"]
+
+MAJORITY = 0.5
+WIDENED = 5.0  # times the quoted error: a mixture that widens the true matches to hold the false
+
+
+def majority_sentence(
+    fit: LinearFit, posterior: Posterior | None = None, *, quoted: float | None = None
+) -> str:
+    """What it means that most pairs are false, as a clause; empty where they are not.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    posterior : Posterior, optional
+    quoted : float, optional
+        Usual quoted error of one axis, in the unit of u, v.
+
+    Returns
+    -------
+    str
+    """
+    if posterior is not None and "f" in posterior.hyper:
+        fraction = float(posterior.hyper["f"].mean())
+        if fraction > MAJORITY:
+            return (
+                f"the mixture takes {100 * fraction:.0f} % of the pairs for false matches: with "
+                "more false than true ones the solution may rest on chance alignments"
+            )
+    if posterior is not None and quoted and "j" in posterior.hyper:
+        jitter = float(posterior.hyper["j"].mean())
+        if jitter > WIDENED * quoted:
+            return (
+                f"the mixture adds {jitter:.3g} {posterior.unit} to the errors of all pairs, "
+                f"{jitter / quoted:.2g} times the quoted one: either that is far too small, or "
+                "most pairs are false matches that were taken for true ones"
+            )
+    share = fit.n_rejected / fit.n_rows
+    if share > MAJORITY:
+        return (
+            f"the least-squares fit left out {100 * share:.0f} % of the pairs: most of them are "
+            "false matches, or the quoted errors are far too small, and the solution may rest on "
+            "chance alignments"
+        )
+    return ""

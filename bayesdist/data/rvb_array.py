@@ -1,0 +1,79 @@
+"""Are these the positions of the array that the pairs are said to be of?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+
+__all__ = ["ArrayCheck"]
+
+Float = NDArray[np.float64]
+
+# Pairs that fill no more than a quarter of the array are those of a smaller one: by chance this
+# many lie there with a probability of 4^-50.
+_ENOUGH = 50
+
+
+@dataclass
+class ArrayCheck:
+    """Positions piece by piece against the array of a band.
+
+    Parameters
+    ----------
+    band : str
+    size : tuple of float
+        Columns and rows of the array.
+    """
+
+    band: str
+    size: tuple[float, float]
+    n: int = 0
+    reach: Float = field(default_factory=lambda: np.zeros(2))
+
+    def see(self, x: Float, y: Float, where: Callable[[int], str]) -> None:
+        """Refuse detections that the array cannot have made.
+
+        Parameters
+        ----------
+        x, y : ndarray, shape (N,)
+            FITS 1-based pixels.
+        where : callable
+            Names file and row of a position.
+
+        Raises
+        ------
+        InputError
+        """
+        for name, values, extent in (("x", x, self.size[0]), ("y", y, self.size[1])):
+            # half a pixel beyond the edge of the outermost: centroids may fall a little outside
+            outside = (values < 0.0) | (values > extent + 1.0)
+            if outside.any():
+                bad = int(np.argmax(outside))
+                raise InputError(
+                    f"value is {values[bad]:g}, outside the {extent:g} pixels of {self.band}'s "
+                    f"array, as in {int(outside.sum())} of {len(values)} rows",
+                    where=f"{where(bad)}, column {name!r}",
+                    do="check the band, the array size and pixel_origin",
+                )
+        self.n += len(x)
+        self.reach = np.maximum(self.reach, [x.max(), y.max()])
+
+    def end(self, sources: str) -> None:
+        """Refuse positions that all lie in the first quarter: those of another array.
+
+        Raises
+        ------
+        InputError
+        """
+        if self.n >= _ENOUGH and (self.reach <= np.array(self.size) / 2 + 0.5).all():
+            raise InputError(
+                f"all {self.n} pairs of {self.band} lie within x <= {self.reach[0]:.0f}, y <= "
+                f"{self.reach[1]:.0f} of an array of {self.size[0]:g} x {self.size[1]:g}",
+                where=sources,
+                do="check the band and the size: these are positions of a smaller array",
+            )

@@ -1,0 +1,188 @@
+"""Which RvB pairs are taken, piece by piece: what the selection drops is counted by reason.
+
+In memory or streamed, the same pairs pass: `colour_between`, `bluest` and `accept_radial`, one
+after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.rvb_accept import CHI2, OFFSET, RadialLimit, radial_rows
+from bayesdist.data.rvb_pairs import COLOUR, NO_COLOUR, RvbPairs, bluest_rows, colours_of
+from bayesdist.errors import InputError
+
+__all__ = ["RvbSelection", "SelectedPairs"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Rows = NDArray[np.bool_]
+
+MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1.6 GB of them
+
+
+@dataclass(frozen=True)
+class RvbSelection:
+    """Which pairs are taken: all limits that are given.
+
+    Parameters
+    ----------
+    colour : tuple of float, optional
+        Lowest and highest colour, both included.
+    bluest : int, optional
+        Of each frame at most so many, those of the smallest colour.
+    offset, chi2 : RadialLimit, optional
+        As `accept_radial`.
+
+    Raises
+    ------
+    InputError
+        For colours that are no range, and less than one pair.
+    """
+
+    colour: tuple[float, float] | None = None
+    bluest: int | None = None
+    offset: RadialLimit | None = None
+    chi2: RadialLimit | None = None
+
+    def __post_init__(self) -> None:
+        if self.colour is not None and not self.colour[0] <= self.colour[1]:
+            low, high = self.colour
+            raise InputError(f"colours from {low:g} to {high:g} are asked for", do="give a range")
+        if self.bluest is not None and self.bluest < 1:
+            raise InputError(
+                f"the {self.bluest} bluest of each frame are asked for", do="ask for one or more"
+            )
+
+    @property
+    def takes_all(self) -> bool:
+        """Whether no limit is given."""
+        return self == RvbSelection()
+
+    @property
+    def by_colour(self) -> bool:
+        """Whether a pair needs a colour."""
+        return self.colour is not None or self.bluest is not None
+
+    def right_colour(self, pairs: RvbPairs) -> Rows:
+        """Which pairs (N,) have a colour within the limits."""
+        colour = colours_of(pairs)
+        low, high = self.colour or (-np.inf, np.inf)
+        return np.asarray((colour >= low) & (colour <= high))
+
+
+@dataclass
+class SelectedPairs:
+    """The pairs that a selection takes, to be gone through once.
+
+    Parameters
+    ----------
+    pieces : callable
+        Gives the pairs of one band piece by piece: once more where the bluest of each frame are
+        asked for, which takes the colours of all.
+    selection : RvbSelection
+    size : tuple of float
+        Columns and rows of the array.
+
+    Attributes
+    ----------
+    n_rows : int
+        Pairs so far.
+    rejected : dict of str to int
+        Those of them that were dropped, by reason.
+    """
+
+    pieces: Callable[[], Iterable[RvbPairs]]
+    selection: RvbSelection
+    size: tuple[float, float]
+    n_rows: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+
+    def __iter__(self) -> Iterator[RvbPairs]:
+        """Pieces of which something is left.
+
+        Raises
+        ------
+        InputError
+            Without colours where they are needed, for u, v in another unit where offsets are
+            judged, and when no pair at all is left.
+        """
+        bluest = self._bluest()
+        sources: dict[str, None] = {}
+        for pairs in self.pieces():
+            sources |= dict.fromkeys(pairs.matches.sources)
+            left = np.ones(len(pairs), bool)
+            for reason, good in self._rules(pairs, bluest).items():
+                dropped = int((left & ~good).sum())
+                if dropped:
+                    self.rejected[reason] = self.rejected.get(reason, 0) + dropped
+                left &= good
+            self.n_rows += len(pairs)
+            if left.any():
+                yield pairs if left.all() else pairs.select(left)
+        if self.n_rows == sum(self.rejected.values()):
+            why = ", ".join(f"{reason} ({n})" for reason, n in self.rejected.items())
+            raise InputError(
+                f"no pair of {self.n_rows} is left by the selection: {why}",
+                where=", ".join(sources),
+                do="widen its limits",
+            )
+
+    def table(self) -> MatchTable:
+        """All of them in memory, with the counts.
+
+        Raises
+        ------
+        InputError
+            As going through them, and as `MatchTable.concatenate`.
+        """
+        found = MatchTable.concatenate([pairs.matches for pairs in self])
+        columns = {one.name: getattr(found, one.name) for one in fields(found)}
+        columns |= {"n_rows": self.n_rows, "rejected": self.rejected}
+        return MatchTable.of_distinct_rows(**columns)
+
+    def _rules(self, pairs: RvbPairs, bluest: Rows | None) -> Mapping[str, Rows]:
+        """Which pairs are good by each reason to drop one."""
+        rules = {}
+        if self.selection.by_colour:
+            right = self.selection.right_colour(pairs)
+            if bluest is not None:
+                right = right & bluest[self.n_rows : self.n_rows + len(pairs)]
+            rules = {NO_COLOUR: ~np.isnan(colours_of(pairs)), COLOUR: right}
+        offset, chi2 = self.selection.offset, self.selection.chi2
+        if offset is not None or chi2 is not None:
+            near, likely = radial_rows(pairs.matches, self.size, offset=offset, chi2=chi2)
+            rules |= {OFFSET: near, CHI2: likely}
+        return rules
+
+    def _bluest(self) -> Rows | None:
+        """Which of all rows are among the bluest of their frames."""
+        if self.selection.bluest is None:
+            return None
+        colours: list[Float] = []
+        frames: list[Int] = []
+        codes: dict[str, int] = {}
+        for pairs in self.pieces():
+            colour = np.where(self.selection.right_colour(pairs), colours_of(pairs), np.nan)
+            names = pairs.matches.exposure_names
+            code = np.array([codes.setdefault(name, len(codes)) for name in names])
+            colours.append(colour)
+            frames.append(code[pairs.matches.exposure])
+            if sum(map(len, colours)) > MOST_COLOURS:
+                raise InputError(
+                    f"the bluest of each frame are asked for among more than {MOST_COLOURS} pairs",
+                    where=", ".join(pairs.matches.sources),
+                    do="select by a range of colours instead",
+                )
+        if set(codes) == {"1"}:
+            raise InputError(
+                "has no column of frames, of each of which the bluest are asked for",
+                where=", ".join(pairs.matches.sources),
+                do="name it as 'exposure' in the option 'columns'",
+            )
+        return bluest_rows(np.concatenate(colours), np.concatenate(frames), self.selection.bluest)
