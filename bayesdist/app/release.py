@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +13,7 @@ from bayesdist.app.campaign.filter_figures import draw_filters
 from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.campaign.release import write_files
 from bayesdist.app.campaign.session import CampaignSession, session_of
+from bayesdist.app.folder import whole_folder
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
@@ -84,7 +82,7 @@ def release_runs(
         )
         if comparison is None:
             table.meta["drift"] = {"verdict": why_not}
-        with _whole_folder(Path(output)) as folder:
+        with whole_folder(Path(output)) as folder:
             files = write_files(
                 next(iter(sessions.values())), folder, solutions, _tables(sessions), notes
             )
@@ -241,40 +239,6 @@ def _notes(
         said = comparison.sentence
         out.append(f"Tested on the exposures: {said}.")
     return out
-
-
-@contextmanager
-def _whole_folder(path: Path) -> Iterator[Path]:
-    """A folder that takes its name when the block succeeds, and else is removed.
-
-    Raises
-    ------
-    InputError
-        For a folder that holds something, or that cannot be made.
-    """
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(
-            "the folder holds other files" if path.is_dir() else "is a file, not a folder",
-            where=str(path),
-            do="choose a new folder: a release is never overwritten",
-        )
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
-    except OSError as error:
-        raise InputError(
-            f"the folder cannot be made ({error.strerror})",
-            where=str(path),
-            do="choose one that you may write to",
-        ) from error
-    try:
-        yield temporary
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o777 & ~mask)  # a temporary folder is its owner's alone
-        os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 # -- what is printed ------------------------------------------------------------------------------

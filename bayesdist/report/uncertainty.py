@@ -29,7 +29,7 @@ from bayesdist.report.vectors import grid_size, spacing, square_cells
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap
 
-__all__ = ["contour_map", "formal_uncertainty", "uncertainty_radius"]
+__all__ = ["contour_map", "crosses", "formal_uncertainty", "uncertainty_radius"]
 
 Float = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def formal_uncertainty(
             for ax, one, color in zip(axes, of_chip, CYCLE, strict=False):
                 mosaic.draw(ax, k, margin=margin)
                 ax.add_collection(
-                    LineCollection(_crosses(one, M, every), colors=color, linewidths=0.8)
+                    LineCollection(crosses(one, M, every), colors=color, linewidths=0.8)
                 )
                 radius = float(np.max(one.radius))
                 text = display_scale(one.unit, radius).text(radius)
@@ -94,8 +94,22 @@ def _step(m: UncertaintyMap, every: int) -> float:
     return spacing(m.x[columns], m.y[rows])
 
 
-def _crosses(m: UncertaintyMap, magnification: float, every: int) -> Float:
-    """The four segments of every place, shape (4 N, 2, 2)."""
+def crosses(m: UncertaintyMap, magnification: float, every: int = 1) -> Float:
+    """Four segments from each place, to all combinations of (+-sigma_u, +-sigma_v).
+
+    Parameters
+    ----------
+    m : UncertaintyMap
+    magnification : float
+        Pixels of the axes for one unit of the uncertainties.
+    every : int
+        As of `square_cells`.
+
+    Returns
+    -------
+    ndarray, shape (4 N, 2, 2)
+        Ends (x, y) of each.
+    """
     rows, columns = square_cells(m.x, m.y, every)
     gx, gy = np.meshgrid(m.x[columns], m.y[rows])
     start = np.stack([gx.ravel(), gy.ravel()], axis=-1)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHANCE",
+    "VectorFlow",
     "grid_size",
     "residual_vectors",
     "significant_cells",
@@ -92,18 +94,16 @@ def vector_flow(
     matplotlib.figure.Figure
         The vectors are in pixels along x and y, whatever the unit and orientation of u and v.
     """
-    flows = [_flow(v) for v in vectors]
+    flows = [VectorFlow.of(v) for v in vectors]
     mosaic = mosaic or Mosaic.column(*(f.size for f in flows))
     largest = max(f.largest for f in flows)
-    # one and a half grid steps do not yet hide a vector's neighbours, as they flow alike
-    M = magnification or _magnification(1.5 * min(f.step for f in flows), largest)
+    M = magnification or min(f.magnification for f in flows)
     margin = max(f.reach(M) for f in flows) + 0.02 * max(max(f.size) for f in flows)
     fig, panels = mosaic.panels()
     with figure_style():
         for k, (f, (ax,)) in enumerate(zip(flows, panels, strict=True)):
             mosaic.draw(ax, k, margin=margin)
-            draw_vectors(ax, f.gx, f.gy, f.du, f.dv, magnification=M)
-            ax.plot(*f.place, "o", ms=4.5, mfc="none", mec=PALETTE["vermilion"], mew=1.2)
+            f.draw(ax, M)
             text = (
                 f"largest {display_scale('pix', f.largest).text(f.largest, 4)}"
                 f" at ({f.place[0]:.0f}, {f.place[1]:.0f})"
@@ -114,8 +114,22 @@ def vector_flow(
 
 
 @dataclass(frozen=True, eq=False)
-class _Flow:
-    """Vectors of one chip as they are drawn, and the largest of all of them."""
+class VectorFlow:
+    """Vectors of one chip as they are drawn, and the largest of all of them.
+
+    Parameters
+    ----------
+    gx, gy, du, dv : ndarray
+        Places and vectors that are drawn, pixels of the chip.
+    largest : float
+        Length of the largest vector of the map, drawn or not.
+    place : tuple of float
+        Where that is.
+    size : tuple of float
+        Columns and rows of the chip.
+    step : float
+        Between neighbouring vectors, in pixels.
+    """
 
     gx: Float
     gy: Float
@@ -126,6 +140,31 @@ class _Flow:
     size: tuple[float, float]
     step: float
 
+    @classmethod
+    def of(cls, vectors: VectorMap, every: int = 1) -> VectorFlow:
+        """Those of a map that stand far enough apart; with `every`, only every so manieth."""
+        rows, columns = square_cells(vectors.x, vectors.y, every)
+        gx, gy = np.meshgrid(vectors.x[columns], vectors.y[rows])
+        along_x, along_y = vectors.on_detector
+        length = np.hypot(along_x, along_y)
+        iy, ix = np.unravel_index(int(length.argmax()), length.shape)
+        return cls(
+            gx=gx,
+            gy=gy,
+            du=along_x[rows, columns],
+            dv=along_y[rows, columns],
+            largest=float(length.max()),
+            place=(float(vectors.x[ix]), float(vectors.y[iy])),
+            size=grid_size(vectors.x, vectors.y),
+            step=spacing(vectors.x[columns], vectors.y[rows]),
+        )
+
+    @property
+    def magnification(self) -> float:
+        """Round factor under which the largest vector does not hide its neighbours."""
+        # one and a half grid steps do not yet, as they flow alike
+        return _magnification(1.5 * self.step, self.largest)
+
     def reach(self, magnification: float) -> float:
         """How far the vectors stand out beyond the chip, in pixels."""
         (nx, ny), M = self.size, magnification
@@ -133,23 +172,13 @@ class _Flow:
         reach_y = np.abs(self.gy + M * self.dv - (ny + 1) / 2).max() - ny / 2
         return float(max(reach_x, reach_y, 0.0))
 
-
-def _flow(vectors: VectorMap) -> _Flow:
-    rows, columns = square_cells(vectors.x, vectors.y)
-    gx, gy = np.meshgrid(vectors.x[columns], vectors.y[rows])
-    along_x, along_y = vectors.on_detector
-    length = np.hypot(along_x, along_y)
-    iy, ix = np.unravel_index(int(length.argmax()), length.shape)
-    return _Flow(
-        gx=gx,
-        gy=gy,
-        du=along_x[rows, columns],
-        dv=along_y[rows, columns],
-        largest=float(length.max()),
-        place=(float(vectors.x[ix]), float(vectors.y[iy])),
-        size=grid_size(vectors.x, vectors.y),
-        step=spacing(vectors.x[columns], vectors.y[rows]),
-    )
+    def draw(self, ax: Axes, magnification: float, *, fine: bool = False) -> None:
+        """The vectors, in small panels with fine arrows, and a ring about the largest."""
+        arrows = draw_vectors(ax, self.gx, self.gy, self.du, self.dv, magnification=magnification)
+        if fine:
+            arrows.width, arrows.headwidth, arrows.headlength = 0.007, 3.2, 4.0
+            arrows.headaxislength = 3.6
+        ax.plot(*self.place, "o", ms=4.5, mfc="none", mec=PALETTE["vermilion"], mew=1.2)
 
 
 def residual_vectors(

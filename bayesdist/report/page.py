@@ -1,0 +1,54 @@
+"""What every page of ours is made with: templates, and pictures that lie in the page itself."""
+
+from __future__ import annotations
+
+import base64
+import struct
+from dataclasses import dataclass
+
+import jinja2
+
+from bayesdist.report.caption import Caption
+from bayesdist.report.figures import DPI
+from bayesdist.report.numerals import number
+
+__all__ = ["Picture", "picture_of", "template"]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture as a page holds it.
+
+    Parameters
+    ----------
+    name : str
+    data : str
+        The PNG file, base64.
+    width : float
+        Inches, at which its letters have the size they were set in.
+    words : Caption
+    """
+
+    name: str
+    data: str
+    width: float
+    words: Caption
+
+
+def picture_of(name: str, png: bytes, words: Caption) -> Picture:
+    """A PNG file, as of `drawn`, with its words."""
+    (pixels,) = struct.unpack(">I", png[16:20])  # width, in the first chunk of every PNG file
+    return Picture(name, base64.b64encode(png).decode("ascii"), pixels / DPI, words)
+
+
+def template(name: str) -> jinja2.Template:
+    """A template by its file name; what it needs and is not given is an error."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("bayesdist.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = lambda v: v if isinstance(v, str) else number(v)
+    return environment.get_template(name)

@@ -1,0 +1,121 @@
+"""Figures and tables of several bands, on numbers made here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.quiver import Quiver
+
+from bayesdist.assess import UncertaintyMap, VectorMap
+from bayesdist.assess.histograms import histogram
+from bayesdist.assess.wise.published import printed_rows
+from bayesdist.report.bands.captions import SECTIONS
+from bayesdist.report.bands.curves import CASES, histograms
+from bayesdist.report.bands.panels import band_images
+from bayesdist.report.bands.tables import as_printed
+from bayesdist.report.bands.vectors import band_crosses, band_flows
+
+
+def vectors(n: float, length: float) -> VectorMap:
+    x = np.linspace(1, n, 33)
+    X, Y = np.meshgrid(x, x)
+    du = length * (2 * X - n - 1) / (n - 1)  # as long at the edge in whatever pixels
+    return VectorMap(x, x, du, 0.5 * du * np.sign(Y), "pix", "no_constant")
+
+
+def arrows(ax) -> Quiver:
+    [one] = [c for c in ax.collections if isinstance(c, Quiver)]
+    return one
+
+
+def test_all_bands_are_drawn_to_one_scale_in_arcsec():
+    """Bands of one field in pixels of different size: equal vectors look equal."""
+    bands = {"A": vectors(1000, 4.0), "B": vectors(500, 2.0)}
+    fig = band_flows(bands, {"A": 2.75, "B": 5.5}, magnification=10.0)
+    drawn = []
+    for ax, (name, n) in zip(fig.axes, (("A", 1000), ("B", 500)), strict=True):
+        q = arrows(ax)
+        assert q.scale == pytest.approx(1 / 10)  # ten axis pixels for each pixel of a vector
+        reach = np.ptp(ax.get_xlim())
+        drawn.append(np.max(np.abs(q.U)) / q.scale / reach)
+        title = ax.get_title(loc="left")
+        largest = bands[name].length_max
+        assert f"Max = {largest:.4g} pix" in title and title.startswith(name)
+        assert reach / n == pytest.approx(np.ptp(fig.axes[0].get_xlim()) / 1000)
+    assert drawn[0] == pytest.approx(drawn[1], rel=1e-9)
+
+
+def test_every_second_vector_is_drawn_with_its_corners():
+    fig = band_flows({"A": vectors(1000, 4.0)}, {"A": 2.75})
+    q = arrows(fig.axes[0])
+    assert len(q.X) == 17**2 and set(q.X) >= {1.0, 1000.0}
+
+
+@pytest.mark.parametrize(("sigma", "factor"), [(0.0093 / np.sqrt(2), 2000), (2.5e-4, None)])
+def test_crosses_have_the_magnification_they_state(sigma, factor):
+    x = np.linspace(1, 1016, 33)
+    s = np.full((33, 33), sigma)
+    m = UncertaintyMap(x, x, s, 2 * s, 0 * s, "pix", 1, None, "least squares")
+    fig = band_crosses({"A": m})
+    ax = fig.axes[0]
+    [stated] = [t.get_text() for t in ax.texts if "drawn" in t.get_text()]
+    M = float(stated.split("×")[-1].replace("\u202f", "").strip())
+    if factor is not None:
+        assert M == factor  # as section 6 of WSDC D-T033
+    [crosses] = [c for c in ax.collections if hasattr(c, "get_segments")]
+    ends = np.array([np.diff(s, axis=0)[0] for s in crosses.get_segments()])
+    np.testing.assert_allclose(np.abs(ends), M * np.array([[sigma, 2 * sigma]] * len(ends)))
+    assert {tuple(np.sign(e)) for e in ends} == {(1, 1), (-1, 1), (-1, -1), (1, -1)}
+    radius = np.hypot(sigma, 2 * sigma)
+    wanted = (
+        f"{radius:.3g}\u202fpix" if radius > 1e-3 else f"{1e3 * radius:.3g}\u202f×\u202f10⁻³ pix"
+    )
+    assert ax.get_title(loc="left").endswith(f"max radius {wanted}")
+
+
+def test_images_have_one_symmetric_scale_unless_alone():
+    rng = np.random.default_rng(1)
+    images = {"A": rng.normal(size=(9, 9)), "B": 3 * rng.normal(size=(9, 9))}
+    sizes = {"A": (90.0, 90.0), "B": (45.0, 45.0)}
+    options = {"label": "r [pix]", "limit": lambda some: max(np.abs(i).max() for i in some)}
+    for alone in (False, True):
+        fig = band_images(images, sizes, {"A": "a", "B": "b"}, alone=alone, **options)
+        maps = [ax.images[0] for ax in fig.axes if ax.images]
+        limits = [m.get_clim() for m in maps]
+        assert all(low == -high for low, high in limits)
+        assert (limits[0] == limits[1]) is not alone
+        for m, image, n in zip(maps, images.values(), (90, 45), strict=True):
+            np.testing.assert_array_equal(m.get_array(), image)
+            assert m.origin == "lower" and list(m.get_extent()) == [0.5, n + 0.5, 0.5, n + 0.5]
+        bars = [ax for ax in fig.axes if ax.get_ylabel() == "r [pix]"]
+        assert len(bars) == (2 if alone else 1)
+
+
+def test_histograms_show_the_counts_of_every_case():
+    rng = np.random.default_rng(2)
+    cases = {
+        c: histogram(w * rng.normal(size=(2, 500)), 4.0, 41)
+        for c, w in zip(CASES, (2, 1, 0.3), strict=True)
+    }
+    fig = histograms({"A": cases, "B": cases})
+    assert len(fig.axes) == 4
+    for k, ax in enumerate(fig.axes):
+        assert ax.get_yscale() == "log"
+        steps = {p.get_label(): p.get_data() for p in ax.patches}
+        for case, one in cases.items():
+            np.testing.assert_array_equal(steps[case].values, one.counts[k % 2])
+            np.testing.assert_allclose(steps[case].edges, one.edges)
+        assert len({to_rgb(p.get_edgecolor()) for p in ax.patches}) == 3
+    assert fig.axes[-1].get_xlabel() == "residual [pix]"
+
+
+def test_printed_values_keep_their_digits():
+    row = printed_rows("W2/X 0.002548 0.01679 -0.05003 0.0 0.1 -0.1020 12")["W2/X"]
+    shown = [as_printed(row, s) for s in ("mean", "sigma", "min", "max", "p01", "p99")]
+    assert shown == ["0.002548", "0.01679", "−0.05003", "0.0", "−0.1020", "12"]
+
+
+def test_every_section_names_figures_once():
+    names = [name for several in SECTIONS.values() for name in several]
+    assert len(names) == len(set(names))
