@@ -33,7 +33,7 @@ GROWS = 0.01  # share of the bins by which the coverage must rise to count as gr
 SETTLED = 0.005  # of the radius in the centre: how far the model may still move
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Round:
     """One match and the fit to it.
 
@@ -56,6 +56,8 @@ class Round:
         Of the residuals that the fit kept, one axis.
     moved : float
         Largest change of the model over the detector.
+    theta : ndarray, shape (n_params,)
+        The model after the fit; terms beyond its order are zero.
     """
 
     order: int
@@ -66,6 +68,7 @@ class Round:
     coverage: float
     rms: float
     moved: float
+    theta: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +207,7 @@ def bring_up(
                 coverage=found.coverage,
                 rms=float(np.hypot(now.rms_u, now.rms_v) / np.sqrt(2)),
                 moved=moved,
+                theta=theta,
             )
         )
         still = moved < SETTLED * acceptance.centre

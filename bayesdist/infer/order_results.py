@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +142,46 @@ class OrderSelection:
     error_scale: float
     n_used: int
     unit: str
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Surfaces and held-out stars beside each other, a row for each order.
+
+        Returns
+        -------
+        list of dict
+            order; terms (of one axis); rms_u, rms_v of the bins; chi2_u, chi2_v for each degree of
+            freedom, and p_noise, the smaller of their two probabilities; F and p_surface of the
+            F-test between this order and the chosen one; stars and stars_error, regions and
+            regions_error: log density of what is held out, minus that of the chosen order; lost.
+            None where the chosen order would be compared with itself.
+        """
+        noise, s = self.surfaces.p_noise(), self.surfaces
+        out = []
+        for k, order in enumerate(self.orders):
+            one = {
+                "order": order,
+                "terms": (order + 1) * (order + 2) // 2,
+                "rms_u": float(s.rms[k, 0]),
+                "rms_v": float(s.rms[k, 1]),
+                "chi2_u": float(s.chi2[k, 0] / s.dof[k]),
+                "chi2_v": float(s.chi2[k, 1] / s.dof[k]),
+                "p_noise": float(noise[k].min()),
+            }
+            lost = 0.0 if order == self.orders[-1] else float(self.lost[k])  # without its rounding
+            out.append(one | self._against_chosen(order) | {"lost": lost})
+        return out
+
+    def _against_chosen(self, order: int) -> dict[str, float | None]:
+        keys = ("F", "p_surface", "stars", "stars_error", "regions", "regions_error")
+        if order == self.order:
+            return dict.fromkeys(keys)
+        low, high = sorted((order, self.order))
+        sign = 1 if order == high else -1
+        values = [*self.surfaces.f_test(low, high)]
+        for held_out in (self.stars, self.regions):
+            difference, error = held_out.difference(low, high)
+            values += [sign * difference, error]
+        return dict(zip(keys, values, strict=True))
 
     @property
     def by_surfaces(self) -> int:

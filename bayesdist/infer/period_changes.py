@@ -15,18 +15,22 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, cho_factor, cho_solve
-from scipy.stats import chi2 as chi_square
+from scipy.linalg import block_diag
 from scipy.stats import norm
 
 from bayesdist.errors import InputError
-from bayesdist.model import DistortionModel
+from bayesdist.infer.period_positions import (
+    DifferenceField,
+    PositionChange,
+    chi_square_of,
+    difference_field,
+    largest_difference,
+)
+from bayesdist.model import Chip, DistortionModel
 
-__all__ = ["CoefficientChange", "PeriodComparison", "PositionChange"]
+__all__ = ["CoefficientChange", "PeriodComparison"]
 
 Float = NDArray[np.float64]
-
-SIGNIFICANT = 0.01  # probability under which a difference is called one
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,45 +57,6 @@ class CoefficientChange:
     def p_value(self) -> Float:
         """Two-sided probability of each difference, of each by itself, shape (D,)."""
         return np.asarray(2 * norm.sf(np.abs(self.z)))
-
-
-@dataclass(frozen=True, eq=False)
-class PositionChange:
-    """The largest difference of two models over the array, and how likely noise makes one.
-
-    Parameters
-    ----------
-    largest : float
-        Radial, in the unit of u, v.
-    at : tuple of float
-        Where, FITS 1-based pixels.
-    chip : int
-        On which chip.
-    sigma : float
-        Standard error of the difference there, along its direction.
-    noise_median, noise_95 : float
-        Largest difference over the array that noise alone makes: median and 95th percentile.
-    p_value : float
-        Share of noise fields with a largest difference of this size: it accounts for the search
-        over the array.
-    chi2 : float
-        Of the whole field with its joint covariance.  The field is as good as its coefficients, so
-        this is also the chi-square of these.
-    dof : int
-    p_field : float
-        Probability of a chi-square as large.
-    """
-
-    largest: float
-    at: tuple[float, float]
-    chip: int
-    sigma: float
-    noise_median: float
-    noise_95: float
-    p_value: float
-    chi2: float
-    dof: int
-    p_field: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +171,7 @@ class PeriodComparison:
     def joint(self, period: str, against: str | None = None) -> tuple[float, int, float]:
         """Chi-square of all coefficients together, its degrees of freedom, and its probability."""
         difference, cov = self.difference(period, against)
-        return _tested(difference, cov)
+        return chi_square_of(difference, cov)
 
     def positions(
         self,
@@ -235,38 +200,33 @@ class PeriodComparison:
         PositionChange
         """
         difference, cov = self.difference(period, against)
-        scale = np.sqrt(np.diag(cov))
-        root = np.linalg.cholesky(cov / np.outer(scale, scale)) * scale[:, None]
-        noise = rng.standard_normal((n_draws, len(scale))) @ root.T
-        largest, worst = np.zeros(n_draws), (-1.0, 0, (0.0, 0.0), 0.0)
-        for chip in self.model.chips:
-            x, y = _points(chip.size, grid)
-            phi = self.model.basis(chip.number).evaluate(x, y)
-            u, v = (self.model.coefficient_slice(chip.number, axis) for axis in (0, 1))
-            radial = (noise[:, u] @ phi.T) ** 2 + (noise[:, v] @ phi.T) ** 2
-            largest = np.maximum(largest, np.sqrt(radial.max(axis=1)))
-            field = np.stack([phi @ difference[u], phi @ difference[v]])
-            size = np.hypot(*field)
-            k = int(np.argmax(size))
-            if size[k] > worst[0]:
-                along = np.zeros(len(scale))
-                direction = field[:, k] / size[k] if size[k] > 0 else np.array([1.0, 0.0])
-                along[u], along[v] = direction[0] * phi[k], direction[1] * phi[k]
-                sigma = float(np.sqrt(along @ cov @ along))
-                worst = (float(size[k]), chip.number, (float(x[k]), float(y[k])), sigma)
-        chi2, dof, p_field = _tested(difference, cov)
-        return PositionChange(
-            largest=worst[0],
-            at=worst[2],
-            chip=worst[1],
-            sigma=worst[3],
-            noise_median=float(np.median(largest)),
-            noise_95=float(np.quantile(largest, 0.95)),
-            p_value=float((1 + (largest >= worst[0]).sum()) / (n_draws + 1)),
-            chi2=chi2,
-            dof=dof,
-            p_field=p_field,
-        )
+        return largest_difference(self.model, difference, cov, rng=rng, grid=grid, n_draws=n_draws)
+
+    def field(
+        self,
+        period: str,
+        against: str | None = None,
+        *,
+        chip: Chip | None = None,
+        grid: tuple[int, int] = (17, 17),
+    ) -> DifferenceField:
+        """Difference of the positions over a chip.
+
+        Parameters
+        ----------
+        period, against
+            As `difference`.
+        chip : Chip, optional
+            The first chip by default.
+        grid : tuple of int
+            Points on x and on y.
+
+        Returns
+        -------
+        DifferenceField
+        """
+        chip = chip or self.model.chips[0]
+        return difference_field(self.model, *self.difference(period, against), chip, grid)
 
     @cached_property
     def homogeneity(self) -> tuple[float, int, float]:
@@ -280,68 +240,9 @@ class PeriodComparison:
             [[_covariance(one, self.covs, other) for other in contrasts] for one in contrasts]
         )
         differences = np.concatenate([self.difference(name)[0] for name in self.names[:-1]])
-        return _tested(differences, cov)
-
-    def verdict(self, *, rng: np.random.Generator, tolerance: float | None = None) -> str:
-        """One sentence: whether the distortion changes, by how much, and whether that matters.
-
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-        tolerance : float, optional
-            Largest difference of positions that does not matter, in the unit of u, v.
-
-        Returns
-        -------
-        str
-        """
-        chi2, dof, p = self.homogeneity
-        changes = {name: self.positions(name, rng=rng) for name in self.names}
-        # the most significant, not the largest: the shortest period has the largest noise
-        name, most = max(changes.items(), key=lambda one: one[1].chi2)
-        unit = self.model.unit
-        head = "The distortion changes" if p < SIGNIFICANT else "No change is seen"
-        out = (
-            f"{head} (chi-square {chi2:.4g} for {dof} degrees of freedom, {_probability(p)}): "
-            f"{name} differs most from the combined model, by up to {most.largest:.2g} +- "
-            f"{most.sigma:.1g} {unit} at ({most.at[0]:.0f}, {most.at[1]:.0f}), where noise alone "
-            f"makes {most.noise_median:.2g} (95 %: {most.noise_95:.2g})"
-        )
-        if tolerance is None:
-            return out + "."
-        limit = f"the tolerance of {tolerance:g} {unit}"
-        # the largest of a noisy field lies too high rather than too low
-        if all(one.largest + 2 * one.sigma <= tolerance for one in changes.values()):
-            return f"{out}; all periods are below {limit}."
-        beyond = [
-            name
-            for name, one in changes.items()
-            if one.p_value < SIGNIFICANT and one.largest - 2 * one.sigma > tolerance
-        ]
-        if beyond:
-            return f"{out}; beyond {limit}: {', '.join(beyond)}."
-        return f"{out}; the data do not decide whether a period exceeds {limit}."
+        return chi_square_of(differences, cov)
 
 
 def _covariance(one: Float, covs: Float, other: Float) -> Float:
     """Covariance (D, D) of two combinations (P, D, D) of independent vectors."""
     return np.asarray((one @ covs @ other.swapaxes(1, 2)).sum(axis=0))
-
-
-def _probability(p: float) -> str:
-    return "p < 1e-12" if p < 1e-12 else f"p = {p:.2g}"
-
-
-def _points(size: tuple[float, float], grid: int) -> tuple[Float, Float]:
-    """Points (grid^2,) from edge to edge of a detector."""
-    x, y = np.meshgrid(np.linspace(1, size[0], grid), np.linspace(1, size[1], grid))
-    return x.ravel(), y.ravel()
-
-
-def _tested(difference: Float, cov: Float) -> tuple[float, int, float]:
-    """Chi-square of a vector, its degrees of freedom, and the probability of one as large."""
-    scale = np.sqrt(np.diag(cov))
-    factor = cho_factor(cov / np.outer(scale, scale))
-    scaled = difference / scale
-    value = float(scaled @ cho_solve(factor, scaled))
-    return value, len(scaled), float(chi_square.sf(value, len(scaled)))

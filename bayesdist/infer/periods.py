@@ -6,26 +6,33 @@ the combined one and all that is to be known of their differences come from thes
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import partial
+from typing import Any
 
 import numpy as np
-from astropy.time import Time
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from bayesdist.data import MatchTable
-from bayesdist.errors import InputError
+from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.identify import require_full_rank
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.normal import NormalEquations, least_squares
 from bayesdist.infer.period_changes import PeriodComparison
+from bayesdist.infer.period_dates import Periods, check_periods
 from bayesdist.infer.shards import Matches
-from bayesdist.infer.stars import prepare
+from bayesdist.infer.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = ["PeriodSums", "compare_periods", "mjd_periods", "period_sums"]
+__all__ = [
+    "PeriodSums",
+    "compare_periods",
+    "period_sums",
+    "sum_by_period",
+    "sums_of_stars",
+]
 
 Float = NDArray[np.float64]
 
@@ -55,60 +62,22 @@ class PeriodSums:
         return PeriodSums(self.equations + other.equations, squares, self.n + other.n)
 
 
-def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
-    """Periods of some days about Modified Julian Dates, for `period_sums`.
+def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable], Any]) -> Any:
+    """Sum over the pairs of each period of a task: one pass over the data, piece by piece.
 
     Parameters
     ----------
-    centres : sequence of float
-    days : float
-        Length of each.
-
-    Returns
-    -------
-    dict of str to tuple of float
-        Decimal years, by the centres' dates.
-
-    Raises
-    ------
-    InputError
-        For a length that is not positive.
-    """
-    if not days > 0:
-        raise InputError(f"periods of {days:g} days are asked for", do="give a positive length")
-    # the time scale of the epochs that a file gives as Modified Julian Dates
-    edges = np.asarray(centres, float)[:, None] + np.array([-days / 2, days / 2])
-    years = np.asarray(Time(edges, format="mjd", scale="tt").decimalyear, float)
-    return {
-        f"{centre:.10g}": (float(start), float(stop))
-        for centre, (start, stop) in zip(centres, years, strict=True)
-    }
-
-
-def period_sums(
-    fit: LinearFit,
-    matches: Matches,
-    periods: Mapping[str, tuple[float, float]],
-    *,
-    radial_weight: float = 1.0,
-) -> dict[str, PeriodSums]:
-    """Sums over the pairs of each period: one pass over the data, piece by piece.
-
-    Parameters
-    ----------
-    fit : LinearFit
-        Of all data: its model, and its rule for leaving pairs out, which is then one for all.
     matches : MatchTable or PartitionedMatches
-        With errors and epochs.
+        With epochs.
     periods : mapping of str to tuple of float
         First epoch of each period, and the epoch at which it is over, in decimal years.  Pairs
         outside all of them are not used.
-    radial_weight : float
-        As the fit's.
+    task : callable
+        Of the pairs of a period that one piece of the data holds; what it returns adds.
 
     Returns
     -------
-    dict of str to PeriodSums
+    dict of str to what the task returns
 
     Raises
     ------
@@ -120,51 +89,78 @@ def period_sums(
         raise InputError(
             "periods need an epoch for every pair", where=where, do="map column 'epoch'"
         )
-    _check_periods(periods)
-    _check_model(fit.model)
-    sums: dict[str, PeriodSums] = {}
+    check_periods(periods)
+    sums: dict[str, Any] = {}
     for piece in matches.pieces():
         table = piece.read()
         assert table.epoch is not None
         for name, (start, stop) in periods.items():
             inside = (table.epoch >= start) & (table.epoch < stop)
-            if not inside.any():
-                continue
-            part = _sums_of(fit, table.select(inside), radial_weight)
-            sums[name] = sums[name] + part if name in sums else part
+            if inside.any():
+                part = task(table.select(inside))
+                sums[name] = sums[name] + part if name in sums else part
     for name, (start, stop) in periods.items():
         if name not in sums:
             raise InputError(
-                f"period {name} ({start:g} to {stop:g}) has no pairs",
+                f"period {name} ({start:.8g} to {stop:.8g}) has no pairs",
                 where=where,
                 do="correct the period or leave it out",
             )
     return {name: sums[name] for name in periods}
 
 
-def _sums_of(fit: LinearFit, matches: MatchTable, radial_weight: float) -> PeriodSums:
-    stars, _ = prepare(fit.model, matches)
+def period_sums(
+    fit: LinearFit, matches: Matches, periods: Periods, *, radial_weight: float = 1.0
+) -> dict[str, PeriodSums]:
+    """Sums over the pairs of each period.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        Of all data: its model, and its rule for leaving pairs out, which is then one for all.
+    matches : MatchTable or PartitionedMatches
+        With errors and epochs.
+    periods : mapping of str to tuple of float
+        As `sum_by_period`.
+    radial_weight : float
+        As the fit's.
+
+    Returns
+    -------
+    dict of str to PeriodSums
+
+    Raises
+    ------
+    InputError
+        As `sum_by_period`, and for a model with frames or time dependence.
+    """
+    _check_model(fit.model)
+    task = partial(_sums_of, fit=fit, radial_weight=radial_weight)
+    out: dict[str, PeriodSums] = sum_by_period(matches, periods, task)
+    return out
+
+
+def _sums_of(matches: MatchTable, *, fit: LinearFit, radial_weight: float) -> PeriodSums:
+    return sums_of_stars(prepare(fit.model, matches)[0], fit, radial_weight)
+
+
+def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:
+    """What some pairs of one period say.
+
+    Parameters
+    ----------
+    stars : Stars
+    fit, radial_weight
+        As `period_sums`.
+
+    Returns
+    -------
+    PeriodSums
+    """
     rule = (fit.clip.theta, fit.clip.chi2_limit, fit.clip.abs_limit, radial_weight)
     equations = least_squares(stars, fit.mean, *rule)
     squares = least_squares(stars, fit.mean, *rule, 2) if radial_weight != 1.0 else None
     return PeriodSums(equations, squares, int(equations.scalars[0]))
-
-
-def _check_periods(periods: Mapping[str, tuple[float, float]]) -> None:
-    if len(periods) < 2:
-        raise InputError(
-            f"{len(periods)} periods are given", do="give two or more: a change needs a before"
-        )
-    ordered = sorted(periods.items(), key=lambda one: one[1])
-    for name, (start, stop) in ordered:
-        if not start < stop:
-            raise InputError(f"period {name} goes from {start:g} to {stop:g}", do="turn it round")
-    for (first, before), (second, after) in pairwise(ordered):
-        if after[0] < before[1]:
-            raise InputError(
-                f"periods {first} and {second} overlap",
-                do="let each begin where the one before it is over, or later",
-            )
 
 
 def _check_model(model: DistortionModel) -> None:
@@ -216,9 +212,16 @@ def compare_periods(
     steps: list[Float] = []
     covs: list[Float] = []
     normals: list[Float] = []
-    for one in sums.values():
+    for name, one in sums.items():
         arrow, right = one.equations.assemble(model, fit.mean)
-        require_full_rank(arrow, model, one.equations.groups)
+        try:
+            require_full_rank(arrow, model, one.equations.groups)
+        except DegenerateError as error:
+            raise DegenerateError(
+                f"the {one.n} pairs of period {name} do not determine the model: {error.cause}",
+                where="periods",
+                do="give longer periods or lower model.order",
+            ) from error
         normal = arrow.dense()
         inverse = _inverse(normal)
         rights.append(right)

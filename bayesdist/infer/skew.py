@@ -55,6 +55,7 @@ def skew_of(solution: LinearFit | Posterior, *, chip: int | None = None) -> Skew
     Parameters
     ----------
     solution : LinearFit or Posterior
+        The error of a fit with extra weight in the corners is that of its sandwich covariance.
     chip : int, optional
         Chip number; the first chip by default.
 

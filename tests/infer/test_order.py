@@ -181,9 +181,7 @@ def wise():
 
 
 def test_wise_asks_for_the_fourth_order_as_the_report_says(wise):
-    """WSDC D-T033, section 3: "Third order was seen to be just inadequate, but fourth order left
-    residuals as small as any of the higher orders."
-    """
+    """WSDC D-T033, section 3: order 3 fell just short, and nothing was gained beyond order 4."""
     (matches, _), model = wise
     chosen = select_order(matches, model)
     assert (chosen.by_surfaces, chosen.by_stars, chosen.by_regions) == (4, 4, 4)

@@ -11,7 +11,9 @@ from bayesdist.data import MatchTable, matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import fit_linear
 from bayesdist.infer.period_changes import PeriodComparison
-from bayesdist.infer.periods import compare_periods, mjd_periods, period_sums
+from bayesdist.infer.period_dates import mjd_periods
+from bayesdist.infer.period_verdict import period_verdict
+from bayesdist.infer.periods import compare_periods, period_sums
 from bayesdist.model import DistortionModel, TimeDependence
 from tests.infer.support import CHIP, SIZE, TWO_CHIPS, UNCLIPPED, legendre_design, simulated
 
@@ -42,6 +44,11 @@ def compared(table, model=MODEL, *, rescale=False, **options) -> PeriodCompariso
     weight = options.get("radial_weight", 1.0)
     sums = period_sums(fit, table, PERIODS, radial_weight=weight)
     return compare_periods(fit, sums, rescale=rescale)
+
+
+def verdict(found, rng, tolerance=None):
+    changes = {name: found.positions(name, rng=rng) for name in found.names}
+    return period_verdict(found, changes, tolerance)
 
 
 def part(table, name):
@@ -162,6 +169,26 @@ def test_the_field_is_as_good_as_its_coefficients(rng):
     assert most.sigma == pytest.approx(np.sqrt(along @ pair @ along))
 
 
+def test_the_map_of_differences_against_its_covariance_by_draws(rng):
+    """Vectors by evaluating both models; each p-value from the scatter of draws at its place."""
+    change = np.zeros(2 * K)
+    change[1] = 0.03
+    found = compared(dated(rng, 1000, change=change))
+    field = found.field("late", "early", grid=(4, 3))
+    assert field.x[[0, -1]].tolist() == [1.0, 1000.0] and field.y[[0, -1]].tolist() == [1.0, 800.0]
+    x, y = (a.ravel() for a in np.meshgrid(field.x, field.y))
+    late, early = (MODEL.predict(found.means[k], x, y) for k in (2, 0))
+    vectors = np.column_stack([field.du.ravel(), field.dv.ravel()])
+    np.testing.assert_allclose(vectors, late - early, rtol=0, atol=1e-9)
+    difference, cov = found.difference("late", "early")
+    phi = legendre_design(2, x, y)
+    draws = rng.multivariate_normal(difference, cov, 20_000)
+    at = np.stack([draws[:, :K] @ phi.T, draws[:, K:] @ phi.T], axis=-1)
+    for n in range(len(x)):
+        z2 = vectors[n] @ np.linalg.solve(np.cov(at[:, n].T), vectors[n])
+        assert field.p_value.ravel()[n] == pytest.approx(np.exp(-z2 / 2), rel=0.3)
+
+
 def test_monomial_coefficients_are_those_of_pixel_offsets(rng):
     """The same difference, evaluated either way; errors from the draws of the difference."""
     found = compared(dated(rng, 1000))
@@ -222,16 +249,16 @@ def test_a_change_is_placed_measured_and_said(rng):
     most = found.positions("late", "early", rng=rng)
     assert abs(most.largest - 0.08) < 4 * most.sigma + 0.01 and most.p_value < 1e-3
     assert most.at[0] in (1.0, 1000.0) and most.p_field < 1e-12
-    said = found.verdict(rng=rng, tolerance=0.5)
+    said = verdict(found, rng, 0.5)
     assert said.startswith("The distortion changes") and "p < 1e-12" in said
     assert "late differs most" in said
     assert said.endswith("all periods are below the tolerance of 0.5 pix.")
-    said = found.verdict(rng=rng, tolerance=0.01)
+    said = verdict(found, rng, 0.01)
     assert "beyond the tolerance of 0.01 pix: " in said and said.endswith("late.")
     quiet = compared(dated(rng, 8000, sigma=0.05))
-    assert quiet.verdict(rng=rng).startswith("No change is seen")
+    assert verdict(quiet, rng).startswith("No change is seen")
     level = max(quiet.positions(name, rng=rng).largest for name in PERIODS)
-    assert "do not decide" in quiet.verdict(rng=rng, tolerance=level)
+    assert "do not decide" in verdict(quiet, rng, level)
 
 
 def test_quoted_errors_that_are_too_small_do_not_make_a_change(rng):

@@ -1,0 +1,173 @@
+"""`bayesdist order`: which polynomial order do the data of a configuration ask for?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.config import load_config
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.screen import table_text
+from bayesdist.app.session import Session, write_table
+from bayesdist.data import atomic_path
+from bayesdist.errors import InputError
+from bayesdist.infer.order import select_order
+from bayesdist.infer.order_results import OrderSelection
+from bayesdist.model.basis import MAX_ORDER
+
+__all__ = ["order"]
+
+
+def order(
+    path: str | Path,
+    orders: Sequence[int] = (3, 9),
+    *,
+    output: str | Path | None = None,
+    figure: str | Path | None = None,
+    force: bool = False,
+) -> str:
+    """Compare orders on the data that a run of a configuration would use.
+
+    Parameters
+    ----------
+    path : path
+        Configuration file; its own order, priors and extra weights do not matter.
+    orders : sequence of int
+        The lowest and the highest.
+    output : path, optional
+        ECSV file for the table.
+    figure : path, optional
+        PNG file.
+    force : bool
+        Replace files that are there.
+
+    Returns
+    -------
+    str
+        A readable table and the verdict.
+
+    Raises
+    ------
+    BayesdistError
+        For whatever would stop the run, and as `select_order`.
+    """
+    targets = [Path(name) for name in (output, figure) if name is not None]
+    for target in targets:
+        if target.exists() and not force:
+            raise InputError("this file exists", where=str(target), do="replace it by --force")
+    low, high = orders
+    if not 1 <= low < high <= MAX_ORDER:
+        raise InputError(
+            f"the orders go from {low} to {high}",
+            where="--orders",
+            do=f"give the lowest and the highest, between 1 and {MAX_ORDER}",
+        )
+    config, text = load_config(path)
+    if config.campaign is not None:
+        raise InputError(
+            "orders are compared on matched stars, and this is a [campaign]",
+            where=str(path),
+            do="give a configuration with [data]",
+        )
+    with TemporaryDirectory() as nowhere:
+        run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
+        with closing(Session(run)) as session:
+            found = _selected(session, range(low, high + 1))
+    if output is not None:
+        write_table(_table(found), Path(output))
+    if figure is not None:
+        _draw(found, Path(figure))
+    return f"{_text(found)}\n\n{found.sentence}"
+
+
+def _selected(session: Session, orders: Sequence[int]) -> OrderSelection:
+    """Errors by magnitude are those of the highest order: its residuals hold the least misfit."""
+    config = session.config
+    # names of priors may be those of other orders
+    free = config.model_copy(update={"prior": []})
+    session.config = free.model_copy(
+        update={"fit": config.fit.model_copy(update={"radial_weight": 1.0})}
+    )
+    session.model = replace(session.model, order=max(orders))
+    if config.data is not None and config.data.sigma == "by_magnitude":
+        _, errors = session.linear
+        session.magnitude_errors = errors
+    return select_order(
+        session.shards,
+        session.model,
+        orders=orders,
+        clip_chi2=config.fit.clip_chi2,
+        clip_abs=config.fit.clip_abs,
+    )
+
+
+def _table(found: OrderSelection) -> Table:
+    rows = found.rows()
+    table = Table(
+        {key: [np.nan if row[key] is None else row[key] for row in rows] for key in rows[0]}
+    )
+    for name in ("rms_u", "rms_v", "lost"):
+        table[name].unit = found.unit
+    noise = found.surfaces.noise
+    table.meta = {
+        "verdict": found.sentence,
+        "order": found.order,
+        "by_surfaces": found.by_surfaces,
+        "by_stars": found.by_stars,
+        "by_regions": found.by_regions,
+        "n_used": found.n_used,
+        "n_bins": found.surfaces.n_bins,
+        "noise_u": float(noise[0]),
+        "noise_v": float(noise[1]),
+        "pair_rms": found.pair_rms,
+        "error_scale": found.error_scale,
+        "unit": found.unit,
+    }
+    return table
+
+
+def _text(found: OrderSelection) -> str:
+    """Surfaces on the left, what is held out on the right."""
+    noise, s = found.surfaces.noise, found.surfaces
+    rows = [
+        {
+            "order": f"{row['order']}{' *' if row['order'] == found.order else ''}",
+            "terms": row["terms"],
+            "rms u": row["rms_u"],
+            "rms v": row["rms_v"],
+            "chi2/dof u": row["chi2_u"],
+            "chi2/dof v": row["chi2_v"],
+            "F": row["F"],
+            "p": row["p_surface"],
+            "held-out stars": _with_error(row["stars"], row["stars_error"]),
+            "held-out regions": _with_error(row["regions"], row["regions_error"]),
+            "lost": row["lost"],
+        }
+        for row in found.rows()
+    ]
+    return (
+        f"{found.n_used} pairs in {s.n_bins} bins; lengths in {found.unit}; noise of the bins "
+        f"{noise[0]:.3g} (u), {noise[1]:.3g} (v); errors are {found.error_scale:.3g} times those "
+        f"quoted\n\n{table_text(rows, 3)}\n\n"
+        "*  chosen: F, p and what is held out (log density) are against this order; lost: how far "
+        f"the model is from that of order {found.orders[-1]}"
+    )
+
+
+def _with_error(value: float | None, error: float | None) -> str:
+    return "" if value is None or error is None else f"{value:.4g} +- {error:.2g}"
+
+
+def _draw(found: OrderSelection, path: Path) -> None:
+    from bayesdist.report.figures import drawn  # figures take seconds to import
+    from bayesdist.report.order import order_comparison
+
+    png = drawn({"orders": order_comparison(found)})["orders"]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(png)

@@ -1,0 +1,234 @@
+"""The periods of a configuration: what is compared, and what of it goes into the files of a run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.table import Table, vstack
+
+from bayesdist.assess import SAMPLE, convert, pixel_scale_of
+from bayesdist.assess.periods import TimeVariation, bins_for, time_variation
+from bayesdist.data import MatchTable
+from bayesdist.errors import InputError
+
+if TYPE_CHECKING:
+    from bayesdist.app.session import Session
+    from bayesdist.assess.wise import PatternChange, StatisticsTable
+    from bayesdist.infer.period_positions import PositionChange
+
+__all__ = ["check_pairs", "periods_of", "periods_summary", "periods_table"]
+
+KEPT = "time_variation"
+
+
+def check_pairs(session: Session) -> dict[str, int]:
+    """About how many pairs each period has, from the epochs of some of the pairs.
+
+    Parameters
+    ----------
+    session : Session
+
+    Returns
+    -------
+    dict of str to int
+        Empty where no periods are asked for.
+
+    Raises
+    ------
+    InputError
+        Without epochs, and for a period without pairs: before anything is sampled.
+    """
+    spans = session.config.spans()
+    if not spans:
+        return {}
+    raw = session.raw_matches
+    where = ", ".join(raw.sources)
+    if not raw.has_epoch:
+        raise InputError(
+            "[periods] needs an epoch for every pair", where=where, do="map column 'epoch'"
+        )
+    some = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
+    epoch = some.epoch
+    assert epoch is not None
+    share = len(raw) / len(some)
+    out = {}
+    for name, (start, stop) in spans.items():
+        n = int(((epoch >= start) & (epoch < stop)).sum())
+        if not n:
+            raise InputError(
+                f"the period about MJD {name} has no pairs: epochs go from {epoch.min():.6g} to "
+                f"{epoch.max():.6g}, and it from {start:.6g} to {stop:.6g}",
+                where=where,
+                do="correct periods.centres and periods.days, or leave the period out",
+            )
+        out[name] = round(n * share)
+    return out
+
+
+def periods_of(session: Session, *, anew: bool = False) -> TimeVariation | None:
+    """The configured periods compared, once in a session.
+
+    Parameters
+    ----------
+    session : Session
+    anew : bool
+        Also where it has been done: the fit may be another one.
+
+    Returns
+    -------
+    TimeVariation or None
+        None where no periods are asked for.
+
+    Raises
+    ------
+    InputError
+        As `check_pairs` and `time_variation`.
+    """
+    if session.config.periods is None:
+        return None
+    if anew or KEPT not in session.__dict__:
+        session.__dict__[KEPT] = _compared(session)
+    return session.__dict__[KEPT]
+
+
+def _compared(session: Session) -> TimeVariation:
+    fit, config = session.fit, session.config
+    least = min(check_pairs(session).values())
+    scale = pixel_scale_of(fit, scale_mas=config.detector.scale_mas)
+    angle = fit.unit != "pix" or scale is not None
+    limits = [
+        convert(r.limit, r.unit, fit.unit, scale, where=f"requirement {r.name!r}")
+        for r in config.requirements()
+    ]
+    return time_variation(
+        fit,
+        session.matches,
+        config.spans(),
+        rng=session.rng("assess"),
+        bins=bins_for(least // len(fit.model.chips)),
+        radial_weight=config.fit.radial_weight,
+        tolerance=min(limits, default=None),
+        unit_arcsec=convert(1.0, fit.unit, "arcsec", scale) if angle else None,
+    )
+
+
+def periods_table(found: TimeVariation) -> Table:
+    """Differences of all coefficients: each period against the combined model, and the ends."""
+    comparison = found.comparison
+    parts = []
+    for name, against in (*((n, None) for n in comparison.names), (found.last, found.first)):
+        change, monomial = (
+            comparison.coefficients(name, against, monomial=m) for m in (False, True)
+        )
+        n = len(change.names)
+        parts.append(
+            Table(
+                {
+                    "period": [name] * n,
+                    "against": [against or "combined"] * n,
+                    "name": list(change.names),
+                    "difference": change.difference,
+                    "sigma": change.sigma,
+                    "z": change.z,
+                    "p_value": change.p_value,
+                    "monomial_difference": monomial.difference,
+                    "monomial_sigma": monomial.sigma,
+                }
+            )
+        )
+    out = vstack(parts)
+    chi2, dof, p = comparison.homogeneity
+    out.meta = {
+        "verdict": found.verdict,
+        "chi2": chi2,
+        "dof": dof,
+        "p_value": p,
+        "error_scale": comparison.error_scale,
+        "unit": comparison.model.unit,
+    }
+    return out
+
+
+def periods_summary(found: TimeVariation) -> dict[str, Any]:
+    """Section 'periods' of summary.json."""
+    comparison = found.comparison
+    chi2, dof, p = comparison.homogeneity
+    rows = []
+    for name, n in zip(comparison.names, comparison.counts, strict=True):
+        start, stop = found.spans[name]
+        change = comparison.coefficients(name)
+        rows.append(
+            {
+                "name": name,
+                "start": start,
+                "stop": stop,
+                "n_pairs": n,
+                **_position(found.changes[name]),
+                "z_max": float(np.abs(change.z).max()),
+            }
+        )
+    return {
+        "verdict": found.verdict,
+        "pattern": found.pattern_sentence,
+        "significant": found.significant,
+        "tolerance": found.tolerance,
+        "unit": comparison.model.unit,
+        "error_scale": comparison.error_scale,
+        "chi2": chi2,
+        "dof": dof,
+        "p_value": p,
+        "n_outside": found.n_outside,
+        "n_repeated": found.n_repeated,
+        "periods": rows,
+        "ends": {"period": found.last, "against": found.first, **_position(found.ends)},
+        "residuals": [
+            _statistics(table, chip.number)
+            for table, chip in zip(found.residuals, comparison.model.chips, strict=True)
+        ],
+        "patterns": [
+            _pattern(one) | {"chip": chip.number}
+            for several, chip in zip(found.patterns, comparison.model.chips, strict=True)
+            for one in several
+        ],
+    }
+
+
+def _position(change: PositionChange) -> dict[str, Any]:
+    return {
+        "largest": change.largest,
+        "sigma": change.sigma,
+        "at": list(change.at),
+        "chip": change.chip,
+        "noise_median": change.noise_median,
+        "noise_95": change.noise_95,
+        "p_value": change.p_value,
+        "chi2": change.chi2,
+        "dof": change.dof,
+        "p_field": change.p_field,
+    }
+
+
+def _statistics(table: StatisticsTable, chip: int) -> dict[str, Any]:
+    rows = [
+        {
+            "label": row.label,
+            **row.value,
+            "sigma_error": row.error["sigma"],
+            "sigma_noise_free": row.noise_free["sigma"],
+            "n_bins": row.n_bins,
+        }
+        for row in table.rows
+    ]
+    return {"chip": chip, "unit": table.unit, "rows": rows}
+
+
+def _pattern(one: PatternChange) -> dict[str, Any]:
+    return {
+        "period": one.period,
+        "axis": one.axis,
+        "p_value": one.p_value,
+        "rms": one.rms,
+        "correlation": one.correlation,
+        "n_bins": one.n_bins,
+    }

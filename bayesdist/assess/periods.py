@@ -1,0 +1,288 @@
+"""Does the distortion change with time?  Models and residuals of several periods (WSDC D-T033, C).
+
+One pass over the data gathers all of it: the normal equations of each period, its residuals in bins
+about the one model of all data, and which reference stars it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.misfit import STARS_PER_BIN
+from bayesdist.assess.wise import (
+    BandBins,
+    PatternChange,
+    StatisticsTable,
+    band_bins,
+    pattern_changes,
+    period_table,
+)
+from bayesdist.data import MatchTable
+from bayesdist.errors import DegenerateError
+from bayesdist.infer import LinearFit, Matches
+from bayesdist.infer.period_changes import PeriodComparison
+from bayesdist.infer.period_positions import PositionChange
+from bayesdist.infer.period_verdict import SIGNIFICANT, all_below, period_verdict
+from bayesdist.infer.periods import PeriodSums, compare_periods, sum_by_period, sums_of_stars
+from bayesdist.infer.stars import prepare
+
+__all__ = ["PeriodPart", "TimeVariation", "bins_for", "period_part", "time_variation"]
+
+Int = NDArray[np.int64]
+
+MOST_BINS = 45  # along each side, as in Appendix C
+COMBINED = "combined"
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodPart:
+    """What some pairs of one period say; parts of pieces of the data add.
+
+    Parameters
+    ----------
+    sums : PeriodSums
+    bins : tuple of BandBins
+        Residuals about the fit of all data, of each chip.
+    n_rows : int
+        Pairs, those included that the fit leaves out.
+    stars : ndarray of int
+        Sorted codes of the reference stars, each once; empty where they are not known.
+    """
+
+    sums: PeriodSums
+    bins: tuple[BandBins, ...]
+    n_rows: int
+    stars: Int
+
+    def __add__(self, other: PeriodPart) -> PeriodPart:
+        return PeriodPart(
+            self.sums + other.sums,
+            tuple(a + b for a, b in zip(self.bins, other.bins, strict=True)),
+            self.n_rows + other.n_rows,
+            np.union1d(self.stars, other.stars),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TimeVariation:
+    """What the periods say of a change with time.
+
+    Parameters
+    ----------
+    comparison : PeriodComparison
+    spans : mapping of str to tuple of float
+        Begin and end of each period, decimal years.
+    changes : mapping of str to PositionChange
+        Of each period against the combined model.
+    first, last : str
+        The earliest and the latest period.
+    ends : PositionChange
+        The latest against the earliest.
+    residuals : tuple of StatisticsTable
+        As Table C-1, of each chip: all periods together, then each; in arcsec where the size of a
+        pixel is known, else in the unit of u, v.
+    patterns : tuple of tuple of PatternChange
+        Of each chip, in the unit of u, v.
+    tolerance : float or None
+        Difference of positions that does not matter, in the unit of u, v.
+    n_outside : int
+        Pairs outside all periods.
+    n_repeated : int
+        Reference stars that several periods have; 0 where stars are not told apart.
+    """
+
+    comparison: PeriodComparison
+    spans: Mapping[str, tuple[float, float]]
+    changes: Mapping[str, PositionChange]
+    first: str
+    last: str
+    ends: PositionChange
+    residuals: tuple[StatisticsTable, ...]
+    patterns: tuple[tuple[PatternChange, ...], ...]
+    tolerance: float | None
+    n_outside: int
+    n_repeated: int
+
+    @property
+    def significant(self) -> bool:
+        """Whether one model of all periods is refuted."""
+        return self.comparison.homogeneity[2] < SIGNIFICANT
+
+    @property
+    def matters(self) -> bool:
+        """Whether one model is refuted, and not known to do all the same."""
+        harmless = self.tolerance is not None and all_below(self.changes, self.tolerance)
+        return self.significant and not harmless
+
+    @property
+    def verdict(self) -> str:
+        """Whether the distortion changes, and whether that matters."""
+        return period_verdict(self.comparison, self.changes, self.tolerance)
+
+    @property
+    def pattern_sentence(self) -> str:
+        """Whether the residuals have the same pattern in all periods."""
+        found = [one for chip in self.patterns for one in chip]
+        least = min(found, key=lambda one: one.p_value)
+        p = min(1.0, len(found) * least.p_value)
+        if p >= SIGNIFICANT:
+            return (
+                "The pattern of the residuals about one model is the same in all periods "
+                f"(least of {len(found)} probabilities, times their number: {p:.2g})."
+            )
+        return (
+            f"The pattern of the residuals about one model changes: in {least.period} the means of "
+            f"bins differ in {least.axis} by {least.rms:.2g} {self.comparison.model.unit} rms from "
+            f"those of the other periods (p = {p:.1g}, of {len(found)} tests)."
+        )
+
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """What a reader of the comparison has to know, as sentences."""
+        out = []
+        if self.n_outside:
+            out.append(
+                f"{self.n_outside} pairs lie outside all periods: the combined model is that of "
+                "the periods, not of all pairs."
+            )
+        if self.n_repeated:
+            out.append(
+                f"{self.n_repeated} reference stars have pairs in several periods: errors of the "
+                "catalogue are common to these, and the periods count as independent here."
+            )
+        return tuple(out)
+
+
+def bins_for(n: int) -> int:
+    """Bins on each axis for so many pairs of the smallest period on a chip."""
+    return int(np.clip(np.sqrt(n / STARS_PER_BIN), 2, MOST_BINS))
+
+
+def period_part(
+    matches: MatchTable, *, fit: LinearFit, bins: int, radial_weight: float = 1.0
+) -> PeriodPart:
+    """A task for `sum_by_period`.
+
+    Parameters
+    ----------
+    matches : MatchTable
+        Of one period.
+    fit : LinearFit
+        Of all data.
+    bins : int
+        On each axis.
+    radial_weight : float
+        As the fit's.
+
+    Returns
+    -------
+    PeriodPart
+    """
+    stars, _ = prepare(fit.model, matches)
+    used = fit.clip.keeps_of(stars)
+    chip = np.repeat(stars.groups.chip, np.diff(stars.starts))
+    columns = (*stars.pixels(), *stars.residuals(fit.mean).T)
+    return PeriodPart(
+        sums=sums_of_stars(stars, fit, radial_weight),
+        bins=tuple(
+            band_bins(*(a[used & (chip == k)] for a in columns), bins=bins, size=one.size)
+            for k, one in enumerate(fit.model.chips)
+        ),
+        n_rows=len(matches),
+        stars=np.zeros(0, np.int64) if matches.star is None else np.unique(matches.star),
+    )
+
+
+def time_variation(
+    fit: LinearFit,
+    matches: Matches,
+    periods: Mapping[str, tuple[float, float]],
+    *,
+    rng: np.random.Generator,
+    bins: int,
+    radial_weight: float = 1.0,
+    tolerance: float | None = None,
+    unit_arcsec: float | None = None,
+) -> TimeVariation:
+    """Compare periods: one pass over the data.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        Of all data, without frames and time dependence.
+    matches : MatchTable or PartitionedMatches
+        With errors and epochs.
+    periods : mapping of str to tuple of float
+        As `sum_by_period`.
+    rng : numpy.random.Generator
+    bins : int
+        On each axis, for the residuals.
+    radial_weight : float
+        As the fit's.
+    tolerance : float, optional
+        Difference of positions that does not matter, in the unit of u, v.
+    unit_arcsec : float, optional
+        The unit of u, v in arcsec.
+
+    Returns
+    -------
+    TimeVariation
+
+    Raises
+    ------
+    InputError
+        As `sum_by_period` and `compare_periods`.
+    DegenerateError
+        For a period with too few pairs.
+    """
+    task = partial(period_part, fit=fit, bins=bins, radial_weight=radial_weight)
+    parts: dict[str, PeriodPart] = sum_by_period(matches, periods, task)
+    comparison = compare_periods(fit, {name: part.sums for name, part in parts.items()})
+    first = min(periods, key=lambda name: periods[name])
+    last = max(periods, key=lambda name: periods[name])
+    _, seen = np.unique(np.concatenate([p.stars for p in parts.values()]), return_counts=True)
+    by_chip = [
+        {name: part.bins[k] for name, part in parts.items()} for k in range(len(fit.model.chips))
+    ]
+    try:
+        residuals = tuple(_residuals(one, fit.unit, unit_arcsec, rng) for one in by_chip)
+        patterns = tuple(pattern_changes(one) for one in by_chip)
+    except DegenerateError as error:
+        least = min(parts, key=lambda name: parts[name].n_rows)
+        raise DegenerateError(
+            f"period {least} has {parts[least].n_rows} pairs, too few for mean residuals in bins",
+            where="periods",
+            do="give longer periods, or leave it out",
+        ) from error
+    return TimeVariation(
+        comparison=comparison,
+        spans=dict(periods),
+        changes={name: comparison.positions(name, rng=rng) for name in periods},
+        first=first,
+        last=last,
+        ends=comparison.positions(last, first, rng=rng),
+        residuals=residuals,
+        patterns=patterns,
+        tolerance=tolerance,
+        n_outside=len(matches) - sum(part.n_rows for part in parts.values()),
+        n_repeated=int((seen > 1).sum()),
+    )
+
+
+def _residuals(
+    periods: Mapping[str, BandBins],
+    unit: str,
+    unit_arcsec: float | None,
+    rng: np.random.Generator,
+) -> StatisticsTable:
+    """Table C-1: all periods together, then each of them."""
+    one, *others = periods.values()
+    together = sum(others, start=one)
+    rows = {COMBINED: together, **periods}
+    table = period_table(rows, rng=rng, arcsec_per_pixel=unit_arcsec or 1.0)
+    return table if unit_arcsec else replace(table, unit=unit)

@@ -1,0 +1,87 @@
+"""Periods: when they begin and end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+from astropy.time import Time
+
+from bayesdist.errors import InputError
+
+__all__ = ["Periods", "check_periods", "mjd_periods"]
+
+Periods = Mapping[str, tuple[float, float]]  # begin and end by name, decimal years
+
+MOST_MJD = 2e6  # some five thousand years: calendars end not far beyond
+
+
+def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
+    """Periods of some days about Modified Julian Dates, for `period_sums`.
+
+    Parameters
+    ----------
+    centres : sequence of float
+    days : float
+        Length of each.
+
+    Returns
+    -------
+    dict of str to tuple of float
+        Decimal years, by the centres' dates.
+
+    Raises
+    ------
+    InputError
+        For a length that is not positive, and a centre that is no date.
+    """
+    if not days > 0:
+        raise InputError(
+            f"periods of {days:g} days are asked for", where="periods", do="give a positive length"
+        )
+    beyond = [c for c in centres if not abs(c) < MOST_MJD]
+    if beyond:
+        raise InputError(
+            f"a period is centred on {beyond[0]:g}, which is no Modified Julian Date",
+            where="periods",
+            do="give days such as 55212.5",
+        )
+    # the time scale of the epochs that a file gives as Modified Julian Dates
+    edges = np.asarray(centres, float)[:, None] + np.array([-days / 2, days / 2])
+    years = np.asarray(Time(edges, format="mjd", scale="tt").decimalyear, float)
+    return {
+        f"{centre:.10g}": (float(start), float(stop))
+        for centre, (start, stop) in zip(centres, years, strict=True)
+    }
+
+
+def check_periods(periods: Periods) -> None:
+    """Refuse periods that cannot be compared.
+
+    Raises
+    ------
+    InputError
+        For less than two, for one that ends before it begins, and for two that overlap.
+    """
+    if len(periods) < 2:
+        raise InputError(
+            f"{len(periods)} periods are given",
+            where="periods",
+            do="give two or more: a change needs a before",
+        )
+    ordered = sorted(periods.items(), key=lambda one: one[1])
+    for name, (start, stop) in ordered:
+        if not start < stop:
+            raise InputError(
+                f"period {name} goes from {start:.8g} to {stop:.8g}",
+                where="periods",
+                do="turn it round",
+            )
+    for (first, before), (second, after) in pairwise(ordered):
+        if after[0] < before[1]:
+            raise InputError(
+                f"periods {first} and {second} overlap",
+                where="periods",
+                do="let each begin where the one before it is over, or later",
+            )

@@ -1,0 +1,58 @@
+"""The examples run as they stand, and say what their texts say."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def printed(name: str, cwd: Path) -> str:
+    """What an example prints, in a process and a folder of its own."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", ROOT / "examples" / name],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_bring_up_ends_at_the_truth_from_every_start(tmp_path):
+    """A sigma of a corner is 0.023 px: that of 5700 pairs of 0.14 px and 15 terms of an axis.
+
+    At a corner each of 15 Legendre products P_i P_j is 1, with variance (2 i + 1)(2 j + 1) / n.
+    """
+    out = printed("wise_bringup.py", tmp_path)
+    starts = out.split("\n\n")[1:]
+    assert [re.match("from [a-z ]+", one).group() for one in starts] == [
+        "from nothing",
+        "from the optical model as delivered",
+        "from the optical model",
+    ]
+    assert "turned by 270 degrees" in starts[2]
+    terms = [(i, j) for i in range(5) for j in range(5 - i)]
+    ends = []
+    for one in starts:
+        first, *_, last = (line.split() for line in re.findall(r"^ +\d.*$", one, re.MULTILINE))
+        pairs, rms = int(last[2]), float(last[4])
+        sigma = rms * sum((2 * i + 1) * (2 * j + 1) for i, j in terms) ** 0.5 / pairs**0.5
+        off = float(re.search(r"([\d.]+) px off", one).group(1))
+        # the largest of eight numbers, four corners of two axes each
+        assert float(last[5]) < 4 * sigma < 0.1 * off
+        assert last[3] == "100.0%" and float(first[3].rstrip("%")) < 95
+        assert "The calibration settled in" in one
+        ends.append(last[5])
+    # not the start decides, but the pairs
+    assert len(set(ends)) == 1
+    # as delivered the optical model is worse than none, turned it is not
+    off = [float(re.search(r"([\d.]+) px off", one).group(1)) for one in starts]
+    pairs = [int(re.search(r"^ +1 +2 +(\d+)", one, re.MULTILINE).group(1)) for one in starts]
+    assert off[1] > 1.5 * off[0] and pairs[1] < pairs[0] and pairs[1] < pairs[2]
