@@ -20,7 +20,7 @@ from bayesdist.products.sip_families import (
 )
 from bayesdist.products.sip_implied import StatedMaxima, implied_values
 from bayesdist.products.sip_lint import lint_sip
-from bayesdist.products.wise_meta import WiseBand
+from bayesdist.products.wise_meta import WiseBand, monomial
 
 __all__ = ["lint_wise_band"]
 
@@ -109,22 +109,13 @@ def _comments(band: WiseBand) -> Iterator[Finding]:
         said = _MONOMIAL.search(comment)
         if said is None or sip_powers(keyword) is None:
             continue
-        right = _monomial(*powers_of(keyword))
+        right = monomial(*powers_of(keyword))
         if said[1].lower() != right:
             wrong.setdefault((said[1].lower(), right), []).append(keyword)
     for (said_there, right), keywords in wrong.items():
         yield Finding(
             "note", ", ".join(keywords), f"the comment says {said_there}, the indices say {right}"
         )
-
-
-def _monomial(p: int, q: int) -> str:
-    """As the comments have it: u2.v, u.v, v3, and v0 for the constant."""
-    if p == 0:
-        return f"v{q}"
-    if q == 0:
-        return f"u{p}"
-    return ".".join(n if k == 1 else f"{n}{k}" for n, k in (("u", p), ("v", q)))
 
 
 def _skew(band: WiseBand) -> Iterator[Finding]:

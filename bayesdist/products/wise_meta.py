@@ -14,13 +14,15 @@ from bayesdist.products.blocks import content_of
 from bayesdist.products.sip import SipHeader
 from bayesdist.products.sip_read import parsed, readable
 
-__all__ = ["WiseBand", "holds_wise_meta", "read_wise_meta"]
+__all__ = ["ARRAYS", "WiseBand", "holds_wise_meta", "monomial", "read_wise_meta"]
 
 _ENTRY = re.compile(r"\S*distort_(?:skew|(?:a|b|ap|bp)_)\S*")
 _ENTRY_LINE = re.compile(r"\S*distort_(\S+)\s+(\d+)\s+(\S+)\s+([ir])\s+(\S+)\s*(.*)")
 _KEYWORD = re.compile(r"SKEW|[AB]P?_(?:ORDER|\d_\d)|[AB]_DMAX")
+# What `write_wise_meta` says in comment lines, which other readers pass over.
+_ASIDE = re.compile(r"\\\s+(\d+)\s+([AB]E_\d_\d|BDCLOS)\s+r\s+(\S+).*")
 # Columns and rows of the arrays, and arcseconds in a pixel: those of W4 are twice as wide.
-_WISE = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
+ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,8 @@ def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
     """Read the distortion entries of a WISE meta-data file.
 
     The layout is that of WSDC D-T033 ("WISE IOC Distortion Calibration"), Appendix B: name, band,
-    keyword, type, value, comment.  Entries of other kinds are passed over.
+    keyword, type, value, comment.  Entries of other kinds are passed over, and comment lines but
+    for the standard deviations and the closure that `write_wise_meta` puts there.
 
     Parameters
     ----------
@@ -73,6 +76,7 @@ def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
     with readable(path) as where:
         lines = content_of(path).decode("ascii").splitlines()
     entries: dict[int, dict[str, tuple[str, str]]] = {}
+    asides: dict[int, dict[str, str]] = {}
     for number, line in enumerate(lines, start=1):
         if _ENTRY.match(line):
             band, keyword, value, comment = _entry(line, f"{where}, line {number}")
@@ -83,11 +87,15 @@ def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
                     do="remove one",
                 )
             entries[band][keyword] = value, comment
+        elif aside := _ASIDE.fullmatch(line.rstrip()):
+            asides.setdefault(int(aside[1]), {})[aside[2]] = aside[3]
     if not entries:
         raise FormatError(
             "there are no distortion entries", where=where, do="give a WISE meta-data file"
         )
-    return tuple(_wise_band(band, entries[band], where) for band in sorted(entries))
+    return tuple(
+        _wise_band(band, entries[band], asides.get(band, {}), where) for band in sorted(entries)
+    )
 
 
 def holds_wise_meta(path: str | os.PathLike[str]) -> bool:
@@ -120,15 +128,27 @@ def _entry(line: str, where: str) -> tuple[int, str, str, str]:
         )
     if not _KEYWORD.fullmatch(keyword):
         raise FormatError(f"{keyword} is no keyword of SIP", where=where, do="correct the keyword")
-    if int(band) not in _WISE:
+    if int(band) not in ARRAYS:
         raise FormatError(f"band {band} is none of 1 to 4", where=where, do="correct the band")
     return int(band), keyword, value, " ".join(comment.split())
 
 
-def _wise_band(band: int, entries: dict[str, tuple[str, str]], where: str) -> WiseBand:
+def monomial(p: int, q: int) -> str:
+    """Of u^p v^q, as the comments have it: u2.v, u.v, v3, and v0 for the constant."""
+    if p == 0:
+        return f"v{q}"
+    if q == 0:
+        return f"u{p}"
+    return ".".join(n if k == 1 else f"{n}{k}" for n, k in (("u", p), ("v", q)))
+
+
+def _wise_band(
+    band: int, entries: dict[str, tuple[str, str]], asides: dict[str, str], where: str
+) -> WiseBand:
     where = f"{where}, band {band}"
     header = fits.Header()
-    for keyword, (value, _) in entries.items():
+    values = {keyword: value for keyword, (value, _) in entries.items()}
+    for keyword, value in (values | asides).items():
         try:
             header[keyword] = int(value) if keyword.endswith("_ORDER") else float(value)
         except ValueError:
@@ -137,7 +157,7 @@ def _wise_band(band: int, entries: dict[str, tuple[str, str]], where: str) -> Wi
                 where=f"{where}, keyword {keyword}",
                 do="correct the value",
             ) from None
-    side, scale = _WISE[band]
+    side, scale = ARRAYS[band]
     for axis, ctype in enumerate(("RA---TAN-SIP", "DEC--TAN-SIP"), start=1):
         header[f"CTYPE{axis}"] = ctype
         header[f"CRPIX{axis}"] = (side + 1) / 2
@@ -147,6 +167,6 @@ def _wise_band(band: int, entries: dict[str, tuple[str, str]], where: str) -> Wi
         band,
         parsed(header, where),
         float(header.get("SKEW", 0.0)),
-        {keyword: value for keyword, (value, _) in entries.items()},
+        values,
         {keyword: comment for keyword, (_, comment) in entries.items()},
     )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.data.files import atomic_path
-from tests.benchmarks import likelihood, linear, samplers, scaling
+from tests.benchmarks import likelihood, linear, samplers, scaling, wise
 from tests.benchmarks.figure import draw_scaling
 from tests.benchmarks.machine import describe
 from tests.benchmarks.markdown import to_markdown
@@ -19,7 +19,13 @@ from tests.benchmarks.timing import say
 
 __all__ = ["main"]
 
-PARTS = {"samplers": samplers, "kernel": likelihood, "linear": linear, "scaling": scaling}
+PARTS = {
+    "samplers": samplers,
+    "kernel": likelihood,
+    "linear": linear,
+    "scaling": scaling,
+    "wise": wise,
+}
 
 
 def _finite(value: Any) -> Any:

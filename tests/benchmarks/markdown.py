@@ -266,7 +266,30 @@ def _scaling(part: dict[str, Any]) -> list[str]:
     return out
 
 
-_PARTS = {"samplers": _samplers, "kernel": _kernel, "linear": _linear, "scaling": _scaling}
+def _wise(part: dict[str, Any]) -> list[str]:
+    out = ["## Simulated WISE pairs", ""]
+    out += [f"With the partition pattern; written as Parquet in {part['threads']} threads.", ""]
+    head = ("band", "pairs", "pairs/s in memory, one thread", "written [s]", "pairs/s written")
+    body = [
+        (
+            r["band"],
+            f"{r['n_pairs']:,}",
+            f"{r['chunk_rate']:,.0f}",
+            _number(r["write_s"]),
+            f"{r['write_rate']:,.0f}",
+        )
+        for r in part["rows"]
+    ]
+    return out + _table(head, body)
+
+
+_PARTS = {
+    "samplers": _samplers,
+    "kernel": _kernel,
+    "linear": _linear,
+    "scaling": _scaling,
+    "wise": _wise,
+}
 
 
 def to_markdown(bench: dict[str, Any]) -> str:
