@@ -1,0 +1,139 @@
+"""The files of a comparison: tables, figure, and the summary that scripts read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from astropy.table import Table, vstack
+
+from bayesdist.app.folder import whole_folder
+from bayesdist.app.rundir import versions, write_json
+from bayesdist.app.session import write_table
+from bayesdist.assess.comparison import Comparison
+from bayesdist.assess.comparison_table import comparison_table, difference_table
+from bayesdist.assess.comparison_verdict import verdict
+from bayesdist.report import drawn, save_images
+from bayesdist.report.comparison import difference_vectors
+from bayesdist.report.mosaic import Mosaic
+from bayesdist.report.vectors import grid_size
+
+__all__ = ["comparison_summary", "joined", "mosaic_of", "write_comparison"]
+
+SCHEMA = 1
+
+
+def write_comparison(output: Path, found: Sequence[Comparison], command: str) -> None:
+    """Write tables, summary and figure of a comparison into a new folder.
+
+    Parameters
+    ----------
+    output : pathlib.Path
+    found : sequence of Comparison
+        One for each chip.
+    command : str
+        For the record.
+
+    Raises
+    ------
+    InputError
+        For a folder that holds something, or cannot be made.
+    """
+    with whole_folder(output) as folder:
+        write_table(joined(found, comparison_table), folder / "comparison.ecsv")
+        write_table(joined(found, difference_table), folder / "difference.ecsv")
+        save_images(
+            drawn({"difference": difference_vectors(*found, mosaic=mosaic_of(found))}),
+            folder / "figures",
+        )
+        record = {
+            "schema": SCHEMA,
+            "command": command,
+            "versions": versions(),
+            "chips": [comparison_summary(one) for one in found],
+        }
+        write_json(folder / "comparison.json", record)
+
+
+def comparison_summary(found: Comparison) -> dict[str, Any]:
+    """What scripts read of a comparison.
+
+    Parameters
+    ----------
+    found : Comparison
+
+    Returns
+    -------
+    dict
+    """
+    s, field = found.similarity, found.field
+    sides = {}
+    for letter, c in (("a", found.a), ("b", found.b)):
+        sides[letter] = {
+            "name": c.name,
+            "order": c.basis.order,
+            "unit": c.unit,
+            "chip": c.chip,
+            "epoch": c.epoch,
+            "errors": c.kind_of_error,
+            "notes": list(c.notes),
+        }
+    return {
+        **sides,
+        "verdict": verdict(found),
+        "unit": "pix",
+        "pixel_mas": found.frame.pixel_mas,
+        "linear": {
+            "taken_out": bool(found.frame.taken.shape[1]),
+            "shift": s.shift,
+            "sigma_shift": s.sigma_shift,
+            "rotation_rad": s.rotation,
+            "sigma_rotation_rad": s.sigma_rotation,
+            "scale": s.scale,
+            "sigma_scale": s.sigma_scale,
+            "mirrored": s.mirrored,
+            "comparable": s.alike,
+        },
+        "rms": found.rms,
+        "noise_rms": found.noise_rms,
+        "largest": found.largest,
+        "sigma_of_largest": found.sigma_of_largest,
+        "position_of_largest": list(found.position_of_largest),
+        "significance_of": found.errors_of if field is not None else "none",
+        "chi2": None if field is None else field.chi2,
+        "dof": None if field is None else field.dof,
+        "p_value": None if field is None else field.p_value,
+        "largest_z": found.largest_z,
+        "p_largest_z": found.p_largest_z,
+        "p_largest_chi2_on_grid": found.p_largest_chi2,
+        "untested_rms": found.unknown_rms,
+    }
+
+
+def joined(found: Sequence[Comparison], table_of: Any) -> Table:
+    """The tables of all chips as one, with the chip in front where there are several.
+
+    Parameters
+    ----------
+    found : sequence of Comparison
+    table_of : callable
+        The table of one of them.
+
+    Returns
+    -------
+    astropy.table.Table
+    """
+    tables = []
+    for one in found:
+        table = table_of(one)
+        if len(found) > 1:
+            table.add_column([one.a.chip] * len(table), name="chip", index=0)
+        tables.append(table)
+    return vstack(tables, metadata_conflicts="silent")
+
+
+def mosaic_of(found: Sequence[Comparison]) -> Mosaic:
+    """The chips of a comparison one above the other, with their names."""
+    column = Mosaic.column(*(grid_size(c.x, c.y) for c in found))
+    return Mosaic(column.sizes, tuple(f"chip {c.a.chip}" for c in found), column.places)

@@ -1,0 +1,287 @@
+"""`bayesdist monitor`: does the released solution of a run still describe new matches?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.comparison_files import joined, mosaic_of
+from bayesdist.app.config import Config, Data, load_config
+from bayesdist.app.folder import whole_folder
+from bayesdist.app.matches import load_matches
+from bayesdist.app.rundir import RunDirectory, versions, write_json
+from bayesdist.app.rvb import load_rvb
+from bayesdist.app.session import Session, write_table
+from bayesdist.assess import misfit_of, partitions_for, star_sums
+from bayesdist.assess.change_maps import Monitored, change_maps, is_late
+from bayesdist.assess.comparison_table import comparison_table, difference_table
+from bayesdist.assess.misfit import Misfit, worst_misfit
+from bayesdist.assess.units import convert, pixel_scale_of
+from bayesdist.errors import InputError
+from bayesdist.infer import Matches, Posterior, load_posterior
+from bayesdist.infer.change_date import PeriodScore, period_scores, scan_dates
+from bayesdist.infer.membership import count_outliers
+from bayesdist.infer.monitoring import NewFit, change_of, fit_new
+from bayesdist.report import drawn, save_images
+from bayesdist.report.comparison import change_over_time, difference_vectors
+
+__all__ = ["monitor"]
+
+SCHEMA = 1
+
+
+def monitor(
+    run: str | Path, new: str | Path, output: str | Path | None = None, *, command: str = ""
+) -> str:
+    """Confront the posterior of a run with new matches.
+
+    Parameters
+    ----------
+    run : path
+        A run with a posterior.  The matches that it was made from are not needed any more.
+    new : path
+        New matches, which are read as the run's were, or a configuration whose [data] says how.
+    output : path, optional
+        New or empty folder for tables, summary and figures.
+    command : str
+        For the record.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For a run that is none, has no posterior, or began with star lists; as `read_matches` and
+        `fit_new`.
+    """
+    directory = RunDirectory(run)
+    if not (directory / "run.json").exists():
+        raise InputError("is no run", where=str(run), do="give the folder of 'bayesdist run'")
+    config = directory.config
+    if config.campaign is not None:
+        raise InputError(
+            "is a run of a campaign, whose new exposures would have to be matched first",
+            where=str(run),
+            do="give a run that began with matches",
+        )
+    posterior = load_posterior(directory / "posterior.nc")
+    matches = _new_matches(directory, config, Path(new))
+    fitted = fit_new(
+        posterior,
+        matches,
+        clip_chi2=config.fit.clip_chi2,
+        clip_abs=config.fit.clip_abs,
+        compute=config.resources(),
+    )
+    try:
+        change = change_of(fitted, draws=posterior.convergence.ess_bulk_min)
+        scores: tuple[PeriodScore, ...] = ()
+        if matches.has_epoch:
+            scores = period_scores(fitted, change, matches)
+        date = scan_dates(scores, change) if scores else None
+        late = date is not None and is_late(change, date)
+        nx, ny = config.assess.grid
+        found = Monitored(
+            change=change,
+            maps=change_maps(
+                date.change if late and date is not None else change,
+                rng=np.random.default_rng([config.sampler.seed, SCHEMA]),
+                names=(str(new), str(run)),
+                grid=(nx, ny),
+            ),
+            date=date,
+            misfit=_misfit(fitted),
+            pixel_mas=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
+        )
+        facts = _facts(fitted, posterior)
+    finally:
+        fitted.target.shards.close()
+    if output is not None:
+        _write(Path(output), found, scores, facts, command)
+    return "\n".join([found.verdict, *_lines(found, facts, scores)])
+
+
+def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
+    """New matches with errors, read as those of the run or as their own configuration says."""
+    if new.suffix == ".toml":
+        loaded, base = load_config(new)[0], new.parent
+        data, size = loaded.data, loaded.detector.size
+        if data is None:
+            raise InputError(
+                "names no table of matches", where=str(new), do="give one in data.matches"
+            )
+        names = data.matches
+        path: Any = base / names if isinstance(names, str) else [base / n for n in names]
+    else:
+        data, path, size = config.data, new, config.detector.size
+        if not new.exists():
+            raise InputError("there is no such file", where=str(new), do="check the name")
+    assert data is not None
+    if data.format == "rvb" and size is not None:
+        matches: Matches = load_rvb(path, data, size)
+    else:
+        matches = load_matches(path, **_reading(data))
+    if data.sigma != "by_magnitude":
+        return matches
+    errors = Session(run).kept_errors()
+    if errors is None:
+        raise InputError(
+            "errors by magnitude are asked for, and the run has measured none",
+            where=str(new),
+            do="give data.sigma another value",
+        )
+    return matches.with_errors_by_magnitude(errors)
+
+
+def _reading(data: Data) -> dict[str, Any]:
+    return {
+        "format": data.format,
+        "columns": data.columns,
+        "unit": data.unit,
+        "sigma": data.sigma,
+        "pixel_origin": data.pixel_origin,
+        "tangent_point": data.tangent_point,
+    }
+
+
+def _misfit(new: NewFit) -> Misfit:
+    """Structure that the least-squares fit of the new matches leaves."""
+    shards, fit, out = new.target.shards, new.fit, []
+    partitions = {
+        chip.number: partitions_for(round(found.n * fit.n_used / fit.n_rows))
+        for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True)
+    }
+    wanted = {number: tuple(bins.values()) for number, bins in partitions.items()}
+    sums = shards.sum(star_sums, fit.mean, fit.clip, wanted)
+    for number, bins in partitions.items():
+        binned = {name: sums.binned[number, size] for name, size in bins.items()}
+        out.append(misfit_of(binned, n_params=2 * fit.model.n_terms, unit=fit.unit))
+    return worst_misfit(out)
+
+
+def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
+    """What is told of the new matches beside the change."""
+    n = new.target.n_theta
+    shards = new.target.shards
+    flagged, _ = count_outliers(shards, new.target.hyper, new.theta[None], new.psi[None, n:])
+    released = {k: (float(v.mean()), float(v.std(ddof=1))) for k, v in posterior.hyper.items()}
+    return {
+        "n_matches": len(shards),
+        "n_flagged": flagged,
+        "n_exposures": len(new.model.exposures),
+        "frames": new.model.frames,
+        "unit": new.model.unit,
+        "mixture": new.hyper,
+        "mixture_released": {k: {"mean": m, "sd": s} for k, (m, s) in released.items()},
+        "converged": bool(posterior.convergence.converged),
+    }
+
+
+def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore]) -> list[str]:
+    """What stands below the verdict."""
+    frames = "nothing" if facts["frames"] == "none" else facts["frames"].replace("_", ", ")
+    lines = [
+        f"new matches: {facts['n_matches']}, of which {facts['n_flagged']} are more likely false "
+        f"than not, in {facts['n_exposures']} exposure(s); fitted to each and taken out: {frames}"
+    ]
+    for key, what in (("j", "error beyond the quoted ones"), ("f", "share of false matches")):
+        if key in facts["mixture"] and key in facts["mixture_released"]:
+            old = facts["mixture_released"][key]
+            unit = f" {facts['unit']}" if key == "j" else ""
+            lines.append(
+                f"{what}: {facts['mixture'][key]:.3g}{unit}; of the release {old['mean']:.3g} +- "
+                f"{old['sd']:.2g}"
+            )
+    if found.change.epoch is not None:
+        lines.append(
+            f"compared at {found.change.epoch:.3f}, the errors of the extrapolated drift included"
+        )
+    if found.date is not None and len(scores) > 1:
+        lines.append(
+            f"mean change p = {found.p_value:.2g}; a change at one of {len(scores)} dates "
+            f"p = {found.p_since:.2g}; scatter of the periods {found.date.scatter:.3g} of what "
+            f"errors make (p = {found.date.p_scatter:.2g})"
+        )
+    lines += [f"WARNING: {doubt}" for doubt in found.doubts]
+    if not facts["converged"]:
+        lines.append("WARNING: the released posterior has not converged")
+    return lines
+
+
+def _write(
+    output: Path,
+    found: Monitored,
+    scores: Sequence[PeriodScore],
+    facts: dict[str, Any],
+    command: str,
+) -> None:
+    date, maps = found.date, found.maps
+    with whole_folder(output) as folder:
+        write_table(joined(maps, comparison_table), folder / "change.ecsv")
+        write_table(joined(maps, difference_table), folder / "difference.ecsv")
+        figures = {
+            "change": difference_vectors(*maps, mosaic=mosaic_of(maps), names=("new", "release"))
+        }
+        if date is not None:
+            table = Table(
+                {
+                    "first": [s.first for s in scores],
+                    "last": [s.last for s in scores],
+                    "n": [s.n for s in scores],
+                    "gain": date.gain,
+                }
+            )
+            write_table(table, folder / "dates.ecsv")
+            if len(scores) > 1:
+                figures["dates"] = change_over_time(
+                    table["first"], date.gain, date.dof, found.p_since
+                )
+        save_images(drawn(figures), folder / "figures")
+        write_json(folder / "monitor.json", _summary(found, facts, command))
+
+
+def _summary(found: Monitored, facts: dict[str, Any], command: str) -> dict[str, Any]:
+    test, date, worst = found.change.test, found.date, found.worst
+    since = None
+    if date is not None:
+        since = {
+            "after": date.after,
+            "before": date.before,
+            "interval_95": list(date.interval),
+            "p_value": found.p_since,
+            "scatter": date.scatter,
+            "scatter_dof": date.scatter_dof,
+            "p_scatter": date.p_scatter,
+        }
+    scale = found.pixel_mas
+    return {
+        "schema": SCHEMA,
+        "command": command,
+        "versions": versions(),
+        "verdict": found.verdict,
+        "changed": found.changed,
+        "p_value": found.p_either,
+        "mean_change": {"chi2": test.chi2, "dof": test.dof, "p_value": found.p_value},
+        "epoch": found.change.epoch,
+        "size": {
+            "unit": "pix",
+            "rms": worst.rms,
+            "noise_rms": worst.noise_rms,
+            "max": worst.largest,
+            "sigma_of_max": worst.sigma_of_largest,
+            "position_of_max": list(worst.position_of_largest),
+            "chip": worst.a.chip,
+            "of": "change from its date on" if found.since_a_date else "mean change",
+            "max_mas": None if scale is None else convert(worst.largest, "pix", "mas", scale),
+        },
+        "since": since,
+        "warnings": found.doubts,
+        "new": facts,
+    }

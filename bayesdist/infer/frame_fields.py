@@ -1,0 +1,83 @@
+"""What frames of exposures can do to polynomials: the part of a difference that says nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.model import DistortionModel, PolynomialBasis
+from bayesdist.model.frames import frame_matrix, frame_names, nearest_frame
+
+__all__ = ["frame_between", "frame_fields", "mean_squares", "term_squares", "without"]
+
+Float = NDArray[np.float64]
+
+
+def term_squares(basis: PolynomialBasis) -> Float:
+    """Mean square over the detector of each term of u and then of v, shape (2 K,)."""
+    return np.tile([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in basis.terms], 2)
+
+
+def mean_squares(model: DistortionModel) -> Float:
+    """Mean square of each polynomial term (n,) over the whole detector, chips by their area."""
+    area = np.array([chip.size[0] * chip.size[1] for chip in model.chips])
+    return np.kron(area / area.sum(), term_squares(model.basis()))
+
+
+def without(fields: Float, norm: Float) -> Float:
+    """Matrix (n, n) that takes fields (n, q) out of a polynomial, by least squares over the area.
+
+    Parameters
+    ----------
+    fields : ndarray, shape (n, q)
+    norm : ndarray, shape (n,)
+        As of `mean_squares`.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+    """
+    out = np.eye(len(fields))
+    if fields.shape[1]:
+        weighted = fields * norm[:, None]
+        out -= fields @ np.linalg.solve(fields.T @ weighted, weighted.T)
+    return out
+
+
+def frame_between(old: Float, now: Float, model: DistortionModel) -> tuple[Float, Float]:
+    """The frame of the model's kind that brings the release nearest to the new polynomials."""
+    if model.frames == "none":
+        return np.eye(2), np.zeros(2)
+    norm = mean_squares(model).reshape(old.shape)[:, 0]
+    o = np.asarray(model.origin)
+    one = np.zeros_like(old[:, 0])
+    one[:, 0] = 1.0
+    shifted = old.copy()
+    shifted[:, :, 0] -= o
+    A = np.stack([one.ravel(), shifted[:, 0].ravel(), shifted[:, 1].ravel()], axis=1)
+    target = now.copy()
+    target[:, :, 0] -= o
+    B = target.transpose(0, 2, 1).reshape(-1, 2)
+    root = np.sqrt(norm.ravel())[:, None]
+    found = np.linalg.lstsq(root * A, root * B)[0]
+    return frame_matrix(model.frames, nearest_frame(model.frames, found[1:].T, found[0]))
+
+
+def frame_fields(model: DistortionModel, kind: str, w: Float, origin: Float) -> Float:
+    """What each parameter of a frame does to the polynomials (chips, 2, K), as columns (n, q)."""
+    about = w.copy()
+    about[:, :, 0] -= origin
+    names = frame_names(kind)
+    out = []
+    for k, name in enumerate(names):
+        if name.startswith("shift"):
+            field = np.zeros_like(w)
+            field[:, k, 0] = 1.0
+        else:
+            unit = np.zeros(len(names))
+            unit[k] = 1e-6
+            # rotations have cosines: the difference of both signs leaves the first order
+            slope = (frame_matrix(kind, unit)[0] - frame_matrix(kind, -unit)[0]) / 2e-6
+            field = np.einsum("ab,cbk->cak", slope, about)
+        out.append(field.ravel())
+    return np.stack(out, axis=1) if out else np.zeros((model.n_polynomial, 0))
