@@ -25,6 +25,7 @@ _HOMES = {
         "read_hst1pass",
         "read_matches",
         "read_matchup",
+        "read_rvb",
         "write_partitioned",
     ),
     "bayesdist.model": (

@@ -13,6 +13,7 @@ __all__ = [
     "FormatError",
     "InputError",
     "NotConvergedError",
+    "NotSettledError",
 ]
 
 
@@ -63,6 +64,10 @@ class FormatError(InputError):
 
 class DegenerateError(InputError):
     """The data do not determine the parameters that are asked for."""
+
+
+class NotSettledError(InputError):
+    """An iteration over the data that does not come to rest."""
 
 
 class NotConvergedError(BayesdistError):

@@ -100,15 +100,69 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("-o", "--output", required=True, metavar="DIR", help="a new folder")
     sub.add_argument("--force", action="store_true", help="also runs that have not converged")
 
+    sub = add("bands", _bands, "tables and diagrams of several bands beside each other")
+    sub.add_argument("runs", nargs="+", metavar="RUN", help="finished runs, one for each band")
+    sub.add_argument("-o", "--output", required=True, metavar="DIR", help="a new folder")
+    sub.add_argument("--bins", type=int, default=31, metavar="N", help="of residuals, on each axis")
+    text = "SIP header or WISE meta-data of an optical model; one, or one for each run"
+    sub.add_argument("--optical", nargs="+", default=(), metavar="FILE", help=text)
+    sub.add_argument("--turn", type=float, default=0.0, metavar="DEG", help="of the optical model")
+    sub.add_argument("--no-published", action="store_true", help="without values of WISE's report")
+
     sub = add("check", _check, "units, rank, null space and expected cost; samples nothing")
     sub.add_argument("config", metavar="CONFIG.toml")
+
+    sub = add("order", _order, "which polynomial order the data of a configuration ask for")
+    sub.add_argument("config", metavar="CONFIG.toml")
+    sub.add_argument("--orders", nargs=2, type=int, default=(3, 9), metavar=("LOW", "HIGH"))
+    sub.add_argument("-o", "--output", metavar="orders.ecsv", help="the table as a file")
+    sub.add_argument("--figure", metavar="orders.png")
+    sub.add_argument("--force", action="store_true", help="replace files that are there")
 
     sub = add("validate", _validate, "margins of a run against requirements; exit 4 unless all met")
     sub.add_argument("run", metavar="RUN")
     sub.add_argument("--requirements", required=True, metavar="REQ.toml")
 
+    sub = add("budget", _budget, "what the error of a position, or of a distance, is made of")
+    sub.add_argument("run", metavar="RUN")
+    place = {"nargs": 2, "type": float, "metavar": ("X", "Y")}
+    sub.add_argument("--at", required=True, help="FITS 1-based pixel", **place)
+    sub.add_argument(
+        "--to", action="append", default=[], help="of the difference to this pixel", **place
+    )
+    sub.add_argument("--chip", type=int, metavar="N")
+    sub.add_argument("--epoch", type=float, metavar="T", help="decimal years")
+    sub.add_argument("--magnitude", type=float, metavar="M", help="adds the centroid's error")
+
+    sub = add("plan", _plan, "how many more exposures, and when, would meet the requirements")
+    sub.add_argument("run", metavar="RUN")
+    sub.add_argument("--requirement", metavar="NAME", help="one of them; all by default")
+    sub.add_argument("--epochs", nargs="+", type=float, default=[], metavar="T", help="dates")
+
     sub = add("inspect", _inspect, "what a product or a posterior holds, and what is wrong in it")
     sub.add_argument("file", metavar="FILE")
+
+    sub = add("compare", _compare, "how two calibrations differ, and whether significantly")
+    sub.add_argument("a", metavar="A", help="a run, posterior, fit, IDCTAB, SIP header, WISE file")
+    sub.add_argument("b", metavar="B", help="the other one")
+    sub.add_argument("-o", "--output", metavar="DIR", help="a new folder for tables and figure")
+    sub.add_argument("--chip", type=int, metavar="N", help="all common chips by default")
+    sub.add_argument("--filter", metavar="F", help="of IDCTABs, or WISE band; F:G for A and B")
+    sub.add_argument("--epoch", type=float, metavar="T", help="decimal years, for what drifts")
+    sub.add_argument("--keep-linear", action="store_true", help="leave shift, rotation, scale in")
+    sub.add_argument("--grid", type=int, nargs=2, default=(33, 17), metavar=("NX", "NY"))
+
+    sub = add("monitor", _monitor, "does a released solution still describe new matches?")
+    sub.add_argument("run", metavar="RUN", help="the run whose posterior is released")
+    sub.add_argument("new", metavar="NEW", help="matches, or a CONFIG.toml that names them")
+    sub.add_argument("-o", "--output", metavar="DIR", help="a new folder for tables and figure")
+
+    sub = add("rotate", _rotate, "a distortion in rotated or mirrored pixels")
+    sub.add_argument("file", metavar="FILE", help="a SIP header, or WISE meta-data")
+    sub.add_argument("--angle", type=float, default=0.0, metavar="DEG", help="from x towards y")
+    sub.add_argument("--mirror", action="store_true", help="change the sign of x first")
+    sub.add_argument("-o", "--output", required=True, metavar="OUT")
+    sub.add_argument("--force", action="store_true", help="replace the file that is there")
 
     sub = add("simulate", _simulate_wise, "data of known truth")
     kinds = sub.add_subparsers(title="what to simulate", required=True, metavar="WHAT")
@@ -142,11 +196,46 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--cte", action="store_true", help="trailed charge moves the stars")
     sub.add_argument("--smooth", action="store_true", help="without look-up tables")
 
+    text = "transform the reference positions of WISE's RvB pairs"
+    sub = commands.add_parser("rvb", help=text, description=text[0].upper() + text[1:] + ".")
+    _add_rvb(sub.add_subparsers(title="what to do", required=True, metavar="WHAT"))
+
     sub = add("init", _init, "a commented configuration for a file of matches")
     sub.add_argument("config", metavar="CONFIG.toml")
     sub.add_argument("--matches", required=True, metavar="FILE")
     sub.add_argument("--force", action="store_true", help="replace the file that is there")
     return parser
+
+
+def _add_rvb(kinds) -> None:  # type: ignore[no-untyped-def]
+    def kind(name: str, function, text: str) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
+        sub = kinds.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        sub.set_defaults(function=function)
+        sub.add_argument("files", nargs="+", metavar="FILE", help="IPAC table, Parquet, a folder")
+        sub.add_argument("-o", "--output", required=True, metavar="DIR", help="a new folder")
+        sub.add_argument("--band", metavar="W1", help="needed where the files hold several")
+        sub.add_argument(
+            "--column", action="append", default=[], metavar="KEY=NAME", help="as data.columns"
+        )
+        sub.add_argument("-q", "--quiet", action="store_true", help="only warnings and errors")
+        return sub
+
+    sub = kind("transform", _rvb_transform, "all pairs by one linear transformation")
+    for option, what in (
+        ("--dx", "shift of the reference positions along x, pixels"),
+        ("--dy", "shift along y, pixels"),
+        ("--rotation", "about the array's centre, degrees from x towards y"),
+        ("--scale-x", "relative to one: 1e-4 stretches x by so much"),
+        ("--scale-y", "relative to one"),
+    ):
+        sub.add_argument(option, type=float, default=0.0, metavar="A", help=what)
+
+    sub = kind("rereference", _rvb_rereference, "each frame from one solution to another")
+    for option, name, what in (
+        ("--from", "free", "frame solutions that the pairs were made with"),
+        ("--to", "fixed", "those that they are brought to"),
+    ):
+        sub.add_argument(option, dest=name, required=True, metavar="TABLE", help=what)
 
 
 def _version() -> str:
@@ -201,39 +290,142 @@ def _release(options: argparse.Namespace) -> None:
     print(release_runs(options.runs, options.output, force=options.force, command=options.line))
 
 
+def _bands(options: argparse.Namespace) -> None:
+    from bayesdist.app.bands.command import bands_of_runs
+
+    text = bands_of_runs(
+        options.runs,
+        options.output,
+        bins=options.bins,
+        optical=options.optical,
+        turn=options.turn,
+        published=not options.no_published,
+        command=options.line,
+    )
+    print(text)
+
+
 def _check(options: argparse.Namespace) -> None:
     from bayesdist.app.check import check
 
     print(check(options.config))
 
 
+def _order(options: argparse.Namespace) -> None:
+    from bayesdist.app.order import order
+
+    files = {"output": options.output, "figure": options.figure}
+    print(order(options.config, options.orders, **files, force=options.force))
+
+
 def _validate(options: argparse.Namespace) -> int:
     from bayesdist.app.campaign.session import session_of
     from bayesdist.app.config import load_requirements
     from bayesdist.app.demo import margins_text
+    from bayesdist.app.horizon import write_horizons
     from bayesdist.app.rundir import RunDirectory
     from bayesdist.app.stages import require
-    from bayesdist.app.stages.assess import margin_rows, margins_of, write_margins
+    from bayesdist.app.stages.assess import (
+        assessed_horizons,
+        margin_rows,
+        margins_of,
+        write_margins,
+    )
 
     requirements = load_requirements(options.requirements)
     with closing(session_of(RunDirectory.open(options.run))) as session:
         require(session, "validate", ("fit", "sample"))
         margins = margins_of(session, requirements)
+        horizons = assessed_horizons(session, requirements)
         write_margins(session, margins)
+        write_horizons(session, horizons)
         label = session.posterior.approximation
     print(margins_text(margin_rows(margins)))
     for m in margins:
         if m.verdict != "met":
             print(f"{m.requirement.name}: {m.verdict}: {m.reason}")
+        if m.remedy is not None:
+            print(f"{m.requirement.name}: {m.remedy.sentence}")
+    for one in horizons:
+        print(one.sentence)
     if label:
         print(f"WARNING: {label}")
     return 0 if all(m.verdict == "met" for m in margins) else MISSED
+
+
+def _budget(options: argparse.Namespace) -> None:
+    from bayesdist.app.budget import budget_at
+
+    print(
+        budget_at(
+            options.run,
+            tuple(options.at),
+            to=[tuple(pixel) for pixel in options.to],
+            chip=options.chip,
+            epoch=options.epoch,
+            magnitude=options.magnitude,
+        )
+    )
+
+
+def _plan(options: argparse.Namespace) -> None:
+    from bayesdist.app.plan import plan
+
+    print(plan(options.run, name=options.requirement, epochs=options.epochs))
 
 
 def _inspect(options: argparse.Namespace) -> None:
     from bayesdist.app.inspect import inspect
 
     print(inspect(options.file))
+
+
+def _compare(options: argparse.Namespace) -> None:
+    from bayesdist.app.compare import compare_files
+
+    text = compare_files(
+        options.a,
+        options.b,
+        options.output,
+        chip=options.chip,
+        filter=options.filter,
+        epoch=options.epoch,
+        keep=options.keep_linear,
+        grid=options.grid,
+        command=options.line,
+    )
+    print(text)
+
+
+def _monitor(options: argparse.Namespace) -> None:
+    from bayesdist.app.monitor import monitor
+
+    print(monitor(options.run, options.new, options.output, command=options.line))
+
+
+def _rotate(options: argparse.Namespace) -> None:
+    from bayesdist.app.rotate import rotate
+
+    text = rotate(
+        options.file,
+        options.output,
+        degrees=options.angle,
+        mirror=options.mirror,
+        force=options.force,
+    )
+    print(text)
+
+
+def _rvb_transform(options: argparse.Namespace) -> None:
+    from bayesdist.app.rvb_commands import transform_files
+
+    print(transform_files(options))
+
+
+def _rvb_rereference(options: argparse.Namespace) -> None:
+    from bayesdist.app.rvb_commands import rereference_files
+
+    print(rereference_files(options))
 
 
 def _simulate_acs(options: argparse.Namespace) -> None:
@@ -251,8 +443,8 @@ def _simulate_wise(options: argparse.Namespace) -> None:
 def _init(options: argparse.Namespace) -> None:
     from bayesdist.app.init import init
 
-    table = init(options.config, options.matches, force=options.force)
-    print(f"{options.config}: for {len(table)} matches; read it, then 'bayesdist check' it")
+    n = init(options.config, options.matches, force=options.force)
+    print(f"{options.config}: for {n} matches; read it, then 'bayesdist check' it")
 
 
 if __name__ == "__main__":

@@ -17,11 +17,17 @@ from pydantic import (
 
 from bayesdist.app.campaign.config import CampaignBlock, ReleaseBlock, TablesBlock
 from bayesdist.app.config_errors import as_config_error
+from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.section import Section
 from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.linear_term import LINEAR_KINDS, LinearTerm
+from bayesdist.assess.solution import Solution
+from bayesdist.assess.terms import GIVEN
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
+from bayesdist.infer.period_dates import check_periods, mjd_periods
 from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
+from bayesdist.products.wise_meta import ARRAYS
 
 __all__ = ["Config", "load_config", "load_requirements", "load_text", "parse_config"]
 
@@ -34,12 +40,29 @@ class Data(Section):
     """What is read, and how."""
 
     matches: str | list[str]
-    format: Literal["auto", "table", "hst1pass", "matchup", "astrometry.net"] = "auto"
+    format: Literal["auto", "table", "hst1pass", "matchup", "astrometry.net", "rvb"] = "auto"
+    band: str | None = None
     columns: dict[str, str] | None = None
     unit: Unit | None = None
     sigma: Literal["columns", "by_magnitude"] | PositiveFloat = "columns"
     pixel_origin: Literal[0, 1] = 1
     tangent_point: tuple[float, float] | None = None
+    rvb: RvbBlock | None = None
+
+    @model_validator(mode="after")
+    def _only_of_rvb(self) -> Data:
+        for key in ("band", "rvb"):
+            if self.format != "rvb" and getattr(self, key) is not None:
+                raise ValueError(
+                    f"data.{key} is given, but data.format is {self.format!r}; set the format to "
+                    f"'rvb', or leave {key} out"
+                )
+        if self.format == "rvb" and self.tangent_point is not None:
+            raise ValueError(
+                "data.tangent_point is given, but RvB pairs lie in pixels of the band frame; "
+                "leave it out"
+            )
+        return self
 
 
 class Detector(Section):
@@ -84,6 +107,7 @@ class Fit(Section):
     clip_chi2: PositiveFloat = 25.0
     clip_abs: PositiveFloat = 2.0
     radial_weight: PositiveFloat = 1.0
+    skew: bool = False
 
 
 class Outliers(Section):
@@ -133,22 +157,55 @@ class ComputeBlock(Section):
         return self
 
 
+class Periods(Section):
+    """Periods whose models are compared."""
+
+    centres: list[float]
+    days: PositiveFloat
+
+
 class Assess(Section):
     """Where and when errors are assessed."""
 
     epoch: float | None = None
     grid: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] = (33, 17)
     draws: Annotated[int, Field(ge=100)] = 4000
+    horizon: Annotated[float, Field(ge=0)] = 10.0
 
 
 class BudgetBlock(Section):
     """An error term that the data cannot show."""
 
     name: str
-    kind: Literal["random", "systematic"]
-    sigma_u: Annotated[float, Field(ge=0)]
-    sigma_v: Annotated[float, Field(ge=0)]
+    kind: Literal["random", "systematic", "scale", "rotation"]
+    sigma_u: Annotated[float, Field(ge=0)] | None = None
+    sigma_v: Annotated[float, Field(ge=0)] | None = None
+    sigma: Annotated[float, Field(ge=0)] | None = None
     unit: Unit = "pix"
+    source: str = GIVEN
+    in_residuals: bool = False
+
+    @model_validator(mode="after")
+    def _sigma_of_its_kind(self) -> BudgetBlock:
+        axes = self.sigma_u is not None and self.sigma_v is not None
+        neither = self.sigma_u is None and self.sigma_v is None
+        if self.kind in LINEAR_KINDS:
+            if self.sigma is None or not neither:
+                raise ValueError(
+                    f"a budget term of kind {self.kind!r} has one sigma, relative or in radians; "
+                    "give sigma, and neither sigma_u nor sigma_v"
+                )
+        elif not axes or self.sigma is not None:
+            raise ValueError(
+                f"a budget term of kind {self.kind!r} has a sigma on each axis; give sigma_u and "
+                "sigma_v, and no sigma"
+            )
+        if self.in_residuals and self.kind != "random":
+            raise ValueError(
+                "in_residuals is of a random budget term, which scatters from star to star; "
+                "leave it out"
+            )
+        return self
 
 
 class RequirementBlock(Section):
@@ -161,6 +218,11 @@ class RequirementBlock(Section):
     probability: Probability = 0.95
     epoch: float | None = None
     chip: int | None = None
+    region: str | list[tuple[float, float]] = "whole"
+    epochs: tuple[float, float] | None = None
+    relative: bool = False
+    separation: PositiveFloat | None = None
+    magnitude: float | None = None
 
 
 class PriorBlock(Section):
@@ -198,6 +260,7 @@ class Products(Section):
 
     sip: Sip | None = None
     idctab: Idctab | None = None
+    wise_meta: bool = False
     release: ReleaseBlock | None = None
 
 
@@ -215,6 +278,7 @@ class Config(Section):
     sampler: Sampler = Sampler()
     compute: ComputeBlock = ComputeBlock()
     assess: Assess = Assess()
+    periods: Periods | None = None
     budget: list[BudgetBlock] = Field(default_factory=list)
     requirement: list[RequirementBlock] = Field(default_factory=list)
     prior: list[PriorBlock] = Field(default_factory=list)
@@ -234,8 +298,30 @@ class Config(Section):
             raise ValueError("model.tdd.rates is of a [campaign]; give [[prior]] blocks")
         if self.campaign is not None and self.model.frames != "none":
             raise ValueError("a [campaign] has frames of its own; leave model.frames out")
+        if self.data is not None and self.data.format == "rvb" and self.chip:
+            raise ValueError(
+                "RvB pairs are of one array; give detector.size in place of [[chip]] blocks"
+            )
         if self.campaign is not None and len(self.chip) == 0:
             raise ValueError("a [campaign] has no [[chip]] blocks; give them, one as the reference")
+        return self
+
+    @model_validator(mode="after")
+    def _periods_of_polynomials(self) -> Config:
+        if self.periods is None:
+            return self
+        if self.campaign is not None:
+            raise ValueError("[periods] is of matched stars, and a [campaign] has drift; drop one")
+        if self.model.frames != "none" or self.model.tdd is not None:
+            key = "tdd" if self.model.tdd is not None else "frames"
+            raise ValueError(
+                f"[periods] compares polynomials alone, and model.{key} is given; drop one of them"
+            )
+        if self.data is not None and (self.data.columns or {}).get("epoch") == "":
+            raise ValueError(
+                "[periods] needs an epoch for every pair, and data.columns leaves the epoch out; "
+                "name its column there"
+            )
         return self
 
     @model_validator(mode="after")
@@ -255,6 +341,31 @@ class Config(Section):
         if not self.chip and self.detector.size is None:
             raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
         return self
+
+    @model_validator(mode="after")
+    def _wise_meta_of_wise(self) -> Config:
+        if not self.products.wise_meta:
+            return self
+        band = self.wise_band
+        if band is None or self.campaign is not None:
+            raise ValueError(
+                "products.wise_meta is of a run of WISE W1, W2, W3 or W4, and detector.name is "
+                f"{self.detector.name!r}; name the band there, or leave wise_meta out"
+            )
+        side, _ = ARRAYS[band]
+        reference = self.model.reference_pixel
+        if self.detector.size != (side, side) or reference not in (None, ((side + 1) / 2,) * 2):
+            raise ValueError(
+                f"products.wise_meta is of the whole array of W{band}, {side} x {side} pixels "
+                f"about {(side + 1) / 2:g}, {(side + 1) / 2:g}; correct detector.size and "
+                "model.reference_pixel, or leave wise_meta out"
+            )
+        return self
+
+    @property
+    def wise_band(self) -> int | None:
+        """Number of the WISE band that the detector is named after."""
+        return next((band for band in ARRAYS if self.detector.name == f"W{band}"), None)
 
     def chips(self) -> tuple[Chip, ...]:
         """Chips of the model; empty for a detector of one chip."""
@@ -280,13 +391,46 @@ class Config(Section):
             fraction_prior=o.fraction_prior,
         )
 
+    def spans(self) -> dict[str, tuple[float, float]]:
+        """Begin and end of each of the periods, decimal years; empty where none are asked for."""
+        if self.periods is None:
+            return {}
+        centres = self.periods.centres
+        twice = next((c for c in centres if centres.count(c) > 1), None)
+        if twice is not None:
+            raise InputError(
+                f"the period centred on {twice:.10g} is given twice",
+                where="periods.centres",
+                do="give each once",
+            )
+        spans = mjd_periods(centres, self.periods.days)
+        check_periods(spans)
+        return spans
+
     def resources(self) -> Compute:
         """Where the work is done."""
         return Compute(**self.compute.model_dump())
 
     def user_terms(self) -> tuple[UserTerm, ...]:
-        """The user's terms of the error budget."""
-        return tuple(UserTerm(**b.model_dump()) for b in self.budget)
+        """The user's terms of the error budget that are the same at every place."""
+        return tuple(
+            UserTerm(b.name, b.kind, b.sigma_u, b.sigma_v, b.unit, b.source)
+            for b in self.budget
+            if b.sigma_u is not None and b.sigma_v is not None
+        )
+
+    def linear_terms(self, solution: Solution) -> tuple[LinearTerm, ...]:
+        """The user's terms of the error budget that grow with the distance from the middle."""
+        return tuple(
+            LinearTerm(b.name, b.kind, b.sigma, solution, b.source)
+            for b in self.budget
+            if b.sigma is not None
+        )
+
+    def in_residuals(self) -> tuple[UserTerm, ...]:
+        """Those of the user's terms that the scatter of residuals holds already."""
+        held = {b.name for b in self.budget if b.in_residuals}
+        return tuple(t for t in self.user_terms() if t.name in held)
 
     def requirements(self) -> tuple[Requirement, ...]:
         """The requirements."""
@@ -327,6 +471,7 @@ def parse_config(text: str, where: str) -> Config:
         config.mixture()
         config.user_terms()
         config.requirements()
+        config.spans()
     except InputError as error:
         raise ConfigError(error.cause, where=f"{where}: {error.where}", do=error.do) from error
     return config

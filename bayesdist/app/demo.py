@@ -11,7 +11,8 @@ from bayesdist.app.run import run
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
-from bayesdist.data import MatchTable, atomic_path
+from bayesdist.data import MatchTable
+from bayesdist.data.files import atomic_path, made_folder
 from bayesdist.errors import InputError
 from bayesdist.simulate import Truth, simulate_wise
 
@@ -82,14 +83,7 @@ def write_simulation(folder: Path, matches: MatchTable, truth: Truth, config: st
     InputError
         When the folder cannot be made or written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"the folder cannot be made ({error.strerror})",
-            where=str(folder),
-            do="choose one that you may write to",
-        ) from error
+    made_folder(folder)
     stars = QTable()
     for name in ("x", "y", "u", "v", "sigma_u", "sigma_v"):
         stars[name] = getattr(matches, name)

@@ -118,6 +118,7 @@ def _begin(session: Session) -> None:
     else:
         rehearse(session)
     session.run.begin()
+    session.begun()
 
 
 def _run_stage(session: Session, stage: str) -> None:

@@ -22,6 +22,7 @@ from bayesdist.app.campaign.files import campaign_files
 from bayesdist.app.config import Config, load_config, load_text
 from bayesdist.app.star_files import FOLDER, PAIRS, part_files
 from bayesdist.data import atomic_path, input_files, is_leftover, remove_leftovers, sha256_of
+from bayesdist.data.files import made_folder
 from bayesdist.errors import InputError
 
 __all__ = ["RunDirectory", "as_json", "write_json"]
@@ -33,7 +34,7 @@ PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 # and nothing else
 OWN_FILES = re.compile(
     r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
-    r"posterior\.nc|(coefficients|budget|margins|matching|series|drift)\.ecsv|maps\.fits|"
+    r"posterior\.nc|(coefficients|budget|margins|periods|matching|series|drift)\.ecsv|maps\.fits|"
     r"(tables|hierarchy|exposure_terms|catalogue_errors)\.h5|summary\.json|report\.html"
 )
 
@@ -197,14 +198,7 @@ class RunDirectory:
         if (self / "run.json").exists():
             self.clear()
         remove_leftovers(self.path)
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"the folder cannot be made ({error.strerror})",
-                where=str(self.path),
-                do="choose one that you may write to",
-            ) from error
+        made_folder(self.path)
         with atomic_path(self / "config.toml") as temporary:
             temporary.write_text(text, encoding="utf-8", newline="")
         self.write_record(record)

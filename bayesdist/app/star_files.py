@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-from bayesdist.data import MatchTable, remove_leftovers
+from bayesdist.data import MatchTable
+from bayesdist.data.files import made_folder, remove_leftovers
 from bayesdist.data.parquet_write import write_columns
-from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Matches, Posterior
 from bayesdist.infer.membership import memberships_of
 from bayesdist.infer.stars import in_table_order, prepare
@@ -41,14 +39,7 @@ def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, fol
     InputError
         When the folder or a file cannot be written, or the data have become unreadable.
     """
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"the folder cannot be made ({error.strerror})",
-            where=str(folder),
-            do="choose one that you may write to",
-        ) from error
+    made_folder(folder)
     remove_leftovers(folder)
     for path in part_files(folder):
         path.unlink()
@@ -65,7 +56,7 @@ def _write_part(table: MatchTable, fit: LinearFit, posterior: Posterior, path: P
         "row": table.row,
         "x": table.x,
         "y": table.y,
-        "chip": np.asarray(table.chip_numbers)[table.chip],
+        "chip": table.chip_number,
         "residual_u": u,
         "residual_v": v,
         "used": in_table_order(fit.clip.keeps_of(stars), order),

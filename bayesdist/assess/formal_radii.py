@@ -15,7 +15,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.grid import mesh, position_of_largest
+from bayesdist.assess.grid import mesh
+from bayesdist.assess.maps import SigmaMap
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model import PolynomialBasis
 
@@ -28,37 +29,8 @@ NODES = 48  # on each axis: integrands are polynomials of twice the order times 
 
 
 @dataclass(frozen=True, eq=False)
-class FormalRadii:
-    """Formal standard deviations over an array.
-
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        FITS 1-based pixels.
-    sigma_u, sigma_v : ndarray, shape (ny, nx)
-        In the unit of the errors that were given.
-    """
-
-    x: Float
-    y: Float
-    sigma_u: Float
-    sigma_v: Float
-
-    @property
-    def radius(self) -> Float:
-        """Length of the four vectors, hypot(sigma_u, sigma_v), (ny, nx)."""
-        return np.hypot(self.sigma_u, self.sigma_v)
-
-    @property
-    def radius_max(self) -> float:
-        """Largest radius: the "max radius" of WSDC D-T033, section 6."""
-        return float(self.radius.max())
-
-    @property
-    def position_of_max(self) -> tuple[float, float]:
-        """Pixel (x, y) of the largest radius."""
-        return position_of_largest(self.radius, self.x, self.y)
+class FormalRadii(SigmaMap):
+    """Formal standard deviations over an array, in the unit of the errors that were given."""
 
     def vectors(self, x: float, y: float) -> Float:
         """The four vectors (4, 2) at the grid point nearest to a pixel."""

@@ -11,14 +11,14 @@ from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_l
 from bayesdist.assess.moments import position_moments
 from bayesdist.assess.solution import Solution, kind_of, place_of
 
-__all__ = ["UncertaintyMap", "uncertainty_map"]
+__all__ = ["SigmaMap", "UncertaintyMap", "uncertainty_map"]
 
 Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class UncertaintyMap:
-    """Standard deviation of the model's position over the detector.
+class SigmaMap:
+    """Standard deviations of a position over the detector.
 
     Parameters
     ----------
@@ -26,41 +26,17 @@ class UncertaintyMap:
     y : ndarray, shape (ny,)
         FITS 1-based pixels.
     sigma_u, sigma_v : ndarray, shape (ny, nx)
-        In `unit`.
-    correlation : ndarray, shape (ny, nx)
-        Between u and v; 0 where one of them is known exactly.
-    unit : str
-    chip : int
-    epoch : float or None
-        Decimal years.
-    kind : str
-        'least squares' or 'posterior'.
     """
 
     x: Float
     y: Float
     sigma_u: Float
     sigma_v: Float
-    correlation: Float
-    unit: str
-    chip: int
-    epoch: float | None
-    kind: str
 
     @property
     def radius(self) -> Float:
         """hypot(sigma_u, sigma_v), (ny, nx): half the diagonal of the +-1 sigma error box."""
         return np.hypot(self.sigma_u, self.sigma_v)
-
-    @property
-    def sigma_u_max(self) -> float:
-        """Largest sigma_u."""
-        return float(self.sigma_u.max())
-
-    @property
-    def sigma_v_max(self) -> float:
-        """Largest sigma_v."""
-        return float(self.sigma_v.max())
 
     @property
     def radius_max(self) -> float:
@@ -71,6 +47,41 @@ class UncertaintyMap:
     def position_of_max(self) -> tuple[float, float]:
         """Pixel (x, y) of the largest radius."""
         return position_of_largest(self.radius, self.x, self.y)
+
+
+@dataclass(frozen=True, eq=False)
+class UncertaintyMap(SigmaMap):
+    """Standard deviation of the model's position over the detector.
+
+    Parameters
+    ----------
+    x, y, sigma_u, sigma_v
+        As `SigmaMap`; sigmas in `unit`.
+    correlation : ndarray, shape (ny, nx)
+        Between u and v; 0 where one of them is known exactly.
+    unit : str
+    chip : int
+    epoch : float or None
+        Decimal years.
+    kind : str
+        'least squares' or 'posterior'.
+    """
+
+    correlation: Float
+    unit: str
+    chip: int
+    epoch: float | None
+    kind: str
+
+    @property
+    def sigma_u_max(self) -> float:
+        """Largest sigma_u."""
+        return float(self.sigma_u.max())
+
+    @property
+    def sigma_v_max(self) -> float:
+        """Largest sigma_v."""
+        return float(self.sigma_v.max())
 
 
 def uncertainty_map(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bayesdist.errors import InputError
 
-__all__ = ["atomic_path", "is_leftover", "remove_leftovers", "sha256_of"]
+__all__ = ["atomic_path", "is_leftover", "made_folder", "remove_leftovers", "sha256_of"]
 
 _MARK = ".bayesdist-"
 
@@ -70,6 +70,34 @@ def _concerns(error: OSError, temporary: Path, target: Path) -> bool:
     if error.filename is None:  # a full disk carries no name
         return True
     return Path(os.fsdecode(error.filename)) in (temporary, target, target.parent)
+
+
+def made_folder(path: str | os.PathLike[str]) -> Path:
+    """A folder that is there from now on, with those above it.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    pathlib.Path
+
+    Raises
+    ------
+    InputError
+        When the system refuses to make it, naming the path and the reason.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"the folder cannot be made ({_reason(error)})",
+            where=str(folder),
+            do="choose one that you may write to",
+        ) from error
+    return folder
 
 
 def is_leftover(name: str) -> bool:

@@ -257,6 +257,11 @@ class MatchTable:
         """Names of the exposures that have stars, in the order of `exposure_names`."""
         return tuple(self.exposure_names[k] for k in np.unique(self.exposure))
 
+    @property
+    def chip_number(self) -> Int:
+        """Number of the chip of each star (N,)."""
+        return np.asarray(self.chip_numbers, np.int64)[self.chip]
+
     def select(self, which: ArrayLike, *, reason: str | None = None) -> MatchTable:
         """Some of the stars.
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bayesdist.data.files import made_folder
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.parquet_write import labelled, save_parquet
 from bayesdist.data.pieces import PIECE
@@ -88,12 +89,7 @@ def write_partitioned(
 
 
 def _make_empty(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"folder cannot be made ({error.strerror})", where=str(folder), do="choose another"
-        ) from error
+    made_folder(folder)
     if next(folder.rglob("*.parquet"), None) is not None:
         raise InputError(
             "holds Parquet files already", where=str(folder), do="choose an empty folder"

@@ -235,7 +235,7 @@ def fit_exposures(
 
 def _require_stars(table: MatchTable, model: DistortionModel, least: int) -> None:
     """Refuse an exposure with a chip that has fewer stars than terms to be fitted."""
-    numbers = np.asarray(table.chip_numbers)[table.chip]
+    numbers = table.chip_number
     for chip in model.chips:
         n = int((numbers == chip.number).sum())
         if n < least:
@@ -296,8 +296,7 @@ def _fit_held(
 def _rotation(table: MatchTable, model: DistortionModel, known: Float) -> float:
     """The angle by which a gauge would turn (u, v), from a linear map of the joint solution."""
     bare = known.reshape(-1)
-    numbers = np.asarray(table.chip_numbers)[table.chip]
-    w = model.predict(bare, table.x, table.y, chip=numbers)
+    w = model.predict(bare, table.x, table.y, chip=table.chip_number)
     A = np.column_stack([np.ones(len(table)), w])
     M = np.linalg.lstsq(A, np.column_stack([table.u, table.v]))[0][1:].T
     return float(-np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))

@@ -220,9 +220,8 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
     parts = []
     for piece in matches.pieces():
         table = piece.read()
-        rows = (np.asarray(table.exposure_names)[table.exposure] == first) & (
-            np.asarray(table.chip_numbers)[table.chip] == number
-        )
+        rows = np.asarray(table.exposure_names)[table.exposure] == first
+        rows &= table.chip_number == number
         if rows.any():
             parts.append(table.select(rows))
     if not parts:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import MatchTable
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer.identify import check_coverage, require_full_rank
 from bayesdist.infer.normal import NormalEquations, least_squares
 from bayesdist.infer.prior import GaussianPriors
@@ -386,7 +386,9 @@ def fit_by_magnitude(
     Raises
     ------
     InputError
-        When the table has no magnitudes, or the errors do not settle.
+        When the table has no magnitudes.
+    NotSettledError
+        When the errors do not settle.
     """
     if not matches.has_mag:
         raise InputError(
@@ -412,7 +414,7 @@ def fit_by_magnitude(
         if before is not None and np.abs(now / before - 1).max() < 0.01:
             return fit, table, errors
         before = now
-    raise InputError(
+    raise NotSettledError(
         f"the errors by magnitude did not settle in {max_iterations} iterations",
         where="data.sigma",
         do="give errors as columns or as one number",

@@ -174,8 +174,9 @@ def groups_of(model: DistortionModel, matches: MatchTable) -> Groups:
     """
     if matches.unit != model.unit:
         raise InputError(f"the matches are in {matches.unit} and the model is in {model.unit}")
-    numbers = np.asarray(matches.chip_numbers)[matches.chip]
-    return model.groups(len(matches), epoch=matches.epoch, exposure=matches.exposure, chip=numbers)
+    return model.groups(
+        len(matches), epoch=matches.epoch, exposure=matches.exposure, chip=matches.chip_number
+    )
 
 
 def in_table_order(values: NDArray[Any], order: Int) -> NDArray[Any]:

@@ -106,7 +106,7 @@ def survey(stars: Stars, matches: MatchTable, every: int) -> Survey:
         Every so manieth star gives its errors to the sample.
     """
     model = stars.model
-    numbers = np.asarray(matches.chip_numbers)[matches.chip]
+    numbers = matches.chip_number
     chips = []
     for chip in model.chips:
         rows = np.flatnonzero(numbers == chip.number) if len(model.chips) > 1 else slice(None)

@@ -7,6 +7,7 @@ pixel offsets, with their covariance, only where a product is written.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["MAX_ORDER", "PolynomialBasis", "polynomial_terms"]
+__all__ = ["MAX_ORDER", "PolynomialBasis", "as_pair", "polynomial_terms"]
 
 MAX_ORDER = 9
 
@@ -43,6 +44,12 @@ def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
         ``(order + 1) (order + 2) / 2`` pairs.
     """
     return tuple((n - j, j) for n in range(order + 1) for j in range(n + 1))
+
+
+def as_pair(values: Sequence[float]) -> tuple[float, float]:
+    """Two numbers of x and y, from whatever sequence holds them."""
+    a, b = values
+    return float(a), float(b)
 
 
 def _legendre_derivatives(order: int) -> Float:

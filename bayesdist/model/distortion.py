@@ -16,7 +16,6 @@ are all that fits, samplers and predictions need to know of the model.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.model.basis import PolynomialBasis
+from bayesdist.model.basis import PolynomialBasis, as_pair
 from bayesdist.model.frames import (
     CHIP_DEVIATIONS,
     FRAME_KINDS,
@@ -788,7 +787,7 @@ class DistortionModel:
         return cls(
             order=data["order"],
             chips=tuple(
-                Chip(c["number"], c["name"], _pair(c["size"]), _pair(c["reference_pixel"]))
+                Chip(c["number"], c["name"], as_pair(c["size"]), as_pair(c["reference_pixel"]))
                 for c in data["chips"]
             ),
             unit=data["unit"],
@@ -801,13 +800,8 @@ class DistortionModel:
             ),
             frames=data["frames"],
             exposures=tuple(data["exposures"]),
-            origin=_pair(data["origin"]),
+            origin=as_pair(data["origin"]),
             gauge=data.get("gauge", "first"),
             held=(float(shift_u), float(shift_v), float(rotation)),
             chip_deviations=data.get("chip_deviations", False),
         )
-
-
-def _pair(values: Sequence[float]) -> tuple[float, float]:
-    a, b = values
-    return float(a), float(b)

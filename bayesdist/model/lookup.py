@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.model.basis import as_pair
 
 __all__ = ["LookupTable", "corrected"]
 
@@ -80,7 +81,7 @@ class LookupTable:
             bad = ~np.isfinite(sigma) | (sigma < 0)
             _refuse(bad, sigma, "sigma", where, "give a finite sigma, zero or above")
             object.__setattr__(self, "sigma", sigma)
-        first, step = _pair(self.first), _pair(self.step)
+        first, step = as_pair(self.first), as_pair(self.step)
         if not (np.isfinite(first).all() and np.isfinite(step).all() and min(step) > 0):
             raise InputError(
                 f"node [0, 0] at {first} and steps of {step} pixels make no grid",
@@ -274,8 +275,3 @@ def _refuse(bad: NDArray[np.bool_], array: Float, what: str, where: str, do: str
             where=where,
             do=do,
         )
-
-
-def _pair(values: Sequence[float]) -> tuple[float, float]:
-    a, b = values
-    return float(a), float(b)

@@ -31,6 +31,7 @@ from bayesdist.products.sip_write import sip_header, write_sip
 from bayesdist.products.storable import Lost, Stored, storable
 from bayesdist.products.wise_lint import lint_wise_band
 from bayesdist.products.wise_meta import WiseBand, read_wise_meta
+from bayesdist.products.wise_write import write_wise_meta
 
 __all__ = [
     "Aperture",
@@ -80,4 +81,5 @@ __all__ = [
     "write_npol",
     "write_release",
     "write_sip",
+    "write_wise_meta",
 ]

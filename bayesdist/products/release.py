@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bayesdist.assess.solution import Solution
+from bayesdist.data.files import made_folder
 from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.d2im import write_d2im
@@ -181,13 +182,7 @@ def write_release(
             ],
         )
 
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"the folder cannot be made ({error.strerror})", where=str(folder), do="choose another"
-        ) from error
+    folder = made_folder(folder)
     idctabs = {}
     for period_name, tab in made.items():
         idctabs[period_name] = folder / f"{name}_{period_name}_idc.fits"

@@ -8,7 +8,9 @@ import numpy as np
 
 from bayesdist.report.caption import Caption
 from bayesdist.report.context import ReportInput
+from bayesdist.report.horizon import horizon_caption
 from bayesdist.report.numerals import count, number, percent
+from bayesdist.report.periods import period_caption
 from bayesdist.report.scales import with_mas
 from bayesdist.report.vectors import CHANCE, significant_cells
 
@@ -29,8 +31,9 @@ SECTIONS: dict[str, tuple[str, ...]] = {
         "uncertainty_radius",
         "pixel_area",
     ),
+    "periods": ("period_differences",),
     "budget": ("budget_terms", "budget_dominating"),
-    "margins": ("margins",),
+    "margins": ("margins", "horizon"),
 }
 
 
@@ -289,7 +292,9 @@ _WRITERS = {
     "formal_uncertainty": _formal,
     "uncertainty_radius": _radius,
     "pixel_area": _area,
+    "period_differences": period_caption,
     "budget_terms": _terms,
     "budget_dominating": _dominating,
     "margins": _margins,
+    "horizon": horizon_caption,
 }

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
         VectorMap,
     )
     from bayesdist.assess.detector_budget import DetectorBudget
+    from bayesdist.assess.horizon import Horizon
+    from bayesdist.assess.misfit import Misfit
+    from bayesdist.assess.periods import TimeVariation
     from bayesdist.data import MagnitudeErrors
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.model import Chip
@@ -136,9 +139,14 @@ class ReportInput:
         posterior may be missing or masked.
     budget : DetectorBudget or None
     margins : tuple of Margin
+    horizons : tuple of Horizon
+        Until when requirements are met; empty where nothing depends on time.
     products : tuple of Product
     warnings : tuple of str
         Sentences that belong on top.
+    misfits : tuple of Misfit
+        Structure that the fit leaves in the residuals of each chip; a campaign's are among its own
+        results.
     magnitude_errors : MagnitudeErrors or None
         Errors by magnitude, where the stars carried none.
     flagged : ndarray of int, shape (E,), or None
@@ -147,6 +155,8 @@ class ReportInput:
         Versions, seed, hashes of the input, timings, command; mappings may be nested.
     campaign : CampaignResults or None
         What a run that began with star lists adds.
+    periods : TimeVariation or None
+        Models of several periods compared, where that was asked for.
     """
 
     name: str
@@ -159,12 +169,15 @@ class ReportInput:
     coefficients: Table
     budget: DetectorBudget | None = None
     margins: tuple[Margin, ...] = ()
+    horizons: tuple[Horizon, ...] = ()
     products: tuple[Product, ...] = ()
     warnings: tuple[str, ...] = ()
+    misfits: tuple[Misfit, ...] = ()
     magnitude_errors: MagnitudeErrors | None = None
     flagged: NDArray[np.int64] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     campaign: CampaignResults | None = None
+    periods: TimeVariation | None = None
 
     @property
     def unit(self) -> str:

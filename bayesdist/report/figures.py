@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from bayesdist.data.files import atomic_path
-from bayesdist.errors import InputError
+from bayesdist.data.files import atomic_path, made_folder
 from bayesdist.report.area import pixel_area
 from bayesdist.report.budget import budget_terms, dominating_term
 from bayesdist.report.campaign.figures import CampaignFigure, campaign_figures
 from bayesdist.report.context import ReportInput
 from bayesdist.report.corners import corner_coefficients, corner_outliers
+from bayesdist.report.horizon import probability_in_time
 from bayesdist.report.margins import margins_against_limits
 from bayesdist.report.mosaic import Mosaic
+from bayesdist.report.periods import period_differences
 from bayesdist.report.residuals import (
     MixtureCurve,
     residual_histogram,
@@ -72,11 +73,15 @@ def all_figures(inputs: ReportInput) -> dict[str, Figure]:
     out["formal_uncertainty"] = formal_uncertainty(*maps, mosaic=mosaic)
     out["uncertainty_radius"] = uncertainty_radius(*maps, mosaic=mosaic)
     out["pixel_area"] = pixel_area(*(c.area for c in chips), mosaic=mosaic)
+    if inputs.periods is not None:
+        out["period_differences"] = period_differences(inputs.periods, mosaic)
     if inputs.budget is not None:
         out["budget_terms"] = budget_terms(inputs.budget, mosaic.names)
         out["budget_dominating"] = dominating_term(inputs.budget, mosaic)
     if inputs.margins:
         out["margins"] = margins_against_limits(inputs.margins)
+    if inputs.horizons:
+        out["horizon"] = probability_in_time(inputs.horizons)
     return out
 
 
@@ -152,15 +157,7 @@ def save_images(images: Mapping[str, bytes], folder: str | os.PathLike[str]) -> 
     InputError
         When the folder cannot be made or a file cannot be written.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"the folder cannot be made ({error.strerror or error})",
-            where=str(folder),
-            do="choose one that you may write to",
-        ) from error
+    folder = made_folder(folder)
     paths = []
     for name, png in images.items():
         path = folder / f"{name}.png"

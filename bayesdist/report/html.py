@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import os
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-
-import jinja2
 
 from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
 from bayesdist.report import tables
 from bayesdist.report.campaign import PARTS, CampaignFigure, campaign_tables
-from bayesdist.report.captions import SECTIONS, Caption, caption
+from bayesdist.report.captions import SECTIONS, caption
 from bayesdist.report.context import ReportInput
-from bayesdist.report.figures import DPI, plan_of_campaign
-from bayesdist.report.numerals import number
+from bayesdist.report.figures import plan_of_campaign
+from bayesdist.report.page import Picture, picture_of, template
+from bayesdist.report.periods import period_tables
 from bayesdist.report.status import status_checks, verdict
 
 __all__ = ["render_report", "write_report"]
-
-
-@dataclass(frozen=True)
-class _Picture:
-    name: str
-    data: str
-    width: float  # inches, at which its letters have the size they were set in
-    words: Caption
 
 
 @dataclass(frozen=True)
@@ -36,7 +25,7 @@ class _Part:
     name: str
     title: str
     tables: tuple[tables.TextTable, ...]
-    pictures: list[_Picture]
+    pictures: list[Picture]
 
 
 def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
@@ -66,21 +55,13 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
                 f"figure {name!r} has no place in the report",
                 do=f"name it one of {', '.join(placed)}",
             )
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("bayesdist.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["number"] = lambda v: v if isinstance(v, str) else number(v)
-    return environment.get_template("report.html.jinja").render(
+    return template("report.html.jinja").render(
         run=inputs,
         chips=_chips(inputs),
         verdict=verdict(inputs),
         status=status_checks(inputs),
         pictures={
-            section: [_picture(n, images[n], caption(n, inputs)) for n in names if n in images]
+            section: [picture_of(n, images[n], caption(n, inputs)) for n in names if n in images]
             for section, names in SECTIONS.items()
         },
         campaign=_campaign_parts(inputs, plan, images),
@@ -90,6 +71,7 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
             "outliers": _present(tables.outlier_table(inputs)),
             "coefficients": tables.coefficient_tables(inputs),
             "maps": (tables.map_table(inputs),),
+            "periods": period_tables(inputs),
             "budget": _present(tables.budget_table(inputs)),
             "margins": _present(tables.margin_table(inputs)),
             "provenance": (
@@ -129,7 +111,7 @@ def _campaign_parts(
             title,
             texts.get(name, ()),
             [
-                _picture(one.name, images[one.name], one.caption)
+                picture_of(one.name, images[one.name], one.caption)
                 for one in plan.values()
                 if one.part == name and one.name in images
             ],
@@ -137,12 +119,6 @@ def _campaign_parts(
         for name, title in PARTS.items()
     ]
     return [part for part in parts if part.tables or part.pictures]
-
-
-def _picture(name: str, png: bytes, words: Caption) -> _Picture:
-    (pixels,) = struct.unpack(">I", png[16:20])  # width, in the first chunk of every PNG file
-    data = base64.b64encode(png).decode("ascii")
-    return _Picture(name, data, pixels / DPI, words)
 
 
 def write_report(

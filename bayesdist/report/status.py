@@ -11,6 +11,7 @@ from bayesdist.report.context import Check, ReportInput
 from bayesdist.report.margins import VERDICT_LEVELS
 from bayesdist.report.numerals import count, number, percent, rounded
 from bayesdist.report.scales import with_mas
+from bayesdist.report.structure import structure_check
 
 __all__ = ["Verdict", "status_checks", "verdict"]
 
@@ -125,6 +126,7 @@ def _fit_checks(inputs: ReportInput) -> tuple[Check, ...]:
     ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
     left_out = fit.n_rejected / fit.n_rows
     low, high = _CHI2
+    structure = (structure_check(inputs.misfits, fit="the fit"),) if inputs.misfits else ()
     return (
         Check(
             "Chi-square per degree of freedom, quoted errors",
@@ -144,6 +146,7 @@ def _fit_checks(inputs: ReportInput) -> tuple[Check, ...]:
             f"at most {number(_CONDITION, 1)}",
             _level(fit.condition <= _CONDITION, "warn"),
         ),
+        *structure,
     )
 
 

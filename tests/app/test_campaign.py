@@ -61,7 +61,7 @@ def test_nearly_all_stars_are_matched_and_hardly_any_wrongly(run, folder):
     assert len(pairs) == found["n_pairs"]
     for code, name in enumerate(pairs.exposure_names[:4]):
         some = pairs.select(pairs.exposure == code)
-        chip = np.asarray(some.chip_numbers)[some.chip]
+        chip = some.chip_number
         u, v = truth.to_catalog(name, some.x, some.y, chip).T
         vafactor = truth.log[name].vafactor
         apart = np.hypot(some.u * vafactor - u, some.v * vafactor - v)

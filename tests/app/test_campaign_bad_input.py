@@ -17,7 +17,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.data.tables import read_table
 from bayesdist.infer import load_fit
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting
-from tests.app.support import good, refused, summary_of
+from tests.app.support import cli, good, one_sentence, refused, summary_of
 
 
 @pytest.fixture(scope="module")
@@ -399,6 +399,28 @@ def test_a_catalogue_without_motions_is_said(campaign, names, words):
     campaign.catalog(lambda t: t.remove_columns(names))
     assert words in campaign.check()
     assert any(words in text for text in campaign.matched()["warnings"])
+
+
+def test_a_catalogue_without_motions_that_stars_outrun(campaign):
+    """Over twelve years 0.01 px/yr are far more than centroids."""
+    names = ["pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"]
+    campaign.catalog(lambda t: t.remove_columns(names)).matched()
+    result = cli("fit", campaign.path.parent / "run", "-q")
+    assert result.code == 1
+    words = ["catalog.ecsv: has no proper motions", "11.6 years", "did not settle", "pm_u and pm_v"]
+    one_sentence(result.err, *words)
+
+
+def test_lists_that_the_log_does_not_have_are_named(campaign):
+    """Seen by `check` and kept by the run; other filters of the log are no strangers."""
+    campaign.log(setting("filter", 8, "F814W"))
+    assert "WARNING" not in campaign.check()
+    campaign.log(lambda t: t[[0, 1, 2, 4, 6, 7]])
+    words = "2 star lists are of exposures that", "f606w-004, f606w-006", "not used"
+    assert all(text in campaign.check() for text in words)
+    found = campaign.matched()
+    assert found["n_exposures"] == 5
+    assert any(all(text in said for text in words) for said in found["warnings"])
 
 
 # -- cuts -----------------------------------------------------------------------------------------

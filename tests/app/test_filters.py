@@ -114,7 +114,7 @@ def test_the_detectors_tables_are_held_and_the_filters_are_fitted(sessions):
         np.testing.assert_array_equal(a.values, b.values)
     # pixels are those that both tables have corrected
     raw, x = other.pairs, other.raw_matches.x
-    numbers = np.asarray(raw.chip_numbers)[raw.chip]
+    numbers = raw.chip_number
     both, _ = corrected(other.tables, raw.x, raw.y, chip=numbers, filter="F814W")
     assert len(x) == len(both) and np.array_equal(x, both)
 

@@ -103,7 +103,7 @@ def stars(n: int = 3000, epochs=EPOCHS) -> Table:
         epochs=epochs,
     )
     table = as_table(matches)
-    table["chip"] = np.asarray(matches.chip_numbers)[matches.chip]
+    table["chip"] = matches.chip_number
     return table
 
 
@@ -258,7 +258,7 @@ def test_structure_is_looked_for_on_each_chip(run):
     residual, used = residuals(fit, table), fit.uses(table)
     p = {}
     for chip in CHIPS:
-        here = used & (np.asarray(table.chip_numbers)[table.chip] == chip.number)
+        here = used & (table.chip_number == chip.number)
         bins = session._partitions[chip.number]
         arrays = (table.x[here], table.y[here], *residual[here].T)
         sums = {n: session.sums.binned[chip.number, bins[n]] for n in bins if n != "shown"}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
@@ -13,8 +11,8 @@ from bayesdist.assess.field_terms import CatalogueTerm, ExposureScatter
 from bayesdist.assess.fields import draw_errors
 from bayesdist.infer import fit_linear
 from bayesdist.infer.hierarchy import fit_hierarchical
-from bayesdist.infer.star_errors import star_covariance, with_star_errors
-from tests.infer.small_campaign import campaign, campaign_truth
+from bayesdist.infer.star_errors import with_star_errors
+from tests.infer.small_campaign import campaign, campaign_truth, shared_stars
 from tests.infer.support import UNCLIPPED
 
 NUMBERS = (1, 2)
@@ -39,43 +37,12 @@ def evenly(n, rng):
 def test_the_budget_is_the_scatter_over_catalogues():
     """From the beginning, 150 times: catalogue, motions, centroids, fit, positions on a grid."""
     rng = np.random.default_rng(6)
-    n_stars, n_exposures = 100, 6
-    model, matches, theta = campaign(
-        6, n_exposures, n_stars, order=2, time=False, frames="shift_rotation"
-    )
-    model = replace(model, gauge="first", held=(0.0, 0.0, 0.0))
-    theta = np.concatenate([theta[: model.n_distortion], theta[-3 * (n_exposures - 1) :]])
-    # every star is in every exposure, within 100 pixels of one place, so that errors add up
-    code = np.tile(np.arange(n_stars), n_exposures)
-    xy = rng.uniform(150, 1900, (n_stars, 2))[code] + rng.uniform(-100, 100, (len(code), 2))
-    xy[:, 0] *= 2
-    chip = rng.integers(2, size=n_stars)[code]
-    exposure = np.repeat(np.arange(n_exposures), n_stars)
-    epoch = np.linspace(2002.5, 2006.8, n_exposures)[exposure]
-    years = epoch - 2004.0
-    centroid, position, motion = 0.01, 0.02, 0.01
-    quoted = np.sqrt(centroid**2 + position**2 + (motion * years) ** 2)
-    true = model.predict(theta, *xy.T, exposure=exposure, chip=np.array(NUMBERS)[chip])
-
-    def fitted(error):
-        table = matches._with(
-            x=xy[:, 0],
-            y=xy[:, 1],
-            u=true[:, 0] + error[:, 0],
-            v=true[:, 1] + error[:, 1],
-            exposure=exposure,
-            chip=chip,
-            epoch=epoch,
-            sigma_u=quoted,
-            sigma_v=quoted,
-            star=code,
-        )
-        return table, fit_linear(table, model, **UNCLIPPED)
-
-    table, fit = fitted(np.zeros((len(code), 2)))
-    stars = star_covariance(
-        fit, table, position, position, motion_u=motion, motion_v=motion, epoch0=2004.0
-    )
+    centroid = 0.01
+    epochs = np.linspace(2002.5, 2006.8, 6)
+    shared = shared_stars(rng, 100, epochs, order=2, centroid=centroid, position=0.02, motion=0.01)
+    model, matches = shared.model, shared.matches
+    fit = fit_linear(matches, model, **UNCLIPPED)
+    stars = shared.covariance(fit)
     options = {"aligned": True, "grid": (9, 5), "n_draws": 4000}
     solution, term = with_star_errors(fit, stars), CatalogueTerm(fit, stars.total)
     budget = detector_budget(solution, fields=[term], rng=np.random.default_rng(1), **options)
@@ -93,10 +60,10 @@ def test_the_budget_is_the_scatter_over_catalogues():
     n = 2 * points.shape[1]
     found = {"all": [], "catalogue": []}
     for _ in range(150):
-        shared = position * rng.standard_normal((n_stars, 2))[code]
-        shared += years[:, None] * motion * rng.standard_normal((n_stars, 2))[code]
+        error = shared.catalogue_errors(rng)
         for name, noise in (("all", centroid), ("catalogue", 0.0)):
-            _, one = fitted(shared + noise * rng.standard_normal(shared.shape))
+            table = shared.with_errors(error + noise * rng.standard_normal(error.shape))
+            one = fit_linear(table, model, **UNCLIPPED)
             found[name].append(model.predict(one.mean, x, y, chip=chips))
     expected = model.predict(fit.mean, x, y, chip=chips)
     rms = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -202,11 +203,12 @@ def _position(
 def alignments(found: Calibrated) -> Outcome:
     """Shared stars of exposures that follow each other, laid on each other by a similarity.
 
-    Rms per axis of all and of the bright stars, by what their centroids do alone, for the solution
-    and for what the calibration began with (no drift, no tables).
+    Rms per axis of all and of the bright stars: for the solution, for the true distortion (where
+    centroids and the exposures' own scatter are left), for what the calibration began with (no
+    drift, no tables); and what the solution leaves in other places than the true distortion does,
+    by which it can be told from what is wrong with the exposures themselves.
     """
     truth = found.campaign.truth
-    view = reference_gauge(without_frames(found.joint), REFERENCE)
     log = found.campaign.log
     lists = dict(zip(log.names, found.campaign.lists, strict=True))
     detections = dict(zip(log.names, truth.detections, strict=True))
@@ -225,26 +227,38 @@ def alignments(found: Calibrated) -> Outcome:
         if len(shared) < SHARED:
             continue
         mag = truth.stars.mag[shared]
-        for name, solved in (("new", True), ("old", False)):
-            places = []
-            for one, rows_of in ((a, index[0][i]), (b, index[1][k])):
-                some = lists[one.name]
-                x, y, chip = some.x[rows_of], some.y[rows_of], some.chip[rows_of]
-                if solved:
-                    x, y = corrected(found.session.tables, x, y, chip=chip)
-                    date = np.full(len(x), one.epoch)
-                    model, theta = view.model, view.mean
-                else:
-                    date = np.full(len(x), 2004.5)
-                    model, theta = truth.model, truth.theta[FILTER]
-                places.append(model.predict(theta, x, y, chip=chip, epoch=date))
-            left = _after_similarity(*places)
-            for kind, of in (("all", mag < 0), ("bright", mag < BRIGHT)):
-                rows.setdefault(f"{name} {kind}", []).append((left[of] ** 2).mean())
+        seen = [
+            (lists[one.name].x[of], lists[one.name].y[of], lists[one.name].chip[of], one.epoch)
+            for one, of in ((a, index[0][i]), (b, index[1][k]))
+        ]
+        left = {
+            name: _after_similarity(*(place(*where) for where in seen))
+            for name, place in _calibrations(found).items()
+        }
+        left["own"] = left["new"] - left["true"]
         for kind, of in (("all", mag < 0), ("bright", mag < BRIGHT)):
-            expected = 2 * (centroid_error(mag[of]) ** 2).mean()
-            rows.setdefault(f"centroids {kind}", []).append(expected)
+            for name, vectors in left.items():
+                rows.setdefault(f"{name} {kind}", []).append((vectors[of] ** 2).mean())
     return {f"alignment {name}": np.sqrt(values) for name, values in rows.items()}
+
+
+def _calibrations(found: Calibrated) -> dict[str, Callable[..., np.ndarray]]:
+    """Positions (N, 2) of x, y, chip and epoch by three calibrations."""
+    truth, tables = found.campaign.truth, found.session.tables
+    view = reference_gauge(without_frames(found.joint), REFERENCE)
+
+    def new(x: np.ndarray, y: np.ndarray, chip: np.ndarray, epoch: float) -> np.ndarray:
+        x, y = corrected(tables, x, y, chip=chip)
+        return view.model.predict(view.mean, x, y, chip=chip, epoch=np.full(len(x), epoch))
+
+    def true(x: np.ndarray, y: np.ndarray, chip: np.ndarray, epoch: float) -> np.ndarray:
+        return old(*corrected(truth.tables, x, y, chip=chip, filter=FILTER), chip, epoch)
+
+    def old(x: np.ndarray, y: np.ndarray, chip: np.ndarray, epoch: float) -> np.ndarray:
+        date = np.full(len(x), epoch)
+        return truth.model.predict(truth.theta[FILTER], x, y, chip=chip, epoch=date)
+
+    return {"new": new, "true": true, "old": lambda x, y, chip, _: old(x, y, chip, 2004.5)}
 
 
 def _after_similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -75,8 +75,7 @@ def test_what_the_table_holds(rng):
         np.testing.assert_array_equal(t.x[here], one.x[t.row[here]])
         np.testing.assert_array_equal(t.y[here], one.y[t.row[here]])
         np.testing.assert_array_equal(t.mag[here], one.mag[t.row[here]])
-        numbers = np.array(t.chip_numbers)[t.chip[here]]
-        np.testing.assert_array_equal(numbers, one.chip[t.row[here]])
+        np.testing.assert_array_equal(t.chip_number[here], one.chip[t.row[here]])
         epoch = log[one.exposure].epoch
         assert np.all(t.epoch[here] == epoch)
         # the catalogue at the epoch, with errors that have grown until then

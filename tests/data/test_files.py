@@ -5,7 +5,7 @@ import hashlib
 
 import pytest
 
-from bayesdist.data import atomic_path, sha256_of
+from bayesdist.data.files import atomic_path, made_folder, sha256_of
 from bayesdist.errors import InputError
 
 
@@ -48,6 +48,18 @@ def test_an_error_about_another_file_passes_unchanged(tmp_path):
     with pytest.raises(FileNotFoundError):
         with atomic_path(tmp_path / "out.txt") as temporary:
             temporary.write_text((tmp_path / "input.txt").read_text())
+
+
+def test_a_folder_is_made_with_those_above_it(tmp_path):
+    for _ in range(2):  # one that is there is as good
+        assert made_folder(tmp_path / "a" / "b") == tmp_path / "a" / "b"
+        assert (tmp_path / "a" / "b").is_dir()
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / "a").write_text("a file")
+    with pytest.raises(InputError, match=r"a/b: the folder cannot be made \(Not a directory\); "):
+        made_folder(tmp_path / "a" / "b")
 
 
 def test_sha256(tmp_path):

@@ -88,6 +88,12 @@ def test_select_keeps_rows_and_counts_what_goes():
         t.select([1, 1])
 
 
+def test_numbers_of_the_chips():
+    t = table(chip=[1, 0, 1, 1, 0], chip_numbers=(2, 7))
+    assert t.chip_number.tolist() == [7, 2, 7, 7, 2]
+    assert t.select([2, 4]).chip_number.tolist() == [7, 2]
+
+
 def test_with_sigma_takes_one_number_or_one_for_each():
     t = table().with_sigma(0.1, np.arange(1.0, 6.0))
     assert t.sigma_u.tolist() == [0.1] * 5 and t.sigma_v.tolist() == [1, 2, 3, 4, 5]

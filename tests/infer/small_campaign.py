@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer import LinearFit
+from bayesdist.infer.star_errors import StarCovariance, star_covariance
 from bayesdist.infer.views import lines
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import CHIP_DEVIATIONS
@@ -136,6 +141,77 @@ def campaign(
         epochs=epochs,
     )
     return model, matches, theta
+
+
+@dataclass(frozen=True, eq=False)
+class SharedStars:
+    """A campaign in which every star of a catalogue is in every exposure.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+        The truth.
+    matches : MatchTable
+        Where they would be without errors, with the quoted errors.
+    position, motion : float
+        Errors of the catalogue, pixels and pixels per year from 2004.0.
+    """
+
+    model: DistortionModel
+    theta: np.ndarray
+    matches: MatchTable
+    position: float
+    motion: float
+
+    def catalogue_errors(self, rng: np.random.Generator) -> np.ndarray:
+        """What one catalogue adds to all matches (N, 2)."""
+        code = self.matches.star
+        position, motion = rng.standard_normal((2, code.max() + 1, 2))
+        years = self.matches.epoch[:, None] - 2004.0
+        return self.position * position[code] + years * self.motion * motion[code]
+
+    def with_errors(self, error: np.ndarray) -> MatchTable:
+        """The matches with errors (N, 2)."""
+        m = self.matches
+        return m._with(u=m.u + error[:, 0], v=m.v + error[:, 1])
+
+    def covariance(self, fit: LinearFit) -> StarCovariance:
+        """What the catalogue's errors make of a fit to the matches."""
+        position, motion = self.position, self.motion
+        return star_covariance(
+            fit, self.matches, position, position, motion_u=motion, motion_v=motion, epoch0=2004.0
+        )
+
+
+def shared_stars(
+    rng: np.random.Generator,
+    n_stars: int,
+    epochs: Sequence[float],
+    *,
+    order: int,
+    centroid: float,
+    position: float,
+    motion: float,
+) -> SharedStars:
+    """Stars within 100 pixels of one place in all exposures, so that their errors add up."""
+    n_exposures = len(epochs)
+    model, matches, theta = campaign(
+        6, n_exposures, n_stars, order=order, time=False, frames="shift_rotation"
+    )
+    model = replace(model, gauge="first", held=(0.0, 0.0, 0.0))
+    theta = np.concatenate([theta[: model.n_distortion], theta[-3 * (n_exposures - 1) :]])
+    star = np.tile(np.arange(n_stars), n_exposures)
+    place = rng.uniform(150, 1900, (n_stars, 2))
+    chip = rng.integers(2, size=n_stars)[star]
+    x, y = (place[star] + rng.uniform(-100, 100, (len(star), 2))).T * [[2], [1]]
+    exposure = np.repeat(np.arange(n_exposures), n_stars)
+    epoch = np.asarray(epochs)[exposure]
+    quoted = np.sqrt(centroid**2 + position**2 + (motion * (epoch - 2004.0)) ** 2)
+    u, v = model.predict(theta, x, y, exposure=exposure, chip=np.array([1, 2])[chip]).T
+    measured = {"x": x, "y": y, "u": u, "v": v, "sigma_u": quoted, "sigma_v": quoted}
+    matches = matches._with(**measured, exposure=exposure, chip=chip, epoch=epoch, star=star)
+    return SharedStars(model, theta, matches, position, motion)
 
 
 class Truth:

@@ -27,6 +27,12 @@ from bayesdist.simulate import simulate_matches
 SIZE = (1000.0, 800.0)
 CHIP = Chip(1, "A", SIZE, (500.0, 400.0))
 TWO_CHIPS = (CHIP, Chip(2, "B", (900.0, 850.0), (450.0, 425.0)))
+# outlier models with all that they sample: log(jitter), logit(f), log(s_out)
+MIXTURES = {
+    "gaussian": (OutlierMixture(), [np.log(0.02), -3.0, np.log(0.8)]),
+    "uniform": (OutlierMixture("uniform", match_radius=2.0), [np.log(0.02), -3.0]),
+    "none": (OutlierMixture("none"), [np.log(0.02)]),
+}
 UNCLIPPED = {"clip_chi2": np.inf, "clip_abs": None}
 
 
@@ -114,7 +120,7 @@ def columns_of(matches: MatchTable) -> dict[str, np.ndarray]:
     return {
         "epoch": matches.epoch,
         "exposure": matches.exposure,
-        "chip": np.asarray(matches.chip_numbers)[matches.chip],
+        "chip": matches.chip_number,
     }
 
 

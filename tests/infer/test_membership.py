@@ -24,6 +24,7 @@ from bayesdist.infer.target import Target
 
 from .oracle import star_terms
 from .support import (
+    MIXTURES,
     TWO_CHIPS,
     posterior_at,
     residual_of,
@@ -34,17 +35,14 @@ from .support import (
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-MIXTURES = {
-    "gaussian": (OutlierMixture(), [np.log(0.02), -3.0, np.log(0.8)]),
-    "uniform": (OutlierMixture("uniform", match_radius=2.0), [np.log(0.02), -3.0]),
-    "none": (OutlierMixture("none"), [np.log(0.02)]),
+ALL = MIXTURES | {
     "jitter fixed": (OutlierMixture(jitter=0.03), [-3.0, np.log(0.8)]),
     "nothing is sampled": (OutlierMixture("none", jitter=0.01), []),
 }
 DRAWS = 9
 
 
-@pytest.fixture(scope="module", params=MIXTURES.values(), ids=MIXTURES)
+@pytest.fixture(scope="module", params=ALL.values(), ids=ALL)
 def known(request):
     """A posterior of a few draws, and the same numbers star by star."""
     mixture, h = request.param

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from bayesdist.infer.star_errors import star_covariance, with_star_errors
 from bayesdist.infer.views import linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
 
-from .small_campaign import campaign
+from .small_campaign import campaign, shared_stars
 from .support import CHIP, SIZE, UNCLIPPED, columns_of, legendre_design, simulated
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -182,57 +182,19 @@ def test_more_exposures_of_the_same_pixels_do_not_help_against_the_catalogue():
 def test_repeated_catalogues():
     """Simulated from the beginning: catalogue, proper motions, centroids, the fit, 200 times."""
     rng = np.random.default_rng(6)
-    n_stars = 100
-    model, matches, theta = campaign(6, 5, 100, order=2, time=False, frames="shift_rotation")
-    model = replace(model, gauge="first", held=(0.0, 0.0, 0.0))
-    theta = np.concatenate([theta[: model.n_distortion], theta[-4 * 3 :]])
-    # every star is in every exposure, within 100 pixels of one place, so that errors add up
-    base = rng.uniform(150, 1900, (n_stars, 2))
-    chip = rng.integers(2, size=n_stars)
-    code = np.tile(np.arange(n_stars), 5)
-    xy = base[code] + rng.uniform(-100, 100, (500, 2))
-    xy[:, 0] *= 2
-    centroid, c_sigma, m_sigma = 0.01, 0.02, 0.01
-    epoch = np.repeat([2002.5, 2003.5, 2004.5, 2005.5, 2006.8], 100)
-    dt = epoch - 2004.0
-    quoted = np.sqrt(centroid**2 + c_sigma**2 + (m_sigma * dt) ** 2)
-    exposure, chip = np.repeat(np.arange(5), 100), chip[code]
-    numbers = np.array([1, 2])[chip]
-    true = model.predict(theta, *xy.T, exposure=exposure, chip=numbers)
-
-    def table(error):
-        return matches._with(
-            x=xy[:, 0],
-            y=xy[:, 1],
-            u=true[:, 0] + error[:, 0],
-            v=true[:, 1] + error[:, 1],
-            exposure=exposure,
-            chip=chip,
-            epoch=epoch,
-            sigma_u=quoted,
-            sigma_v=quoted,
-            star=code,
-        )
-
-    fit = fit_linear(table(np.zeros((500, 2))), model, **UNCLIPPED)
-    stars = star_covariance(
-        fit,
-        table(np.zeros((500, 2))),
-        c_sigma,
-        c_sigma,
-        motion_u=m_sigma,
-        motion_v=m_sigma,
-        epoch0=2004.0,
-    )
-    solution = with_star_errors(fit, stars)
+    centroid = 0.01
+    epochs = [2002.5, 2003.5, 2004.5, 2005.5, 2006.8]
+    shared = shared_stars(rng, 100, epochs, order=2, centroid=centroid, position=0.02, motion=0.01)
+    model, matches = shared.model, shared.matches
+    fit = fit_linear(matches, model, **UNCLIPPED)
+    solution = with_star_errors(fit, shared.covariance(fit))
     distance, naive = [], []
-    J = model.jacobian(theta, xy[:40, 0], xy[:40, 1], exposure=exposure[:40], chip=numbers[:40])
+    some = matches.select(np.arange(40))
+    J = model.jacobian(shared.theta, some.x, some.y, exposure=some.exposure, chip=some.chip_number)
     far = []
     for _ in range(200):
-        error = centroid * rng.standard_normal((500, 2))
-        error += c_sigma * rng.standard_normal((n_stars, 2))[code]
-        error += dt[:, None] * m_sigma * rng.standard_normal((n_stars, 2))[code]
-        one = fit_linear(table(error), model, **UNCLIPPED)
+        error = centroid * rng.standard_normal((len(matches), 2)) + shared.catalogue_errors(rng)
+        one = fit_linear(shared.with_errors(error), model, **UNCLIPPED)
         d = one.mean - fit.mean
         distance.append(d @ np.linalg.solve(solution.cov, d))
         naive.append(d @ np.linalg.solve(fit.cov, d))

@@ -20,6 +20,7 @@ from bayesdist.model import FRAME_KINDS, DistortionModel
 
 from .support import (
     CHIP,
+    MIXTURES,
     TWO_CHIPS,
     UNCLIPPED,
     numerical_gradient,
@@ -31,11 +32,6 @@ from .support import (
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-MIXTURES = {
-    "gaussian": (OutlierMixture(), [np.log(0.02), -3.0, np.log(0.8)]),
-    "uniform": (OutlierMixture("uniform", match_radius=2.0), [np.log(0.02), -3.0]),
-    "none": (OutlierMixture("none"), [np.log(0.02)]),
-}
 FIXED = {
     "gaussian, jitter fixed": (OutlierMixture(jitter=0.02), [-3.0, np.log(0.8)]),
     "uniform, jitter fixed": (OutlierMixture("uniform", match_radius=2.0, jitter=0.0), [-3.0]),

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
+from bayesdist.assess.misfit import Misfit
 from bayesdist.errors import InputError
 from bayesdist.report import Check, Product, write_report
 from bayesdist.report.captions import SECTIONS
@@ -82,7 +83,10 @@ def test_links_lead_to_sections_in_the_order_of_the_report(page):
 
 def test_pictures_are_whole_and_described(page, figures):
     images = lxml_html.fromstring(page).xpath("//figure/img")
-    assert len(images) == len(figures) == sum(map(len, SECTIONS.values()))
+    named = {name for names in SECTIONS.values() for name in names}
+    # periods were not asked for, and nothing depends on time
+    assert set(figures) == named - {*SECTIONS["periods"], "horizon"}
+    assert len(images) == len(figures)
     for image in images:
         png = base64.b64decode(image.get("src").split(",", 1)[1], validate=True)
         assert png.startswith(b"\x89PNG") and png.endswith(b"IEND\xaeB`\x82")
@@ -184,6 +188,17 @@ def test_one_limit_missed_is_one_failure(converged):
     run = replace(converged, posterior=replace(converged.posterior, convergence=worse))
     failed = [check.name for check in status_checks(run)["Sampling"] if check.level == "fail"]
     assert len(failed) == 2 and "Converged" in failed  # the criterion itself, and the sum of them
+
+
+def test_structure_in_the_residuals_has_a_row(converged):
+    """The verdict of the row is that of the warning, whichever chip it is of."""
+    (chip,) = (c.chip for c in converged.chips)
+    for p, level in ((0.3, "pass"), (2e-4, "pass"), (1e-5, "warn")):
+        found = Misfit(p, "columns", 0.0021, "pix", chip)
+        assert found.significant == (level == "warn")
+        *_, row = status_checks(replace(converged, misfits=(found,)))["Fit"]
+        assert row.name.startswith("Structure in the residuals of the fit") and row.level == level
+        assert row.value.startswith("0.0021\u202fpix rms in columns of W2, p ")
 
 
 def test_names_cannot_break_the_page(converged, figures):

@@ -142,7 +142,7 @@ def test_fine_scale_is_as_large_as_published(tables):
     for name, most in (("F606W", 0.032), ("F435W", 0.062), ("F475W", 0.08)):
         assert max(longest[1, name], longest[2, name]) == pytest.approx(most)
     assert 0.02 < max(longest[1, "F814W"], longest[2, "F814W"]) <= 0.08
-    # "amplitude of these residuals varies from 0.02 to 0.05": typical vectors are shorter still
+    # amplitudes of 0.02 to 0.05 px are quoted: typical vectors are shorter still
     rms = [np.sqrt((tables[1, name].values ** 2).sum(axis=0).mean()) for name in ACS_FILTERS]
     assert 0.005 < min(rms) and max(rms) < 0.05
 

@@ -33,7 +33,7 @@ def residual(model, matches, truth):
         matches.y,
         epoch=matches.epoch,
         exposure=matches.exposure,
-        chip=np.asarray(matches.chip_numbers)[matches.chip],
+        chip=matches.chip_number,
     )
     return np.column_stack([matches.u, matches.v]) - predicted
 

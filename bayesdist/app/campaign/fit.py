@@ -16,7 +16,7 @@ from bayesdist.app.campaign.tables import fit_tables, tables_summary
 from bayesdist.app.session import ERROR_COLUMNS, write_table
 from bayesdist.app.stages.fit import summarise_fit
 from bayesdist.data import MatchTable, centroid_errors
-from bayesdist.infer import fit_by_magnitude, load, save_fit
+from bayesdist.infer import load, save_fit
 from bayesdist.infer.checkpoints import write_arrays
 from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
@@ -89,7 +89,7 @@ def _fit_errors(session: CampaignSession) -> None:
     """Errors of the centroids by magnitude, from the scatter that the tables leave."""
     pairs = session.raw_matches
     assert isinstance(pairs, MatchTable)
-    _, _, total = fit_by_magnitude(pairs, session.plain_model)
+    _, _, total = session.errors_by_magnitude(pairs)
     errors = centroid_errors(pairs, total)
     table = Table({name: getattr(errors, name) for name in ERROR_COLUMNS})
     write_table(table, session.run / "magnitude_errors.ecsv")

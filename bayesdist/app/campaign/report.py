@@ -196,7 +196,7 @@ def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
     pairs, moved, model = session.pairs, session.matches, session.plain_model
     assert isinstance(moved, MatchTable)
     errors, farthest = session.magnitude_errors, session.config.fit.clip_abs
-    numbers = np.asarray(pairs.chip_numbers)[pairs.chip]
+    numbers = pairs.chip_number
     plain = pairs if errors is None else with_centroid_errors(pairs, errors)
     if any(table.filter for table in session.tables):  # those of the detector are not of this run
         detector = [table for table in session.tables if not table.filter]

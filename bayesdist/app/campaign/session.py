@@ -21,7 +21,8 @@ from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
 from bayesdist.assess import LocalTerm
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
-from bayesdist.infer import GaussianPriors, Matches, Posterior
+from bayesdist.errors import NotSettledError
+from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, fit_by_magnitude
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
 from bayesdist.infer.series import Series
@@ -100,14 +101,40 @@ class CampaignSession(Session):
         pairs = self.pairs
         if not self.tables:
             return pairs
-        numbers = np.asarray(pairs.chip_numbers)[pairs.chip]
-        x, y = corrected(self.tables, pairs.x, pairs.y, chip=numbers, filter=self.inputs.filter)
+        x, y = corrected(
+            self.tables, pairs.x, pairs.y, chip=pairs.chip_number, filter=self.inputs.filter
+        )
         return on_the_chips(with_columns(pairs, x=x, y=y), self.plain_model)
+
+    def errors_by_magnitude(self, pairs: Matches) -> tuple[LinearFit, Matches, MagnitudeErrors]:
+        """Fit of every exposure by itself and errors by magnitude, as `fit_by_magnitude`.
+
+        Raises
+        ------
+        NotSettledError
+            Naming the catalogue: with its errors and motions right, residuals are those of the
+            centroids and settle.
+        """
+        try:
+            return fit_by_magnitude(pairs, self.plain_model)
+        except NotSettledError as error:
+            catalog, cause = self.inputs.catalog, error.cause
+            do = "check its positions, its motions and their epoch, or lower campaign.radius"
+            if catalog.pm_u is None:
+                span = float(np.ptp(self.inputs.log.values("epoch")))
+                cause = f"has no proper motions, and the exposures span {span:.1f} years: {cause}"
+                do = "give it columns pm_u and pm_v, or calibrate exposures of one epoch"
+            raise NotSettledError(cause, where=catalog.source, do=do) from error
 
     @cached_property
     def magnitude_errors(self) -> MagnitudeErrors | None:
         """Errors of the centroids, as the fit left them."""
         return self.kept_errors()
+
+    @property
+    def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
+        """The same: the catalogue's errors have been taken off."""
+        return self.magnitude_errors
 
     @cached_property
     def matches(self) -> Matches:

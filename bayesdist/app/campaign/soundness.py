@@ -35,6 +35,7 @@ SAME_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
 LINEAR_KINDS = 3  # drifting terms from which on scale and both shears drift
 OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
 EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
+NAMED = 5  # exposures in a sentence
 STILL = 1.0  # years over which stars may stand still
 
 
@@ -69,6 +70,8 @@ def input_doubts(session: CampaignSession) -> list[str]:
     """What a campaign will not be able to tell, or takes on trust, each as a clause."""
     log, catalog = session.inputs.log, session.inputs.catalog
     out = []
+    if session.inputs.strangers:
+        out.append(_said_of_strangers(session.inputs.strangers, log.source))
     epochs = log.values("epoch")
     span = float(np.ptp(epochs))
     if catalog.pm_u is None and span > STILL:
@@ -96,6 +99,16 @@ def input_doubts(session: CampaignSession) -> list[str]:
             "up to 2.5e-5, is in the scales of the exposures"
         )
     return out
+
+
+def _said_of_strangers(names: tuple[str, ...], log: str) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    several = len(names) > 1
+    return (
+        f"{len(names)} star list{'s are of exposures' if several else ' is of an exposure'} that "
+        f"{log} does not have, and {'are' if several else 'is'} not used: "
+        f"{', '.join(names[:NAMED])}{more}"
+    )
 
 
 def shear_doubts(rolls: Float, of: str) -> list[str]:

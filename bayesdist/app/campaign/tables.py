@@ -12,7 +12,7 @@ from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.data import MatchTable
-from bayesdist.infer import LinearFit, fit_by_magnitude
+from bayesdist.infer import LinearFit
 from bayesdist.infer.nodes import Round, TableFit, fit_with_tables, pixel_jacobian
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.model import LookupTable, corrected
@@ -36,7 +36,7 @@ def fit_tables(session: CampaignSession) -> TableFit | None:
     session.keep_tables(held)
     if block.method == "none":
         if held:
-            fit, _, _ = fit_by_magnitude(session.raw_matches, session.plain_model)
+            fit, _, _ = session.errors_by_magnitude(session.raw_matches)
             session.keep_tables(held, _held_errors(session, fit, held))
         return None
     found = fit_with_tables(
@@ -65,7 +65,7 @@ def _with_errors(session: CampaignSession, held: tuple[LookupTable, ...]) -> Mat
     there the tables would be smoothed too much, and their own errors twice too large.
     """
     pairs, model = session.pairs, session.plain_model
-    _, rough_errors, _ = fit_by_magnitude(pairs, model)
+    _, rough_errors, _ = session.errors_by_magnitude(pairs)
     assert isinstance(rough_errors, MatchTable)
     rough = fit_with_tables(
         rough_errors,
@@ -76,7 +76,7 @@ def _with_errors(session: CampaignSession, held: tuple[LookupTable, ...]) -> Mat
         step=session.config.tables.step,
         rounds=ROUGH,
     )
-    _, _, errors = fit_by_magnitude(rough.corrected(pairs), model)
+    _, _, errors = session.errors_by_magnitude(rough.corrected(pairs))
     return pairs.with_errors_by_magnitude(errors)
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
+from bayesdist.app.periods import check_pairs
 from bayesdist.app.session import Session
 from bayesdist.app.stages.assess import budget_of, margins_of, run_assess
-from bayesdist.app.stages.export import idctab_of, run_export, sip_of
+from bayesdist.app.stages.export import idctab_of, run_export, sip_of, wise_sip_of
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.report import run_report
 from bayesdist.app.stages.sample import run_sample
@@ -56,6 +57,7 @@ def rehearse(session: Session) -> None:
     BayesdistError
     """
     config = session.config
+    check_pairs(session)
     fit, _ = session.linear
     budget_of(session, fit, REHEARSAL_DRAWS)
     margins_of(session, config.requirements(), fit, REHEARSAL_DRAWS)
@@ -64,6 +66,8 @@ def rehearse(session: Session) -> None:
             sip_of(session, fit, chip.number)
     if config.products.idctab is not None:
         idctab_of(session, fit)
+    if config.products.wise_meta:
+        wise_sip_of(session, fit)
 
 
 def require(session: Session, stage: str, needs: tuple[str, ...]) -> None:

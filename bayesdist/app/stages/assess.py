@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.horizon import horizons_of, write_horizons
+from bayesdist.app.periods import periods_of, periods_summary, periods_table
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session, write_table
 from bayesdist.assess import (
@@ -23,14 +26,20 @@ from bayesdist.assess import (
 )
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.detector_budget import DetectorBudget, detector_budget
+from bayesdist.assess.horizon import Horizon
+from bayesdist.assess.position_errors import PositionErrors, position_errors
 from bayesdist.assess.solution import Solution
+from bayesdist.errors import InputError
 from bayesdist.products.maps_file import write_maps
 
 __all__ = [
+    "assessed_horizons",
     "budget_of",
+    "errors_of",
     "judged_requirements",
     "margin_rows",
     "margins_of",
+    "probability_met",
     "run_assess",
     "write_margins",
 ]
@@ -39,9 +48,15 @@ log = logging.getLogger("bayesdist")
 
 LEAST_CHI2, MOST_CHI2 = 0.67, 1.5
 
+HORIZON_DRAWS = 1000  # for each of its epochs
+
+# of what a requirement is, beside chip and epoch
+SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
+
 
 def run_assess(session: Session) -> None:
     config, run = session.config, session.run
+    periods_of(session, anew=True)  # the fit may be another one since
     solution, grid, epoch = session.solution, config.assess.grid, session.epoch
     places = [{"grid": grid, "epoch": epoch, "chip": c.number} for c in solution.model.chips]
     formal = [uncertainty_map(session.fit, **place) for place in places]
@@ -57,14 +72,17 @@ def run_assess(session: Session) -> None:
         log.warning("assess: WARNING: %s", text)
     budget = budget_of(session)
     several = len(budget.chips) > 1
-    table = Table(rows=budget.rows_by_chip() if several else budget.rows())
-    for name in ("u", "v", "radial"):
+    rows = budget.rows_by_chip() if several else budget.rows()
+    table = Table([{k: np.nan if v is None else v for k, v in row.items()} for row in rows])
+    for name in ("u", "v", "radial", "radial_error"):
         table[name].unit = solution.unit
     table.meta = {"epoch": epoch, "grid": list(grid), "statistic": "rms over the grid"}
     table.meta |= state | labelled(session)
     write_table(table, run / "budget.ecsv")
     margins = margins_of(session, config.requirements())
     write_margins(session, margins)
+    write_horizons(session, assessed_horizons(session, config.requirements()))
+    _assess_periods(session)
     run.summarise(
         map=_map_summary(maps, formal),
         budget=budget.rows(),
@@ -73,6 +91,16 @@ def run_assess(session: Session) -> None:
     )
     worst = max(maps, key=lambda m: m.radius_max)
     log.info("assess: largest formal radius %.4g %s", worst.radius_max, worst.unit)
+
+
+def _assess_periods(session: Session) -> None:
+    found = periods_of(session)
+    if found is None:
+        return
+    write_table(periods_table(found), session.run / "periods.ecsv")
+    session.run.summarise(periods=periods_summary(found))
+    for text in (found.verdict, found.pattern_sentence, *found.cautions):
+        log.info("assess: %s", text)
 
 
 def _map_summary(
@@ -119,9 +147,14 @@ def _assessment(session: Session, solution: Solution | None, n_draws: int | None
     config = session.config
     what: dict[str, Any] = {"solution": solution}
     if solution is None:
-        known = session.systematics
-        solution = known.solution
-        what = {"solution": solution, "fields": known.fields, "aligned": known.aligned}
+        solution = session.solution
+        what = {
+            "solution": solution,
+            "fields": session.field_terms,
+            "aligned": session.systematics.aligned,
+        }
+    else:
+        what["fields"] = config.linear_terms(solution)
     return what | {
         "terms": config.user_terms(),
         "local": session.local_terms,
@@ -143,6 +176,38 @@ def budget_of(
     return detector_budget(**_assessment(session, solution, n_draws))
 
 
+def errors_of(session: Session) -> PositionErrors:
+    """Draws of all errors of a position, as budget and margins have them."""
+    what = _assessment(session, None, None)
+    del what["epoch"]
+    return position_errors(centroid=session.centroid, **what)
+
+
+def assessed_horizons(session: Session, requirements: Sequence[Requirement]) -> tuple[Horizon, ...]:
+    """Until when requirements are met, on fewer draws than their margins."""
+    if session.posterior.model.time is None or not requirements:
+        return ()
+    what = _assessment(session, None, min(HORIZON_DRAWS, session.config.assess.draws))
+    del what["epoch"]
+    centroid = session.centroid if any(r.magnitude is not None for r in requirements) else None
+    found = horizons_of(session, position_errors(centroid=centroid, **what), requirements)
+    for one in found:
+        log.info("assess: %s", one.sentence)
+    return found
+
+
+def probability_met(
+    session: Session, requirement: Requirement, candidate: Solution, n_draws: int
+) -> float:
+    """With which a requirement would be met if the session had another solution.
+
+    The same random numbers serve every candidate.
+    """
+    what = _assessment(session, None, n_draws) | {"solution": candidate}
+    [margin] = check_requirements(requirements=[requirement], centroid=session.centroid, **what)
+    return margin.probability_met
+
+
 def margins_of(
     session: Session,
     requirements: tuple[Requirement, ...],
@@ -151,16 +216,52 @@ def margins_of(
 ) -> tuple[Margin, ...]:
     """Margins of a solution, as in `budget_of`; as many draws as configured by default."""
     doubt = ""
-    if n_draws is None and session.misfit.significant:
-        doubt = session.misfit.sentence
-    return check_requirements(
-        requirements=requirements, doubt=doubt, **_assessment(session, solution, n_draws)
+    if n_draws is None:
+        doubt = session.majority or (session.misfit.sentence if session.misfit.significant else "")
+    centroid = None
+    if any(r.magnitude is not None for r in requirements):
+        if n_draws is None:
+            centroid = session.centroid
+        else:  # without a posterior centroids have no errors yet
+            requirements = tuple(_of_any_star(session, r) for r in requirements)
+    margins = check_requirements(
+        requirements=requirements,
+        doubt=doubt,
+        centroid=centroid,
+        **_assessment(session, solution, n_draws),
     )
+    if doubt or n_draws is not None:
+        return margins
+    return tuple(_where_stars_are(session, margin) for margin in margins)
+
+
+def _of_any_star(session: Session, requirement: Requirement) -> Requirement:
+    """A requirement without its magnitude, if the matches have such."""
+    if requirement.magnitude is not None and not session.raw_matches.has_mag:
+        raise InputError(
+            f"names magnitude {requirement.magnitude:g}, and the matches have no magnitudes",
+            where=requirement.where,
+            do="name their column in [data.columns], or leave magnitude out",
+        )
+    return replace(requirement, magnitude=None)
+
+
+def _where_stars_are(session: Session, margin: Margin) -> Margin:
+    """A margin without verdict where it is judged on pixels that no stars cover."""
+    for one in session.coverages:
+        if margin.verdict != "undecided" and one.misses(
+            margin.requirement, session.config.assess.grid
+        ):
+            return replace(margin, verdict="undecided", reason=one.sentence)
+    return margin
 
 
 def warnings_of(session: Session) -> list[str]:
     """What a reader of the numbers has to know, each as a sentence."""
     fit, out = session.fit, [*session.doubts]
+    out += [one.sentence for one in session.coverages if one.significant]
+    if session.majority:
+        out.append(session.majority)
     if session.misfit.significant:
         out.append(session.misfit.sentence)
     ratio = fit.chi2 / max(fit.dof, 1)
@@ -190,8 +291,10 @@ def labelled(session: Session) -> dict[str, str]:
 
 def posterior_warnings(session: Session) -> list[str]:
     """Those of the fit, and before them what must be said of the draws."""
-    label = session.posterior.approximation
-    return [label[0].upper() + label[1:], *warnings_of(session)] if label else warnings_of(session)
+    label, periods = session.posterior.approximation, periods_of(session)
+    out = [label[0].upper() + label[1:]] if label else []
+    out += warnings_of(session)
+    return [*out, periods.verdict.rstrip(".")] if periods and periods.matters else out
 
 
 def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
@@ -204,14 +307,18 @@ def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
             "value": m.value,
             "interval": list(m.interval),
             "margin": m.margin,
+            "margin_percent": m.percent,
             "unit": m.unit,
             "epoch": m.epoch,
             "chip": m.requirement.chip,
+            **{key: getattr(m.requirement, key) for key in SCOPE},
             "probability": m.requirement.probability,
             "probability_met": m.probability_met,
             "mc_error": m.mc_error,
             "verdict": m.verdict,
             "reason": m.reason,
+            "worst": {"chip": m.worst.chip, "x": m.worst.x, "y": m.worst.y, "rms": m.worst.rms},
+            "remedy": None if m.remedy is None else m.remedy.sentence,
         }
         for m in margins
     ]
@@ -222,14 +329,15 @@ def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
     rows = margin_rows(margins)
     several = len(session.posterior.model.chips) > 1
     columns: dict[str, list[Any]] = {}
-    for row in rows:
-        low, high = row["interval"]
-        flat = {**row, "lo95": low, "hi95": high}
-        del flat["interval"]
+    for m, row in zip(margins, rows, strict=True):
+        flat = {k: v for k, v in row.items() if k not in ("interval", "worst", *SCOPE)}
         flat["epoch"] = np.nan if flat["epoch"] is None else flat["epoch"]
         flat["chip"] = "all" if flat["chip"] is None else str(flat["chip"])
+        flat["remedy"] = flat["remedy"] or ""
+        flat |= {"scope": m.requirement.scope, "lo95": m.interval[0], "hi95": m.interval[1]}
+        flat |= {f"worst_{key}": value for key, value in row["worst"].items()}
         if not several:
-            del flat["chip"]
+            del flat["chip"], flat["worst_chip"]
         for name, value in flat.items():
             columns.setdefault(name, []).append(value)
     table = Table(columns)
@@ -240,8 +348,12 @@ def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
 
 def judged_requirements(run: RunDirectory) -> tuple[Requirement, ...]:
     """The requirements behind the margins in summary.json."""
-    keys = ("name", "statistic", "limit", "unit", "probability", "epoch", "chip")
-    # runs of earlier versions had one chip and named none
-    return tuple(
-        Requirement(**{k: row.get(k) for k in keys}) for row in run.summary.get("margins", [])
-    )
+    keys = ("name", "statistic", "limit", "unit", "probability", "epoch", "chip", *SCOPE)
+    out = []
+    for row in run.summary.get("margins", []):
+        # runs of earlier versions had one chip and named none, and no part of it
+        known = {k: row[k] for k in keys if row.get(k) is not None}
+        if "epochs" in known:
+            del known["epoch"]  # the worst one of them
+        out.append(Requirement(**known))
+    return tuple(out)

@@ -14,14 +14,18 @@ from bayesdist.products import (
     idctab_from_solution,
     lint_idctab,
     lint_sip,
+    lint_wise_band,
     read_idctab,
     read_sip,
+    read_wise_meta,
     sip_from_solution,
     write_idctab,
     write_sip,
+    write_wise_meta,
 )
+from bayesdist.products.sip import SIP_ORDERS
 
-__all__ = ["idctab_of", "run_export", "sip_of"]
+__all__ = ["idctab_of", "run_export", "sip_of", "wise_sip_of"]
 
 log = logging.getLogger("bayesdist")
 
@@ -60,6 +64,20 @@ def run_export(session: Session, written: Sequence[dict[str, Any]] = ()) -> None
                 "findings": [f"{f.level}: {f.where}: {f.message}" for f in findings],
             }
         )
+    if config.wise_band is not None and config.products.wise_meta:
+        path = run / f"w{config.wise_band}.meta"
+        write_wise_meta(path, {config.wise_band: wise_sip_of(session, session.solution)})
+        [band] = read_wise_meta(path)
+        products.append(
+            {
+                "path": path.name,
+                "kind": "WISE meta-data",
+                "closure_pix": band.sip.closure,
+                "a_dmax": band.sip.a_dmax,
+                "b_dmax": band.sip.b_dmax,
+                "findings": [f"{f.level}: {f.where}: {f.message}" for f in lint_wise_band(band)],
+            }
+        )
     run.summarise(products=products)
     log.info("export: %s", ", ".join(p["path"] for p in products) or "no products asked for")
 
@@ -74,6 +92,17 @@ def sip_of(session: Session, solution: Solution, chip: int) -> SipHeader:
         inverse_order=sip.inverse_order,
         linear=sip.linear,
         crval=sip.crval,
+        scale_arcsec=session.scale_arcsec,
+    )
+
+
+def wise_sip_of(session: Session, solution: Solution) -> SipHeader:
+    """As WISE has it: all linear terms in A and B, and an inverse of the same order."""
+    return sip_from_solution(
+        solution,
+        epoch=session.epoch,
+        inverse_order=max(solution.model.order, SIP_ORDERS[0]),
+        linear="sip",
         scale_arcsec=session.scale_arcsec,
     )
 

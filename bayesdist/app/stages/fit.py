@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 from astropy.table import Table
 
 from bayesdist.app.session import ERROR_COLUMNS, Session, write_table
 from bayesdist.infer import LinearFit, save_fit
+from bayesdist.infer.skew import Skew, skew_of
 
 __all__ = ["run_fit", "summarise_fit"]
 
@@ -51,6 +53,7 @@ def summarise_fit(session: Session, fit: LinearFit) -> None:
             "unit": fit.unit,
             "condition": fit.condition,
             "n_parameters": fit.model.n_params,
+            **(_skew(fit) if session.config.fit.skew else {}),
         },
     )
     log.info(
@@ -62,3 +65,21 @@ def summarise_fit(session: Session, fit: LinearFit) -> None:
         fit.unit,
         fit.chi2 / max(fit.dof, 1),
     )
+
+
+def _skew(fit: LinearFit) -> dict[str, Any]:
+    """Skew of the first chip and, where there are several, of each."""
+    rows = [
+        {"chip": chip.number, **_skew_row(skew_of(fit, chip=chip.number))}
+        for chip in fit.model.chips
+    ]
+    first = {key: value for key, value in rows[0].items() if key != "chip"}
+    return {"skew": first | ({"chips": rows} if len(rows) > 1 else {})}
+
+
+def _skew_row(skew: Skew) -> dict[str, float]:
+    return {
+        "value_rad": skew.value,
+        "sigma_rad": skew.sigma,
+        "significance": skew.significance,
+    }

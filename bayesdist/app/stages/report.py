@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from bayesdist.app.campaign.report import campaign_results
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.horizon import kept_horizons
+from bayesdist.app.periods import periods_of
 from bayesdist.app.rundir import as_json
 from bayesdist.app.session import Session
 from bayesdist.app.stages.assess import (
@@ -60,6 +62,7 @@ def run_report(session: Session) -> None:
         )
         for p in run.summary.get("products", [])
     )
+    judged = judged_requirements(run)
     inputs = ReportInput(
         name=run.path.resolve().name,
         config=as_json(config.model_dump(exclude_none=True)),
@@ -71,9 +74,12 @@ def run_report(session: Session) -> None:
         coefficients=coefficient_table(fit, session.solution),
         budget=budget_of(session),
         # the requirements that were judged last, be it by `assess` or by `validate`
-        margins=margins_of(session, judged_requirements(run)),
+        margins=margins_of(session, judged),
+        horizons=kept_horizons(run / "horizon.ecsv", judged),
         products=products,
         warnings=tuple(posterior_warnings(session)),
+        misfits=() if isinstance(session, CampaignSession) else session.misfits,
+        periods=periods_of(session),
         magnitude_errors=session.magnitude_errors,
         flagged=flagged_by_exposure(session.shards, posterior) if several else None,
         provenance={

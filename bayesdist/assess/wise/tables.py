@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations, product
 
 import numpy as np
 from astropy.table import Table
@@ -173,9 +174,7 @@ def band_to_band_table(
             absorbed=absorbed,
             rng=rng,
         )
-        for k, earlier in enumerate(names)
-        for later in names[k + 1 :]
-        for axis in _AXES
+        for earlier, later, axis in _two_bands(bands)
     )
     title = "Single-frameset band-to-band alignment residuals"
     return StatisticsTable(title, "Bands/Axis", "arcsec", rows)
@@ -211,7 +210,6 @@ def multiframe_table(
         As `fitting_table`.
     """
     values = _in_arcsec(bands, arcsec)
-    names = list(bands)
     if across:
         rows = tuple(
             pair_row(
@@ -221,16 +219,13 @@ def multiframe_table(
                 absorbed=absorbed,
                 rng=rng,
             )
-            for k, earlier in enumerate(names)
-            for later in names[k + 1 :]
-            for axis in _AXES
+            for earlier, later, axis in _two_bands(bands)
         )
         title = "Band-to-band multiframe alignment residuals"
         return StatisticsTable(title, "Bands/Axis", "arcsec", rows)
     rows = tuple(
         pair_row(f"{name}/{axis}", values[name, axis], absorbed=absorbed, rng=rng)
-        for name in names
-        for axis in _AXES
+        for name, axis in values
     )
     title = "In-band multiframe alignment residuals"
     return StatisticsTable(title, "Band/Axis", "arcsec", rows)
@@ -274,6 +269,12 @@ def period_table(
         for name, bins in periods.items()
     )
     return StatisticsTable("Residuals by period", "Period/Axis", "arcsec", rows)
+
+
+def _two_bands(bands: Iterable[str]) -> Iterator[tuple[str, str, str]]:
+    """Every band with every later one, on each axis."""
+    for (earlier, later), axis in product(combinations(bands, 2), _AXES):
+        yield earlier, later, axis
 
 
 def _in_arcsec(

@@ -112,7 +112,7 @@ def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[n
         "sigma_u": matches.sigma_u,
         "sigma_v": matches.sigma_v,
         "exposure": np.asarray(matches.exposure),
-        "chip": np.asarray(matches.chip_numbers)[matches.chip],
+        "chip": matches.chip_number,
         "outlier_probability": outlier_probability(posterior, matches),
         "row": matches.row,
     }

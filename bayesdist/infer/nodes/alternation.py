@@ -122,20 +122,8 @@ def alternate(
         Tables that are applied first and held.
     filter : str
         Filter of the new tables; '' for the detector's.
-    method : str
-        'field' or 'binned'.
-    rounds : int
-        At most.
-    tolerance : float
-        Change of every node, pixels, below which the rounds end.
-    step : tuple of float
-        Pixels between nodes.
-    smoothness : sequence of float
-        For 'field'.
-    fit : callable
-        Takes matches and a model, returns a solution with `model`, `mean` and `cov`.
-    report : callable, optional
-        Called with each round.
+    method, rounds, tolerance, step, smoothness, fit, report
+        As `fit_with_tables`.
 
     Returns
     -------
@@ -156,7 +144,7 @@ def alternate(
             do="give one round or more and a positive tolerance",
         )
     chips = [c for k, c in enumerate(matches.chip_numbers) if (matches.chip == k).any()]
-    numbers = np.asarray(matches.chip_numbers)[matches.chip]
+    numbers = matches.chip_number
     x, y = corrected(beneath, matches.x, matches.y, chip=numbers)
     tables: dict[int, LookupTable] = {}
     posteriors: dict[int, TablePosterior] = {}

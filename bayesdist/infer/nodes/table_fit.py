@@ -87,9 +87,8 @@ class TableFit:
         MatchTable
             The few that are moved off their chip are left out, and counted in `rejected`.
         """
-        numbers = np.asarray(matches.chip_numbers)[matches.chip]
         names = np.asarray(matches.filter_names)[matches.filter]
-        x, y = corrected(self.tables, matches.x, matches.y, chip=numbers, filter=names)
+        x, y = corrected(self.tables, matches.x, matches.y, chip=matches.chip_number, filter=names)
         return on_the_chips(with_columns(matches, x=x, y=y), self.part().fit.model)
 
     def predict(

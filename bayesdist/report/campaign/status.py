@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from bayesdist.assess.misfit import SIGNIFICANT, worst_misfit
 from bayesdist.report.campaign.context import CampaignResults
 from bayesdist.report.context import Check
-from bayesdist.report.numerals import count, number, percent, probability
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numerals import count, percent
+from bayesdist.report.structure import structure_check
 
 __all__ = ["campaign_checks"]
 
@@ -68,7 +67,7 @@ def campaign_checks(r: CampaignResults) -> tuple[Check, ...]:
             Check("Exposures that could not be fitted alone", ", ".join(skipped), "none", "warn")
         )
     if r.misfits:
-        out.append(_structure(r))
+        out.append(structure_check(r.misfits, fit="the joint fit"))
     out.append(
         Check(
             "Other doubts" if r.misfits else "Doubts",
@@ -78,17 +77,3 @@ def campaign_checks(r: CampaignResults) -> tuple[Check, ...]:
         )
     )
     return tuple(out)
-
-
-def _structure(r: CampaignResults) -> Check:
-    """Whether the joint fit leaves structure in the residuals: what the banner warns of."""
-    worst = worst_misfit(r.misfits)
-    chip = "" if worst.chip is None else f" of {worst.chip.name}"
-    size = display_scale(worst.unit, worst.structure).text(worst.structure, 2)
-    found = f"{size} rms in {worst.partition}{chip}" if worst.structure > 0 else "none"
-    return Check(
-        "Structure in the residuals of the joint fit, beyond noise",
-        f"{found}, {probability(worst.p_value)}",
-        f"p at least {number(SIGNIFICANT, 1)}",
-        _level(not worst.significant),
-    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesdist.assess import Margin
 from bayesdist.report.context import ReportInput
 from bayesdist.report.gauge import gauge_mark, gauge_of_maps, gauge_of_new_exposure
 from bayesdist.report.numerals import MISSING, interval, number, rounded
@@ -87,20 +88,23 @@ def margin_table(inputs: ReportInput) -> TextTable | None:
         cells = (
             rounded(m.value, spread),
             interval(*m.interval, spread),
-            rounded(m.margin, spread),
+            f"{rounded(m.margin, spread)} ({m.percent:.0f} %)",
             f"{number(m.probability_met)} ± {number(m.mc_error, 2)}",
         )
         epoch = "" if m.epoch is None else f" at {m.epoch:.2f}"
+        if r.epochs is not None:
+            epoch = f" from {r.epochs[0]:.2f} to {r.epochs[1]:.2f}, worst{epoch}"
         chip = next((c.chip.name for c in inputs.chips if c.chip.number == r.chip), "")
         on = f" on {chip}" if chip and inputs.several else ""
+        scope = f" {r.scope}" if r.scope else ""
         out.append(
             (
                 r.name,
-                f"{r.statistic}{on}{epoch} at most {r.limit:g} {r.unit},"
+                f"{r.statistic}{scope}{on}{epoch} at most {r.limit:g} {r.unit},"
                 f" with probability {r.probability:g}",
                 *(marked(inputs, c) for c in cells),
                 m.unit,
-                f"{m.verdict}: {m.reason}" if m.reason else m.verdict,
+                _judgement(m, inputs.several),
             )
         )
     return TextTable(
@@ -111,3 +115,13 @@ def margin_table(inputs: ReportInput) -> TextTable | None:
         note="Margin: the limit minus the value that the statistic stays under with the probability"
         f" asked for. {gauge_of_new_exposure(inputs)}".rstrip(),
     )
+
+
+def _judgement(m: Margin, several: bool) -> str:
+    """Verdict, reason, where the error is largest, and what would help."""
+    on = f" of chip {m.worst.chip}" if several else ""
+    out = [
+        f"{m.verdict}: {m.reason}" if m.reason else m.verdict,
+        f"largest at ({m.worst.x:.0f}, {m.worst.y:.0f}){on}: {number(m.worst.rms, 2)} {m.unit} rms",
+    ]
+    return "; ".join(out + ([] if m.remedy is None else [m.remedy.sentence]))

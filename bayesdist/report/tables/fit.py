@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess import residual_statistics
+from bayesdist.infer.skew import skew_of
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numerals import MISSING, count, interval, number, rounded
 from bayesdist.report.scales import Scale, display_scale, with_mas
@@ -44,12 +45,46 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
         pairs["Parameters"] += f", {count(len(inputs.held))} of them held by a prior"
     return (
         listing("Linear fit", pairs),
+        *((_skew_table(inputs),) if inputs.setting("fit", "skew", False) else ()),
         TextTable(
             f"Residuals of the stars used [{scale.unit}]",
             ("Chip, axis" if inputs.several else "Axis", *heads),
             tuple(rows),
             note=f"From {inputs.sample}." if inputs.sample else "",
         ),
+    )
+
+
+def _skew_table(inputs: ReportInput) -> TextTable:
+    """The skew that the linear terms of each chip hold."""
+    rows = []
+    for c in inputs.chips:
+        for name, solution in (("least squares", inputs.fit), ("posterior", inputs.posterior)):
+            if solution is None:
+                continue
+            skew = skew_of(solution, chip=c.chip.number)
+            cells = [
+                rounded(1e6 * skew.value, 1e6 * skew.sigma),
+                number(1e6 * skew.sigma, 2),
+                number(skew.significance, 3),
+            ]
+            if name == "posterior":
+                cells = [marked(inputs, text) for text in cells]
+            rows.append((f"{c.chip.name}, {name}" if inputs.several else name, *cells))
+    note = "The angle from the image of a row to that of a column is 90° plus the skew. It is held"
+    note += " by the linear terms, which are all free: beside them there is no further parameter."
+    weight = inputs.setting("fit", "radial_weight", 1.0)
+    if weight != 1.0:
+        note += (
+            f" With {weight:g} times the weight in the corners the weights of the fit are not the"
+            " inverse variances: its σ allows for that, but is larger than it need be, and"
+            " chi-square does not test a skew of zero."
+        )
+    return TextTable(
+        "Skew of the axes at the reference pixel [10⁻⁶ rad]",
+        ("Chip, solution" if inputs.several else "Solution", "Skew", "σ", "Skew / σ"),
+        tuple(rows),
+        note=note,
     )
 
 
@@ -82,7 +117,7 @@ def _chips_of_stars(inputs: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
     table, used = inputs.stars.table, inputs.stars.used
     if not inputs.several:
         return [("", used)]
-    numbers = np.asarray(table.chip_numbers)[table.chip]
+    numbers = table.chip_number
     each = [(f"{c.chip.name}, ", used & (numbers == c.chip.number)) for c in inputs.chips]
     return [("all, ", used), *each]
 

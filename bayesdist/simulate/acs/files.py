@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.data import ReferenceCatalog, atomic_path, read_catalog
+from bayesdist.data import ReferenceCatalog, read_catalog
 from bayesdist.data.exposures import read_exposures, write_exposures
+from bayesdist.data.files import atomic_path, made_folder
 from bayesdist.data.parquet_write import write_columns
 from bayesdist.data.starlists import read_star_lists
 from bayesdist.errors import InputError
@@ -142,14 +143,14 @@ def _prepare(folder: Path, *, force: bool) -> None:
         raise InputError(
             "the folder holds a campaign", where=str(folder), do="choose another, or replace it"
         )
+    for path in (lists, folder / "truth"):
+        made_folder(path)
     try:
-        for path in (lists, folder / "truth"):
-            path.mkdir(parents=True, exist_ok=True)
         for path in (*old, folder / "truth" / "tables.parquet"):
             path.unlink(missing_ok=True)  # lists of other exposures must not stay among the new
     except OSError as error:
         raise InputError(
-            f"the folder cannot be made or emptied ({error.strerror})",
+            f"the folder cannot be emptied ({error.strerror})",
             where=str(folder),
             do="choose one that you may write to",
         ) from error

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data import atomic_path
+from bayesdist.data.files import atomic_path, made_folder
 from bayesdist.data.parquet_write import write_columns
 from bayesdist.errors import InputError
 from bayesdist.simulate.wise.sets import PairChunk, WiseSet
@@ -72,12 +72,7 @@ def write_wise_set(
 
 
 def _make_empty(folder: Path, force: bool) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"folder cannot be made ({error.strerror})", where=str(folder), do="choose another"
-        ) from error
+    made_folder(folder)
     for path in folder.glob("*.parquet"):
         if not force:
             raise InputError(

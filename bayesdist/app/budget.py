@@ -1,0 +1,121 @@
+"""`bayesdist budget`: what the error of a position, or of the distance of two, is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from bayesdist.app.campaign.session import session_of
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.screen import number, table_text
+from bayesdist.app.session import Session
+from bayesdist.app.stages import require
+from bayesdist.app.stages.assess import errors_of
+from bayesdist.assess.budget import TOTAL
+from bayesdist.assess.place_budget import PlaceBudget, place_budget
+from bayesdist.assess.verdict import effective_draws
+from bayesdist.errors import InputError
+
+__all__ = ["budget_at"]
+
+
+def budget_at(
+    run: str | Path,
+    at: tuple[float, float],
+    *,
+    to: Sequence[tuple[float, float]] = (),
+    chip: int | None = None,
+    epoch: float | None = None,
+    magnitude: float | None = None,
+) -> str:
+    """The error budget of a position.
+
+    Parameters
+    ----------
+    run : path
+        A run that has been sampled.
+    at : tuple of float
+        FITS 1-based pixel.
+    to : sequence of tuple of float
+        Other pixels of the same image: the errors are then those of their differences to `at`.
+    chip : int, optional
+        Chip number; needed where there are several.
+    epoch : float, optional
+        Decimal years; that of the assessment by default.
+    magnitude : float, optional
+        Of the stars: the errors of their centroids are a term then.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For a run that has not been sampled, a chip that is not named or not there, and what
+        `place_budget` refuses.
+    """
+    with closing(session_of(RunDirectory.open(run))) as session:
+        require(session, "budget", ("fit", "sample"))
+        number_of = _chip(session, chip, str(run))
+        errors = errors_of(session)
+        noise = (2.0 * effective_draws(session.solution, errors.n_draws)) ** -0.5
+        x, y = zip(at, *to, strict=True)
+        found = place_budget(
+            errors,
+            x,
+            y,
+            chip=number_of,
+            epoch=session.epoch if epoch is None else epoch,
+            magnitude=magnitude,
+            relative=bool(to),
+            relative_error=noise,
+            sources={t.name: t.source for t in session.field_terms},
+        )
+        mas = session.config.detector.scale_mas if found.unit == "pix" else None
+        return _text(found, at, mas)
+
+
+def _chip(session: Session, chip: int | None, run: str) -> int:
+    chips = session.posterior.model.chips
+    if chip is None and len(chips) > 1:
+        raise InputError(
+            f"has {len(chips)} chips, and none is named",
+            where=run,
+            do=f"add --chip, one of {', '.join(str(c.number) for c in chips)}",
+        )
+    return chips[0].number if chip is None else chip
+
+
+def _text(found: PlaceBudget, at: tuple[float, float], scale_mas: float | None) -> str:
+    lines = []
+    when = "" if found.epoch is None else f" at {found.epoch:.2f}"
+    of = "" if found.magnitude is None else f", magnitude {found.magnitude:g}"
+    for k, (x, y) in enumerate(zip(found.x, found.y, strict=True)):
+        place = f"({x:g}, {y:g}) of chip {found.chip}{when}{of}"
+        if found.relative:
+            place = f"({at[0]:g}, {at[1]:g}) to {place}"
+        rows: list[dict[str, Any]] = []
+        for t in found.terms:
+            radial = float(t.radial[k])
+            row = {
+                "term": t.name,
+                "kind": "" if t.kind == TOTAL else t.kind,
+                f"u ({found.unit})": number(float(t.u[k])),
+                f"v ({found.unit})": number(float(t.v[k])),
+                "radial": number(radial)
+                + (
+                    ""
+                    if t.relative_error is None
+                    else f" +- {number(t.relative_error * radial, 1)}"
+                ),
+            }
+            if scale_mas is not None:
+                row["mas"] = number(radial * scale_mas)
+            rows.append(row | {"source": t.source})
+        lines += [place, table_text(rows), ""]
+    lines.append("1 sigma; terms of the model are correlated and enter the total jointly")
+    return "\n".join(lines)

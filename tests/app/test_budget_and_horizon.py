@@ -1,0 +1,177 @@
+"""Budget of a position, horizon and plan, through the command line, on pairs that drift."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from tests.app.support import cli, good, one_sentence
+
+SIZE = (512, 256)
+N, EPOCHS = 250, np.linspace(2004.0, 2012.0, 6)
+SIGMA, DRIFT = 0.02, 2e-5
+
+CONFIG = """
+[data]
+matches = "stars.ecsv"
+unit = "pix"
+[detector]
+name = "chip"
+size = [512, 256]
+scale_mas = 50.0
+[model]
+order = 2
+reference_pixel = [256.0, 128.0]
+[model.tdd]
+epoch0 = 2008.0
+terms = [["u", 1, 0], ["v", 1, 0]]
+[sampler]
+target_ess = 200
+[assess]
+epoch = 2008.0
+grid = [9, 5]
+draws = 2000
+horizon = 20.0
+[[budget]]
+name = "catalogue"
+kind = "random"
+sigma_u = 0.004
+sigma_v = 0.004
+in_residuals = true
+source = "a paper"
+[[budget]]
+name = "aberration"
+kind = "scale"
+sigma = 4e-6
+[[requirement]]
+name = "edge"
+statistic = "max"
+limit = 0.02
+region = "inner 100 %"
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("drift")
+    rng = np.random.default_rng(1)
+    epoch = np.repeat(EPOCHS, N)
+    x, y = rng.uniform(1, SIZE[0], epoch.size), rng.uniform(1, SIZE[1], epoch.size)
+    dx = x - 256.0
+    mag = rng.uniform(14, 18, epoch.size)
+    table = Table(
+        {
+            "x": x,
+            "y": y,
+            "u": dx + DRIFT * dx * (epoch - 2008) + rng.normal(0, SIGMA, epoch.size),
+            "v": y - 128.0 + rng.normal(0, SIGMA, epoch.size),
+            "sigma_u": np.full(epoch.size, SIGMA),
+            "sigma_v": np.full(epoch.size, SIGMA),
+            "epoch": epoch,
+            "mag": mag,
+        }
+    )
+    table.write(folder / "stars.ecsv")
+    (folder / "config.toml").write_text(CONFIG)
+    good("run", folder / "config.toml", "-o", folder / "run", "-q")
+    return folder / "run"
+
+
+def rows_of(text):
+    """The printed table: numbers of each term."""
+    out = {}
+    for line in text.splitlines():
+        words = re.sub(r"\b(random|systematic|local)\b", " ", line).split()
+        numbers = [k for k, word in enumerate(words) if re.fullmatch(r"[\d.]+(e-\d+)?", word)]
+        if len(numbers) > 2:
+            out[" ".join(words[: numbers[0]])] = tuple(float(words[k]) for k in numbers[:2])
+    return out
+
+
+def test_the_budget_of_a_position_names_every_term_and_its_source(run):
+    text = good("budget", run, "--at", 512, 128, "--magnitude", 16).out
+    rows = rows_of(text)
+    assert set(rows) == {
+        "coefficients", "time dependence", "aberration", "catalogue", "centroid", "total"
+    }  # fmt: skip
+    assert rows["aberration"][0] == pytest.approx(4e-6 * 256, rel=5 / np.sqrt(2 * 2000))
+    # the scatter holds the catalogue: what is left is the centroid's, to some 5 % in bins of 60
+    assert rows["centroid"][0] == pytest.approx(np.sqrt(SIGMA**2 - 0.004**2), rel=0.2)
+    assert "a paper" in text and "given by the user" in text and "measured in this run" in text
+    # at the reference date the drift adds nothing, ten years later it does
+    assert rows["time dependence"][0] == 0
+    later = rows_of(good("budget", run, "--at", 512, 128, "--epoch", 2018).out)
+    fit = json.loads((run / "summary.json").read_text())
+    assert later["time dependence"][0] > 0
+    assert "centroid" not in later
+    assert fit["budget"][-1]["name"] == "total"
+
+
+def test_the_budget_of_a_difference_leaves_out_what_both_share(run):
+    near = rows_of(good("budget", run, "--at", 300, 128, "--to", 310, 128).out)
+    far = rows_of(good("budget", run, "--at", 1, 128, "--to", 512, 128).out)
+    assert near["aberration"][0] == pytest.approx(4e-6 * 10, rel=0.1)
+    assert far["aberration"][0] == pytest.approx(4e-6 * 511, rel=0.1)
+    assert near["catalogue"][0] == pytest.approx(np.sqrt(2) * 0.004, rel=1e-3)
+    assert near["coefficients"][0] < far["coefficients"][0]
+
+
+def test_the_horizon_is_said_written_and_drawn(run):
+    [row] = json.loads((run / "summary.json").read_text())["horizons"]
+    table = Table.read(run / "horizon.ecsv")
+    assert len(table) == 40
+    assert table["epoch"][0] == pytest.approx(2012.0) and table["epoch"][-1] == 2032.0
+    below = np.flatnonzero(table["probability"] < 0.95)
+    assert below.size and below[0] > 0
+    low, high = table["epoch"][below[0] - 1], table["epoch"][below[0]]
+    assert low <= row["date"] <= high
+    assert row["interval"][0] <= row["date"] <= row["interval"][1]
+    assert "recalibrate before" in row["sentence"]
+    assert (run / "figures" / "horizon.png").exists()
+    text = (run / "report.html").read_text()
+    assert row["sentence"] in text and "How long the requirements are met" in text
+    # an independent judgement on both sides of the date
+    for epoch, verdict in ((row["interval"][0] - 2.0, "met"), (row["interval"][1] + 2.0, "missed")):
+        req = run.parent / f"{verdict}.toml"
+        req.write_text(
+            f'[[requirement]]\nname = "edge"\nstatistic = "max"\nlimit = 0.02\nepoch = {epoch}\n'
+        )
+        out = cli("validate", run, "--requirements", req, "-q")
+        assert out.code == (0 if verdict == "met" else 4)
+        assert verdict in out.out
+
+
+def test_exposures_after_the_data_are_worth_more_than_early_ones(run):
+    req = run.parent / "late.toml"
+    req.write_text(
+        '[[requirement]]\nname = "late"\nstatistic = "max"\nlimit = 0.02\nepoch = 2025.0\n'
+    )
+    cli("validate", run, "--requirements", req, "-q")
+    text = good("plan", run, "--epochs", 2009.0, 2013.0, 2020.0).out
+    found = {float(at): int(n) for at, n in re.findall(r"at (\d+\.\d+): (\d+) more exposure", text)}
+    assert found[2020.0] <= found[2013.0]
+    assert found[2025.0] <= found[2013.0]
+    assert 2009.0 not in found or found[2009.0] > found[2013.0]
+    assert "evenly from 2012.00 to 2025.00" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--at", 600, 10), ["x = 600", "not on chip"]),
+        (("--at", 10, 10, "--chip", 4), ["chip 4"]),
+        (("--at", 10, 10, "--epoch", "inf"), ["epoch"]),
+    ],
+)
+def test_a_budget_that_cannot_be_given_is_refused_in_one_sentence(run, arguments, words):
+    result = cli("budget", run, *arguments)
+    assert result.code == 1
+    one_sentence(result.err, *words)
+
+
+def test_a_plan_without_the_requirement_is_refused(run):
+    result = cli("plan", run, "--requirement", "none such")
+    assert result.code == 1
+    one_sentence(result.err, "no requirement 'none such'")

@@ -1,0 +1,94 @@
+"""Requirements with a scope, through the command line."""
+
+import json
+
+import pytest
+from astropy.table import Table
+
+from bayesdist.app.cli import main
+
+SCOPED = """
+[[requirement]]
+name = "inner"
+statistic = "p95"
+limit = 0.5
+region = "inner 80 %"
+
+[[requirement]]
+name = "between two stars"
+statistic = "rms"
+limit = 0.0001
+relative = true
+separation = 200.0
+
+[[requirement]]
+name = "a corner"
+statistic = "max"
+limit = 0.5
+region = [[1.0, 1.0], [300.0, 1.0], [1.0, 300.0]]
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scope")
+    assert main(["simulate", "wise", "-o", str(folder), "--stars", "1500", "-q"]) == 0
+    config = folder / "config.toml"
+    assert main(["run", str(config), "-o", str(folder / "run"), "-q"]) == 0
+    return folder / "run"
+
+
+def validated(run, text, code):
+    path = run.parent / "req.toml"
+    path.write_text(text)
+    assert main(["validate", str(run), "--requirements", str(path), "-q"]) == code
+    return json.loads((run / "summary.json").read_text())["margins"]
+
+
+def test_scopes_are_judged_and_kept(run, capsys):
+    inner, pair, corner = validated(run, SCOPED, 4)
+    assert [m["verdict"] for m in (inner, pair, corner)] == ["met", "missed", "met"]
+    assert inner["region"] == "inner 80 %"
+    assert pair["relative"] is True and pair["separation"] == 200.0
+    assert corner["region"] == [[1.0, 1.0], [300.0, 1.0], [1.0, 300.0]]
+    assert corner["worst"]["x"] < 300 and corner["worst"]["y"] < 300
+    assert inner["margin_percent"] == pytest.approx(100 * inner["margin"] / 0.5)
+    printed = capsys.readouterr().out
+    assert "between two stars: it would be met if coefficients fell from" in printed
+    table = Table.read(run / "margins.ecsv")
+    assert list(table["scope"]) == [
+        "over the inner 80 %",
+        "between two positions up to 200 px apart",
+        "over a polygon of 3 corners",
+    ]
+
+
+def test_the_report_judges_them_again_as_they_were_asked(run):
+    before = validated(run, SCOPED, 4)
+    assert main(["report", str(run), "-q"]) == 0
+    text = (run / "report.html").read_text()
+    assert "between two positions up to 200 px apart" in text
+    assert "fell from" in text
+    assert json.loads((run / "summary.json").read_text())["margins"] == before
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('region = "middle"', "no region 'middle'"),
+        ("region = [[1.0, 1.0], [2.0, 2.0], [3.0, 1.5]]", "holds 0 points"),
+        ("epochs = [2010.0, 2012.0]", "does not depend on time"),
+        ("separation = 5.0", "of two positions"),
+        ("magnitude = 10.0", "is not known"),
+    ],
+)
+def test_scopes_that_cannot_be_judged_are_refused_in_one_sentence(run, line, message, capsys):
+    text = f'[[requirement]]\nname = "r"\nstatistic = "max"\nlimit = 1.0\n{line}\n'
+    before = (run / "margins.ecsv").read_bytes()
+    path = run.parent / "bad.toml"
+    path.write_text(text)
+    assert main(["validate", str(run), "--requirements", str(path), "-q"]) == 1
+    said = capsys.readouterr().err
+    assert message in said and "requirement 'r'" in said
+    assert said.count("\n") == 1
+    assert (run / "margins.ecsv").read_bytes() == before
