@@ -9,6 +9,7 @@ from bayesdist.infer.kernel.cache import kept_by_content
 
 with kept_by_content():
     from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
+    from bayesdist.infer.kernel.clusters import cluster_moments, products_of
     from bayesdist.infer.kernel.likelihood import log_likelihood
     from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
     from bayesdist.infer.kernel.moments import (
@@ -27,11 +28,13 @@ __all__ = [
     "UNIFORM",
     "Constants",
     "Moments",
+    "cluster_moments",
     "least_squares_moments",
     "log_likelihood",
     "memberships",
     "mixture_moments",
     "pieces_of",
+    "products_of",
     "residuals",
     "set_threads",
 ]
