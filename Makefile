@@ -1,13 +1,15 @@
-# Three targets do everything on a bare machine with Python 3.11 or newer:
+# Four targets do everything on a bare machine with Python 3.11 or newer:
 #   make demo    the environment, then `bayesdist demo`
 #   make test    the environment with the test extra, then the tests
 #   make bench   the same environment, then the benchmarks: build/bench/bench.json and bench.md;
 #                some 20 minutes on two cores that have nothing else to do
+#   make docs    the environment with the docs extra, then the site: build/docs/index.html; a
+#                warning is an error
 PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
 
-.PHONY: demo test bench lint clean
+.PHONY: demo test docs bench lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bayesdist demo -o demo-run --force
@@ -17,6 +19,10 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+docs: $(VENV)/.installed-docs
+	$(BIN)/sphinx-build -q -W --keep-going -n -d build/doctrees docs build/docs
+	@echo build/docs/index.html
 
 bench: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks --output build/bench --figures build/bench/figures
@@ -36,6 +42,10 @@ $(VENV)/.installed: pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	@touch $@ $(VENV)/.installed
+
+$(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	@touch $@ $(VENV)/.installed
 
 clean:

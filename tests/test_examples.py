@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+from astropy.io import fits
+
+from bayesdist.app.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -56,3 +62,36 @@ def test_the_bring_up_ends_at_the_truth_from_every_start(tmp_path):
     off = [float(re.search(r"([\d.]+) px off", one).group(1)) for one in starts]
     pairs = [int(re.search(r"^ +1 +2 +(\d+)", one, re.MULTILINE).group(1)) for one in starts]
     assert off[1] > 1.5 * off[0] and pairs[1] < pairs[0] and pairs[1] < pairs[2]
+
+
+def test_every_example_is_run_here():
+    """Scripts of the folder itself are those that the tests of this file go through."""
+    tested = set(re.findall(r'printed\("(\w+\.py)"', Path(__file__).read_text(encoding="utf-8")))
+    assert {p.name for p in (ROOT / "examples").glob("*.py")} == tested
+
+
+def test_the_python_example_finds_the_mixture_wider_than_the_formal_errors(tmp_path):
+    """Formal errors know neither the jitter of 0.03 px nor the false matches."""
+    out = printed("python_api.py", tmp_path)
+    assert "converged: True" in out
+    formal, posterior = (float(re.search(rf"{k}: +([\d.]+)", out).group(1))
+                         for k in ("formal", "posterior"))  # fmt: skip
+    assert formal < posterior < 2 * formal
+    assert out.splitlines()[-1] == "met"
+    header = fits.Header.fromtextfile(tmp_path / "w2.hdr")
+    assert header["A_ORDER"] == header["B_ORDER"] == 4
+
+
+@pytest.mark.parametrize("name", ["hst1pass_uvis", "anet"])
+def test_the_examples_of_real_data_are_read(name, tmp_path, data_dir, capsys):
+    """Their configurations are sound: nothing is degenerate, few rows are left out."""
+    folder = tmp_path / name
+    shutil.copytree(ROOT / "examples" / name, folder)
+    if name == "anet":
+        shutil.copy(data_dir / "anet_pairs" / "Harry695_corr.fits", folder / "corr.fits")
+    else:
+        done = subprocess.run([sys.executable, folder / "match.py", data_dir / name],
+                              env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False)  # fmt: skip
+        assert done.returncode == 0
+    assert main(["check", str(folder / "config.toml")]) == 0
+    assert "nothing is degenerate" in capsys.readouterr().out

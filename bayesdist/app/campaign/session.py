@@ -131,6 +131,9 @@ class CampaignSession(Session):
         """Errors of the centroids, as the fit left them."""
         return self.kept_errors()
 
+    def measure(self) -> None:
+        """Nothing: scatter of exposures, tables and catalogue are in the fit and its errors."""
+
     @property
     def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
         """The same: the catalogue's errors have been taken off."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.fingerprint import fingerprint_of
 from bayesdist.app.systematics import Systematics
 from bayesdist.assess.field_terms import CatalogueTerm, ExposureScatter, FieldTerm
 from bayesdist.data import MatchTable, ReferenceCatalog
@@ -91,7 +91,7 @@ def catalogue_covariance(
     errors = _by_star(catalog)
     if matches.star is None or not errors:
         return None
-    fingerprint = _fingerprint(fit, posterior)
+    fingerprint = fingerprint_of(fit, posterior)
     names = ("total", "counted")
     try:
         return StarCovariance(**read_arrays(path, fingerprint, names, do=""))
@@ -123,13 +123,6 @@ def _by_star(catalog: ReferenceCatalog) -> dict[str, Float]:
             out[name] = np.zeros(int(catalog.star.max()) + 1)
             out[name][catalog.star] = values
     return out
-
-
-def _fingerprint(fit: LinearFit, posterior: Posterior) -> str:
-    digest = hashlib.sha256()
-    for values in (fit.mean, fit.cov, posterior.theta):
-        digest.update(np.ascontiguousarray(values))
-    return digest.hexdigest()
 
 
 def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovariance) -> Posterior:

@@ -203,7 +203,8 @@ class RobustCovariance:
     @property
     def statement(self) -> str:
         """What a report has to say, in one sentence, and the doubts."""
-        ratio = f"{self.ratio.value:.2g} +- {self.ratio.error:.1g}"
+        digits = ".0f" if self.ratio.value >= 10 else ".2f"
+        ratio = f"{self.ratio.value:{digits}} +- {self.ratio.error:{digits}}"
         if self.exceeds:
             said = (
                 f"stars err together: the variances of coefficients are {ratio} times the formal "

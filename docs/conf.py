@@ -1,0 +1,48 @@
+"""The documentation as a site: `make docs`.  The pages read well without it, too."""
+
+from __future__ import annotations
+
+import bayesdist
+
+project = "bayesdist"
+author = "The bayesdist developers"
+copyright = author
+version = release = bayesdist.__version__
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "numpydoc",
+    "myst_parser",
+    "sphinx-mathjax-offline",
+]
+templates_path = ["_templates"]
+nitpicky = True
+# a name in backticks becomes a link where it is the name of something documented, else it is code
+default_role = "py:obj"
+nitpick_ignore_regex = [("py:obj", ".*")]
+
+autodoc_typehints = "none"  # the docstrings have types, shapes and units
+autodoc_member_order = "bysource"
+autosummary_generate = False
+numpydoc_show_class_members = False
+
+myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 3
+
+html_theme = "pydata_sphinx_theme"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_title = f"bayesdist {version}"
+html_sidebars = {"**": ["sidebar-tree"]}
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {
+    "show_prev_next": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "navbar_start": ["navbar-logo"],
+    "navbar_center": [],
+    "navbar_align": "left",
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}

@@ -1,0 +1,222 @@
+"""The documentation says what is so: pages run, links lead somewhere, nothing is left out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import typing
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+import bayesdist as bd
+from bayesdist.app.cli import _parser
+from bayesdist.app.config import Config
+
+from .docs_blocks import DOCS, blocks, run_page
+
+ROOT = DOCS.parent
+PAGES = sorted([*DOCS.glob("*.md"), ROOT / "README.md", ROOT / "examples" / "README.md"])
+# what make docs needs beyond the test extra's other packages
+SITE = ("sphinx", "myst_parser", "numpydoc", "pydata_sphinx_theme", "sphinx-mathjax-offline")
+
+
+@pytest.fixture(scope="module")
+def wise_tutorial(tmp_path_factory):
+    """Folder of the WISE tutorial after it was gone through, and what its Python found."""
+    folder = tmp_path_factory.mktemp("tutorial_wise")
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        return folder, run_page(DOCS / "tutorial_wise.md")
+    finally:
+        os.chdir(before)
+
+
+def test_the_wise_tutorial_runs_and_its_pulls_are_normal(wise_tutorial):
+    """30 pulls: between 9 and 29 within one sigma but for 4e-6 of normal ones (binomial)."""
+    _, namespace = wise_tutorial
+    pulls = np.asarray(namespace["pulls"])
+    assert pulls.size == 30 and 9 <= (abs(pulls) < 1).sum() <= 29
+
+
+def test_the_page_of_the_files_describes_those_of_a_run(wise_tutorial, monkeypatch):
+    folder, _ = wise_tutorial
+    monkeypatch.chdir(folder)
+    namespace = run_page(DOCS / "posterior_file.md")
+    tree, text = namespace["tree"], (DOCS / "posterior_file.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"\w+", text))
+    for group in tree.subtree:
+        words = {*group.variables, *group.dims, *group.attrs, group.name}
+        assert {w for w in words if w} <= named, group.path
+    named = set(re.findall(r"\w+", (DOCS / "files.md").read_text(encoding="utf-8")))
+    found = json.loads((folder / "run_w1" / "summary.json").read_text(encoding="utf-8"))
+    assert _keys(found) - set(found["data"]["rejected"]) <= named
+
+
+def _keys(value: object) -> set[str]:
+    if isinstance(value, dict):
+        return {*value, *(k for v in value.values() for k in _keys(v))}
+    return {k for v in value for k in _keys(v)} if isinstance(value, list) else set()
+
+
+def test_the_tutorial_in_python_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = run_page(DOCS / "tutorial_python.md")
+    assert namespace["margin"].verdict == "met" and Path("w2.hdr").is_file()
+
+
+@pytest.mark.slow
+def test_the_hst1pass_tutorial_runs_on_real_lists(tmp_path, monkeypatch, data_dir):
+    monkeypatch.chdir(tmp_path)
+    Path("lists").symlink_to(data_dir / "hst1pass_uvis")
+    run_page(DOCS / "tutorial_hst1pass.md")
+    assert Path("run/report.html").is_file()
+
+
+@pytest.mark.slow
+def test_the_acs_tutorial_runs(tmp_path, monkeypatch, full):
+    if not full:
+        pytest.skip("two minutes of processor time: set BAYESDIST_FULL=1")
+    monkeypatch.chdir(tmp_path)
+    run_page(DOCS / "tutorial_acs.md")
+    assert Path("acs-run/report.html").is_file()
+
+
+def test_every_block_that_could_run_is_run():
+    """Pages with blocks of console or Python are those that tests above go through."""
+    run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
+    tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
+    assert run == {*tutorials, "posterior_file.md"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_links_lead_to_files_and_headings(page):
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text):
+        name, _, anchor = target.partition("#")
+        to = (page.parent / name).resolve() if name else page
+        assert to.is_file(), f"{page.name}: {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", to.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {_slug(h) for h in headings}, f"{page.name}: {target}"
+
+
+def _slug(heading: str) -> str:
+    kept = re.sub(r"[^\w\- ]", "", heading.lower().replace("`", ""))
+    return kept.strip().replace(" ", "-")
+
+
+def test_every_page_is_in_the_table_of_contents():
+    index = (DOCS / "index.md").read_text(encoding="utf-8")
+    listed = {line.strip() for body in re.findall(r"```\{toctree\}(.*?)```", index, re.S)
+              for line in body.splitlines()}  # fmt: skip
+    assert {p.stem for p in DOCS.glob("*.md")} - {"index"} <= listed
+
+
+def _configured(kind: type[BaseModel], section: str = "") -> set[tuple[str, str]]:
+    """Section and key of all that a configuration may hold."""
+    found = set()
+    for key, field in kind.model_fields.items():
+        inner = [m for m in _models(field.annotation)]
+        path = f"{section}.{key}".strip(".")
+        if inner:
+            found |= {pair for m in inner for pair in _configured(m, path)}
+        if section:
+            found.add((section, key))
+    return found
+
+
+def _models(annotation: object) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for part in typing.get_args(annotation) for m in _models(part)]
+
+
+def _documented() -> tuple[set[tuple[str, str]], set[tuple[str, str]]]:
+    """Section and key of all rows of the tables, and of all words in the text of these rows."""
+    keys, words = set(), set()
+    for name in ("configuration.md", "campaign.md"):
+        section = ""
+        for line in (DOCS / name).read_text(encoding="utf-8").splitlines():
+            first, _, text = line.strip().strip("|").partition("|")
+            if head := re.fullmatch(r"\*\*\[{1,2}([\w.]+)\]{1,2}\*\*", first.strip()):
+                section = head.group(1)
+                words |= {(section, w) for w in re.findall(r"\w+", text)}
+                parent, _, key = section.rpartition(".")
+                keys.add((parent, key))
+            elif not line.startswith("|"):
+                section = ""
+            elif section:
+                named = [k.strip() for k in first.split(",")]
+                keys |= {(section, k) for k in named}
+                words |= {(f"{section}.{k}", w) for k in named for w in re.findall(r"\w+", text)}
+    return keys, words
+
+
+def test_every_key_of_the_configuration_is_documented_and_no_other():
+    keys, words = _documented()
+    configured = _configured(Config)
+    assert configured - keys - words == set()
+    assert {(s, k) for s, k in keys if s} - configured == set()
+
+
+def _commands(parser: argparse.ArgumentParser, path: str = "bayesdist"):
+    """Each command with its parser, those with a second word by both."""
+    subs = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    if not subs:
+        yield path, parser
+    for sub in subs:
+        for name, inner in sub.choices.items():
+            yield from _commands(inner, f"{path} {name}")
+
+
+def test_every_command_is_documented_with_its_options():
+    text = (DOCS / "commands.md").read_text(encoding="utf-8")
+    everywhere = "\n".join(p.read_text(encoding="utf-8") for p in DOCS.glob("*.md"))
+    for path, parser in _commands(_parser()):
+        name = path.removeprefix("bayesdist ")
+        assert re.search(rf"bayesdist (?:[\w]+ \| )*{name}\b", text), path
+        for action in parser._actions:
+            option = max(action.option_strings, key=len, default="")
+            if option not in ("", "--help", "--quiet", "--output"):
+                assert option in everywhere, f"{path} {option}"
+
+
+def test_the_reference_names_all_that_is_public():
+    api = (DOCS / "api.md").read_text(encoding="utf-8")
+    listed = {n.rpartition(".")[2] for n in re.findall(r"^   ~(bayesdist[\w.]+)$", api, re.M)}
+    assert listed == set(bd.__all__) - {"__version__"}
+    modules = re.findall(r"^   (bayesdist[\w.]+)$", api, re.MULTILINE)
+    assert {p.stem for p in (DOCS / "api").glob("*.md")} == set(modules)
+    for name in modules:
+        module = import_module(name)
+        for public in getattr(module, "__all__", ()):
+            member = getattr(module, public)
+            assert not callable(member) or member.__doc__, f"{name}.{public}"
+
+
+def test_the_site_is_built_without_warnings_and_needs_no_network(tmp_path):
+    for package in SITE:
+        pytest.importorskip(package, reason=f"{package} is not installed: pip install '.[docs]'")
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", *"-q -W --keep-going -n".split(),
+         "-d", tmp_path / "doctrees", DOCS, tmp_path / "site"],
+        capture_output=True, text=True, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    built = {p.relative_to(tmp_path / "site").with_suffix(".md") for p in
+             (tmp_path / "site").rglob("*.html")}  # fmt: skip
+    assert {p.relative_to(DOCS) for p in DOCS.rglob("*.md")} <= built
+    for page in (tmp_path / "site").rglob("*.html"):
+        loaded = re.findall(
+            r"<(?:script|link|img)\b[^>]*?(?:src|href)=\"(https?:[^\"]*)", page.read_text()
+        )
+        assert not loaded, f"{page.name} loads {loaded}"
