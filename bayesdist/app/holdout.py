@@ -1,0 +1,137 @@
+"""Stars set aside before the fit: which ones, what they say afterwards, what is written of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.assess.holdout import LEAST_HELD, HeldOutTruth, held_out_truth
+from bayesdist.data.holdout import SetAside, Split, exposures_drawn, split_matches
+from bayesdist.errors import InputError
+
+if TYPE_CHECKING:
+    from bayesdist.app.session import Session
+    from bayesdist.infer import Matches
+
+__all__ = ["held_out_of", "holdout_summary", "holdout_table", "split_of", "whole_exposures"]
+
+KEPT = "held_out_truth"
+
+
+def whole_exposures(session: Session, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Exposures that are set aside whole: the named ones, or so many drawn by the seed."""
+    block, seed = session.config.holdout, session.config.sampler.seed
+    if block is None:
+        return ()
+    if isinstance(block.exposures, int):
+        return exposures_drawn(names, block.exposures, seed)
+    return tuple(dict.fromkeys(block.exposures))
+
+
+def split_of(session: Session, matches: Matches) -> Split | None:
+    """Matches that are fitted, and those that are set aside; None where none are.
+
+    Raises
+    ------
+    InputError
+        For an unknown exposure, and when nothing would be left, or too little set aside.
+    """
+    block = session.config.holdout
+    if block is None:
+        return None
+    whole = whole_exposures(session, matches.exposure_names)
+    split = split_matches(matches, SetAside(block.fraction, whole, session.config.sampler.seed))
+    if len(split.held) < LEAST_HELD:
+        raise InputError(
+            f"{len(split.held)} of {len(matches)} stars are held out, which say too little",
+            where=", ".join(matches.sources),
+            do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
+        )
+    return split
+
+
+def held_out_of(session: Session, *, anew: bool = False) -> HeldOutTruth | None:
+    """What held-out stars say of the posterior, once in a session.
+
+    Parameters
+    ----------
+    session : Session
+    anew : bool
+        Also where it has been done: the posterior may be another one.
+
+    Returns
+    -------
+    HeldOutTruth or None
+        None where no stars were set aside.
+
+    Raises
+    ------
+    InputError
+        For too few stars.
+    """
+    held = session.held_matches
+    if held is None:
+        return None
+    if anew or KEPT not in session.__dict__:
+        whole = whole_exposures(session, held.exposure_names)
+        session.__dict__[KEPT] = held_out_truth(session.posterior, held, whole=whole)
+    return session.__dict__[KEPT]
+
+
+def holdout_table(found: HeldOutTruth) -> Table:
+    """All tests, the most telling first."""
+    names = (
+        "name",
+        "part",
+        "together",
+        "where",
+        "n",
+        "value",
+        "expected",
+        "p_value",
+        "p_corrected",
+        "limit",
+    )
+    table = Table({name: [getattr(t, name) for t in found.tests] for name in names})
+    table["lo95"], table["hi95"] = np.array([t.interval for t in found.tests]).T
+    table["limit"].description = "of tails, in sigma"
+    table["value"].description = (
+        f"offset: {found.unit}; spread: factor on the predicted errors; distribution: largest "
+        "difference of distribution functions; tails: fraction of stars"
+    )
+    table.meta = {
+        "verdict": found.verdict,
+        "n": found.n,
+        "n_left_out": found.n_left_out,
+        "exposures": list(found.exposures),
+        "p_corrected": "Holm 1979, over all tests of this table",
+    }
+    return table
+
+
+def holdout_summary(found: HeldOutTruth) -> dict[str, Any]:
+    """Section 'holdout' of summary.json."""
+    return {
+        "n": found.n,
+        "n_left_out": found.n_left_out,
+        "exposures": list(found.exposures),
+        "p_value": found.p_value,
+        "verdict": found.verdict,
+        "level": found.level,
+        "tests": [
+            {
+                "name": t.name,
+                "part": t.part,
+                "together": t.together,
+                "where": t.where,
+                "n": t.n,
+                "value": t.value,
+                "expected": t.expected,
+                "p_value": t.p_value,
+                "p_corrected": t.p_corrected,
+            }
+            for t in found.tests
+        ],
+    }

@@ -1,0 +1,191 @@
+"""Held-out truth: stars that were set aside before the fit, against what it predicts of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.holdout_bins import Bin, partitions_of
+from bayesdist.assess.holdout_predictive import Predictive, predictive_of
+from bayesdist.assess.holdout_rows import frames_for
+from bayesdist.assess.holdout_spread import scale_of
+from bayesdist.assess.holdout_sums import held_sums
+from bayesdist.assess.holdout_tests import HeldTest, all_tests, holm
+from bayesdist.errors import InputError
+from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.shards import Matches
+
+__all__ = ["DOUBTFUL", "LEAST_HELD", "UNUSUAL", "HeldOutTruth", "held_out_truth"]
+
+Float = NDArray[np.float64]
+
+LEAST_HELD = 50  # stars, without which nothing can be said
+SAMPLE = 200_000  # stars that say where bins end
+UNUSUAL, DOUBTFUL = 0.01, 1e-3  # probability, over all tests together
+ORDER = ("offset", "spread", "tails", "distribution")  # of what tells most
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutTruth:
+    """What held-out stars say of a solution.
+
+    Parameters
+    ----------
+    unit : str
+        Of u and v.
+    n : int
+        Stars that were predicted.
+    n_left_out : int
+        Of exposures with too few stars for a frame of their own.
+    exposures : tuple of str
+        Held out whole.
+    tests : tuple of HeldTest
+        The most telling first.
+    pit : ndarray, shape (3, bins)
+        Counts of the predictive probabilities: of u, of v given u, of the distance.
+    regions : tuple of Bin
+    region_n : ndarray, shape (B,)
+    region_scale : ndarray, shape (B,)
+        Factor on the predicted errors in each region; NaN where there are too few stars.
+    region_offset : ndarray, shape (B, 2)
+        Mean offset from the prediction, in units of its own predicted error.
+    """
+
+    unit: str
+    n: int
+    n_left_out: int
+    exposures: tuple[str, ...]
+    tests: tuple[HeldTest, ...]
+    pit: Float
+    regions: tuple[Bin, ...]
+    region_n: Float
+    region_scale: Float
+    region_offset: Float
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so much disagreement by chance, over all tests together."""
+        return self.tests[0].p_corrected
+
+    @property
+    def level(self) -> str:
+        """'pass', 'warn' or 'fail'."""
+        if self.doubtful:
+            return "fail"
+        return "warn" if self.p_value < UNUSUAL else "pass"
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether errors are larger than the solution says, beyond chance."""
+        return self._telling(DOUBTFUL) is not None
+
+    @property
+    def verdict(self) -> str:
+        """One clause."""
+        found = self._telling(DOUBTFUL)
+        if found is None and self.p_value < UNUSUAL:
+            found = self.tests[0]
+        if found is None:
+            return f"held-out stars agree with the prediction (p = {self.p_value:.2g})"
+        return f"{self._words(found)} ({_chance(found.p_corrected)})"
+
+    def _telling(self, level: float) -> HeldTest | None:
+        """The test that tells most of those that matter."""
+        found = [t for t in self.tests if t.p_corrected < level and t.matters]
+        places = [t for t in found if t.name in ("offset", "spread")]
+        return min(places or found, key=_rank, default=None)
+
+    def _words(self, test: HeldTest) -> str:
+        if test.name == "offset":
+            return (
+                f"{test.where} held-out stars lie {test.value:.2g} {self.unit} from where they are "
+                "predicted"
+            )
+        if test.name == "spread":
+            return (
+                f"{test.where} the residuals of held-out stars are {test.value:.2g} times as large "
+                "as predicted"
+            )
+        if test.name == "tails":
+            return (
+                f"{test.value * test.n:.0f} of {test.n} held-out stars lie {test.where}, and "
+                f"{test.expected * test.n:.2g} are predicted"
+            )
+        return f"the residuals {test.where} of held-out stars are not distributed as predicted"
+
+
+def _rank(test: HeldTest) -> tuple[float, int, float]:
+    """Where a test stands among others: tails of distributions underflow together."""
+    return test.p_value, ORDER.index(test.name), -abs(test.value - test.expected)
+
+
+def _chance(p: float) -> str:
+    return "p < 1e-300" if p < 1e-300 else f"p = {p:.1g}"
+
+
+def held_out_truth(
+    solution: Posterior | Predictive, held: Matches, *, whole: Sequence[str] = ()
+) -> HeldOutTruth:
+    """Judge a solution by stars that it has not seen.
+
+    Parameters
+    ----------
+    solution : Posterior or Predictive
+    held : MatchTable or PartitionedMatches
+        Held-out stars, with errors.
+    whole : sequence of str
+        Exposures all of whose stars were held out.
+
+    Returns
+    -------
+    HeldOutTruth
+
+    Raises
+    ------
+    InputError
+        For too few stars, and for a solution that has frames of a kind that cannot be predicted.
+    """
+    predictive = solution if isinstance(solution, Predictive) else predictive_of(solution)
+    where = ", ".join(held.sources)
+    if predictive.model.gauge != "first":
+        raise InputError(
+            "held-out stars cannot be predicted by a model of a campaign",
+            where=where,
+            do="give matched stars",
+        )
+    pieces = held.pieces()
+    partitions = partitions_of(predictive.model, held, held.sample(SAMPLE), whole)
+    frames = frames_for(predictive, pieces, held.exposure_names)
+    sums = held_sums(predictive, pieces, partitions, frames)
+    if sums.n < LEAST_HELD:
+        raise InputError(
+            f"{sums.n} held-out stars say too little of the solution",
+            where=where,
+            do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
+        )
+    tests = all_tests(sums, predictive, partitions)
+    corrected = holm(np.array([t.p_value for t in tests]))
+    tests = [replace(t, p_corrected=float(p)) for t, p in zip(tests, corrected, strict=True)]
+    regions = next(p for p in partitions if p.kind == "region")
+    found = sums.bins["region"]
+    seen = found.n >= 1
+    error = np.sqrt(np.einsum("bii->bi", found.place_2))
+    return HeldOutTruth(
+        unit=predictive.model.unit,
+        n=sums.n,
+        n_left_out=sums.n_left_out,
+        exposures=tuple(whole),
+        tests=tuple(sorted(tests, key=_rank)),
+        pit=sums.pit,
+        regions=regions.bins,
+        region_n=found.n,
+        region_scale=np.array(
+            [scale_of(s) if n else np.nan for s, n in zip(found.scales, seen, strict=True)]
+        ),
+        region_offset=np.divide(
+            found.place, error, out=np.full_like(error, np.nan), where=error > 0
+        ),
+    )

@@ -1,0 +1,175 @@
+"""How held-out stars are divided: by place, magnitude, date and exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data import MatchTable
+from bayesdist.model import Chip, DistortionModel
+
+__all__ = ["ALL", "Bin", "Partition", "partitions_of"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+ALL = "all"
+STARS_PER_BIN = 60
+MOST_CELLS = 8  # along each side of a chip
+MOST_BINS = 8  # of magnitudes, and of dates
+MOST_EXPOSURES = 60  # beyond it only those that were held out whole are looked at one by one
+
+
+@dataclass(frozen=True)
+class Bin:
+    """One part of the held-out stars.
+
+    Parameters
+    ----------
+    words : str
+        Where it is, as a clause: 'at x 1 to 512, y 1 to 512'.
+    chip : Chip or None
+        Of a region.
+    limits : tuple of float
+        x and y of a region's edges, pixels; lowest and highest magnitude or date.
+    """
+
+    words: str
+    chip: Chip | None = None
+    limits: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Partition:
+    """Bins that hold each star once, or not at all.
+
+    Parameters
+    ----------
+    kind : str
+        'all', 'region', 'magnitude', 'epoch' or 'exposure'.
+    bins : tuple of Bin
+    code : callable
+        Of a table and some of its rows: bin of each, negative where there is none.
+    """
+
+    kind: str
+    bins: tuple[Bin, ...]
+    code: Callable[[MatchTable, Int], Int]
+
+    def codes(self, table: MatchTable, rows: Int) -> Int:
+        """Bin of each of some rows."""
+        return self.code(table, rows)
+
+
+def partitions_of(
+    model: DistortionModel, held: Any, sample: MatchTable, whole: Sequence[str]
+) -> tuple[Partition, ...]:
+    """The parts in which held-out stars are judged.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    held : MatchTable or PartitionedMatches
+    sample : MatchTable
+        Some of them, evenly spread: they say where bins end.
+    whole : sequence of str
+        Exposures that were held out whole.
+
+    Returns
+    -------
+    tuple of Partition
+    """
+    n = len(held)
+    out = [Partition(ALL, (Bin("over the whole detector"),), lambda _, rows: rows * 0)]
+    out.append(_regions(model, n))
+    share = n // STARS_PER_BIN
+    if sample.mag is not None:
+        out += _quantiles("magnitude", "mag", sample.mag, min(share, MOST_BINS))
+    if sample.epoch is not None:
+        out += _quantiles("epoch", "epoch", sample.epoch, min(share, MOST_BINS))
+    names = held.exposure_names
+    if len(names) > MOST_EXPOSURES:
+        names = tuple(name for name in names if name in set(whole))
+    if len(held.exposure_names) > 1 and names:
+        out.append(_exposures(names, set(whole)))
+    return tuple(out)
+
+
+def _regions(model: DistortionModel, n: int) -> Partition:
+    side = int(np.clip(np.sqrt(n / len(model.chips) / STARS_PER_BIN), 1, MOST_CELLS))
+    several = len(model.chips) > 1
+    bins = []
+    for chip in model.chips:
+        nx, ny = chip.size
+        x, y = np.linspace(0.5, nx + 0.5, side + 1), np.linspace(0.5, ny + 0.5, side + 1)
+        for j in range(side):
+            for i in range(side):
+                limits = (x[i], x[i + 1], y[j], y[j + 1])
+                where = f"{_place(limits, chip, side)}{f' of {chip.name}' if several else ''}"
+                bins.append(Bin(where, chip, limits))
+
+    def code(table: MatchTable, rows: Int) -> Int:
+        out = np.full(len(rows), -1)
+        numbers = table.chip_number[rows]
+        for c, chip in enumerate(model.chips):
+            here = numbers == chip.number
+            places = []
+            for values, size in (
+                (table.x[rows[here]], chip.size[0]),
+                (table.y[rows[here]], chip.size[1]),
+            ):
+                places.append(np.clip(((values - 0.5) / size * side).astype(np.int64), 0, side - 1))
+            out[here] = (c * side + places[1]) * side + places[0]
+        return out
+
+    return Partition("region", tuple(bins), code)
+
+
+def _place(limits: tuple[float, ...], chip: Chip, side: int) -> str:
+    """A cell in words."""
+    if side == 1:
+        return "over the whole detector"
+    a, b, c, d = (round(value) for value in limits)
+    x = f"x < {b}" if a <= 1 else f"x > {a}" if b >= chip.size[0] else f"x {a} to {b}"
+    y = f"y < {d}" if c <= 1 else f"y > {c}" if d >= chip.size[1] else f"y {c} to {d}"
+    corner = "to" not in x and "to" not in y
+    return f"{'in the corner' if corner else 'at'} {x}, {y}"
+
+
+def _quantiles(kind: str, name: str, values: Float, n: int) -> list[Partition]:
+    """Bins of about equally many stars; none where all values are equal."""
+    if n < 2:
+        return []
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, n + 1)))
+    if len(edges) < 3:
+        return []
+    inner = edges[1:-1]
+    of = "at magnitudes" if kind == "magnitude" else "at epochs"
+    digits = 4 if kind == "magnitude" else 7
+    bins = tuple(
+        Bin(f"{of} {a:.{digits}g} to {b:.{digits}g}", limits=(float(a), float(b)))
+        for a, b in pairwise(edges)
+    )
+
+    def code(table: MatchTable, rows: Int) -> Int:
+        return np.searchsorted(inner, getattr(table, name)[rows], side="right")
+
+    return [Partition(kind, bins, code)]
+
+
+def _exposures(names: Sequence[str], whole: set[str]) -> Partition:
+    number = {name: k for k, name in enumerate(names)}
+
+    def code(table: MatchTable, rows: Int) -> Int:
+        of_code = np.array([number.get(name, -1) for name in table.exposure_names], np.int64)
+        return of_code[table.exposure[rows]]
+
+    bins = (
+        Bin(f"in exposure {name}{', held out whole' if name in whole else ''}") for name in names
+    )
+    return Partition("exposure", tuple(bins), code)

@@ -1,0 +1,259 @@
+"""Tests of held-out stars, from their sums.
+
+All statistics are sums of scores, whose mean is zero where the prediction is right.  They vary with
+the stars themselves, and together through what all predictions share: the solution's parameters and
+those of the mixture, whose covariances are carried through (the scores are the derivatives).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import beta, binom, chi2
+
+from bayesdist.assess.holdout_bins import ALL, Partition
+from bayesdist.assess.holdout_predictive import Predictive
+from bayesdist.assess.holdout_spread import scale_of, sum_tails
+from bayesdist.assess.holdout_sums import PIT_BINS, STEP, TAILS, BinSums, HeldSums
+
+__all__ = ["HeldTest", "all_tests", "holm"]
+
+Float = NDArray[np.float64]
+
+LEAST_STARS = 20  # of a bin that is judged by itself
+STARS_PER_PIT_BIN = 20
+SINGULAR = 1e-6  # of a variance: what frames have taken up whole
+RATIO = 1.05  # of predicted errors: less does not matter, however significant
+DEPARTURE = 0.02  # of a distribution function
+EXCESS = 1.5  # of stars in the tails
+
+
+@dataclass(frozen=True)
+class HeldTest:
+    """One question that held-out stars were asked.
+
+    Parameters
+    ----------
+    name : str
+        'offset', 'spread', 'distribution' or 'tails'.
+    part : str
+        'all', 'region', 'magnitude', 'epoch' or 'exposure'.
+    where : str
+        In words.
+    index : int
+        Of the bin in its partition; -1 for all bins together.
+    n : int
+        Stars.
+    value : float
+        Distance from the prediction in the unit of u, v; factor on the predicted errors; largest
+        difference of distribution functions; fraction of stars beyond the limit.
+    expected : float
+        0, 1, 0, or the expected fraction.
+    interval : tuple of float
+        Of a fraction, 95 %; else NaN.
+    p_value : float
+    p_corrected : float
+        For the number of tests (Holm 1979).
+    limit : float
+        Of the tails, in sigma; else NaN.
+    wider : bool
+        Of distributions: whether stars lie farther out than predicted.
+    """
+
+    name: str
+    part: str
+    where: str
+    index: int
+    n: int
+    value: float
+    expected: float
+    p_value: float
+    p_corrected: float = 1.0
+    interval: tuple[float, float] = (np.nan, np.nan)
+    limit: float = np.nan
+    wider: bool = True
+
+    @property
+    def together(self) -> bool:
+        """Whether all bins of the part are tested at once; `where` and `value` are of the worst."""
+        return self.index < 0
+
+    @property
+    def matters(self) -> bool:
+        """Whether errors would be larger than predicted, if it is no chance."""
+        if self.name == "spread":
+            return self.value > RATIO
+        if self.name == "distribution":
+            return self.wider and self.value > DEPARTURE
+        return self.name == "offset" or self.value > EXCESS * self.expected
+
+
+def all_tests(
+    sums: HeldSums, predictive: Predictive, partitions: Sequence[Partition]
+) -> list[HeldTest]:
+    """Every test that there are enough stars for, without correction.
+
+    Parameters
+    ----------
+    sums : HeldSums
+    predictive : Predictive
+    partitions : sequence of Partition
+
+    Returns
+    -------
+    list of HeldTest
+    """
+    out = []
+    for partition in partitions:
+        found = sums.bins[partition.kind]
+        out += _offsets(found, sums, predictive, partition)
+        out += _spreads(found, predictive, partition)
+    return [*out, *_distributions(sums, predictive), *_tails(sums, predictive)]
+
+
+def holm(p_values: Float) -> Float:
+    """Probabilities corrected for their number (Holm 1979).
+
+    Parameters
+    ----------
+    p_values : ndarray, shape (m,)
+
+    Returns
+    -------
+    ndarray, shape (m,)
+    """
+    order = np.argsort(p_values, kind="stable")
+    steps = np.arange(len(p_values), 0, -1) * p_values[order]
+    out = np.empty(len(p_values))
+    out[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return out
+
+
+def _offsets(
+    found: BinSums, sums: HeldSums, predictive: Predictive, partition: Partition
+) -> list[HeldTest]:
+    """Whether stars lie about their predictions: each bin, then all together."""
+    n_bins = len(found.n)
+    by = found.place_by.reshape(2 * n_bins, -1)
+    cov = by @ predictive.cov @ by.T
+    for b in range(n_bins):
+        cov[2 * b : 2 * b + 2, 2 * b : 2 * b + 2] += found.place_2[b]
+    for name, lost in found.lost.items():
+        along = lost.reshape(2 * n_bins, -1)
+        cov -= along @ np.linalg.pinv(sums.frames[name].information) @ along.T
+    out, good = [], []
+    for b in range(n_bins):
+        pair = slice(2 * b, 2 * b + 2)
+        least = np.linalg.eigvalsh(cov[pair, pair])[0]
+        if found.n[b] < LEAST_STARS or least < SINGULAR * np.trace(found.place_2[b]):
+            continue
+        good.append(b)
+        score = found.place[b]
+        t = float(score @ np.linalg.solve(cov[pair, pair], score))
+        # their variance is their own, as in Hotelling's test about zero
+        p = float(beta.sf(min(t / found.n[b], 1.0), 1.0, (found.n[b] - 2) / 2))
+        size = float(np.hypot(*(score / found.weight[b])))
+        bin_ = partition.bins[b]
+        out.append(HeldTest("offset", partition.kind, bin_.words, b, int(found.n[b]), size, 0.0, p))
+    if len(good) > 1:
+        rows = np.ravel([[2 * b, 2 * b + 1] for b in good])
+        root = np.sqrt(np.diag(cov)[rows])
+        values, vectors = np.linalg.eigh(cov[np.ix_(rows, rows)] / np.outer(root, root))
+        along = vectors.T @ (found.place.ravel()[rows] / root)
+        known = values > SINGULAR
+        p = float(chi2.sf((along[known] ** 2 / values[known]).sum(), known.sum()))
+        worst = min(out, key=lambda one: (one.p_value, -one.value))
+        out.append(
+            HeldTest(
+                "offset", partition.kind, worst.where, -1, int(found.n.sum()), worst.value, 0.0, p
+            )
+        )
+    return out
+
+
+def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> list[HeldTest]:
+    """Whether true matches scatter as predicted, in each bin."""
+    out = []
+    for b, bin_ in enumerate(partition.bins):
+        if found.n[b] < LEAST_STARS:
+            continue
+        g = found.spread_by[b]
+        variance = float(found.spread_2[b] + g @ predictive.free_cov @ g)
+        p = sum_tails(float(found.spread[b]), variance, float(found.spread_3[b]))
+        out.append(
+            HeldTest(
+                "spread",
+                partition.kind,
+                bin_.words,
+                b,
+                int(found.n[b]),
+                scale_of(found.scales[b]),
+                1.0,
+                p,
+            )
+        )
+    return out
+
+
+def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
+    """Whether the predictive probabilities are uniform."""
+    merge = 1
+    while merge < PIT_BINS // 4 and sums.n * merge < STARS_PER_PIT_BIN * PIT_BINS:
+        merge = {1: 2, 2: 4, 4: 5}[merge]
+    m = PIT_BINS // merge
+    wider = bool(sums.pit[2] @ (np.arange(PIT_BINS) + 0.5) > sums.n * PIT_BINS / 2)
+    out = []
+    for k, what in enumerate(("of u", "of v", "of their distances")):
+        counts = sums.pit[k].reshape(m, merge).sum(axis=1)
+        by = sums.pit_by[k].reshape(m, merge, -1).sum(axis=1)
+        free = sums.pit_free[k].reshape(m, merge, -1).sum(axis=1)
+        cov = sums.n * (np.eye(m) / m - 1 / m**2)
+        cov += by @ predictive.cov @ by.T + free @ predictive.free_cov @ free.T
+        for name, several in sums.pit_lost.items():
+            along = several[k].reshape(m, merge, -1).sum(axis=1)
+            cov -= along @ np.linalg.pinv(sums.frames[name].information) @ along.T
+        rest = (counts - sums.n / m)[:-1]
+        p = float(chi2.sf(rest @ np.linalg.solve(cov[:-1, :-1], rest), m - 1))
+        size = float(np.abs(np.cumsum(sums.pit[k]) / sums.n - np.arange(1, 21) / PIT_BINS).max())
+        out.append(HeldTest("distribution", ALL, what, k, sums.n, size, 0.0, p, wider=wider))
+    return out
+
+
+def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
+    """Whether as many stars lie far out as predicted, false matches among them."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+    weights = weights / weights.sum()
+    sd = np.sqrt(np.diag(predictive.free_cov))
+    out = []
+    for k, limit in enumerate(TAILS):
+        middle = max(sums.expected[k, 0], 1e-300)
+        low, high = np.maximum(sums.expected[k, 1:].reshape(-1, 2).T, 1e-300)
+        slope = np.divide(np.log(high / low), 2 * STEP * sd, out=np.zeros_like(sd), where=sd > 0)
+        spread = np.sqrt(max(slope @ predictive.free_cov @ slope, 0.0))
+        share = np.minimum(middle * np.exp(spread * nodes) / sums.n, 1.0)
+        seen = int(sums.beyond[k])
+        below = float(weights @ binom.cdf(seen, sums.n, share))
+        above = float(weights @ binom.sf(seen - 1, sums.n, share))
+        interval = (
+            float(beta.ppf(0.025, seen, sums.n - seen + 1)) if seen else 0.0,
+            float(beta.ppf(0.975, seen + 1, sums.n - seen)) if seen < sums.n else 1.0,
+        )
+        p = float(min(1.0, 2 * min(below, above)))
+        out.append(
+            HeldTest(
+                "tails",
+                ALL,
+                f"beyond {limit:g} sigma",
+                k,
+                sums.n,
+                seen / sums.n,
+                middle / sums.n,
+                p,
+                interval=interval,
+                limit=limit,
+            )
+        )
+    return out

@@ -1,0 +1,240 @@
+"""Matches that are set aside before anything is fitted, to be predicted afterwards.
+
+Which ones is a matter of a star's own code, or of its place on the detector where it has none, and
+of a seed: neither the order of the rows nor the pieces in which they are read play a part.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.partitioned import PartitionedMatches
+from bayesdist.data.pieces import Piece
+from bayesdist.errors import InputError
+
+__all__ = ["HELD_OUT", "ChosenMatches", "SetAside", "Split", "exposures_drawn", "split_matches"]
+
+Bits = NDArray[np.uint64]
+Matches = MatchTable | PartitionedMatches
+
+HELD_OUT = "held out"  # the reason under which they are counted
+
+
+@dataclass(frozen=True)
+class SetAside:
+    """Which matches are set aside.
+
+    Parameters
+    ----------
+    fraction : float
+        Of the stars, from 0 to below 1.
+    exposures : tuple of str
+        Those that are set aside whole.
+    seed : int
+    """
+
+    fraction: float
+    exposures: tuple[str, ...] = ()
+    seed: int = 1
+
+    def which(self, table: MatchTable) -> NDArray[np.bool_]:
+        """Mask (N,) of the matches that are set aside.
+
+        All matches of a star that has a code go together.
+        """
+        if table.star is not None:
+            keys = [table.star.view(np.uint64)]
+        else:
+            # zero has two signs, and one place
+            keys = [(a + 0.0).view(np.uint64) for a in (table.x, table.y)]
+        bits = np.full(len(table), _mixed(np.array([self.seed], np.uint64))[0])
+        for key in keys:
+            bits = _mixed(bits ^ key)
+        chosen = (bits >> np.uint64(11)) * 2.0**-53 < self.fraction
+        whole = [name in set(self.exposures) for name in table.exposure_names]
+        return np.asarray(chosen | np.array(whole, bool)[table.exposure])
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Matches in two parts.
+
+    Parameters
+    ----------
+    kept : MatchTable or PartitionedMatches
+        What is fitted; exposures without stars among them are not named.
+    held : MatchTable or PartitionedMatches
+        What was set aside, with the names of all exposures.
+    """
+
+    kept: Matches
+    held: Matches
+
+
+@dataclass(frozen=True, eq=False)
+class _ChosenPiece:
+    """The rows of a piece that are, or are not, set aside."""
+
+    piece: Piece
+    aside: SetAside
+    held: bool
+    names: tuple[str, ...]
+    n: int
+
+    def __len__(self) -> int:
+        return self.n
+
+    def read(self) -> MatchTable:
+        """The rows."""
+        table = self.piece.read()
+        rows = table.select(self.aside.which(table) == self.held)
+        return _renamed(rows, self.names)
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenMatches(PartitionedMatches):
+    """Matches on disk without those that are set aside, or these alone.
+
+    Parameters
+    ----------
+    origin : PartitionedMatches
+        All of them.
+    aside : SetAside
+    held : bool
+        Whether these are the ones that were set aside.
+    counts : tuple of int
+        Rows that each piece of the origin has here.
+    """
+
+    origin: PartitionedMatches | None = None
+    aside: SetAside | None = None
+    held: bool = False
+    counts: tuple[int, ...] = ()
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """The rows in consecutive pieces: those of the origin that have any."""
+        assert self.origin is not None and self.aside is not None
+        pieces = replace(self.origin, errors=self.errors).pieces()
+        return tuple(
+            _ChosenPiece(piece, self.aside, self.held, self.exposure_names, n)
+            for piece, n in zip(pieces, self.counts, strict=True)
+            if n
+        )
+
+
+def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
+    """So many exposures, drawn by a seed, whatever their order.
+
+    Raises
+    ------
+    InputError
+        When none would be left.
+    """
+    if n >= len(names):
+        raise InputError(
+            f"{n} exposures are to be held out, and there are {len(names)}",
+            where="holdout.exposures",
+            do="ask for fewer",
+        )
+    drawn = sorted(names, key=lambda name: hashlib.sha256(f"{seed}\n{name}".encode()).digest())
+    chosen = set(drawn[:n])
+    return tuple(name for name in names if name in chosen)
+
+
+def split_matches(matches: Matches, aside: SetAside) -> Split:
+    """Set matches aside.
+
+    Parameters
+    ----------
+    matches : MatchTable or PartitionedMatches
+        The latter are gone through once.
+    aside : SetAside
+
+    Returns
+    -------
+    Split
+
+    Raises
+    ------
+    InputError
+        For an unknown exposure, and when nothing would be left, or nothing set aside.
+    """
+    where = ", ".join(matches.sources)
+    for name in aside.exposures:
+        if name not in matches.exposure_names:
+            raise InputError(
+                f"there is no exposure {name!r} to be held out",
+                where=where,
+                do=f"name some of {', '.join(matches.exposure_names[:5])}, ... "
+                "in holdout.exposures",
+            )
+    if isinstance(matches, MatchTable):
+        which = aside.which(matches)
+        _refuse_nothing(int(which.sum()), len(which), where)
+        kept = matches.select(~which, reason=HELD_OUT)
+        return Split(_renamed(kept, kept.exposures), matches.select(which))
+    n_held, n_all = [], []
+    seen = np.zeros(len(matches.exposure_names), bool)
+    for piece in matches.pieces():
+        table = piece.read()
+        which = aside.which(table)
+        seen[table.exposure[~which]] = True
+        n_held.append(int(which.sum()))
+        n_all.append(len(table))
+    total = sum(n_held)
+    _refuse_nothing(total, len(matches), where)
+    named = tuple(n for n, there in zip(matches.exposure_names, seen, strict=True) if there)
+    n_kept = tuple(n - k for n, k in zip(n_all, n_held, strict=True))
+
+    def chosen(held: bool) -> ChosenMatches:
+        n = total if held else len(matches) - total
+        others = {} if held else {HELD_OUT: total}
+        return ChosenMatches(
+            replace(
+                matches.whole,
+                n_rows=n,
+                exposure_names=matches.exposure_names if held else named,
+            ),
+            matches.parts,
+            matches.errors,
+            {**matches.dropped, **others},
+            matches,
+            aside,
+            held,
+            tuple(n_held) if held else n_kept,
+        )
+
+    return Split(chosen(False), chosen(True))
+
+
+def _refuse_nothing(held: int, n: int, where: str) -> None:
+    if 0 < held < n:
+        return
+    raise InputError(
+        "no star is set aside" if held == 0 else "every star is set aside, and none is left to fit",
+        where=where,
+        do="correct holdout.fraction and holdout.exposures",
+    )
+
+
+def _renamed(table: MatchTable, names: tuple[str, ...]) -> MatchTable:
+    """A table whose exposures are numbered by other names, which hold all of its own."""
+    if names == table.exposure_names:
+        return table
+    code = {name: k for k, name in enumerate(names)}
+    codes = np.array([code.get(name, -1) for name in table.exposure_names], np.int64)
+    return table._with(exposure=codes[table.exposure], exposure_names=names)
+
+
+def _mixed(bits: Bits) -> Bits:
+    """Bits that depend on all bits: the finaliser of SplitMix64 (Steele, Lea and Flood 2014)."""
+    out = bits + np.uint64(0x9E3779B97F4A7C15)
+    out = (out ^ (out >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    out = (out ^ (out >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.asarray(out ^ (out >> np.uint64(31)))
