@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import Table, vstack
+from astropy.time import Time
 
 from bayesdist.assess import SAMPLE, convert, pixel_scale_of
 from bayesdist.assess.periods import TimeVariation, bins_for, time_variation
@@ -56,9 +57,11 @@ def check_pairs(session: Session) -> dict[str, int]:
     for name, (start, stop) in spans.items():
         n = int(((epoch >= start) & (epoch < stop)).sum())
         if not n:
+            years = [epoch.min(), epoch.max(), start, stop]
+            first, last, begin, end = Time(years, format="decimalyear", scale="tt").mjd
             raise InputError(
-                f"the period about MJD {name} has no pairs: epochs go from {epoch.min():.6g} to "
-                f"{epoch.max():.6g}, and it from {start:.6g} to {stop:.6g}",
+                f"the period about MJD {name} has no pairs: they go from MJD {first:.3f} to "
+                f"{last:.3f}, and it from {begin:.3f} to {end:.3f}",
                 where=where,
                 do="correct periods.centres and periods.days, or leave the period out",
             )

@@ -250,7 +250,9 @@ def time_variation(
         {name: part.bins[k] for name, part in parts.items()} for k in range(len(fit.model.chips))
     ]
     try:
-        residuals = tuple(_residuals(one, fit.unit, unit_arcsec, rng) for one in by_chip)
+        residuals = tuple(
+            _residuals(one, fit.unit, unit_arcsec, rng, fit.model.n_terms) for one in by_chip
+        )
         patterns = tuple(pattern_changes(one) for one in by_chip)
     except DegenerateError as error:
         least = min(parts, key=lambda name: parts[name].n_rows)
@@ -279,10 +281,17 @@ def _residuals(
     unit: str,
     unit_arcsec: float | None,
     rng: np.random.Generator,
+    n_terms: int,
 ) -> StatisticsTable:
     """Table C-1: all periods together, then each of them."""
     one, *others = periods.values()
     together = sum(others, start=one)
     rows = {COMBINED: together, **periods}
-    table = period_table(rows, rng=rng, arcsec_per_pixel=unit_arcsec or 1.0)
+    # of a part of the stars the model of all takes out the same part of its coefficients
+    n_all = float(together.axes.count.sum())
+    absorbed = {
+        name: max(1, round(n_terms * float(one.axes.count.sum()) / n_all))
+        for name, one in rows.items()
+    }
+    table = period_table(rows, rng=rng, arcsec_per_pixel=unit_arcsec or 1.0, absorbed=absorbed)
     return table if unit_arcsec else replace(table, unit=unit)

@@ -125,7 +125,8 @@ def stream_rvb(
     InputError
         For missing columns, several bands of which none is chosen, a band that is not there,
         positions outside the array, pairs that all lie in the array's first quarter (those of
-        another array), and for all that `read_matches` refuses in a row.
+        another array), u, v in pixels that are mostly far from x, y, and for all that
+        `read_matches` refuses in a row.
     """
     check_sigma(sigma)
     files = open_rvb_files(path, columns)
@@ -142,7 +143,12 @@ def stream_rvb(
                 continue
             pairs = _pairs(file, table, first, place, which, band, unit, sigma, pixel_origin)
             matches = pairs.matches
-            check.see(matches.x, matches.y, partial(_row_name, matches))
+            check.see(
+                matches.x,
+                matches.y,
+                partial(_row_name, matches),
+                reference=(matches.u, matches.v) if matches.unit == "pix" else None,
+            )
             yield pairs
     sources = ", ".join(file.source for file in files)
     if not check.n:

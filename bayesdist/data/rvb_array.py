@@ -17,6 +17,9 @@ Float = NDArray[np.float64]
 # Pairs that fill no more than a quarter of the array are those of a smaller one: by chance this
 # many lie there with a probability of 4^-50.
 _ENOUGH = 50
+# Of the longer side: reference stars in pixels of the array lie this near to their detections.
+# Distortion and frame solutions move them by less; swapped columns and other units by far more.
+_NEAR = 0.05
 
 
 @dataclass
@@ -33,9 +36,17 @@ class ArrayCheck:
     band: str
     size: tuple[float, float]
     n: int = 0
+    n_far: int = 0
     reach: Float = field(default_factory=lambda: np.zeros(2))
 
-    def see(self, x: Float, y: Float, where: Callable[[int], str]) -> None:
+    def see(
+        self,
+        x: Float,
+        y: Float,
+        where: Callable[[int], str],
+        *,
+        reference: tuple[Float, Float] | None = None,
+    ) -> None:
         """Refuse detections that the array cannot have made.
 
         Parameters
@@ -44,6 +55,8 @@ class ArrayCheck:
             FITS 1-based pixels.
         where : callable
             Names file and row of a position.
+        reference : tuple of ndarray, shape (N,), optional
+            u and v, where these are said to be pixels of the array.
 
         Raises
         ------
@@ -62,9 +75,14 @@ class ArrayCheck:
                 )
         self.n += len(x)
         self.reach = np.maximum(self.reach, [x.max(), y.max()])
+        if reference is not None:
+            away = np.hypot(reference[0] - x, reference[1] - y)
+            self.n_far += int((away > _NEAR * max(self.size)).sum())
 
     def end(self, sources: str) -> None:
-        """Refuse positions that all lie in the first quarter: those of another array.
+        """Refuse positions that all lie in the first quarter, and references far from detections.
+
+        The first are those of another array, the second those of no array, or in swapped columns.
 
         Raises
         ------
@@ -76,4 +94,11 @@ class ArrayCheck:
                 f"{self.reach[1]:.0f} of an array of {self.size[0]:g} x {self.size[1]:g}",
                 where=sources,
                 do="check the band and the size: these are positions of a smaller array",
+            )
+        if 2 * self.n_far > self.n:
+            raise InputError(
+                f"in {self.n_far} of {self.n} pairs u, v lies more than "
+                f"{_NEAR * max(self.size):.0f} pixels from x, y",
+                where=sources,
+                do="give u and v in pixels of the band frame, and check which column is which",
             )

@@ -53,9 +53,14 @@ def open_rvb(
         return None
     check = ArrayCheck(band, size)
     for file in files:
-        for table, _, place in file.blocks(["x", "y"]):
-            x, y = (file.column(table, key, place).numbers() + 1 - pixel_origin for key in "xy")
-            check.see(x, y, partial(_row_name, file, place))
+        for table, _, place in file.blocks(["x", "y", "u", "v"]):
+            x, y, u, v = (file.column(table, key, place).numbers() for key in "xyuv")
+            check.see(
+                x + 1 - pixel_origin,
+                y + 1 - pixel_origin,
+                partial(_row_name, file, place),
+                reference=(u, v) if unit == "pix" else None,
+            )
     check.end(", ".join(file.source for file in files))
     found = files[0].found
     named = {key: found.get(key, "") for key in ALIASES}

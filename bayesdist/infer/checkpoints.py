@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,27 @@ from numpy.typing import NDArray
 from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
 
-__all__ = ["read_arrays", "write_arrays"]
+__all__ = ["new_hdf5", "read_arrays", "write_arrays"]
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """A file to be filled, which appears whole or not at all.
+
+    It is made in memory: where a disk is full, HDF5 fails again as it closes its file, and may end
+    the process.
+
+    Raises
+    ------
+    InputError
+        When the system refuses to write.
+    """
+    with atomic_path(path) as temporary:
+        with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+            yield file
+            file.flush()
+            content = file.id.get_file_image()
+        temporary.write_bytes(content)
 
 
 def read_arrays(
@@ -52,7 +73,7 @@ def read_arrays(
 
 def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Keep arrays by name; the file appears whole or not at all."""
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         for name, values in arrays.items():
             file[name] = values
         file.attrs["fingerprint"] = fingerprint

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from astropy.io import fits
 from astropy.table import Table
 
 from bayesdist.infer import load_fit, load_posterior
@@ -251,6 +252,17 @@ def test_every_file_is_there_and_the_page_needs_no_other(compared):
 def test_the_stand_in_says_what_it_is(compared):
     text = (compared.folder / "set" / "optical_w2.hdr").read_text(encoding="ascii")
     assert "not the Code V model" in text
+
+
+def test_an_optical_model_of_another_field_is_refused(compared, tmp_path):
+    text = (compared.folder / "set" / "optical_w2.hdr").read_text(encoding="ascii")
+    header = fits.Header.fromstring(text, sep="\n")
+    for key in ("CD1_1", "CD2_2"):  # pixels of 0.05 arcsec
+        header[key] *= 0.05 / 2.75
+    header.totextfile(tmp_path / "camera.hdr")
+    options = ["--bins", BINS, "--optical", tmp_path / "camera.hdr"]
+    words = ["camera.hdr", "0.847 arcmin", "W1 sees 46.6", "own field"]
+    refused(tmp_path, "bands", compared.run("W1"), "-o", tmp_path / "out", *options, words=words)
 
 
 def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):

@@ -33,7 +33,7 @@ class SmallDisk:
         if done.returncode:
             pytest.skip(f"no tmpfs may be mounted here ({done.stderr.strip()})")
 
-    def resize(self, size: int) -> None:
+    def resize(self, size: int | str) -> None:
         self._mount(f"remount,size={size}")
 
     def leave(self, free: int) -> None:
@@ -126,6 +126,15 @@ def test_while_the_posterior_is_written(job, undisturbed, disk, no_report):
     disk.resize(200_000_000)
     assert cli("run", job, "-o", path, "--resume", "-q").code == 0
     _assert_same_draws(undisturbed, path)
+
+
+def test_while_the_first_checkpoints_are_written(job, disk):
+    """HDF5 must not end the process as it closes what it could not write."""
+    path = disk.path / "run"
+    for size in ("180k", "240k", "300k"):
+        disk.resize(size)
+        _refused("run", job, "-o", path, "--force", words=(str(path),))
+        assert not list(path.glob(".*"))
 
 
 def test_from_the_start(job, disk):

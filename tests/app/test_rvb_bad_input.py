@@ -48,6 +48,22 @@ def _called(name: str, make: Callable[[], Table]) -> Callable[[], Table]:
     return renamed
 
 
+def _swapped(one: str, other: str) -> Callable[[], Table]:
+    def make() -> Table:
+        table = rvb_pairs()
+        table[one], table[other] = table[other].copy(), table[one].copy()
+        return table
+
+    return make
+
+
+def arcseconds() -> Table:
+    table = rvb_pairs()
+    for name in ("u", "v", "sigma_u", "sigma_v"):
+        table[name] = 5.5 * np.asarray(table[name])
+    return table
+
+
 def w1() -> Table:
     return rvb_pairs(band="W1")
 
@@ -85,6 +101,9 @@ CASES: dict[str, tuple[Callable[[], Table], dict[str, Any], list[str]]] = {
         {"data": {"rvb": {"accept_centre": 1e-6, "accept_corner": 1e-6}}},
         ["offset beyond the radial limit (600)"],
     ),
+    "arcseconds called pixels": (arcseconds, {}, ["u, v lies more than 25 pixels from x, y"]),
+    "u and v swapped": (_swapped("u", "v"), {}, ["more than 25 pixels", "which column is which"]),
+    "x and y swapped": (_swapped("x", "y"), {}, ["more than 25 pixels", "which column is which"]),
     "arcseconds": (
         rvb_pairs,
         {"data": {"unit": "arcsec", "rvb": {"accept_centre": 1.0, "accept_corner": 2.0}}},
@@ -123,7 +142,7 @@ CASES: dict[str, tuple[Callable[[], Table], dict[str, Any], list[str]]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_wrong_is_said_in_one_sentence(tmp_path, name):
     make, sections, words = CASES[name]
-    suffix = ".parquet" if name in ("W4 declared W1", "nan") else ".tbl"
+    suffix = ".parquet" if name in ("W4 declared W1", "nan", "u and v swapped") else ".tbl"
     config = rvb_job(tmp_path / "job", make(), suffix, **sections)
     refused(tmp_path, "run", config, "-o", tmp_path / "run", words=words)
 

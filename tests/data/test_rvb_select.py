@@ -164,6 +164,10 @@ def test_pairs_in_place_are_checked_against_the_array(rng, tmp_path):
         open_rvb(path, band="W1", **(OPTIONS | {"size": (508.0, 508.0)}))
     with pytest.raises(InputError, match=r"lie within x <= .* positions of a smaller array"):
         open_rvb(path, band="W1", **(OPTIONS | {"size": (4096.0, 4096.0)}))
+    table["u"], table["v"] = table["v"].copy(), table["u"].copy()
+    swapped = write(table, tmp_path / "swapped.parquet")
+    with pytest.raises(InputError, match="more than 51 pixels from x, y"):
+        open_rvb(swapped, band="W1", **OPTIONS)
 
 
 def test_both_spellings_name_the_column_of_colours(rng, tmp_path):

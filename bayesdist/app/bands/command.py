@@ -16,8 +16,8 @@ from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.errors import InputError
 from bayesdist.products import sip_from_solution, write_wise_meta
-from bayesdist.report import drawn, save_images
-from bayesdist.report.bands import BandsInput, band_figures, save_pdfs, write_bands
+from bayesdist.report import drawn, save_images, save_pdfs
+from bayesdist.report.bands import BandsInput, band_figures, write_bands
 from bayesdist.report.bands.findings import overview_table
 from bayesdist.simulate.wise import WISE_BANDS
 

@@ -114,7 +114,7 @@ def _measured(
     run: BandRun, field: DistortionField, optical: OpticalModel | None, bins: int, wise: bool
 ) -> BandResult:
     session, fit = run.session, run.session.fit
-    less = None if optical is None else field.minus(optical.field(run.chip))
+    less = None if optical is None else field.minus(optical.field(run.chip, run.arcsec))
     vectors = field.vectors(GRID)
     without = {"no correction": field} | ({} if less is None else {"optical model": less})
     rms = float(np.linalg.norm(field.to_pixels) * max(fit.rms_u, fit.rms_v) / np.sqrt(2))

@@ -16,6 +16,8 @@ from bayesdist.products.wise_meta import holds_wise_meta
 
 __all__ = ["OpticalModel", "optical_models"]
 
+OTHER_FIELD = 1.5  # by this factor in extent the header's image is of another instrument
+
 
 @dataclass(frozen=True, eq=False)
 class OpticalModel:
@@ -32,12 +34,14 @@ class OpticalModel:
     label: str
     sip: SipHeader
 
-    def field(self, chip: Chip) -> DistortionField:
+    def field(self, chip: Chip, arcsec: float) -> DistortionField:
         """The model over an array that sees the same field, in that array's pixels.
 
         Parameters
         ----------
         chip : Chip
+        arcsec : float
+            Per pixel of the array.
 
         Returns
         -------
@@ -46,7 +50,8 @@ class OpticalModel:
         Raises
         ------
         InputError
-            When the header's image has another shape than the array.
+            When the header's image has another shape than the array, or covers a field of quite
+            another size by its CD matrix.
         """
         size = self.sip.size or chip.size
         times = [own / n for own, n in zip(size, chip.size, strict=True)]
@@ -56,6 +61,15 @@ class OpticalModel:
                 f"{chip.size[0]:g} x {chip.size[1]:g}",
                 where=self.label,
                 do="give a model of an array of the same shape",
+            )
+        own_arcsec = 3600 * float(np.sqrt(abs(np.linalg.det(self.sip.cd))))
+        extents = size[0] * own_arcsec, chip.size[0] * arcsec
+        if max(extents) > OTHER_FIELD * min(extents):
+            raise InputError(
+                f"covers {extents[0] / 60:.3g} arcmin by its size and CD matrix, and {chip.name} "
+                f"sees {extents[1] / 60:.3g}",
+                where=self.label,
+                do="give a model of the band's own field, or correct size and CD of the header",
             )
         # where CRPIX lies on this array, whose pixels may be wider than the model's
         x, y = ((r - 0.5) / t + 0.5 for r, t in zip(self.sip.crpix, times, strict=True))

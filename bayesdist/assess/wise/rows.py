@@ -79,6 +79,7 @@ class StatisticsRow:
     noise_free : mapping of str to float
         `value` less what noise adds on average to a set of this width and shape.  It takes the
         widening out; shape finer than the noise, on which a median may hang, does not come back.
+        Min, percentiles, median and max stay in their order: they meet where only noise is left.
     variance : float
         What is left of sigma^2 without noise; below zero where chance makes it so.
     variance_error : float
@@ -269,6 +270,11 @@ def _row(
         "mean": value["mean"],
         "sigma": float(np.sqrt(max(variance, 0.0))),
     }
+    # where noise is all there is, what it adds to extremes may carry them past the middle
+    free["p01"] = min(free["p01"], free["median"])
+    free["min"] = min(free["min"], free["p01"])
+    free["p99"] = max(free["p99"], free["median"])
+    free["max"] = max(free["max"], free["p99"])
     n = int(good.sum())
     return StatisticsRow(
         label, dict(value), error, free, variance, variance_error, n, good.size - n

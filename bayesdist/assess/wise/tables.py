@@ -236,7 +236,7 @@ def period_table(
     *,
     rng: np.random.Generator,
     arcsec_per_pixel: float,
-    absorbed: int = 1,
+    absorbed: int | Mapping[str, int] = 1,
 ) -> StatisticsTable:
     """Table C-1: residuals of one band in several periods, in arcsec.
 
@@ -246,7 +246,7 @@ def period_table(
         By the name of the period, in the order of the table: the combined one and single ones, all
         against the combined model.
     rng, absorbed
-        As `fitting_table`.
+        As `fitting_table`; by the name of the period where they differ.
     arcsec_per_pixel : float
 
     Returns
@@ -262,7 +262,7 @@ def period_table(
         bin_row(
             f"{name}/{axis}",
             bins.values(axis).scaled(arcsec_per_pixel),
-            absorbed=absorbed,
+            absorbed=absorbed if isinstance(absorbed, int) else absorbed[name],
             rng=rng,
         )
         for axis in _AXES

@@ -1,7 +1,7 @@
 """Tables and diagrams of several bands beside each other."""
 
 from bayesdist.report.bands.context import BandResult, BandsInput, Printed
-from bayesdist.report.bands.figures import band_figures, save_pdfs
+from bayesdist.report.bands.figures import band_figures
 from bayesdist.report.bands.page import render_bands, write_bands
 
 __all__ = [
@@ -10,6 +10,5 @@ __all__ = [
     "Printed",
     "band_figures",
     "render_bands",
-    "save_pdfs",
     "write_bands",
 ]

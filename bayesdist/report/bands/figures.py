@@ -1,28 +1,24 @@
-"""All figures of a comparison of bands, by name, and their files."""
+"""All figures of a comparison of bands, by name."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Collection, Mapping
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
 from bayesdist.report.bands.context import BandResult, BandsInput
 from bayesdist.report.bands.curves import correlation_curves, histograms
 from bayesdist.report.bands.panels import band_images
 from bayesdist.report.bands.vectors import band_crosses, band_flows
-from bayesdist.report.style import figure_style
 
 if TYPE_CHECKING:
     from bayesdist.assess.wise.rows import BinValues
 
-__all__ = ["DIFFERENCE", "FLOW", "OPTICAL", "band_figures", "save_pdfs"]
+__all__ = ["DIFFERENCE", "FLOW", "OPTICAL", "band_figures"]
 
 Float = NDArray[np.float64]
 
@@ -140,27 +136,3 @@ def _coverage(bands: tuple[BandResult, ...]) -> Figure:
         limit=partial(_limit, centre=1.0),
         centre=1.0,
     )
-
-
-def save_pdfs(figures: Mapping[str, Figure], folder: Path) -> None:
-    """Write figures as PDF files.
-
-    Parameters
-    ----------
-    figures : mapping of str to matplotlib.figure.Figure
-    folder : pathlib.Path
-        One that is there.
-
-    Raises
-    ------
-    InputError
-        When a file cannot be written.
-    """
-    for name, figure in figures.items():
-        buffer = io.BytesIO()
-        with figure_style():
-            figure.savefig(
-                buffer, format="pdf", bbox_inches="tight", metadata={"CreationDate": None}
-            )
-        with atomic_path(folder / f"{name}.pdf") as temporary:
-            temporary.write_bytes(buffer.getvalue())

@@ -44,7 +44,14 @@ def statistics_table(name: str, inputs: BandsInput) -> TextTable:
             rows.append(("", "printed", *(as_printed(one.printed, s) for s in STATISTICS)))
     number_of = f"Table {name}. " if inputs.wise else ""
     title = f"{number_of}{TITLES[name]}, {inputs.n_bins} × {inputs.n_bins} bins ({table.unit})"
-    return TextTable(title, (table.first, "", *_HEADS), tuple(rows), words=(0, 1))
+    note = ""
+    if name != "5-3" and any(one.printed is not None for one in inputs.accounts[name]):
+        note = (
+            "Found: the reference star minus the calibrated detection. The report speaks of WISE"
+            " minus 2MASS: there means and medians have the other sign, and minima and 1 % stand"
+            " for maxima and 99 %."
+        )
+    return TextTable(title, (table.first, "", *_HEADS), tuple(rows), words=(0, 1), note=note)
 
 
 def as_printed(row: PrintedRow, statistic: str) -> str:
