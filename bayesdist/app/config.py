@@ -17,6 +17,7 @@ from pydantic import (
 
 from bayesdist.app.campaign.config import CampaignBlock, ReleaseBlock, TablesBlock
 from bayesdist.app.config_errors import as_config_error
+from bayesdist.app.holdout_config import HoldoutBlock
 from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.section import Section
 from bayesdist.assess import Requirement, UserTerm
@@ -279,6 +280,7 @@ class Config(Section):
     compute: ComputeBlock = ComputeBlock()
     assess: Assess = Assess()
     periods: Periods | None = None
+    holdout: HoldoutBlock | None = None
     budget: list[BudgetBlock] = Field(default_factory=list)
     requirement: list[RequirementBlock] = Field(default_factory=list)
     prior: list[PriorBlock] = Field(default_factory=list)
@@ -302,6 +304,8 @@ class Config(Section):
             raise ValueError(
                 "RvB pairs are of one array; give detector.size in place of [[chip]] blocks"
             )
+        if self.campaign is not None and self.holdout is not None:
+            raise ValueError("[holdout] is of matched stars, not of a [campaign]; leave it out")
         if self.campaign is not None and len(self.chip) == 0:
             raise ValueError("a [campaign] has no [[chip]] blocks; give them, one as the reference")
         return self

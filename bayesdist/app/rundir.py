@@ -34,8 +34,8 @@ PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 # and nothing else
 OWN_FILES = re.compile(
     r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
-    r"posterior\.nc|(coefficients|budget|margins|periods|matching|series|drift)\.ecsv|maps\.fits|"
-    r"(tables|hierarchy|exposure_terms|catalogue_errors)\.h5|summary\.json|report\.html"
+    r"posterior\.nc|(coefficients|budget|margins|periods|holdout|matching|series|drift)\.ecsv|maps\.fits|"
+    r"(tables|hierarchy|exposure_terms|catalogue_errors)\.h5|summary\.json|report\.(html|md)"
 )
 
 

@@ -13,6 +13,8 @@ from astropy.table import Table
 
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
+from bayesdist.app.correlated import SharedErrors, kept_shared_errors, measure_shared_errors
+from bayesdist.app.holdout import split_of
 from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.rvb import RvbInput
@@ -35,6 +37,7 @@ from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.majority import majority_sentence
 from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
+from bayesdist.data.holdout import Split
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -77,7 +80,25 @@ class Session:
         return self.run.config
 
     @cached_property
+    def _split(self) -> Split | None:
+        """Matches that are fitted and those that are held out, where some are."""
+        return None if self.config.holdout is None else split_of(self, self._all_matches)
+
+    @property
     def raw_matches(self) -> Matches:
+        """Matches as read, without those that are held out."""
+        return self._all_matches if self._split is None else self._split.kept
+
+    @property
+    def held_matches(self) -> Matches | None:
+        """Those that are held out, with their errors; None where there are none."""
+        if self._split is None:
+            return None
+        held, errors = self._split.held, self.magnitude_errors
+        return held if errors is None else held.with_errors_by_magnitude(errors)
+
+    @cached_property
+    def _all_matches(self) -> Matches:
         """Matches as read."""
         data = self.config.data
         assert data is not None
@@ -101,7 +122,7 @@ class Session:
     def begun(self) -> None:
         """Move into the run's folder what was prepared beside it: the run has begun."""
         if "_rvb" in self.__dict__ and self._rvb.settle():
-            for name in ("raw_matches", "matches"):
+            for name in ("_all_matches", "_split", "matches"):
                 self.__dict__.pop(name, None)
             if self.config.compute.engine == "dask":  # workers may read the pairs again
                 self.errors_changed()
@@ -201,7 +222,19 @@ class Session:
     @cached_property
     def systematics(self) -> Systematics:
         """The posterior with all that is known of its errors."""
-        return Systematics(self.posterior)
+        found = self.shared_errors
+        return Systematics(self.posterior if found is None else found.widened(self.posterior))
+
+    @cached_property
+    def shared_errors(self) -> SharedErrors | None:
+        """What `assess` has measured of errors that stars have in common."""
+        return kept_shared_errors(self)
+
+    def measure(self) -> None:
+        """What the assessment measures beside the posterior, anew."""
+        measure_shared_errors(self)
+        for name in ("shared_errors", "systematics", "field_terms"):
+            self.__dict__.pop(name, None)
 
     @property
     def solution(self) -> Posterior:
@@ -223,12 +256,14 @@ class Session:
     @property
     def doubts(self) -> list[str]:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
-        return []
+        found = self.shared_errors
+        return [found.sentence] if found is not None and found.sentence else []
 
     @property
     def local_terms(self) -> tuple[LocalTerm, ...]:
         """Errors that were measured beside the solution, on the grid of the assessment."""
-        return ()
+        found = self.shared_errors
+        return () if found is None else found.local_term(self.config.assess.grid)
 
     @property
     def scale_arcsec(self) -> float | None:

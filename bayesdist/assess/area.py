@@ -26,7 +26,7 @@ class AreaMap:
     y : ndarray, shape (ny,)
         FITS 1-based pixels.
     area : ndarray, shape (ny, nx)
-        |det d(u, v) / d(x, y)| over its value at the reference pixel.
+        ``|det d(u, v) / d(x, y)|`` over its value at the reference pixel.
     sigma : ndarray, shape (ny, nx)
         Standard deviation of `area`; 0 at the reference pixel by definition.
     reference_area : float

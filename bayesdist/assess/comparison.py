@@ -51,7 +51,7 @@ class Comparison:
     largest_z : float, optional
         Of the Legendre coefficients, in units of their errors.
     p_largest_z, p_largest_chi2 : float, optional
-        Share of noise fields whose largest |z|, and whose largest chi-square on the grid, is as
+        Share of noise fields whose largest ``|z|``, and whose largest chi-square on the grid, is as
         large: they account for the search.
     """
 

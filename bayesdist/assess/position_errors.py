@@ -35,6 +35,7 @@ CENTROID = "centroid"
 BLOCK = 500_000
 MOST_PAIRS = 5000  # pairs of places that stand for all: percentiles over them to about 1 %
 FEWEST_PLACES = 4
+BEYOND = 0.5  # magnitudes by which the outermost bins may be left
 
 
 @dataclass(frozen=True)
@@ -200,13 +201,21 @@ class PositionErrors:
         Raises
         ------
         InputError
-            Where no errors by magnitude are known.
+            Where no errors by magnitude are known, or none near this one.
         """
         if self.centroid is None:
             raise InputError(
                 f"the error of a star of magnitude {magnitude:g} is not known",
                 where="magnitude",
                 do="give the matches magnitudes, or leave it out",
+            )
+        low, high = self.centroid.mag[0] - BEYOND, self.centroid.mag[-1] + BEYOND
+        if not low <= magnitude <= high:
+            raise InputError(
+                f"centroids of magnitude {magnitude:g} were not measured, but those of "
+                f"{low:.1f} to {high:.1f}",
+                where="magnitude",
+                do="name one of these",
             )
         return np.ravel(self.centroid.at([magnitude]))
 

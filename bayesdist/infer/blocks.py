@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.infer.checkpoints import new_hdf5
 
 __all__ = ["Block", "Walkers", "block_path", "read_block", "write_block"]
 
@@ -69,7 +69,7 @@ def block_path(folder: Path, ensemble: int, end: int) -> Path:
 
 def write_block(path: Path, mark: str, block: Block) -> None:
     """Keep a block; `mark` says to what it belongs."""
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         file["chain"], file["log_prob"] = block.coords, block.log_prob
         file["accepted"], file["log_weights"] = block.accepted, block.log_weights
         file["end_log_q"] = block.end.log_q

@@ -6,7 +6,7 @@ zero.  With all linear terms in both polynomials the skew is no parameter beside
 the same order.  The skew is a function of four linear coefficients.  To fit it is to leave them
 free, and both axes are fitted apart; to fix it is one condition on them, and that ties the axes.
 
-For e_x, e_y, the images of one pixel along x and along y at the reference pixel:
+For e_x, e_y, the images of one pixel along x and along y at the reference pixel::
 
     sin(skew) = - e_x . e_y / (|e_x| |e_y|)         the angle from e_x to e_y is 90 degrees + skew
 """

@@ -148,7 +148,7 @@ class LinearTerms:
     Parameters
     ----------
     labels : tuple of str
-        'A_1' is the constant of u, 'A_2' its term in x, 'A_3' in y; 'B_...' are those of v.  With
+        'A_1' is the constant of u, 'A_2' its term in x, 'A_3' in y; ``B_...`` are those of v.  With
         the chip's name before it where there are several chips; with '.alpha' and '.beta' behind
         it for the value at the reference date and the rate.
     values : ndarray, shape (k,)

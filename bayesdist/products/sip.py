@@ -53,7 +53,7 @@ class SipHeader:
     sigma_a, sigma_b : mapping
         Standard deviations of `a` and `b`: keywords AE_p_q and BE_p_q.
     dmax : tuple of float, optional
-        A_DMAX and B_DMAX: largest |A| and |B| over the detector, pixels.
+        A_DMAX and B_DMAX: largest ``|A|`` and ``|B|`` over the detector, pixels.
     closure : float, optional
         Worst distance between a pixel and the inverse of its forward position: keyword BDCLOS,
         pixels.

@@ -4,7 +4,7 @@ from bayesdist.report.area import pixel_area
 from bayesdist.report.budget import budget_terms, dominating_term
 from bayesdist.report.context import Check, Product, ReportInput
 from bayesdist.report.corners import corner_coefficients, corner_outliers
-from bayesdist.report.figures import all_figures, drawn, save_images
+from bayesdist.report.figures import all_figures, drawn, save_images, save_pdfs
 from bayesdist.report.html import write_report
 from bayesdist.report.margins import margins_against_limits
 from bayesdist.report.residuals import residual_histogram, residuals_by_magnitude
@@ -29,6 +29,7 @@ __all__ = [
     "residual_vectors",
     "residuals_by_magnitude",
     "save_images",
+    "save_pdfs",
     "traces",
     "uncertainty_radius",
     "vector_flow",

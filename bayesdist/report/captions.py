@@ -8,6 +8,7 @@ import numpy as np
 
 from bayesdist.report.caption import Caption
 from bayesdist.report.context import ReportInput
+from bayesdist.report.holdout import holdout_caption
 from bayesdist.report.horizon import horizon_caption
 from bayesdist.report.numerals import count, number, percent
 from bayesdist.report.periods import period_caption
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["SECTIONS", "Caption", "caption"]
 
 SECTIONS: dict[str, tuple[str, ...]] = {
+    "holdout": ("holdout",),
     "data": ("residuals_by_magnitude",),
     "fit": ("residual_histogram", "residual_vectors"),
     "outliers": ("outliers_corner",),
@@ -297,4 +299,5 @@ _WRITERS = {
     "budget_dominating": _dominating,
     "margins": _margins,
     "horizon": horizon_caption,
+    "holdout": holdout_caption,
 }

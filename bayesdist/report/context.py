@@ -23,7 +23,9 @@ if TYPE_CHECKING:
         UncertaintyMap,
         VectorMap,
     )
+    from bayesdist.assess.budget_surface import BudgetSurface
     from bayesdist.assess.detector_budget import DetectorBudget
+    from bayesdist.assess.holdout import HeldOutTruth
     from bayesdist.assess.horizon import Horizon
     from bayesdist.assess.misfit import Misfit
     from bayesdist.assess.periods import TimeVariation
@@ -138,6 +140,8 @@ class ReportInput:
         sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit.  Those of the
         posterior may be missing or masked.
     budget : DetectorBudget or None
+    surface : BudgetSurface or None
+        The same budget at every position and epoch, for the page to compute from.
     margins : tuple of Margin
     horizons : tuple of Horizon
         Until when requirements are met; empty where nothing depends on time.
@@ -157,6 +161,8 @@ class ReportInput:
         What a run that began with star lists adds.
     periods : TimeVariation or None
         Models of several periods compared, where that was asked for.
+    held_out : HeldOutTruth or None
+        What stars say that were set aside before the fit, where there are any.
     """
 
     name: str
@@ -168,6 +174,7 @@ class ReportInput:
     chips: tuple[ChipResults, ...]
     coefficients: Table
     budget: DetectorBudget | None = None
+    surface: BudgetSurface | None = None
     margins: tuple[Margin, ...] = ()
     horizons: tuple[Horizon, ...] = ()
     products: tuple[Product, ...] = ()
@@ -178,6 +185,7 @@ class ReportInput:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     campaign: CampaignResults | None = None
     periods: TimeVariation | None = None
+    held_out: HeldOutTruth | None = None
 
     @property
     def unit(self) -> str:

@@ -1,10 +1,12 @@
-"""The report: one HTML file that needs nothing else."""
+"""The report: one HTML file that needs nothing else, and the same as Markdown."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
@@ -12,12 +14,66 @@ from bayesdist.report import tables
 from bayesdist.report.campaign import PARTS, CampaignFigure, campaign_tables
 from bayesdist.report.captions import SECTIONS, caption
 from bayesdist.report.context import ReportInput
+from bayesdist.report.explorer import budget_data, embedded, map_data
 from bayesdist.report.figures import plan_of_campaign
+from bayesdist.report.holdout import holdout_tables
 from bayesdist.report.page import Picture, picture_of, template
 from bayesdist.report.periods import period_tables
 from bayesdist.report.status import status_checks, verdict
 
-__all__ = ["render_report", "write_report"]
+__all__ = ["render_markdown", "render_report", "write_report"]
+
+_TITLES = {
+    "holdout": "Held-out stars",
+    "data": "Data",
+    "campaign": "Campaign",
+    "fit": "Least-squares fit",
+    "outliers": "Outliers",
+    "coefficients": "Coefficients",
+    "maps": "Distortion and its uncertainty over the detector",
+    "periods": "Time variation",
+    "budget": "Error budget",
+    "margins": "Margins",
+    "products": "Products",
+    "provenance": "Provenance",
+}
+_EMPTY = {
+    "outliers": "Nothing was sampled: the fit rejects outliers by its limits and does not model"
+    " them.",
+    "budget": "No error budget was made.",
+    "margins": "No requirement was stated.",
+    "products": "No product was written.",
+}
+_PROVISIONAL = (
+    "The sampler did not reach its targets. Every number below is provisional; those marked † rest"
+    " on its draws and may be wrong by more than their stated errors. Sample longer, or look at the"
+    " reasons, before anything is used."
+)
+_FOOTER = (
+    "Made by bayesdist. u and v are the reference axes; x runs to the right and y up, in FITS"
+    " pixels (centre of the first pixel = 1)."
+)
+_BUDGET_WORDS = (
+    "The budget of the table, computed in this page at any position, between two positions of one"
+    " image, and at any epoch and magnitude. The parts of the model are correlated: the bar stacks"
+    " variances, and the hatched piece is what their correlation adds. Where it takes off, the"
+    " stack is longer than the total, which the dark line marks; in the table it then has a minus"
+    " before the root of its size."
+)
+_PRINT_WORDS = (
+    "In print: what decides. All tables and figures, and the budget at any position and epoch, are"
+    " in report.html; the figures also lie in figures/."
+)
+# figures that a printed report shows: what a board signs, not what an analyst looks through
+_PRINTED = (
+    "residual_vectors",
+    "distortion",
+    "uncertainty_radius",
+    "period_differences",
+    "holdout",
+    "margins",
+    "horizon",
+)
 
 
 @dataclass(frozen=True)
@@ -40,13 +96,37 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
     Returns
     -------
     str
-        A whole HTML document without scripts and without links to other files.
+        A whole HTML document that needs no other file.  Its script computes from numbers in the
+        page; whoever does without sees all tables and figures.
 
     Raises
     ------
     InputError
         For a figure whose name has no place in the report.
     """
+    return template("report.html.jinja").render(
+        **_contents(inputs, images),
+        budget_words=_BUDGET_WORDS,
+        print_words=_PRINT_WORDS,
+        printed=_PRINTED,
+        map_data=embedded(map_data(inputs)),
+        budget_data=None if inputs.surface is None else embedded(budget_data(inputs)),
+    )
+
+
+def render_markdown(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
+    """The same tables, figures and words as Markdown; figures are links into figures/.
+
+    Parameters
+    ----------
+    inputs, images
+        As in `render_report`.
+    """
+    return template("report.md.jinja").render(**_contents(inputs, images))
+
+
+def _contents(inputs: ReportInput, images: Mapping[str, bytes]) -> dict[str, Any]:
+    """What every form of the report shows."""
     plan = plan_of_campaign(inputs)
     placed = [*plan, *(name for names in SECTIONS.values() for name in names)]
     for name in images:
@@ -55,17 +135,28 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
                 f"figure {name!r} has no place in the report",
                 do=f"name it one of {', '.join(placed)}",
             )
-    return template("report.html.jinja").render(
-        run=inputs,
-        chips=_chips(inputs),
-        verdict=verdict(inputs),
-        status=status_checks(inputs),
-        pictures={
+    campaign = _campaign_parts(inputs, plan, images)
+    titles = {k: v for k, v in _TITLES.items() if k != "campaign" or campaign}
+    if inputs.periods is None:
+        del titles["periods"]
+    if inputs.held_out is None:
+        del titles["holdout"]
+    return {
+        "run": inputs,
+        "sections": titles,
+        "empty": _EMPTY,
+        "provisional": _PROVISIONAL,
+        "footer": _FOOTER,
+        "chips": _chips(inputs),
+        "verdict": verdict(inputs),
+        "status": status_checks(inputs),
+        "pictures": {
             section: [picture_of(n, images[n], caption(n, inputs)) for n in names if n in images]
             for section, names in SECTIONS.items()
         },
-        campaign=_campaign_parts(inputs, plan, images),
-        tables={
+        "campaign": campaign,
+        "tables": {
+            "holdout": holdout_tables(inputs.held_out),
             "data": tables.data_tables(inputs),
             "fit": tables.fit_tables(inputs),
             "outliers": _present(tables.outlier_table(inputs)),
@@ -79,7 +170,7 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
                 *_present(tables.config_table(inputs)),
             ),
         },
-    )
+    }
 
 
 def _chips(inputs: ReportInput) -> str:
@@ -124,11 +215,12 @@ def _campaign_parts(
 def write_report(
     path: str | os.PathLike[str], inputs: ReportInput, images: Mapping[str, bytes]
 ) -> None:
-    """Write the report.
+    """Write the report, and beside it the same as Markdown.
 
     Parameters
     ----------
     path : path-like
+        Of the page; the other file has its name with .md for .html.
     inputs : ReportInput
     images : mapping of str to bytes
         PNG files by name, as of `drawn`.
@@ -138,6 +230,10 @@ def write_report(
     InputError
         When the file cannot be written, or as `render_report`.
     """
-    text = render_report(inputs, images)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    texts = {
+        Path(path): render_report(inputs, images),
+        Path(path).with_suffix(".md"): render_markdown(inputs, images),
+    }
+    for target, text in texts.items():
+        with atomic_path(target) as temporary:
+            temporary.write_text(text, encoding="utf-8")

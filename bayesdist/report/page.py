@@ -45,10 +45,22 @@ def template(name: str) -> jinja2.Template:
     """A template by its file name; what it needs and is not given is an error."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("bayesdist.report"),
-        autoescape=True,
+        autoescape=".html" in name,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["md"] = _markdown
     environment.filters["number"] = lambda v: v if isinstance(v, str) else number(v)
     return environment.get_template(name)
+
+
+# what Markdown would take for its own, in words of ours or of a user's file
+_SPECIAL = str.maketrans(
+    {"|": "\\|", "*": "\\*", "`": "\\`", "[": "\\[", "<": "&lt;", "&": "&amp;", "\n": " "}
+)
+
+
+def _markdown(value: object) -> str:
+    """Words as a line of Markdown that shows them as they are."""
+    return str(value).translate(_SPECIAL)

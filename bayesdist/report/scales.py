@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from bayesdist.report.numerals import MISSING, number
 
-__all__ = ["Scale", "display_scale", "with_mas"]
+__all__ = ["Scale", "display_scale", "ladder", "with_mas"]
 
 # (factor, name) from the largest unit down
 _LADDERS: dict[str, tuple[tuple[float, str], ...]] = {
@@ -56,20 +56,25 @@ def display_scale(unit: str, values: ArrayLike) -> Scale:
     Scale
     """
     base, _, rate = unit.partition("/")
-    ladder = _LADDERS.get(base, ((1.0, base),))
+    steps = ladder(base)
     if rate:
-        ladder = tuple((factor, f"{name}/{rate}") for factor, name in ladder)
+        steps = tuple((factor, f"{name}/{rate}") for factor, name in steps)
     size = np.abs(np.asarray(values, float))
     size = size[np.isfinite(size)]
     largest = float(size.max()) if size.size else 0.0
     if largest == 0.0:
-        return Scale(*next(step for step in ladder if step[0] == 1.0))
+        return Scale(*next(step for step in steps if step[0] == 1.0))
     # pixels have no name for a thousandth, so that 0.0266 pix reads better than 26.6 × 10⁻³ pix
     readable = 0.000999 if base == "pix" else 0.0999
-    for factor, name in ladder:
+    for factor, name in steps:
         if largest * factor >= readable:
             return Scale(factor, name)
-    return Scale(*ladder[-1])
+    return Scale(*steps[-1])
+
+
+def ladder(unit: str) -> tuple[tuple[float, str], ...]:
+    """Units in which lengths of a native unit are shown: (factor, name), the largest first."""
+    return _LADDERS.get(unit, ((1.0, unit),))
 
 
 def with_mas(value: float, unit: str, scale_mas: float | None, digits: int = 3) -> str:

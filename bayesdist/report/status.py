@@ -8,6 +8,7 @@ import numpy as np
 
 from bayesdist.report.campaign.status import campaign_checks
 from bayesdist.report.context import Check, ReportInput
+from bayesdist.report.holdout import holdout_checks
 from bayesdist.report.margins import VERDICT_LEVELS
 from bayesdist.report.numerals import count, number, percent, rounded
 from bayesdist.report.scales import with_mas
@@ -50,9 +51,11 @@ def status_checks(inputs: ReportInput) -> dict[str, tuple[Check, ...]]:
     Returns
     -------
     dict of str to tuple of Check
-        Groups 'Campaign', 'Sampling', 'Fit', 'Requirements', 'Products'; empty ones are left out.
+        Groups 'Held-out truth', 'Campaign', 'Sampling', 'Fit', 'Requirements', 'Products'; empty
+        ones are left out.
     """
     groups = {
+        "Held-out truth": holdout_checks(inputs.held_out),
         "Campaign": () if inputs.campaign is None else campaign_checks(inputs.campaign),
         "Sampling": _sampling_checks(inputs),
         "Fit": _fit_checks(inputs),

@@ -79,7 +79,7 @@ def test_the_report_judges_them_again_as_they_were_asked(run):
         ("region = [[1.0, 1.0], [2.0, 2.0], [3.0, 1.5]]", "holds 0 points"),
         ("epochs = [2010.0, 2012.0]", "does not depend on time"),
         ("separation = 5.0", "of two positions"),
-        ("magnitude = 10.0", "is not known"),
+        ("magnitude = 99.0", "were not measured"),
     ],
 )
 def test_scopes_that_cannot_be_judged_are_refused_in_one_sentence(run, line, message, capsys):

@@ -110,6 +110,20 @@ def test_bins_without_noise_have_no_errors():
             )
 
 
+def test_what_noise_hides_stays_in_order():
+    """Of noise alone extremes meet in the middle; they do not pass each other."""
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        noise = _bins(0.02 * rng.standard_normal((12, 12)), 0.02)
+        for row in (
+            bin_row("a", noise, absorbed=1, rng=rng),
+            pair_row("b", noise, absorbed=1, rng=rng),
+        ):
+            free = [row.noise_free[name] for name in ("min", "p01", "median", "p99", "max")]
+            assert free == sorted(free)
+            assert free[-1] - free[0] <= row.value["max"] - row.value["min"]
+
+
 WIDENED = ("sigma", "min", "max", "p01", "p99")
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.holdout import held_out_of, holdout_summary, holdout_table
 from bayesdist.app.horizon import horizons_of, write_horizons
 from bayesdist.app.periods import periods_of, periods_summary, periods_table
 from bayesdist.app.rundir import RunDirectory
@@ -56,7 +57,9 @@ SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
 
 def run_assess(session: Session) -> None:
     config, run = session.config, session.run
+    session.measure()
     periods_of(session, anew=True)  # the fit may be another one since
+    _assess_holdout(session)
     solution, grid, epoch = session.solution, config.assess.grid, session.epoch
     places = [{"grid": grid, "epoch": epoch, "chip": c.number} for c in solution.model.chips]
     formal = [uncertainty_map(session.fit, **place) for place in places]
@@ -91,6 +94,15 @@ def run_assess(session: Session) -> None:
     )
     worst = max(maps, key=lambda m: m.radius_max)
     log.info("assess: largest formal radius %.4g %s", worst.radius_max, worst.unit)
+
+
+def _assess_holdout(session: Session) -> None:
+    found = held_out_of(session, anew=True)
+    if found is None:
+        return
+    write_table(holdout_table(found), session.run / "holdout.ecsv")
+    session.run.summarise(holdout=holdout_summary(found))
+    log.info("assess: %s", found.verdict)
 
 
 def _assess_periods(session: Session) -> None:
@@ -217,7 +229,10 @@ def margins_of(
     """Margins of a solution, as in `budget_of`; as many draws as configured by default."""
     doubt = ""
     if n_draws is None:
-        doubt = session.majority or (session.misfit.sentence if session.misfit.significant else "")
+        doubt = session.majority or _unaccounted(session)
+        held = held_out_of(session)
+        if not doubt and held is not None and held.doubtful:
+            doubt = held.verdict
     centroid = None
     if any(r.magnitude is not None for r in requirements):
         if n_draws is None:
@@ -233,6 +248,14 @@ def margins_of(
     if doubt or n_draws is not None:
         return margins
     return tuple(_where_stars_are(session, margin) for margin in margins)
+
+
+def _unaccounted(session: Session) -> str:
+    """Structure in the residuals that no error stands for; empty where there is none."""
+    shared = session.shared_errors
+    if not session.misfit.significant or (shared is not None and shared.trusted):
+        return ""
+    return session.misfit.sentence
 
 
 def _of_any_star(session: Session, requirement: Requirement) -> Requirement:
@@ -291,8 +314,14 @@ def labelled(session: Session) -> dict[str, str]:
 
 def posterior_warnings(session: Session) -> list[str]:
     """Those of the fit, and before them what must be said of the draws."""
-    label, periods = session.posterior.approximation, periods_of(session)
+    label, periods, held = (
+        session.posterior.approximation,
+        periods_of(session),
+        held_out_of(session),
+    )
     out = [label[0].upper() + label[1:]] if label else []
+    if held is not None and held.level != "pass":
+        out.append(held.verdict[0].upper() + held.verdict[1:])
     out += warnings_of(session)
     return [*out, periods.verdict.rstrip(".")] if periods and periods.matters else out
 

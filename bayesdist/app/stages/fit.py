@@ -8,6 +8,7 @@ from typing import Any
 from astropy.table import Table
 
 from bayesdist.app.session import ERROR_COLUMNS, Session, write_table
+from bayesdist.assess.majority import majority_sentence
 from bayesdist.infer import LinearFit, save_fit
 from bayesdist.infer.skew import Skew, skew_of
 
@@ -29,6 +30,9 @@ def run_fit(session: Session) -> None:
     for stale in ("fit", "sums", "misfits", "stars"):
         session.__dict__.pop(stale, None)
     summarise_fit(session, fit)
+    majority = majority_sentence(fit)
+    if majority:  # said before hours of sampling
+        log.warning("fit: WARNING: %s", majority)
 
 
 def summarise_fit(session: Session, fit: LinearFit) -> None:

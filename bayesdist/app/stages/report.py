@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from bayesdist.app.campaign.report import campaign_results
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.holdout import held_out_of
 from bayesdist.app.horizon import kept_horizons
 from bayesdist.app.periods import periods_of
 from bayesdist.app.rundir import as_json
 from bayesdist.app.session import Session
 from bayesdist.app.stages.assess import (
     budget_of,
+    errors_of,
     judged_requirements,
     margins_of,
     posterior_warnings,
@@ -25,8 +27,10 @@ from bayesdist.assess import (
     flagged_by_exposure,
     uncertainty_map,
 )
+from bayesdist.assess.budget_surface import BudgetSurface, budget_surface
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.mosaic import chip_places
+from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
     from bayesdist.report.context import ChipResults
@@ -35,6 +39,7 @@ __all__ = ["run_report"]
 
 log = logging.getLogger("bayesdist")
 
+YEARS_AHEAD = 10.0  # to which the page extrapolates the budget
 VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
 
 
@@ -47,6 +52,7 @@ def run_report(session: Session) -> None:
         all_figures,
         drawn,
         save_images,
+        save_pdfs,
         write_report,
     )
 
@@ -73,6 +79,7 @@ def run_report(session: Session) -> None:
         chips=_chip_results(session),
         coefficients=coefficient_table(fit, session.solution),
         budget=budget_of(session),
+        surface=_surface(session),
         # the requirements that were judged last, be it by `assess` or by `validate`
         margins=margins_of(session, judged),
         horizons=kept_horizons(run / "horizon.ecsv", judged),
@@ -80,6 +87,7 @@ def run_report(session: Session) -> None:
         warnings=tuple(posterior_warnings(session)),
         misfits=() if isinstance(session, CampaignSession) else session.misfits,
         periods=periods_of(session),
+        held_out=held_out_of(session),
         magnitude_errors=session.magnitude_errors,
         flagged=flagged_by_exposure(session.shards, posterior) if several else None,
         provenance={
@@ -89,14 +97,30 @@ def run_report(session: Session) -> None:
     if isinstance(session, CampaignSession):
         inputs = replace(inputs, campaign=campaign_results(session))
     figures = all_figures(inputs)
-    names = [f"{name}.png" for name in figures]
+    names = [f"{name}.{kind}" for name in figures for kind in ("png", "pdf")]
     for stale in set(run.summary.get("figures", [])) - set(names):
         (run / "figures" / stale).unlink(missing_ok=True)
     run.summarise(figures=names)
     images = drawn(figures)
     save_images(images, run / "figures")
+    save_pdfs(figures, run / "figures")
     write_report(run / "report.html", inputs, images)
     log.info("report: %s", run / "report.html")
+
+
+def _surface(session: Session) -> BudgetSurface | None:
+    """The budget for the page to compute from; None where its errors contradict each other."""
+    try:
+        errors = errors_of(session)
+    except InputError as error:  # what is said to be in the residuals is larger than these
+        log.warning("report: WARNING: the page's budget has no position and no epoch: %s", error)
+        return None
+    years, epochs = None, session.stars.table.epoch
+    if session.solution.model.time is not None and epochs is not None:
+        seen = [*epochs, session.epoch]
+        years = float(min(seen)), float(max(seen)) + YEARS_AHEAD
+    sources = {t.name: t.source for t in session.field_terms if hasattr(t, "source")}
+    return budget_surface(errors, epoch=session.epoch, years=years, sources=sources)
 
 
 def _chip_results(session: Session) -> tuple[ChipResults, ...]:

@@ -132,6 +132,7 @@ def _line_table(
         tuple(rows),
         words=(0, 2),
         note=f"{MISSING}: no rate is fitted." if any(MISSING in row for row in rows) else "",
+        detail=True,
     )
 
 
@@ -190,6 +191,7 @@ def _changes(breaks: list[Mapping[str, Any]], unit: str) -> TextTable:
         rows,
         words=(1, 2),
         note=f"Beyond {_SIGNIFICANT:g} σ a change is hardly chance.",
+        detail=True,
     )
 
 

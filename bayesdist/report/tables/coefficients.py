@@ -42,7 +42,8 @@ def coefficient_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
             others[:MOST_ROWS],
             with_unit=True,
         )
-        out.append(replace(table, note=_notes(_held_note(fixed_others), further(len(others)))))
+        note = _notes(_held_note(fixed_others), further(len(others)))
+        out.append(replace(table, note=note, detail=True))
     out += [_monomial_table(inputs, chip.number) for chip in inputs.fit.model.chips]
     return tuple(out)
 
@@ -160,4 +161,5 @@ def _monomial_table(inputs: ReportInput, chip: int) -> TextTable:
             " if they were independent. The covariance stands in the products.",
             gauge,
         ),
+        detail=True,
     )

@@ -66,6 +66,7 @@ def _magnitude_table(inputs: ReportInput) -> TextTable:
         ("Magnitude", "Stars", f"σ u [{scale.unit}]", f"σ v [{scale.unit}]"),
         rows,
         words=(),
+        detail=True,
     )
 
 
@@ -95,4 +96,5 @@ def _exposure_table(inputs: ReportInput) -> TextTable:
         ),
         rows[:MOST_ROWS],
         note=further(len(rows)),
+        detail=True,
     )

@@ -14,6 +14,9 @@ from bayesdist.report.tables.text import TextTable, listing
 __all__ = ["config_table", "provenance_tables"]
 
 
+_DETAILS = ("stages", "timings")
+
+
 def _plain(value: Any) -> str:
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: MISSING}[value]
@@ -42,7 +45,11 @@ def provenance_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
         if isinstance(value, Mapping):
             unit = " [s]" if key == "timings" else ""
             out.append(
-                listing(f"{key.capitalize()}{unit}", {str(k): _plain(v) for k, v in value.items()})
+                listing(
+                    f"{key.capitalize()}{unit}",
+                    {str(k): _plain(v) for k, v in value.items()},
+                    detail=key in _DETAILS,
+                )
             )
     return tuple(out)
 
@@ -57,4 +64,4 @@ def config_table(inputs: ReportInput) -> TextTable | None:
             pairs.update({f"{section} {k}": _plain(v) for k, v in enumerate(value, start=1)})
         else:
             pairs[str(section)] = _plain(value)
-    return listing("Resolved configuration", pairs) if pairs else None
+    return listing("Resolved configuration", pairs, detail=True) if pairs else None

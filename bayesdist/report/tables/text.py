@@ -27,6 +27,8 @@ class TextTable:
         Columns that hold words; the others hold numbers.
     note : str
         Below the table.
+    detail : bool
+        Whether the page leaves the table out when it is printed.
     """
 
     caption: str
@@ -34,6 +36,7 @@ class TextTable:
     rows: tuple[tuple[str, ...], ...]
     words: tuple[int, ...] = (0,)
     note: str = ""
+    detail: bool = False
 
 
 def marked(inputs: ReportInput, text: str) -> str:
@@ -41,9 +44,12 @@ def marked(inputs: ReportInput, text: str) -> str:
     return f"{text}\u202f†" if inputs.provisional and text != MISSING else text
 
 
-def listing(caption: str, pairs: Mapping[str, str], note: str = "") -> TextTable:
+def listing(
+    caption: str, pairs: Mapping[str, str], note: str = "", *, detail: bool = False
+) -> TextTable:
     """A plain list of names and values."""
-    return TextTable(caption, ("", ""), tuple(pairs.items()), words=(0, 1), note=note)
+    rows = tuple(pairs.items())
+    return TextTable(caption, ("", ""), rows, words=(0, 1), note=note, detail=detail)
 
 
 def further(n: int) -> str:

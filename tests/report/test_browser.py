@@ -1,0 +1,304 @@
+"""The page in a browser: what its script computes equals the assessment, and nothing else is asked.
+
+Truth is `place_budget` and the rows of `budget.ecsv`, which know nothing of the page.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bayesdist.assess import UserTerm
+from bayesdist.assess.budget_surface import budget_surface
+from bayesdist.assess.detector_budget import detector_budget
+from bayesdist.assess.linear_term import LinearTerm
+from bayesdist.assess.place_budget import place_budget
+from bayesdist.assess.position_errors import position_errors
+from bayesdist.assess.terms import LocalTerm
+from bayesdist.data.magnitude_errors import estimate
+from bayesdist.report import drawn
+from bayesdist.report.html import write_report
+from bayesdist.report.margins import margins_against_limits
+
+from .runs import TERMS, report_input
+
+selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+DRIVER = shutil.which("chromedriver")
+pytestmark = [
+    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium"),
+    pytest.mark.skipif(not DRIVER, reason="there is no chromedriver"),
+]
+
+GRID, DRAWS, SCALE = (9, 7), 400, 2757.0
+YEARS = (2009.5, 2020.5)
+OPTIONS = (
+    "--headless=new --no-sandbox --disable-gpu --no-first-run --disable-background-networking"
+    " --disable-component-update --disable-sync --disable-dev-shm-usage"
+).split()
+
+
+@pytest.fixture(scope="module")
+def asked():
+    """A run of two chips that drifts, the draws behind its budget, and that budget."""
+    run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
+    solution, rng = run.solution, np.random.default_rng(4)
+    local = {c.chip.number: rng.uniform(0.001, 0.01, (*GRID[::-1], 2)) for c in run.chips}
+    what = {
+        "terms": (*TERMS, UserTerm("background", "random", 0.003, 0.006)),
+        "fields": (LinearTerm("aberration", "scale", 2e-6, solution, "a paper"),),
+        "local": (LocalTerm("look-up tables", local),),
+        "grid": GRID,
+        "n_draws": DRAWS,
+        "pixel_scale": SCALE,
+    }
+    mag, residual = (a[run.stars.used] for a in (run.stars.table.mag, run.stars.fit_residual))
+    errors = position_errors(
+        solution, centroid=estimate(mag, *residual.T), rng=np.random.default_rng(9), **what
+    )
+    budget = detector_budget(solution, epoch=2010.3, rng=np.random.default_rng(9), **what)
+    surface = budget_surface(errors, epoch=2010.3, years=YEARS, sources={"aberration": "a paper"})
+    run = replace(run, budget=budget, surface=surface)
+    return SimpleNamespace(run=run, errors=errors, budget=budget)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    options = selenium.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for one in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(one)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    driver = selenium.Chrome(options=options, service=selenium.ChromeService(DRIVER))
+    driver.get("about:blank")
+    driver.get_log("performance")  # what the browser's own first page asked for
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture(scope="module")
+def opened(asked, browser, tmp_path_factory):
+    path = tmp_path_factory.mktemp("run") / "report.html"
+    images = drawn({"margins": margins_against_limits(asked.run.margins)})
+    write_report(path, asked.run, images)
+    browser.get(path.as_uri())
+    return browser
+
+
+def requests(browser) -> list[str]:
+    return [
+        found
+        for entry in browser.get_log("performance")
+        for found in re.findall(r'"method":"Network.requestWillBeSent".*?"url":"(.*?)"',
+                                entry["message"])
+    ]  # fmt: skip
+
+
+def put(browser, **values):
+    """Set controls by their names, as a person does, in the order given."""
+    for name, value in values.items():
+        browser.execute_script(
+            "const e = document.getElementById('budget-' + arguments[0]);"
+            "e.value = arguments[1];"
+            "for (const n of ['input', 'change']) e.dispatchEvent(new Event(n, {bubbles: true}));",
+            name.rstrip("_"),
+            str(value),
+        )
+
+
+def shown(browser) -> dict[str, tuple[str, ...]]:
+    """Texts of u, v and radial by term."""
+    rows = browser.execute_script(
+        "return [...document.querySelectorAll('#budget-explorer tbody tr')]"
+        ".map(r => [...r.cells].map(c => c.textContent))"
+    )
+    return {name: tuple(cells[:3]) for name, *cells in rows}
+
+
+def agree(text: str, value: float) -> bool:
+    """Whether a text of three digits in pixels is the value, and its mas are too."""
+    if value == 0:
+        return text == "0\u202fpix (0\u202fmas)"
+    pix, mas = re.match(r"([\d.]+)\u202fpix \(([\d.]+)\u202f(mas|µas|arcsec)\)", text).group(1, 2)
+    unit = {"mas": 1.0, "µas": 1e-3, "arcsec": 1e3}[text.rstrip(")").rsplit("\u202f", 1)[1]]
+    found = (float(pix), float(mas) * unit)
+    # half of the third digit, and the rounding of the numbers in the page
+    return all(
+        abs(f - v) <= 0.5001 * 10 ** (np.floor(np.log10(v)) - 2) + 1e-5 * v
+        for f, v in zip(found, (value, value * SCALE), strict=True)
+    )
+
+
+def test_at_first_it_is_the_table_of_the_budget(asked, opened):
+    """All terms and the total, averaged over both chips at the budget's epoch."""
+    found = shown(opened)
+    for row in asked.budget.rows():
+        texts = found[row["name"]]
+        assert all(agree(t, row[k]) for t, k in zip(texts, ("u", "v", "radial"), strict=True)), (
+            row,
+            texts,
+        )
+    extra = set(found) - {r["name"] for r in asked.budget.rows()}
+    assert extra <= {"correlation of the parts"}
+
+
+@pytest.mark.parametrize(
+    ("chip", "x", "y", "epoch", "magnitude"),
+    [
+        (0, 1.0, 1.0, 2010.3, None),
+        (0, 1500.0, 700.5, 2015.0, None),
+        (1, 4096.0, 3.25, 2020.5, 13.0),
+        (1, 700.0, 1999.0, 2009.5, 15.2),
+        (0, 3333.0, 444.0, 2012.55, 99.0),
+    ],
+)
+def test_a_position_is_that_of_the_assessment(asked, opened, chip, x, y, epoch, magnitude):
+    mag = "" if magnitude is None else magnitude
+    put(opened, mode="one", chip=chip, ax=x, ay=y, epoch=epoch, mag=mag)
+    truth = place_budget(
+        asked.errors, x, y, chip=chip + 1, epoch=slider(opened), magnitude=magnitude
+    )
+    assert slider(opened) == pytest.approx(epoch, abs=0.026)  # the slider's steps
+    found = shown(opened)
+    assert [t.name for t in truth.terms if t.name not in found] == []
+    for term in truth.terms:
+        values = (term.u[0], term.v[0], term.radial[0])
+        assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
+
+
+def control(browser, name) -> float:
+    script = "return document.getElementById('budget-' + arguments[0]).value"
+    return float(browser.execute_script(script, name))
+
+
+def slider(browser) -> float:
+    return control(browser, "epoch")
+
+
+def test_the_difference_of_two_positions_is_that_of_the_assessment(asked, opened):
+    put(opened, mode="two", chip=1, epoch=2018.0, mag=14.0, ax=100, ay=200, bx=3000.5, by=1500)
+    truth = place_budget(
+        asked.errors,
+        [100.0, 3000.5],
+        [200.0, 1500.0],
+        chip=2,
+        epoch=slider(opened),
+        magnitude=14.0,
+        relative=True,
+    )
+    found = shown(opened)
+    for term in truth.terms:
+        values = (term.u[0], term.v[0], term.radial[0])
+        assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
+    # what both positions share: the frames of this run are shifts
+    assert [t.name for t in truth.terms if t.radial[0] == 0] == [
+        "exposure frame",
+        "reference catalogue",
+    ]
+
+
+def test_the_slider_and_the_button_change_the_numbers(asked, opened):
+    put(opened, mode="rms", mag="", epoch=2010.3)
+    early = shown(opened)
+    put(opened, epoch=2020.5)
+    late = shown(opened)
+    assert early["time dependence"] != late["time dependence"]
+    assert early["coefficients"] == late["coefficients"]  # at the zero point of the drift
+    opened.find_element("xpath", "//button[text()='As in the table']").click()
+    total = asked.budget.rows()[-1]
+    assert agree(shown(opened)["total"][2], total["radial"])
+
+
+def test_keys_and_clicks_choose_a_position(opened):
+    from selenium.webdriver.common.keys import Keys
+
+    chip = opened.find_elements("css selector", "#budget-explorer .chip")[0]
+    opened.execute_script("arguments[0].scrollIntoView({block: 'center'})", chip)
+    chip.click()  # its middle
+    place = [control(opened, f"a{axis}") for axis in "xy"]
+    assert place == pytest.approx([2048.5, 1024.5], abs=25)  # a pixel of the screen is some twelve
+    chip.send_keys(Keys.ARROW_RIGHT)
+    moved = control(opened, "ax")
+    assert moved - place[0] == pytest.approx(41, abs=1)  # a hundredth of the chip
+    assert "pixel" in opened.find_element("css selector", "[aria-live]").text
+
+
+def test_tables_sort_by_value_and_keep_the_total_below(opened):
+    table = opened.find_element("css selector", "#budget table.grid")
+    radial = table.find_elements("css selector", "thead th")[-1]
+
+    def column():
+        rows = opened.execute_script(
+            "return [...arguments[0].tBodies[0].rows].map(r =>"
+            " [r.cells[0].textContent, r.cells[r.cells.length - 1].textContent])",
+            table,
+        )
+        return [(n, float(t.split("\u202f")[0])) for n, t in rows]
+
+    before = column()
+    for order, sign in (("ascending", 1), ("descending", -1)):
+        opened.execute_script("arguments[0].querySelector('button').click()", radial)
+        assert radial.get_attribute("aria-sort") == order
+        values = [sign * v for n, v in column() if n != "total"]
+        assert values == sorted(values)
+        assert {n for n, _ in column()[-3:]} == {"total"}
+    assert sorted(before) == sorted(column())
+    assert len(before) > 6
+
+
+def test_signs_and_powers_of_ten_sort_as_numbers(opened):
+    texts = [
+        "−2.5",
+        "3.1 × 10⁻⁶",
+        "0.002",
+        "12\u202f345",
+        "999 µas",
+        "1.2 arcsec",
+        "–",
+        "∞",
+        "4 mas",
+    ]
+    worth = opened.execute_script("return arguments[0].map(t => [worth(t)].map(String)[0])", texts)
+    expected = [-2.5, 3.1e-6, 0.002, 12345.0, 0.999, 1200.0, np.nan, np.inf, 4.0]
+    found = [float(w.replace("Infinity", "inf")) for w in worth]
+    np.testing.assert_allclose(found, expected)
+
+
+def test_a_pointer_reads_the_maps(asked, opened):
+    """At a point of the grid the reading is the map's own value."""
+    best = asked.run.chips[0].best_map
+    opened.execute_script(
+        "const s = document.getElementById('map-layer'); s.value = arguments[0];"
+        "s.dispatchEvent(new Event('change'));", str(len(asked.run.chips[0].maps) - 1))  # fmt: skip
+    reading = opened.execute_script(
+        "const c = document.querySelector('#map-reader .chip'), b = c.getBoundingClientRect();"
+        "c.dispatchEvent(new PointerEvent('pointermove',"
+        " {clientX: b.left + 0.01, clientY: b.bottom - 0.01}));"
+        "return document.querySelector('#map-reader .reading').textContent")  # fmt: skip
+    where, value = reading.split(": ")
+    assert where == "pixel (1, 1) of WFC2"
+    assert agree(value, best.radius[0, 0])
+
+
+@pytest.mark.parametrize("width", [390, 1440])
+def test_the_page_is_as_wide_as_the_screen(opened, width):
+    opened.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False},
+    )
+    wide = opened.execute_script("return document.documentElement.scrollWidth")
+    opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert wide <= width
+
+
+def test_no_error_is_logged_and_nothing_leaves_the_page(opened):
+    """Last, after all that was done above, and from the first moment on."""
+    opened.refresh()
+    assert opened.get_log("browser") == []
+    asked = requests(opened)
+    assert asked and all(url.startswith(("file:", "data:")) for url in asked)
