@@ -162,7 +162,7 @@ def _misfit(new: NewFit) -> Misfit:
     sums = shards.sum(star_sums, fit.mean, fit.clip, wanted)
     for number, bins in partitions.items():
         binned = {name: sums.binned[number, size] for name, size in bins.items()}
-        out.append(misfit_of(binned, n_params=2 * fit.model.n_terms, unit=fit.unit))
+        out.append(misfit_of(binned, order=fit.model.order, unit=fit.unit))
     return worst_misfit(out)
 
 

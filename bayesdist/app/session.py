@@ -302,7 +302,7 @@ class Session:
             sums = {
                 name: self.sums.binned[chip.number, bins[name]] for name in bins if name != "shown"
             }
-            found = misfit_of(sums, n_params=2 * fit.model.n_terms, unit=fit.unit)
+            found = misfit_of(sums, order=fit.model.order, unit=fit.unit)
             out.append(replace(found, chip=chip) if len(fit.model.chips) > 1 else found)
         return tuple(out)
 

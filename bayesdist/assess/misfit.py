@@ -10,12 +10,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from bayesdist.assess.residuals import BinnedResiduals, BinnedSums
 from bayesdist.model import Chip
+from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["MOST_BINS", "STARS_PER_BIN", "Misfit", "misfit_of", "partitions_for", "worst_misfit"]
+
+Float = NDArray[np.float64]
 
 STARS_PER_BIN = 25
 MOST_BINS = 32  # along each side
@@ -83,15 +88,15 @@ def partitions_for(n: int) -> dict[str, tuple[int, int]]:
     return {"cells": (side, side), "columns": (strips, 1), "rows": (1, strips)}
 
 
-def misfit_of(sums: Mapping[str, BinnedSums], *, n_params: int, unit: str) -> Misfit:
+def misfit_of(sums: Mapping[str, BinnedSums], *, order: int | None = None, unit: str) -> Misfit:
     """Test residuals for structure over the detector.
 
     Parameters
     ----------
     sums : mapping of str to BinnedSums
         Of the residuals of the stars that were not rejected, in each of `partitions_for` so many.
-    n_params : int
-        Polynomial coefficients of both axes, which the fit has taken out of the residuals.
+    order : int, optional
+        Of the polynomial that the fit has taken out of the residuals of both axes.
     unit : str
         Of the residuals.
 
@@ -99,7 +104,7 @@ def misfit_of(sums: Mapping[str, BinnedSums], *, n_params: int, unit: str) -> Mi
     -------
     Misfit
     """
-    found = [(*_test(one.residuals(), n_params), name) for name, one in sums.items()]
+    found = [(*_test(one.residuals(), _absorbed(one, order)), name) for name, one in sums.items()]
     p, structure, name = min(found)
     return Misfit(min(1.0, len(found) * p), name, structure, unit)
 
@@ -121,7 +126,28 @@ def worst_misfit(found: Sequence[Misfit]) -> Misfit:
     return replace(worst, p_value=min(1.0, len(found) * worst.p_value))
 
 
-def _test(cells: BinnedResiduals, n_params: int) -> tuple[float, float]:
+def _absorbed(sums: BinnedSums, order: int | None) -> float:
+    """Degrees of freedom, of both axes, that means over these bins have lost to the polynomial.
+
+    A term takes from the bins what it keeps when it is averaged over them: nothing where it
+    oscillates within a bin, as all that vary along a column do in columns.
+    """
+    if order is None:
+        return 0.0
+    kept_y, kept_x = (_kept(n, order) for n in sums.count.shape)
+    return 2.0 * sum(kept_x[i] * kept_y[j] for i, j in polynomial_terms(order))
+
+
+def _kept(n: int, order: int) -> Float:
+    """Mean square of each Legendre polynomial, averaged over n equal bins, over its mean square."""
+    edges = np.linspace(-1.0, 1.0, n + 1)
+    degrees = np.arange(order + 1)
+    integrals = [legendre.Legendre.basis(k).integ()(edges) for k in degrees]
+    means = np.diff(integrals, axis=1) * n / 2
+    return (2 * degrees + 1) * np.mean(means**2, axis=1)
+
+
+def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:
     good = cells.count >= 5
     n = cells.count[good]
     # the square of a t variable is larger than that of a normal one
@@ -129,7 +155,6 @@ def _test(cells: BinnedResiduals, n_params: int) -> tuple[float, float]:
     mean = np.stack([cells.mean_u[good], cells.mean_v[good]])
     sem = np.stack([cells.sem_u[good], cells.sem_v[good]]) / shrink
     total = float(((mean / sem) ** 2).sum())
-    # a fit of few stars has taken most of the structure that bins could show
-    dof = max(mean.size - (n_params if mean.size > 2 * n_params else 0), 1)
+    dof = max(mean.size - absorbed * n.size / cells.count.size, 1.0)
     excess = (mean**2 - sem**2).sum(axis=0).mean() if n.size else 0.0
     return float(chi2.sf(total, dof)), float(np.sqrt(max(excess, 0.0)))

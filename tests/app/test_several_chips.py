@@ -266,7 +266,7 @@ def test_structure_is_looked_for_on_each_chip(run):
             expected = binned_residuals(*arrays, bins=bins[name], size=chip.size)
             np.testing.assert_array_equal(one.residuals().count, expected.count)
             np.testing.assert_allclose(one.residuals().mean_u, expected.mean_u, atol=1e-9)
-        p[chip.number] = misfit_of(sums, n_params=2 * fit.model.n_terms, unit="pix").p_value
+        p[chip.number] = misfit_of(sums, order=fit.model.order, unit="pix").p_value
     found = summary_of(run)["misfit"]
     assert {c["chip"]: c["p_value"] for c in found["chips"]} == p
     worst = min(p, key=p.get)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from numpy.polynomial import legendre
 from scipy.stats import binom
 
 from bayesdist.assess import Misfit, binned_sums, misfit_of, partitions_for
@@ -17,10 +19,10 @@ def _stars(n, rng):
     return x, y, 0.05 * rng.standard_normal((n, 2)) * np.exp(0.5 * rng.normal(size=(n, 1)))
 
 
-def _misfit(x, y, r):
+def _misfit(x, y, r, order=None):
     partitions = partitions_for(len(x))
     sums = {k: binned_sums(x, y, *r.T, bins=b, size=SIZE) for k, b in partitions.items()}
-    return misfit_of(sums, n_params=0, unit="pix")
+    return misfit_of(sums, order=order, unit="pix")
 
 
 def test_noise_is_no_structure():
@@ -33,6 +35,25 @@ def test_noise_is_no_structure():
     p = np.array(p)
     assert (p < 0.01).sum() <= binom.ppf(0.999, 200, 0.01)
     assert p.min() > 1e-4
+
+
+@pytest.mark.parametrize("order", [1, 4, 7])
+def test_what_a_polynomial_leaves_of_noise_is_no_structure(order):
+    """200 data sets, fitted by numpy: p-values are those of chance, in no partition too small."""
+    rng = np.random.default_rng(order)
+    p = []
+    for _ in range(200):
+        x, y, r = _stars(3000, rng)
+        X, Y = (x - 500.5) / 500, (y - 400.5) / 400
+        i, j = np.array([(i, j) for i in range(order + 1) for j in range(order + 1 - i)]).T
+        design = legendre.legvander2d(X, Y, [order, order])[:, i * (order + 1) + j]
+        left = r - design @ np.linalg.lstsq(design, r, rcond=None)[0]
+        p.append(_misfit(x, y, left, order).p_value)
+    p = np.array(p)
+    for level in (0.01, 0.1, 0.3):
+        # three tests share the probability: Bonferroni leaves them a little too careful
+        assert (p < level).sum() <= binom.ppf(0.999, 200, level)
+    assert (p < 0.3).sum() >= binom.ppf(0.001, 200, 0.2)
 
 
 def test_a_step_in_a_column_is_found_with_its_size():
