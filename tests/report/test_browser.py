@@ -154,7 +154,7 @@ def test_at_first_it_is_the_table_of_the_budget(asked, opened):
         (0, 1500.0, 700.5, 2015.0, None),
         (1, 4096.0, 3.25, 2020.5, 13.0),
         (1, 700.0, 1999.0, 2009.5, 15.2),
-        (0, 3333.0, 444.0, 2012.55, 99.0),
+        (0, 3333.0, 444.0, 2012.55, 15.5),
     ],
 )
 def test_a_position_is_that_of_the_assessment(asked, opened, chip, x, y, epoch, magnitude):
