@@ -7,7 +7,7 @@ common, make errors of coefficients that no posterior of independent stars shows
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from bayesdist.assess.unmodelled import Unmodelled, unmodelled
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.recoloured import recolouring
+from bayesdist.infer.recoloured import with_spread
 from bayesdist.infer.robust import recommended_cells, robust_covariance
 
 if TYPE_CHECKING:
@@ -98,8 +98,7 @@ class SharedErrors:
         """The posterior with its draws spread to the larger covariance; they keep their shape."""
         if not self.exceeds:
             return posterior
-        spread, mean = recolouring(self.formal, self.cov), posterior.mean
-        return replace(posterior, theta=mean + (posterior.theta - mean) @ spread.T)
+        return with_spread(posterior, self.formal, self.cov)
 
     def local_term(self, grid: tuple[int, int]) -> tuple[LocalTerm, ...]:
         """What is left out at a place, as a term of the budget; nothing where none is found."""

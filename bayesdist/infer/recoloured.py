@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.views import Derived, Solution
 from bayesdist.model import DistortionModel
 
-__all__ = ["Recoloured", "recolouring"]
+__all__ = ["Recoloured", "recolouring", "with_spread"]
 
 Float = NDArray[np.float64]
 
@@ -62,6 +63,24 @@ class Recoloured(Derived):
         mean = np.asarray(self.mean)
         theta = np.asarray(self.source.draws(n, rng), float)
         return np.asarray(mean + (theta - mean) @ self._map.T)
+
+
+def with_spread(posterior: Posterior, before: Float, after: Float) -> Posterior:
+    """A posterior whose deviations of one covariance are given another; its mean stays.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    before, after : ndarray, shape (D, D)
+        Positive definite.
+
+    Returns
+    -------
+    Posterior
+        With other draws of theta; all else is as it was.
+    """
+    spread, mean = recolouring(before, after), posterior.mean
+    return replace(posterior, theta=mean + (posterior.theta - mean) @ spread.T)
 
 
 def recolouring(before: Float, after: Float) -> Float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,7 @@ from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.recoloured import recolouring
+from bayesdist.infer.recoloured import with_spread
 from bayesdist.infer.star_errors import StarCovariance, star_covariance
 
 if TYPE_CHECKING:
@@ -148,6 +147,4 @@ def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovarianc
     formal = np.asarray(fit.cov, float)
     wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
     before = wider * formal
-    spread = recolouring(before, before + stars.extra)
-    mean = posterior.mean
-    return replace(posterior, theta=mean + (posterior.theta - mean) @ spread.T)
+    return with_spread(posterior, before, before + stars.extra)
