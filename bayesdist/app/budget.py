@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.campaign.session import session_of
+from bayesdist.app.judging import errors_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
 from bayesdist.app.stages import require
-from bayesdist.app.stages.assess import errors_of
 from bayesdist.assess.budget import TOTAL
 from bayesdist.assess.place_budget import PlaceBudget, place_budget
 from bayesdist.assess.verdict import effective_draws

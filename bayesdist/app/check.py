@@ -14,7 +14,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number
 from bayesdist.app.session import Session
 from bayesdist.app.stages import rehearse
-from bayesdist.app.stages.assess import warnings_of
+from bayesdist.app.trust import warnings_of
 from bayesdist.infer import Limits
 from bayesdist.infer.certified import PILOTS, has_second_stage
 from bayesdist.infer.plan import expected_passes

@@ -323,14 +323,10 @@ def _validate(options: argparse.Namespace) -> int:
     from bayesdist.app.config import load_requirements
     from bayesdist.app.demo import margins_text
     from bayesdist.app.horizon import write_horizons
+    from bayesdist.app.judging import assessed_horizons, margins_of
+    from bayesdist.app.margins import margin_rows, write_margins
     from bayesdist.app.rundir import RunDirectory
     from bayesdist.app.stages import require
-    from bayesdist.app.stages.assess import (
-        assessed_horizons,
-        margin_rows,
-        margins_of,
-        write_margins,
-    )
 
     requirements = load_requirements(options.requirements)
     with closing(session_of(RunDirectory.open(options.run))) as session:

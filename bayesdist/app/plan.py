@@ -10,10 +10,11 @@ import numpy as np
 
 from bayesdist.app.campaign.session import session_of
 from bayesdist.app.horizon import last_epoch
+from bayesdist.app.judging import probability_met
+from bayesdist.app.margins import judged_requirements
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.stages import require
-from bayesdist.app.stages.assess import judged_requirements, probability_met
 from bayesdist.assess.planning import Schedule, exposures_needed
 from bayesdist.assess.requirement import Requirement
 from bayesdist.assess.solution import Solution

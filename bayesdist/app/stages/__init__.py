@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
+from bayesdist.app.judging import budget_of, margins_of
 from bayesdist.app.periods import check_pairs
 from bayesdist.app.session import Session
-from bayesdist.app.stages.assess import budget_of, margins_of, run_assess
+from bayesdist.app.stages.assess import run_assess
 from bayesdist.app.stages.export import idctab_of, run_export, sip_of, wise_sip_of
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.report import run_report

@@ -11,16 +11,12 @@ from bayesdist.app.campaign.report import campaign_results
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.horizon import kept_horizons
+from bayesdist.app.judging import budget_of, errors_of, margins_of
+from bayesdist.app.margins import judged_requirements
 from bayesdist.app.periods import periods_of
 from bayesdist.app.rundir import as_json
 from bayesdist.app.session import Session
-from bayesdist.app.stages.assess import (
-    budget_of,
-    errors_of,
-    judged_requirements,
-    margins_of,
-    posterior_warnings,
-)
+from bayesdist.app.trust import posterior_warnings
 from bayesdist.assess import (
     area_map,
     distortion_vectors,

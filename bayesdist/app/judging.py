@@ -1,0 +1,155 @@
+"""What a session's solution is judged by: budget, margins, horizons."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from bayesdist.app.holdout import held_out_of
+from bayesdist.app.horizon import horizons_of
+from bayesdist.app.session import Session
+from bayesdist.assess import Margin, Requirement, check_requirements, pixel_scale_of
+from bayesdist.assess.detector_budget import DetectorBudget, detector_budget
+from bayesdist.assess.horizon import Horizon
+from bayesdist.assess.position_errors import PositionErrors, position_errors
+from bayesdist.assess.solution import Solution
+from bayesdist.errors import InputError
+
+__all__ = [
+    "assessed_horizons",
+    "budget_of",
+    "errors_of",
+    "margins_of",
+    "probability_met",
+]
+
+log = logging.getLogger("bayesdist")
+
+HORIZON_DRAWS = 1000  # for each of its epochs
+
+
+def _assessment(session: Session, solution: Solution | None, n_draws: int | None) -> dict[str, Any]:
+    """What a budget and margins have in common."""
+    config = session.config
+    what: dict[str, Any] = {"solution": solution}
+    if solution is None:
+        solution = session.solution
+        what = {
+            "solution": solution,
+            "fields": session.field_terms,
+            "aligned": session.systematics.aligned,
+        }
+    else:
+        what["fields"] = config.linear_terms(solution)
+    return what | {
+        "terms": config.user_terms(),
+        "local": session.local_terms,
+        "grid": config.assess.grid,
+        "epoch": session.epoch,
+        "n_draws": n_draws or config.assess.draws,
+        "rng": session.rng("assess"),
+        "pixel_scale": pixel_scale_of(solution, scale_mas=config.detector.scale_mas),
+    }
+
+
+def budget_of(
+    session: Session, solution: Solution | None = None, n_draws: int | None = None
+) -> DetectorBudget:
+    """The budget of the session's solution with all that is known of its errors.
+
+    Another solution is assessed by itself.
+    """
+    return detector_budget(**_assessment(session, solution, n_draws))
+
+
+def errors_of(session: Session) -> PositionErrors:
+    """Draws of all errors of a position, as budget and margins have them."""
+    what = _assessment(session, None, None)
+    del what["epoch"]
+    return position_errors(centroid=session.centroid, **what)
+
+
+def assessed_horizons(session: Session, requirements: Sequence[Requirement]) -> tuple[Horizon, ...]:
+    """Until when requirements are met, on fewer draws than their margins."""
+    if session.posterior.model.time is None or not requirements:
+        return ()
+    what = _assessment(session, None, min(HORIZON_DRAWS, session.config.assess.draws))
+    del what["epoch"]
+    centroid = session.centroid if any(r.magnitude is not None for r in requirements) else None
+    found = horizons_of(session, position_errors(centroid=centroid, **what), requirements)
+    for one in found:
+        log.info("assess: %s", one.sentence)
+    return found
+
+
+def probability_met(
+    session: Session, requirement: Requirement, candidate: Solution, n_draws: int
+) -> float:
+    """With which a requirement would be met if the session had another solution.
+
+    The same random numbers serve every candidate.
+    """
+    what = _assessment(session, None, n_draws) | {"solution": candidate}
+    [margin] = check_requirements(requirements=[requirement], centroid=session.centroid, **what)
+    return margin.probability_met
+
+
+def margins_of(
+    session: Session,
+    requirements: tuple[Requirement, ...],
+    solution: Solution | None = None,
+    n_draws: int | None = None,
+) -> tuple[Margin, ...]:
+    """Margins of a solution, as in `budget_of`; as many draws as configured by default."""
+    doubt = ""
+    if n_draws is None:
+        doubt = session.majority or _unaccounted(session)
+        held = held_out_of(session)
+        if not doubt and held is not None and held.doubtful:
+            doubt = held.verdict
+    centroid = None
+    if any(r.magnitude is not None for r in requirements):
+        if n_draws is None:
+            centroid = session.centroid
+        else:  # without a posterior centroids have no errors yet
+            requirements = tuple(_of_any_star(session, r) for r in requirements)
+    margins = check_requirements(
+        requirements=requirements,
+        doubt=doubt,
+        centroid=centroid,
+        **_assessment(session, solution, n_draws),
+    )
+    if doubt or n_draws is not None:
+        return margins
+    return tuple(_where_stars_are(session, margin) for margin in margins)
+
+
+def _unaccounted(session: Session) -> str:
+    """Structure in the residuals that no error stands for; empty where there is none."""
+    shared = session.shared_errors
+    if not session.misfit.significant or (shared is not None and shared.trusted):
+        return ""
+    return session.misfit.sentence
+
+
+def _of_any_star(session: Session, requirement: Requirement) -> Requirement:
+    """A requirement without its magnitude, if the matches have such."""
+    if requirement.magnitude is not None and not session.raw_matches.has_mag:
+        raise InputError(
+            f"names magnitude {requirement.magnitude:g}, and the matches have no magnitudes",
+            where=requirement.where,
+            do="name their column in [data.columns], or leave magnitude out",
+        )
+    return replace(requirement, magnitude=None)
+
+
+def _where_stars_are(session: Session, margin: Margin) -> Margin:
+    """A margin without verdict where it is judged on pixels that no stars cover."""
+    for one in session.coverages:
+        if margin.verdict != "undecided" and one.misses(
+            margin.requirement, session.config.assess.grid
+        ):
+            return replace(margin, verdict="undecided", reason=one.sentence)
+    return margin

@@ -1,0 +1,80 @@
+"""Margins as a run keeps them: rows of margins.ecsv and of summary.json."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.session import Session, write_table
+from bayesdist.app.trust import labelled, trust
+from bayesdist.assess import Margin, Requirement
+
+__all__ = ["judged_requirements", "margin_rows", "write_margins"]
+
+# of what a requirement is, beside chip and epoch
+SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
+
+
+def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
+    """Margins as plain rows, for files and for the screen."""
+    return [
+        {
+            "name": m.requirement.name,
+            "statistic": m.requirement.statistic,
+            "limit": m.requirement.limit,
+            "value": m.value,
+            "interval": list(m.interval),
+            "margin": m.margin,
+            "margin_percent": m.percent,
+            "unit": m.unit,
+            "epoch": m.epoch,
+            "chip": m.requirement.chip,
+            **{key: getattr(m.requirement, key) for key in SCOPE},
+            "probability": m.requirement.probability,
+            "probability_met": m.probability_met,
+            "mc_error": m.mc_error,
+            "verdict": m.verdict,
+            "reason": m.reason,
+            "worst": {"chip": m.worst.chip, "x": m.worst.x, "y": m.worst.y, "rms": m.worst.rms},
+            "remedy": None if m.remedy is None else m.remedy.sentence,
+        }
+        for m in margins
+    ]
+
+
+def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
+    """Replace the margins of a run: margins.ecsv and summary.json."""
+    rows = margin_rows(margins)
+    several = len(session.posterior.model.chips) > 1
+    columns: dict[str, list[Any]] = {}
+    for m, row in zip(margins, rows, strict=True):
+        flat = {k: v for k, v in row.items() if k not in ("interval", "worst", *SCOPE)}
+        flat["epoch"] = np.nan if flat["epoch"] is None else flat["epoch"]
+        flat["chip"] = "all" if flat["chip"] is None else str(flat["chip"])
+        flat["remedy"] = flat["remedy"] or ""
+        flat |= {"scope": m.requirement.scope, "lo95": m.interval[0], "hi95": m.interval[1]}
+        flat |= {f"worst_{key}": value for key, value in row["worst"].items()}
+        if not several:
+            del flat["chip"], flat["worst_chip"]
+        for name, value in flat.items():
+            columns.setdefault(name, []).append(value)
+    table = Table(columns)
+    table.meta = trust(session) | labelled(session)
+    write_table(table, session.run / "margins.ecsv")
+    session.run.summarise(margins=rows)
+
+
+def judged_requirements(run: RunDirectory) -> tuple[Requirement, ...]:
+    """The requirements behind the margins in summary.json."""
+    keys = ("name", "statistic", "limit", "unit", "probability", "epoch", "chip", *SCOPE)
+    out = []
+    for row in run.summary.get("margins", []):
+        # runs of earlier versions had one chip and named none, and no part of it
+        known = {k: row[k] for k in keys if row.get(k) is not None}
+        if "epochs" in known:
+            del known["epoch"]  # the worst one of them
+        out.append(Requirement(**known))
+    return tuple(out)

@@ -1,0 +1,58 @@
+"""What a reader of a run's numbers has to know: doubts, and whether they may be relied on."""
+
+from __future__ import annotations
+
+from bayesdist.app.holdout import held_out_of
+from bayesdist.app.periods import periods_of
+from bayesdist.app.session import Session
+
+__all__ = ["labelled", "posterior_warnings", "trust", "warnings_of"]
+
+LEAST_CHI2, MOST_CHI2 = 0.67, 1.5
+
+
+def warnings_of(session: Session) -> list[str]:
+    """What a reader of the numbers has to know, each as a sentence."""
+    fit, out = session.fit, [*session.doubts]
+    out += [one.sentence for one in session.coverages if one.significant]
+    if session.majority:
+        out.append(session.majority)
+    if session.misfit.significant:
+        out.append(session.misfit.sentence)
+    ratio = fit.chi2 / max(fit.dof, 1)
+    if ratio < LEAST_CHI2:
+        out.append(
+            f"chi-square per degree of freedom is {ratio:.2g}: the quoted errors are too large, "
+            "and with them all uncertainties"
+        )
+    if ratio > MOST_CHI2:
+        out.append(
+            f"chi-square per degree of freedom is {ratio:.3g} with the quoted errors: they are too "
+            "small, which the jitter takes up, or the model does not fit"
+        )
+    return [text[0].upper() + text[1:] for text in out]
+
+
+def trust(session: Session) -> dict[str, bool]:
+    """Whether the posterior may be relied on, for the head of a file."""
+    return {"converged": session.posterior.convergence.converged}
+
+
+def labelled(session: Session) -> dict[str, str]:
+    """What must be said of draws that are not exact, for the head of a file."""
+    label = session.posterior.approximation
+    return {"posterior": label} if label else {}
+
+
+def posterior_warnings(session: Session) -> list[str]:
+    """Those of the fit, and before them what must be said of the draws."""
+    label, periods, held = (
+        session.posterior.approximation,
+        periods_of(session),
+        held_out_of(session),
+    )
+    out = [label[0].upper() + label[1:]] if label else []
+    if held is not None and held.level != "pass":
+        out.append(held.verdict[0].upper() + held.verdict[1:])
+    out += warnings_of(session)
+    return [*out, periods.verdict.rstrip(".")] if periods and periods.matters else out
