@@ -142,6 +142,46 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("inspect", _inspect, "what a product or a posterior holds, and what is wrong in it")
     sub.add_argument("file", metavar="FILE")
 
+    def applied(name: str, function, text: str) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
+        sub = add(name, function, text)
+        sub.add_argument("file", metavar="FILE", help="an IDCTAB, a run, or what `compare` takes")
+        sub.add_argument("--filter", metavar="F", help="of an IDCTAB, or WISE band")
+        sub.add_argument("--epoch", type=float, metavar="T", help="decimal years, for what drifts")
+        sub.add_argument("--scale", type=float, metavar="S", help="of a corrected pixel")
+        return sub
+
+    pair = {"nargs": 2, "type": float}
+    sub = applied("apply", _apply, "pixels to the undistorted frame, or back, with their errors")
+    sub.add_argument("table", metavar="TABLE", help="columns x, y, chip; back: x_out, y_out")
+    sub.add_argument("-o", "--output", required=True, metavar="OUT", help=".ecsv, .csv or .fits")
+    sub.add_argument("--inverse", action="store_true", help="back to pixels")
+    text = "of the inverse: by Newton, by a polynomial fitted here, by INVERSE rows"
+    sub.add_argument(
+        "--method", choices=("newton", "polynomial", "table"), default="newton", help=text
+    )
+    sub.add_argument("--order", type=int, metavar="N", help="of the polynomial fitted")
+    sub.add_argument("--columns", nargs=2, metavar=("X", "Y"), help="names of the positions")
+    sub.add_argument("--chip", type=int, metavar="N", help="in place of a column")
+    text = "output pixel of the zero point; 0 0 by default"
+    sub.add_argument("--origin", metavar=("X", "Y"), help=text, **pair)
+    sub.add_argument("--vafactor", type=float, default=1.0, metavar="V", help="of the exposure")
+    sub.add_argument("--image", metavar="FLT", help="a calibrated image whose pixels these are")
+    sub.add_argument("--ltv", metavar=("LTV1", "LTV2"), help="of a subarray", **pair)
+    sub.add_argument("--corner", metavar=("X", "Y"), help="first pixel of a subarray", **pair)
+    sub.add_argument("--force", action="store_true", help="replace the file that is there")
+
+    sub = applied("pam", _pam, "pixel area maps, with their errors")
+    sub.add_argument("-o", "--output", required=True, metavar="OUT.fits")
+    sub.add_argument("--chip", type=int, metavar="N", help="in the primary HDU; all by default")
+    sub.add_argument("--image", metavar="FLT", help="a calibrated image that the maps are to fit")
+    sub.add_argument("--force", action="store_true", help="replace the file that is there")
+
+    text = "figures and numbers as in the ACS handbook, published ones beside"
+    sub = applied("handbook", _handbook, text)
+    sub.add_argument("-o", "--output", required=True, metavar="DIR", help="a new folder")
+    sub.add_argument("--detector", metavar="WFC", help="of ACS, whose numbers stand beside")
+    sub.add_argument("--magnification", type=float, metavar="M", help="of the vectors")
+
     sub = add("compare", _compare, "how two calibrations differ, and whether significantly")
     sub.add_argument("a", metavar="A", help="a run, posterior, fit, IDCTAB, SIP header, WISE file")
     sub.add_argument("b", metavar="B", help="the other one")
@@ -374,6 +414,30 @@ def _inspect(options: argparse.Namespace) -> None:
     from bayesdist.app.inspect import inspect
 
     print(inspect(options.file))
+
+
+def _apply(options: argparse.Namespace) -> None:
+    from bayesdist.app.apply import apply_to_table
+
+    names = "inverse method order columns chip filter epoch scale origin vafactor image ltv corner"
+    chosen = {name: getattr(options, name) for name in (*names.split(), "force")}
+    print(apply_to_table(options.file, options.table, options.output, **chosen))
+
+
+def _pam(options: argparse.Namespace) -> None:
+    from bayesdist.app.pam import write_area_maps
+
+    names = ("chip", "filter", "epoch", "scale", "image", "force")
+    chosen = {name: getattr(options, name) for name in names}
+    print(write_area_maps(options.file, options.output, **chosen))
+
+
+def _handbook(options: argparse.Namespace) -> None:
+    from bayesdist.app.handbook import handbook
+
+    names = ("filter", "epoch", "scale", "detector", "magnification")
+    chosen = {name: getattr(options, name) for name in names}
+    print(handbook(options.file, options.output, **chosen))
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -1,5 +1,13 @@
 """Calibration files that pipelines read, each with its uncertainty: written, read, and checked."""
 
+from bayesdist.products.application import (
+    Application,
+    OutputFrame,
+    Positions,
+    frame_that_holds,
+)
+from bayesdist.products.application_inverse import InversePolynomial, fitted_inverse
+from bayesdist.products.chips_in_frame import chips_of_idctab, chips_of_solution
 from bayesdist.products.d2im import read_d2im, write_d2im
 from bayesdist.products.idctab import IdcTab, read_idctab, write_idctab
 from bayesdist.products.idctab_build import idctab_from_solution
@@ -13,6 +21,7 @@ from bayesdist.products.orientation import Orientation
 from bayesdist.products.orientation_aperture import orientation_from_aperture
 from bayesdist.products.orientation_idctab import orientation_from_idctab
 from bayesdist.products.oriented import Oriented, oriented
+from bayesdist.products.pam import PixelAreaMap, pixel_area_map, write_pam
 from bayesdist.products.release import Period, Release, write_release
 from bayesdist.products.siaf import Aperture, read_aperture
 from bayesdist.products.sip import SipHeader
@@ -29,29 +38,40 @@ from bayesdist.products.sip_rotate import (
 )
 from bayesdist.products.sip_write import sip_header, write_sip
 from bayesdist.products.storable import Lost, Stored, storable
+from bayesdist.products.subarray import Subarray
 from bayesdist.products.wise_lint import lint_wise_band
 from bayesdist.products.wise_meta import WiseBand, read_wise_meta
 from bayesdist.products.wise_write import write_wise_meta
 
 __all__ = [
     "Aperture",
+    "Application",
     "Finding",
     "IdcTab",
     "Implied",
+    "InversePolynomial",
     "LookupFile",
     "Lost",
     "Orientation",
     "Oriented",
+    "OutputFrame",
     "Period",
+    "PixelAreaMap",
+    "Positions",
     "Release",
     "SipHeader",
     "Stored",
+    "Subarray",
     "WiseBand",
+    "chips_of_idctab",
+    "chips_of_solution",
     "coefficient_map",
     "describe",
     "describe_idctab",
     "describe_lookup_file",
     "describe_sip",
+    "fitted_inverse",
+    "frame_that_holds",
     "idctab_from_solution",
     "implied_values",
     "lint_idctab",
@@ -61,6 +81,7 @@ __all__ = [
     "orientation_from_aperture",
     "orientation_from_idctab",
     "oriented",
+    "pixel_area_map",
     "pixel_matrix",
     "read_aperture",
     "read_d2im",
@@ -79,6 +100,7 @@ __all__ = [
     "write_idctab",
     "write_lookup_file",
     "write_npol",
+    "write_pam",
     "write_release",
     "write_sip",
     "write_wise_meta",
