@@ -30,3 +30,34 @@ def rng() -> np.random.Generator:
 def full() -> bool:
     """Whether the statistical suites run at full size (BAYESDIST_FULL=1) or reduced."""
     return os.environ.get("BAYESDIST_FULL", "") not in ("", "0")
+
+
+# A run compiles the kernels that most tests need, and the files beside it none: a machine that has
+# none of them yet compiles once, not in each process.  What takes long is not left for the end.
+FIRST = ("tests/app/test_run.py", "tests/data/", "tests/model/", "tests/wise/", "tests/report/")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The order of FIRST, then that of the folders."""
+
+    def place(item: pytest.Item) -> int:
+        return next((k for k, name in enumerate(FIRST) if item.nodeid.startswith(name)), len(FIRST))
+
+    items.sort(key=place)
+
+
+# folders whose files look at the same thing, which is long in the making
+TOGETHER = ("tests/campaign/", "tests/report/")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """One process for all files of a folder of TOGETHER: what they share is made once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            own = super()._split_scope(nodeid)
+            return next((folder for folder in TOGETHER if own.startswith(folder)), own)
+
+    return Scheduling(config, log) if config.getvalue("dist") == "loadfile" else None

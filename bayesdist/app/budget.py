@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.campaign.session import session_of
-from bayesdist.app.judging import errors_of
+from bayesdist.app.judging import errors_of, products_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
 from bayesdist.app.stages import require
 from bayesdist.assess.budget import TOTAL
 from bayesdist.assess.place_budget import PlaceBudget, place_budget
+from bayesdist.assess.product_terms import PRODUCT
 from bayesdist.assess.verdict import effective_draws
 from bayesdist.errors import InputError
 
@@ -74,6 +75,7 @@ def budget_at(
             relative=bool(to),
             relative_error=noise,
             sources={t.name: t.source for t in session.field_terms},
+            products=products_of(session),
         )
         mas = session.config.detector.scale_mas if found.unit == "pix" else None
         return _text(found, at, mas)
@@ -118,4 +120,6 @@ def _text(found: PlaceBudget, at: tuple[float, float], scale_mas: float | None) 
             rows.append(row | {"source": t.source})
         lines += [place, table_text(rows), ""]
     lines.append("1 sigma; terms of the model are correlated and enter the total jointly")
+    if any(t.kind == PRODUCT for t in found.terms):
+        lines.append("rows of kind product come on top for whoever uses that file: in no total")
     return "\n".join(lines)

@@ -9,14 +9,21 @@ import numpy as np
 
 from bayesdist.app.comparison_files import write_comparison
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.solutions import solution_at
 from bayesdist.assess import DEFAULT_GRID
 from bayesdist.assess.calibration import Calibration, calibration_of_solution
 from bayesdist.assess.comparison import Comparison, compare
-from bayesdist.assess.comparison_verdict import comparison_lines, verdict
-from bayesdist.assess.solution import Solution
+from bayesdist.assess.comparison_gap import (
+    ChipPair,
+    GapDifference,
+    gap_difference,
+    pair_of_solution,
+)
+from bayesdist.assess.comparison_verdict import comparison_lines, gap_lines, gap_verdict, verdict
 from bayesdist.errors import InputError
-from bayesdist.infer import load_fit, load_posterior
+from bayesdist.products import read_idctab
 from bayesdist.products.calibration_file import read_calibrations
+from bayesdist.products.chip_pairs import pair_of_idctab, reference_first
 from bayesdist.products.sip_read import holds_sip, read_sip
 
 __all__ = ["calibrations_of", "compare_files"]
@@ -83,10 +90,11 @@ def compare_files(
         compare(one, other, rng=rng, grid=(nx, ny), keep=keep)
         for one, other in _pairs(both[0], both[1], chip, (str(a), str(b)))
     ]
+    gaps = _gaps(paths, filters, epoch, [one.a.chip for one in found])
     if output is not None:
-        write_comparison(Path(output), found, command)
+        write_comparison(Path(output), found, gaps, command)
     scale = _scale_of(a) or _scale_of(b)
-    return _text(found, scale, related=_home(a) == _home(b))
+    return _text(found, gaps, scale, related=_home(a) == _home(b))
 
 
 def _lacks_size(path: Path) -> bool:
@@ -138,7 +146,7 @@ def calibrations_of(
         and no epoch.
     """
     path = Path(path)
-    solution = _solution(path)
+    solution = solution_at(path)
     if solution is None:
         if not path.exists():
             raise InputError("there is no such file", where=str(path), do="check the name")
@@ -152,17 +160,6 @@ def calibrations_of(
         )
         for one in solution.model.chips
     }
-
-
-def _solution(path: Path) -> Solution | None:
-    """The fit or posterior at a place; None where it is no such file."""
-    if path.is_dir():
-        if (path / "posterior.nc").exists() or not (path / "fit.nc").exists():
-            return load_posterior(path)
-        return load_fit(path / "fit.nc")
-    if path.suffix != ".nc":
-        return None
-    return load_fit(path) if path.name == "fit.nc" else load_posterior(path)
 
 
 def _pairs(
@@ -196,12 +193,61 @@ def _chip(chips: Chips, number: int, name: str) -> Calibration:
     return chips[number]
 
 
-def _text(found: Sequence[Comparison], scale: float | None, *, related: bool) -> str:
+def _gaps(
+    paths: tuple[Path, Path],
+    filters: tuple[str | None, str | None],
+    epoch: float | None,
+    numbers: list[int | None],
+) -> list[GapDifference]:
+    """How every further chip lies against the first one of A, or chip 2 of a table."""
+    if len(numbers) < 2:
+        return []
+    reference = next((n for n in _in_order(paths[0]) if n in numbers), None)
+    out = []
+    for number in numbers:
+        if number is None or reference is None or number == reference:
+            continue
+        a, b = (
+            _chip_pair(path, reference, number, filter=one, epoch=epoch)
+            for path, one in zip(paths, filters, strict=True)
+        )
+        out.append(gap_difference(a, b))
+    return out
+
+
+def _in_order(path: Path) -> list[int]:
+    """Chips of a calibration, that first which the others are referred to."""
+    solution = solution_at(path)
+    if solution is not None:
+        return [chip.number for chip in solution.model.chips]
+    return reference_first(read_idctab(path))
+
+
+def _chip_pair(
+    path: Path, reference: int, number: int, *, filter: str | None, epoch: float | None
+) -> ChipPair:
+    """Two chips of whatever holds several: a solution or an IDCTAB."""
+    solution = solution_at(path)
+    if solution is None:
+        return pair_of_idctab(read_idctab(path), reference, number, filter=filter, epoch=epoch)
+    date = epoch if solution.model.time is not None else None
+    return pair_of_solution(solution, str(path), reference, number, epoch=date)
+
+
+def _text(
+    found: Sequence[Comparison],
+    gaps: Sequence[GapDifference],
+    scale: float | None,
+    *,
+    related: bool,
+) -> str:
     lines = []
     for one in found:
         if len(found) > 1:
             lines.append(f"chip {one.a.chip}, by itself:")
         lines += [verdict(one, scale), *comparison_lines(one)]
+    for gap in gaps:
+        lines += [gap_verdict(gap), *gap_lines(gap)]
     if related and any(one.errors_of == "both" for one in found):
         lines.append("A and B come from one source: errors that they share make p too large here")
     elif any(one.errors_of == "both" for one in found):

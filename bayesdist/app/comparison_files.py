@@ -12,8 +12,9 @@ from bayesdist.app.folder import whole_folder
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.session import write_table
 from bayesdist.assess.comparison import Comparison
-from bayesdist.assess.comparison_table import comparison_table, difference_table
-from bayesdist.assess.comparison_verdict import verdict
+from bayesdist.assess.comparison_gap import GapDifference
+from bayesdist.assess.comparison_table import comparison_table, difference_table, gap_table
+from bayesdist.assess.comparison_verdict import gap_verdict, verdict
 from bayesdist.report import drawn, save_images
 from bayesdist.report.comparison import difference_vectors
 from bayesdist.report.mosaic import Mosaic
@@ -24,7 +25,9 @@ __all__ = ["comparison_summary", "joined", "mosaic_of", "write_comparison"]
 SCHEMA = 1
 
 
-def write_comparison(output: Path, found: Sequence[Comparison], command: str) -> None:
+def write_comparison(
+    output: Path, found: Sequence[Comparison], gaps: Sequence[GapDifference], command: str
+) -> None:
     """Write tables, summary and figure of a comparison into a new folder.
 
     Parameters
@@ -32,6 +35,8 @@ def write_comparison(output: Path, found: Sequence[Comparison], command: str) ->
     output : pathlib.Path
     found : sequence of Comparison
         One for each chip.
+    gaps : sequence of GapDifference
+        Between them, where there are several in one system.
     command : str
         For the record.
 
@@ -43,6 +48,8 @@ def write_comparison(output: Path, found: Sequence[Comparison], command: str) ->
     with whole_folder(output) as folder:
         write_table(joined(found, comparison_table), folder / "comparison.ecsv")
         write_table(joined(found, difference_table), folder / "difference.ecsv")
+        if gaps:
+            write_table(gap_table(gaps), folder / "gap.ecsv")
         save_images(
             drawn({"difference": difference_vectors(*found, mosaic=mosaic_of(found))}),
             folder / "figures",
@@ -52,6 +59,7 @@ def write_comparison(output: Path, found: Sequence[Comparison], command: str) ->
             "command": command,
             "versions": versions(),
             "chips": [comparison_summary(one) for one in found],
+            "gaps": [_gap_summary(one) for one in gaps],
         }
         write_json(folder / "comparison.json", record)
 
@@ -108,6 +116,27 @@ def comparison_summary(found: Comparison) -> dict[str, Any]:
         "p_largest_z": found.p_largest_z,
         "p_largest_chi2_on_grid": found.p_largest_chi2,
         "untested_rms": found.unknown_rms,
+    }
+
+
+def _gap_summary(gap: GapDifference) -> dict[str, Any]:
+    shift, (scale, rotation) = gap.values[:2].tolist(), gap.values[2:].tolist()
+    sigma = gap.sigma
+    return {
+        "chip": gap.chip,
+        "reference": gap.reference,
+        "verdict": gap_verdict(gap),
+        "unit": "pix",
+        "shift": shift,
+        "sigma_shift": None if sigma is None else sigma[:2].tolist(),
+        "scale": scale,
+        "sigma_scale": None if sigma is None else float(sigma[2]),
+        "rotation_rad": rotation,
+        "sigma_rotation_rad": None if sigma is None else float(sigma[3]),
+        "significance_of": gap.errors_of,
+        "chi2": None if gap.test is None else gap.test.chi2,
+        "dof": None if gap.test is None else gap.test.dof,
+        "p_value": None if gap.test is None else gap.test.p_value,
     }
 
 

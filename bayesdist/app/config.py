@@ -23,7 +23,7 @@ from bayesdist.app.section import Section
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.linear_term import LINEAR_KINDS, LinearTerm
 from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms import GIVEN
+from bayesdist.assess.terms import GIVEN, said_by_user
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.period_dates import check_periods, mjd_periods
@@ -304,8 +304,6 @@ class Config(Section):
             raise ValueError(
                 "RvB pairs are of one array; give detector.size in place of [[chip]] blocks"
             )
-        if self.campaign is not None and self.holdout is not None:
-            raise ValueError("[holdout] is of matched stars, not of a [campaign]; leave it out")
         if self.campaign is not None and len(self.chip) == 0:
             raise ValueError("a [campaign] has no [[chip]] blocks; give them, one as the reference")
         return self
@@ -418,7 +416,7 @@ class Config(Section):
     def user_terms(self) -> tuple[UserTerm, ...]:
         """The user's terms of the error budget that are the same at every place."""
         return tuple(
-            UserTerm(b.name, b.kind, b.sigma_u, b.sigma_v, b.unit, b.source)
+            UserTerm(b.name, b.kind, b.sigma_u, b.sigma_v, b.unit, said_by_user(b.source))
             for b in self.budget
             if b.sigma_u is not None and b.sigma_v is not None
         )
@@ -426,7 +424,7 @@ class Config(Section):
     def linear_terms(self, solution: Solution) -> tuple[LinearTerm, ...]:
         """The user's terms of the error budget that grow with the distance from the middle."""
         return tuple(
-            LinearTerm(b.name, b.kind, b.sigma, solution, b.source)
+            LinearTerm(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
             for b in self.budget
             if b.sigma is not None
         )

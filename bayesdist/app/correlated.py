@@ -14,19 +14,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.fingerprint import fingerprint_of
+from bayesdist.assess.centroid import without
 from bayesdist.assess.residual_correlation import residual_correlation
 from bayesdist.assess.terms import LocalTerm
 from bayesdist.assess.unmodelled import Unmodelled, unmodelled
+from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.recoloured import with_spread
-from bayesdist.infer.robust import recommended_cells, robust_covariance
+from bayesdist.infer.robust import (
+    RobustCovariance,
+    by_fitting_cells,
+    recommended_cells,
+    robust_covariance,
+)
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
 
-__all__ = ["UNMODELLED", "SharedErrors", "kept_shared_errors", "measure_shared_errors"]
+__all__ = [
+    "ENOUGH",
+    "EXPOSURES",
+    "UNMODELLED",
+    "SharedErrors",
+    "facts_of",
+    "keep_shared_errors",
+    "kept_shared_errors",
+    "measure_shared_errors",
+]
 
 Float = NDArray[np.float64]
 
@@ -49,7 +65,9 @@ class SharedErrors:
     formal : ndarray, shape (D, D)
     facts : dict
         As in summary.json: ratio {value, error, p_value}, exceeds, statement, doubts, cells_pix,
-        reach_pix, unmodelled [{chip, rms_u, rms_v, error_u, error_v, found}].
+        reach_pix, unmodelled [{chip, rms_u, rms_v, error_u, error_v, beside_u,
+        beside_v, found}]: what comes beside the coefficients' errors is less than the structure, as
+        the fit was drawn towards it.
     """
 
     cov: Float
@@ -100,22 +118,35 @@ class SharedErrors:
             return posterior
         return with_spread(posterior, self.formal, self.cov)
 
+    def of_centroids(self, errors: MagnitudeErrors | None) -> MagnitudeErrors | None:
+        """Scatter by magnitude without what is left out at a place, which is a term of its own."""
+        found = [one for one in self.facts["unmodelled"] if one["found"]]
+        if errors is None or not found:
+            return errors
+        n = len(self.facts["unmodelled"])  # stars are on all chips
+        u, v = (np.sqrt(sum(one[f"rms_{axis}"] ** 2 for one in found) / n) for axis in "uv")
+        return without(errors, u, v)
+
     def local_term(self, grid: tuple[int, int]) -> tuple[LocalTerm, ...]:
         """What is left out at a place, as a term of the budget; nothing where none is found."""
         if not any(one["found"] for one in self.facts["unmodelled"]):
             return ()
         sigma, relative = {}, []
         for one in self.facts["unmodelled"]:
-            rms = np.array([one["rms_u"], one["rms_v"]]) * one["found"]
+            rms = np.array([one.get(f"beside_{a}", one[f"rms_{a}"]) for a in "uv"]) * one["found"]
             sigma[one["chip"]] = np.tile(rms, (grid[1], grid[0], 1))
-            if one["found"]:
+            if rms.any():
                 relative.append(np.hypot(one["error_u"], one["error_v"]) / np.hypot(*rms))
-        return (LocalTerm(UNMODELLED, sigma, float(max(relative))),)
+        return (LocalTerm(UNMODELLED, sigma, float(max(relative, default=0.0))),)
 
 
 def measure_shared_errors(session: Session) -> None:
     """Two passes over the stars; what they show is kept in the run's folder."""
-    found = _measured(session)
+    keep_shared_errors(session, _measured(session))
+
+
+def keep_shared_errors(session: Session, found: SharedErrors | None) -> None:
+    """Write what was measured for the stages that follow; nothing where it was not."""
     path = session.run / FILE
     if found is None:
         path.unlink(missing_ok=True)
@@ -147,24 +178,41 @@ def _measured(session: Session) -> SharedErrors | None:
     if len(session.shards) < ENOUGH:
         return None
     model, posterior = session.posterior.model, session.posterior
-    reach = _reach(session)
-    cells = recommended_cells(model, reach)
     try:
         robust = robust_covariance(
             session.shards,
             posterior,
-            cells,
+            recommended_cells(model),
             exposures=bool(model.n_frame) and len(model.exposures) >= EXPOSURES,
             priors=session.priors,
         )
     except (InputError, DegenerateError) as error:
         log.info("assess: correlation of errors was not measured: %s", error)
         return None
+    robust = by_fitting_cells(robust)
+    return SharedErrors(robust.cov, robust.formal, facts_of(session, robust))
+
+
+def facts_of(
+    session: Session, robust: RobustCovariance, *, at_place: bool = True
+) -> dict[str, Any]:
+    """What summary.json says of shared errors.
+
+    Parameters
+    ----------
+    session : Session
+    robust : RobustCovariance
+    at_place : bool
+        Whether what is left out at a place is measured too.
+    """
+    model, doubts, left = robust.model, list(robust.doubts), tuple[Unmodelled, ...]()
     try:
-        left = unmodelled(session.shards, posterior, cells, robust=robust)
-    except DegenerateError:  # too few stars near each other
-        left = ()
-    facts = {
+        if at_place:
+            left = unmodelled(session.shards, session.posterior, robust.cells, robust=robust)
+    except DegenerateError:
+        if robust.exceeds:
+            doubts.append("stars are too far apart to show what the model leaves out at a place")
+    return {
         "unit": model.unit,
         "ratio": {
             "value": robust.ratio.value,
@@ -173,12 +221,11 @@ def _measured(session: Session) -> SharedErrors | None:
         },
         "exceeds": robust.exceeds,
         "statement": robust.statement,
-        "doubts": list(robust.doubts),
-        "cells_pix": list(cells.sides(model)),
-        "reach_pix": reach,
-        "unmodelled": [_row(one) for one in left],
+        "doubts": doubts,
+        "cells_pix": list(robust.cells.sides(model)),
+        "reach_pix": _reach(session),
+        "unmodelled": [_row(one, robust.exceeds) for one in left],
     }
-    return SharedErrors(robust.cov, robust.formal, facts)
 
 
 def _reach(session: Session) -> float:
@@ -196,14 +243,18 @@ def _reach(session: Session) -> float:
     return max(out)
 
 
-def _row(one: Unmodelled) -> dict[str, Any]:
+def _row(one: Unmodelled, exceeds: bool) -> dict[str, Any]:
     u, v = (float(r) for r in one.rms)
     error_u, error_v = (float(e) for e in one.rms_error)
+    beside_u, beside_v = (float(r) for r in one.rms_beside)
     return {
         "chip": one.chip,
         "rms_u": u,
         "rms_v": v,
         "error_u": error_u,
         "error_v": error_v,
-        "found": bool(one.found.any()),
+        "beside_u": beside_u,
+        "beside_v": beside_v,
+        # where cells have shown that there is something, it is as large as it was measured
+        "found": bool(one.found.any() or (exceeds and one.rms.any())),
     }

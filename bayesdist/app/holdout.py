@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.kept import kept
 from bayesdist.assess.holdout import LEAST_HELD, HeldOutTruth, held_out_truth
 from bayesdist.data.holdout import SetAside, Split, exposures_drawn, split_matches
 from bayesdist.errors import InputError
@@ -17,16 +18,22 @@ if TYPE_CHECKING:
 
 __all__ = ["held_out_of", "holdout_summary", "holdout_table", "split_of", "whole_exposures"]
 
-KEPT = "held_out_truth"
-
 
 def whole_exposures(session: Session, names: tuple[str, ...]) -> tuple[str, ...]:
     """Exposures that are set aside whole: the named ones, or so many drawn by the seed."""
     block, seed = session.config.holdout, session.config.sampler.seed
     if block is None:
         return ()
+    needed = names[: session.needed_exposures]
     if isinstance(block.exposures, int):
-        return exposures_drawn(names, block.exposures, seed)
+        return exposures_drawn(names[len(needed) :], block.exposures, seed)
+    for name in block.exposures:
+        if name in needed:
+            raise InputError(
+                f"exposure {name!r} is to be held out, and defines the gauge",
+                where="holdout.exposures",
+                do="name another one",
+            )
     return tuple(dict.fromkeys(block.exposures))
 
 
@@ -74,10 +81,12 @@ def held_out_of(session: Session, *, anew: bool = False) -> HeldOutTruth | None:
     held = session.held_matches
     if held is None:
         return None
-    if anew or KEPT not in session.__dict__:
+
+    def judged() -> HeldOutTruth:
         whole = whole_exposures(session, held.exposure_names)
-        session.__dict__[KEPT] = held_out_truth(session.posterior, held, whole=whole)
-    return session.__dict__[KEPT]
+        return held_out_truth(session.predictive, held, whole=whole)
+
+    return kept(session, "held_out_truth", judged, anew=anew)
 
 
 def holdout_table(found: HeldOutTruth) -> Table:
@@ -96,10 +105,10 @@ def holdout_table(found: HeldOutTruth) -> Table:
     )
     table = Table({name: [getattr(t, name) for t in found.tests] for name in names})
     table["lo95"], table["hi95"] = np.array([t.interval for t in found.tests]).T
-    table["limit"].description = "of tails, in sigma"
+    table["limit"].description = "of tails, in sigma; scatter of deviations"
     table["value"].description = (
         f"offset: {found.unit}; spread: factor on the predicted errors; distribution: largest "
-        "difference of distribution functions; tails: fraction of stars"
+        "difference of distribution functions; tails: fraction of stars; deviation: in its own unit"
     )
     table.meta = {
         "verdict": found.verdict,

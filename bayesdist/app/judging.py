@@ -9,13 +9,15 @@ from typing import Any
 
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.horizon import horizons_of
+from bayesdist.app.product_terms import product_terms
 from bayesdist.app.session import Session
 from bayesdist.assess import Margin, Requirement, check_requirements, pixel_scale_of
 from bayesdist.assess.detector_budget import DetectorBudget, detector_budget
 from bayesdist.assess.horizon import Horizon
 from bayesdist.assess.position_errors import PositionErrors, position_errors
+from bayesdist.assess.product_terms import ProductTerm
 from bayesdist.assess.solution import Solution
-from bayesdist.errors import InputError
+from bayesdist.errors import BayesdistError, InputError
 
 __all__ = [
     "assessed_horizons",
@@ -23,6 +25,7 @@ __all__ = [
     "errors_of",
     "margins_of",
     "probability_met",
+    "products_of",
 ]
 
 log = logging.getLogger("bayesdist")
@@ -61,7 +64,21 @@ def budget_of(
 
     Another solution is assessed by itself.
     """
-    return detector_budget(**_assessment(session, solution, n_draws))
+    products = products_of(session) if solution is None else ()
+    return detector_budget(**_assessment(session, solution, n_draws), products=products)
+
+
+def products_of(session: Session) -> tuple[ProductTerm, ...]:
+    """What the files that are asked for differ by; none where they cannot be made."""
+    solution, kept = session.solution, session.__dict__.get("_products")
+    if kept is None or kept[0] is not solution:
+        try:
+            kept = solution, product_terms(session)
+        except BayesdistError as error:  # the export says so, and stops
+            log.info("assess: the files were not compared with the solution: %s", error)
+            kept = solution, ()
+        session.__dict__["_products"] = kept
+    return kept[1]
 
 
 def errors_of(session: Session) -> PositionErrors:

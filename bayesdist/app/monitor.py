@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
+from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.comparison_files import joined, mosaic_of
 from bayesdist.app.config import Config, Data, load_config
 from bayesdist.app.folder import whole_folder
@@ -45,6 +47,7 @@ def monitor(
         A run with a posterior.  The matches that it was made from are not needed any more.
     new : path
         New matches, which are read as the run's were, or a configuration whose [data] says how.
+        Of a campaign: another run of which stage 'match' is done, or pairs as a run keeps them.
     output : path, optional
         New or empty folder for tables, summary and figures.
     command : str
@@ -58,28 +61,14 @@ def monitor(
     Raises
     ------
     InputError
-        For a run that is none, has no posterior, or began with star lists; as `read_matches` and
+        For a run that is none, or has no posterior; as `read_matches`, `read_new_exposures` and
         `fit_new`.
     """
     directory = RunDirectory(run)
     if not (directory / "run.json").exists():
         raise InputError("is no run", where=str(run), do="give the folder of 'bayesdist run'")
     config = directory.config
-    if config.campaign is not None:
-        raise InputError(
-            "is a run of a campaign, whose new exposures would have to be matched first",
-            where=str(run),
-            do="give a run that began with matches",
-        )
-    posterior = load_posterior(directory / "posterior.nc")
-    matches = _new_matches(directory, config, Path(new))
-    fitted = fit_new(
-        posterior,
-        matches,
-        clip_chi2=config.fit.clip_chi2,
-        clip_abs=config.fit.clip_abs,
-        compute=config.resources(),
-    )
+    posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
     try:
         change = change_of(fitted, draws=posterior.convergence.ess_bulk_min)
         scores: tuple[PeriodScore, ...] = ()
@@ -100,12 +89,33 @@ def monitor(
             misfit=_misfit(fitted),
             pixel_mas=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
         )
-        facts = _facts(fitted, posterior)
+        facts = _facts(fitted, posterior) | {"left_out": list(left_out)}
     finally:
         fitted.target.shards.close()
     if output is not None:
         _write(Path(output), found, scores, facts, command)
     return "\n".join([found.verdict, *_lines(found, facts, scores)])
+
+
+def _fitted(
+    run: RunDirectory, config: Config, new: Path
+) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
+    """Release, new matches and their fit, and the exposures that the release has seen."""
+    if config.campaign is not None:
+        session = CampaignSession(run)
+        exposures = read_new_exposures(session, new)
+        found = fit_exposures_of(session, exposures)
+        return exposures.released, exposures.matches, found, exposures.left_out
+    posterior = load_posterior(run / "posterior.nc")
+    matches = _new_matches(run, config, new)
+    found = fit_new(
+        posterior,
+        matches,
+        clip_chi2=config.fit.clip_chi2,
+        clip_abs=config.fit.clip_abs,
+        compute=config.resources(),
+    )
+    return posterior, matches, found, ()
 
 
 def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
@@ -176,7 +186,8 @@ def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
         "n_matches": len(shards),
         "n_flagged": flagged,
         "n_exposures": len(new.model.exposures),
-        "frames": new.model.frames,
+        "frames": new.open.frames,
+        "deviating": bool(new.scatter.any()),
         "unit": new.model.unit,
         "mixture": new.hyper,
         "mixture_released": {k: {"mean": m, "sd": s} for k, (m, s) in released.items()},
@@ -191,6 +202,10 @@ def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore
         f"new matches: {facts['n_matches']}, of which {facts['n_flagged']} are more likely false "
         f"than not, in {facts['n_exposures']} exposure(s); fitted to each and taken out: {frames}"
     ]
+    if facts["deviating"]:
+        lines.append("exposures deviate as those of the release scatter")
+    if facts["left_out"]:
+        lines.append(f"left out: {len(facts['left_out'])} exposure(s) that the release has seen")
     for key, what in (("j", "error beyond the quoted ones"), ("f", "share of false matches")):
         if key in facts["mixture"] and key in facts["mixture_released"]:
             old = facts["mixture_released"][key]

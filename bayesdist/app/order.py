@@ -165,7 +165,7 @@ def _with_error(value: float | None, error: float | None) -> str:
 
 
 def _draw(found: OrderSelection, path: Path) -> None:
-    from bayesdist.report.figures import drawn  # figures take seconds to import
+    from bayesdist.report import drawn  # figures take seconds to import
     from bayesdist.report.order import order_comparison
 
     png = drawn({"orders": order_comparison(found)})["orders"]

@@ -8,6 +8,7 @@ import numpy as np
 from astropy.table import Table, vstack
 from astropy.time import Time
 
+from bayesdist.app.kept import kept
 from bayesdist.assess import SAMPLE, convert, pixel_scale_of
 from bayesdist.assess.periods import TimeVariation, bins_for, time_variation
 from bayesdist.data import MatchTable
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from bayesdist.infer.period_positions import PositionChange
 
 __all__ = ["check_pairs", "periods_of", "periods_summary", "periods_table"]
-
-KEPT = "time_variation"
 
 
 def check_pairs(session: Session) -> dict[str, int]:
@@ -90,9 +89,7 @@ def periods_of(session: Session, *, anew: bool = False) -> TimeVariation | None:
     """
     if session.config.periods is None:
         return None
-    if anew or KEPT not in session.__dict__:
-        session.__dict__[KEPT] = _compared(session)
-    return session.__dict__[KEPT]
+    return kept(session, "time_variation", lambda: _compared(session), anew=anew)
 
 
 def _compared(session: Session) -> TimeVariation:

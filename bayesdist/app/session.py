@@ -34,6 +34,7 @@ from bayesdist.assess import (
 from bayesdist.assess.centroid import centroid_scatter
 from bayesdist.assess.coverage import Coverage, coverage_of
 from bayesdist.assess.field_terms import FieldTerm
+from bayesdist.assess.holdout_predictive import Predictive, predictive_of
 from bayesdist.assess.majority import majority_sentence
 from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
@@ -88,6 +89,13 @@ class Session:
     def raw_matches(self) -> Matches:
         """Matches as read, without those that are held out."""
         return self._all_matches if self._split is None else self._split.kept
+
+    needed_exposures = 0  # the first ones, which cannot be held out
+
+    @property
+    def predictive(self) -> Predictive:
+        """The posterior as it predicts stars that are held out."""
+        return predictive_of(self.posterior)
 
     @property
     def held_matches(self) -> Matches | None:
@@ -233,7 +241,7 @@ class Session:
     def measure(self) -> None:
         """What the assessment measures beside the posterior, anew."""
         measure_shared_errors(self)
-        for name in ("shared_errors", "systematics", "field_terms"):
+        for name in ("shared_errors", "systematics", "field_terms", "centroid"):
             self.__dict__.pop(name, None)
 
     @property
@@ -251,7 +259,9 @@ class Session:
         """Errors of the centroids by magnitude, where the stars have magnitudes."""
         unit, scale = self.posterior.model.unit, self.config.detector.scale_mas
         held = [(t.name, *t.sigma(unit, scale)) for t in self.config.in_residuals()]
-        return centroid_scatter(self.stars, held, n_params=self.posterior.model.n_params)
+        errors = centroid_scatter(self.stars, held, n_params=self.posterior.model.n_params)
+        found = self.shared_errors
+        return errors if found is None else found.of_centroids(errors)
 
     @property
     def doubts(self) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.fields import MODEL, ErrorFields, draw_errors
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.assess.product_terms import PRODUCT, ProductTerm
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms import LOCAL, MEASURED, LocalTerm, UserTerm
 from bayesdist.assess.units import pixel_scale_of
@@ -29,6 +30,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 TOTAL = "total"
+TOGETHER = "all terms but products, combined by draws"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +41,12 @@ class BudgetTerm:
     ----------
     name : str
     kind : str
-        'random', 'systematic' (as the parts of the model, which all stars share), or 'local'
-        (shared by the stars at one place).
+        'random', 'systematic' (as the parts of the model, which all stars share), 'local' (shared
+        by the stars at one place), or 'product' (of a file, known, and in no total).
     u, v : ndarray, shape (ny, nx)
-        Standard deviations, in the unit of the budget.
+        Standard deviations, in the unit of the budget; of products the displacements' sizes.
     source : str
-        'measured in this run', 'given by the user', or what the user says.
+        Begins with 'measured in this run', 'given by the user' or 'published'.
     relative_error : float or None
         How well the standard deviations are known themselves, relative to their size: of draws the
         Monte-Carlo error.  None where it is not known.
@@ -86,6 +88,8 @@ class ErrorBudget:
         Index into `terms` of the one with the largest radial error.
     n_draws : int
         Draws behind the model's parts: their relative error is about 1 / sqrt(2 n_draws).
+    products : tuple of BudgetTerm
+        What files differ by from the solution: in no total.
     """
 
     x: Float
@@ -100,6 +104,7 @@ class ErrorBudget:
     total_v: Float
     dominant: Int
     n_draws: int
+    products: tuple[BudgetTerm, ...] = ()
 
     @property
     def radial(self) -> Float:
@@ -109,10 +114,10 @@ class ErrorBudget:
     @property
     def total(self) -> BudgetTerm:
         """All terms together, as one."""
-        return BudgetTerm("total", TOTAL, self.total_u, self.total_v, "")
+        return BudgetTerm("total", TOTAL, self.total_u, self.total_v, TOGETHER)
 
     def rows(self) -> list[dict[str, Any]]:
-        """The budget as a table: one row for each term, the total last.
+        """The budget as a table: one row for each term and each product, the total last.
 
         Returns
         -------
@@ -120,7 +125,7 @@ class ErrorBudget:
             name, kind, u, v, radial (root mean squares over the grid), radial_error (how well that
             is known; None where it is not), source.
         """
-        return budget_rows([*self.terms, self.total])
+        return budget_rows([*self.terms, *self.products, self.total])
 
 
 def budget_rows(terms: Sequence[BudgetTerm]) -> list[dict[str, Any]]:
@@ -148,7 +153,9 @@ def budget_rows(terms: Sequence[BudgetTerm]) -> list[dict[str, Any]]:
     total = rows[-1]
     if total["kind"] == TOTAL and total["radial"] > 0:
         known = [
-            (r["radial"], r["radial_error"]) for r in rows[:-1] if r["radial_error"] is not None
+            (r["radial"], r["radial_error"])
+            for r in rows[:-1]
+            if r["radial_error"] is not None and r["kind"] != PRODUCT
         ]
         spread = sum((radial * error) ** 2 for radial, error in known) ** 0.5
         total["radial_error"] = spread / total["radial"] if known else None
@@ -228,6 +235,7 @@ def error_budgets(
     fields: Sequence[FieldTerm] = (),
     aligned: bool = False,
     local: Sequence[LocalTerm] = (),
+    products: Sequence[ProductTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     n_draws: int = 4000,
@@ -243,6 +251,8 @@ def error_budgets(
         Chip numbers.
     local : sequence of LocalTerm
         Measured beside the solution, on this grid.
+    products : sequence of ProductTerm
+        Shown beside the others, and in no total.
     terms, fields, aligned, grid, epoch, n_draws, rng, pixel_scale
         As in `error_budget`.
 
@@ -265,8 +275,19 @@ def error_budgets(
     draws = draw_errors(solution, n_draws, rng, fields=fields, aligned=aligned)
     drawn = draws.at({c: mesh(*xy) for c, xy in grids.items()}, epoch=epoch)
     noise = 1.0 / (2.0 * effective_draws(solution, n_draws)) ** 0.5
-    sources = {t.name: getattr(t, "source", MEASURED) for t in fields}
-    return tuple(_budget(f, *grids[f.chip], terms, sigmas, local, noise, sources) for f in drawn)
+    sources = {t.name: t.source for t in fields}
+    return tuple(
+        replace(
+            _budget(f, *grids[f.chip], terms, sigmas, local, noise, sources),
+            products=tuple(_product(p, *grids[f.chip], f.chip, f.epoch) for p in products),
+        )
+        for f in drawn
+    )
+
+
+def _product(term: ProductTerm, x: Float, y: Float, chip: int, epoch: float | None) -> BudgetTerm:
+    u, v = np.abs(term.at(*mesh(x, y), chip, epoch)).T.reshape(2, y.size, x.size)
+    return BudgetTerm(term.name, PRODUCT, u, v, term.source, 0.0)
 
 
 def _budget(

@@ -16,13 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.fields import MODEL
+from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.assess.position_errors import PositionErrors
+from bayesdist.assess.product_terms import ProductTerm
 from bayesdist.assess.terms import LocalTerm, UserTerm
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
-__all__ = ["BudgetSpan", "BudgetSurface", "budget_surface"]
+__all__ = ["BudgetSpan", "BudgetSurface", "SurfaceProduct", "budget_surface"]
 
 Float = NDArray[np.float64]
 
@@ -48,6 +50,23 @@ class BudgetSpan:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceProduct:
+    """What a file differs by from the solution, on the grid.
+
+    Parameters
+    ----------
+    name, source : str
+    shifts : tuple of dict of int to ndarray, shape (n, N, 2)
+        For each span, by chip number: displacements at its nodes, linear in time between them;
+        n = 1 for those that do not depend on time.
+    """
+
+    name: str
+    source: str
+    shifts: tuple[dict[int, Float], ...]
+
+
+@dataclass(frozen=True, eq=False)
 class BudgetSurface:
     """The error budget as a function of position, epoch and magnitude.
 
@@ -67,6 +86,8 @@ class BudgetSurface:
         Of these, in the unit of the model.
     local : tuple of LocalTerm
     centroid : MagnitudeErrors or None
+    products : tuple of SurfaceProduct
+        In no total.
     """
 
     model: DistortionModel
@@ -78,6 +99,7 @@ class BudgetSurface:
     sigmas: tuple[tuple[float, float], ...]
     local: tuple[LocalTerm, ...]
     centroid: MagnitudeErrors | None
+    products: tuple[SurfaceProduct, ...] = ()
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -92,6 +114,7 @@ def budget_surface(
     epoch: float | None = None,
     years: tuple[float, float] | None = None,
     sources: dict[str, str] | None = None,
+    products: Sequence[ProductTerm] = (),
 ) -> BudgetSurface:
     """Second moments of all errors of a position.
 
@@ -105,6 +128,7 @@ def budget_surface(
         First and last epoch; needed by a model with time dependence.
     sources : dict of str to str, optional
         Where parts come from.
+    products : sequence of ProductTerm
 
     Returns
     -------
@@ -127,7 +151,25 @@ def budget_surface(
         sigmas=errors.sigmas,
         local=errors.local,
         centroid=errors.centroid,
+        products=tuple(_on_the_grid(p, model, errors.grid, spans) for p in products),
     )
+
+
+def _on_the_grid(
+    term: ProductTerm,
+    model: DistortionModel,
+    grid: tuple[int, int],
+    spans: Sequence[BudgetSpan],
+) -> SurfaceProduct:
+    shifts = []
+    for span in spans:
+        by_chip = {}
+        for chip in model.chips:
+            at = mesh(*grid_pixels(chip.size, grid))
+            nodes = [term.at(*at, chip.number, epoch) for epoch in span.nodes or (None,)]
+            by_chip[chip.number] = _short(np.stack(nodes))
+        shifts.append(by_chip)
+    return SurfaceProduct(term.name, term.source, tuple(shifts))
 
 
 def _nodes(

@@ -17,7 +17,7 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.preparing import LEAST_SHARE
 from bayesdist.errors import InputError
 
-__all__ = ["centroid_scatter"]
+__all__ = ["centroid_scatter", "without"]
 
 FEWEST = 50  # stars whose scatter says anything by magnitude
 CERTAIN = 0.5  # probability of a false match from which on a star is left out
@@ -72,5 +72,29 @@ def centroid_scatter(
                 where=f"budget term {contained[0][0]!r}",
                 do="correct them, or set in_residuals = false",
             )
-        left[name] = np.sqrt(np.maximum(sigma**2 - known**2, (LEAST_SHARE * sigma) ** 2))
-    return replace(total, **left)
+        left[name] = known
+    return without(total, left["sigma_u"], left["sigma_v"])
+
+
+def without(errors: MagnitudeErrors, sigma_u: float, sigma_v: float) -> MagnitudeErrors:
+    """Errors by magnitude, less an error that all of them hold.
+
+    Parameters
+    ----------
+    errors : MagnitudeErrors
+    sigma_u, sigma_v : float
+        In their unit.
+
+    Returns
+    -------
+    MagnitudeErrors
+        At least a quarter of what they were.
+    """
+    left = {
+        name: np.sqrt(np.maximum(sigma**2 - known**2, (LEAST_SHARE * sigma) ** 2))
+        for name, sigma, known in (
+            ("sigma_u", errors.sigma_u, sigma_u),
+            ("sigma_v", errors.sigma_v, sigma_v),
+        )
+    }
+    return replace(errors, **left)

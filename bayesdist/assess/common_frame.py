@@ -22,7 +22,16 @@ from bayesdist.errors import InputError
 from bayesdist.infer.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
 
-__all__ = ["CommonFrame", "Similarity", "common_frame"]
+__all__ = [
+    "CommonFrame",
+    "Similarity",
+    "as_real",
+    "common_frame",
+    "linear_part",
+    "padded",
+    "similarity_fields",
+    "turn_between",
+]
 
 Float = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -138,13 +147,13 @@ def common_frame(a: Calibration, b: Calibration, *, keep: bool = False) -> Commo
     basis = PolynomialBasis(order, a.basis.size, a.basis.reference_pixel)
     same_unit = (a.unit == "pix") == (b.unit == "pix")
     factor = convert(1.0, b.unit, a.unit) if same_unit else 1.0
-    wa, cov_a = _padded(a, basis.n_terms)
-    wb, cov_b = _padded(b, basis.n_terms)
+    wa, cov_a = padded(a, basis.n_terms)
+    wb, cov_b = padded(b, basis.n_terms)
     za, zb = wa[0] + 1j * wa[1], factor * (wb[0] + 1j * wb[1])
-    turn, mirrored = _turn(za, zb, basis, b)
+    turn, mirrored = turn_between(za, zb, basis, b)
     if mirrored:
         zb = zb.conj()
-    linear = _linear_part(basis, wa, a)
+    linear = linear_part(basis, wa, a)
     to_pixels = np.kron(np.linalg.inv(linear), np.eye(basis.n_terms))
 
     lies_alike = same_unit and not mirrored and abs(turn - 1.0) < NEAR
@@ -171,10 +180,10 @@ def common_frame(a: Calibration, b: Calibration, *, keep: bool = False) -> Commo
         of_a = float(np.mean(np.diag(parts[0])[known] / np.diag(cov)[known]))
         shares = (of_a, 1.0 - of_a)
 
-    fields = _fields(moved)
+    fields = similarity_fields(moved)
     weighted = fields * term_squares(basis)[:, None]
     estimate = np.linalg.solve(fields.T @ weighted, weighted.T)
-    raw = _real(za - moved)
+    raw = as_real(za - moved)
     found = estimate @ raw
     errors = None
     if cov is not None and a.correlated and b.correlated:
@@ -196,7 +205,7 @@ def common_frame(a: Calibration, b: Calibration, *, keep: bool = False) -> Commo
     )
 
 
-def _padded(c: Calibration, n_terms: int) -> tuple[Float, Float | None]:
+def padded(c: Calibration, n_terms: int) -> tuple[Float, Float | None]:
     """Coefficients (2, n) and covariance (2 n, 2 n) with zeros for terms that are not there."""
     K = c.basis.n_terms
     coefficients = np.zeros((2, n_terms))
@@ -208,7 +217,9 @@ def _padded(c: Calibration, n_terms: int) -> tuple[Float, Float | None]:
     return coefficients, cov.reshape(2 * n_terms, 2 * n_terms)
 
 
-def _turn(za: Complex, zb: Complex, basis: PolynomialBasis, b: Calibration) -> tuple[complex, bool]:
+def turn_between(
+    za: Complex, zb: Complex, basis: PolynomialBasis, b: Calibration
+) -> tuple[complex, bool]:
     """Scale and rotation that bring B nearest to A, and whether B is mirrored first."""
     weight = term_squares(basis)[: basis.n_terms].copy()
     weight[0] = 0.0  # the shift takes the mean
@@ -220,24 +231,26 @@ def _turn(za: Complex, zb: Complex, basis: PolynomialBasis, b: Calibration) -> t
     return complex((flipped if mirrored else straight) / norm), mirrored
 
 
-def _linear_part(basis: PolynomialBasis, coefficients: Float, a: Calibration) -> Float:
+def linear_part(basis: PolynomialBasis, coefficients: Float, a: Calibration) -> Float:
+    """Derivatives (2, 2) of A's positions by the pixel, at its reference pixel."""
     linear = basis.to_monomials(coefficients)[:, 1:3]
     if abs(np.linalg.det(linear)) <= 1e-9 * np.abs(linear).max() ** 2:
         raise InputError("has a singular linear part", where=a.name, do="check its coefficients")
     return linear
 
 
-def _real(z: Complex) -> Float:
+def as_real(z: Complex) -> Float:
+    """Coefficients (2 K,), u before v, of u + i v."""
     return np.concatenate([z.real, z.imag])
 
 
-def _fields(z: Complex) -> Float:
+def similarity_fields(z: Complex) -> Float:
     """What shift along u and v, scale and rotation do to positions, (2 K, 4)."""
     one = np.zeros_like(z)
     one[0] = 1.0
     offsets = z.copy()
     offsets[0] = 0.0  # about the mean position, so that a rotation is no shift
-    return np.stack([_real(f) for f in (one, 1j * one, offsets, 1j * offsets)], axis=1)
+    return np.stack([as_real(f) for f in (one, 1j * one, offsets, 1j * offsets)], axis=1)
 
 
 def _symmetric(cov: Float) -> Float:
@@ -256,7 +269,7 @@ def _similarity(
     errors: Float | None,
 ) -> Similarity:
     inverse = np.linalg.inv(linear)
-    shift = inverse @ _real((za - zb)[:1])
+    shift = inverse @ as_real((za - zb)[:1])
     sigma = sigma_shift = None
     if errors is not None:
         sigma = np.sqrt(np.maximum(np.diag(errors), 0.0))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from astropy.table import Table
 
 from bayesdist.assess.comparison import Comparison, term_sigmas
+from bayesdist.assess.comparison_gap import GapDifference
 from bayesdist.model import AXES
 
-__all__ = ["comparison_table", "difference_table"]
+__all__ = ["comparison_table", "difference_table", "gap_table"]
 
 
 def comparison_table(found: Comparison) -> Table:
@@ -83,3 +86,27 @@ def difference_table(found: Comparison) -> Table:
         if name not in ("correlation", "chi2"):
             table[name].unit = "pix"
     return table
+
+
+def gap_table(gaps: Sequence[GapDifference]) -> Table:
+    """Where chips lie against the reference chip, A minus B.
+
+    Parameters
+    ----------
+    gaps : sequence of GapDifference
+        One for each chip but the reference.
+
+    Returns
+    -------
+    astropy.table.Table
+        Columns: chip, reference, quantity, difference, sigma and z (NaN without errors), unit.
+    """
+    quantities = (("shift_x", "pix"), ("shift_y", "pix"), ("scale", ""), ("rotation", "rad"))
+    rows = []
+    for gap in gaps:
+        sigma = np.full(4, np.nan) if gap.sigma is None else gap.sigma
+        for (name, unit), value, error in zip(quantities, gap.values, sigma, strict=True):
+            z = value / error if error > 0 else np.nan
+            rows.append((gap.chip, gap.reference, name, float(value), float(error), float(z), unit))
+    names = ("chip", "reference", "quantity", "difference", "sigma", "z", "unit")
+    return Table(rows=rows, names=names)

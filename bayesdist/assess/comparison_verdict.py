@@ -6,9 +6,10 @@ import numpy as np
 from scipy.stats import norm
 
 from bayesdist.assess.comparison import SIGNIFICANT, Comparison
+from bayesdist.assess.comparison_gap import GapDifference
 from bayesdist.assess.comparison_table import comparison_table
 
-__all__ = ["comparison_lines", "probability", "verdict"]
+__all__ = ["comparison_lines", "gap_lines", "gap_verdict", "probability", "verdict"]
 
 IDENTICAL = 1e-9  # pixels
 
@@ -142,6 +143,57 @@ def _measured(value: float, sigma: float | None) -> str:
     if not sigma > 0:
         return f"{value:+.4g}"
     return f"{value:+.4g} +- {sigma:.2g} ({abs(value) / sigma:.1f} sigma)"
+
+
+def gap_verdict(gap: GapDifference) -> str:
+    """One sentence: whether a chip lies elsewhere against the reference chip.
+
+    Parameters
+    ----------
+    gap : GapDifference
+
+    Returns
+    -------
+    str
+    """
+    chips, d = f"against chip {gap.reference}", float(np.hypot(*gap.values[:2]))
+    if np.abs(gap.values).max() < IDENTICAL:
+        return f"Chip {gap.chip} lies alike {chips}, to rounding."
+    size = f"{d:.3g} pix from where B has it"
+    if gap.test is None:
+        return f"Chip {gap.chip} lies {size} {chips}; neither gives errors of the gap."
+    test = (
+        f"shift, rotation and scale together: chi-square {gap.test.chi2:.4g} for {gap.test.dof} "
+        f"degrees of freedom, {probability(gap.test.p_value)}"
+    )
+    if gap.errors_of != "both":
+        test += f", on the errors of {gap.errors_of} alone"
+    if gap.test.p_value < SIGNIFICANT:
+        return f"Chip {gap.chip} lies elsewhere {chips}, significantly: {size} ({test})."
+    return f"Chip {gap.chip} lies alike {chips} within the errors: {size} ({test})."
+
+
+def gap_lines(gap: GapDifference) -> list[str]:
+    """What stands below it: A minus B, the reference chips laid on each other.
+
+    Parameters
+    ----------
+    gap : GapDifference
+
+    Returns
+    -------
+    list of str
+    """
+    sigma = [None] * 4 if gap.sigma is None else gap.sigma.tolist()
+    shift_x, shift_y, scale, turn = zip(gap.values.tolist(), sigma, strict=True)
+    degrees = [None if part is None else float(np.degrees(part)) for part in turn]
+    assert degrees[0] is not None
+    return [
+        f"  shift in x  {_measured(*shift_x)} pix",
+        f"  shift in y  {_measured(*shift_y)} pix",
+        f"  rotation    {_measured(degrees[0], degrees[1])} deg",
+        f"  scale - 1   {_measured(*scale)}",
+    ]
 
 
 def _errors(kind: str) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.budget import ErrorBudget, budget_rows, error_budgets
 from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.grid import DEFAULT_GRID
+from bayesdist.assess.product_terms import ProductTerm
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms import LocalTerm, UserTerm
 
@@ -59,9 +60,9 @@ class DetectorBudget:
         Returns
         -------
         list of dict
-            As those of an `ErrorBudget`; one for each term, the total last.
+            As those of an `ErrorBudget`; one for each term and product, the total last.
         """
-        by_term = zip(*((*b.terms, b.total) for b in self.chips), strict=True)
+        by_term = zip(*((*b.terms, *b.products, b.total) for b in self.chips), strict=True)
         return budget_rows(
             [
                 replace(
@@ -86,6 +87,7 @@ def detector_budget(
     fields: Sequence[FieldTerm] = (),
     aligned: bool = False,
     local: Sequence[LocalTerm] = (),
+    products: Sequence[ProductTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     n_draws: int = 4000,
@@ -103,6 +105,8 @@ def detector_budget(
         Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`.
     local : sequence of LocalTerm
         Measured beside the solution, on this grid.
+    products : sequence of ProductTerm
+        Shown beside the others, and in no total.
     grid : tuple of int
         Points on x and y of each chip.
     epoch : float, optional
@@ -130,6 +134,7 @@ def detector_budget(
             fields=fields,
             aligned=aligned,
             local=local,
+            products=products,
             grid=grid,
             epoch=epoch,
             n_draws=n_draws,

@@ -13,21 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.terms import GIVEN, MEASURED
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 
 __all__ = [
     "CATALOGUE",
     "EXPOSURE_SCATTER",
+    "MOTIONS",
     "CatalogueTerm",
     "ExposureScatter",
     "FieldDraws",
     "FieldTerm",
+    "part_of",
 ]
 
 Float = NDArray[np.float64]
 
 CATALOGUE = "reference catalogue (shared stars)"
+MOTIONS = "proper motions (shared stars)"
 EXPOSURE_SCATTER = "exposure scatter"
 
 
@@ -71,18 +75,27 @@ class FieldDraws:
 class FieldTerm(Protocol):
     """An error that is a field over the detector.
 
-    A term is one of two things.  It may come in addition to a solution; `without` is None then.  Or
-    the solution's draws hold it already, and it is shown beside its other parts: then `without` is
-    the solution that lacks it.
+    A term is one of three things.  It may come in addition to a solution; `without` is None then.
+    Or the solution's draws hold it already, and it is shown beside its other parts: then `without`
+    is the solution that lacks it.  Or another term holds it, which it names (see `part_of`): it is
+    shown then, and not added either.
     """
 
     @property
     def name(self) -> str: ...
 
     @property
+    def source(self) -> str: ...
+
+    @property
     def without(self) -> Solution | None: ...
 
     def draws(self, n: int, rng: np.random.Generator) -> FieldDraws: ...
+
+
+def part_of(term: FieldTerm) -> str:
+    """Name of the term that holds this one; empty for one that stands by itself."""
+    return str(getattr(term, "part_of", ""))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,13 +113,17 @@ class CatalogueTerm:
     without : Posterior or LinearFit
         The solution that takes the catalogue's errors for independent.
     covariance : ndarray, shape (D, D)
-        Of the error of its parameters that the catalogue causes: `total` of a `StarCovariance`.
+        Of the error of its parameters that the catalogue causes: `total` of a `StarCovariance`, or
+        its part for the positions, and the one for the motions in a term of its own.
     name : str
+    source : str
+        Where the errors of the catalogue come from.
     """
 
     without: Solution
     covariance: Float
     name: str = CATALOGUE
+    source: str = GIVEN
 
     def draws(self, n: int, rng: np.random.Generator) -> FieldDraws:
         """Draws of the error from N(0, covariance)."""
@@ -136,7 +153,7 @@ class ExposureScatter:
         Deviations that scatter, as an exposure's parameters are named: 'scale', 'shear_plus', ...
     tau : ndarray, shape (m, k)
         Draws of the scatter of each kind.
-    name : str
+    name, source : str
 
     Raises
     ------
@@ -149,6 +166,7 @@ class ExposureScatter:
     kinds: tuple[str, ...]
     tau: Float
     name: str = EXPOSURE_SCATTER
+    source: str = MEASURED
     without: None = None
 
     def __post_init__(self) -> None:

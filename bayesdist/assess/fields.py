@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.field_terms import FieldDraws, FieldTerm
+from bayesdist.assess.field_terms import FieldDraws, FieldTerm, part_of
 from bayesdist.assess.moments import position_moments
 from bayesdist.assess.rigid import without_rigid
 from bayesdist.assess.solution import Solution, place_of, point_blocks
@@ -190,7 +190,7 @@ class ErrorDraws:
     ----------
     whole : draws of the solution
     shown : draws of the one whose parts are shown
-        The same, but where a field term is among the solution's errors.
+        The same, but where field terms are among the solution's errors.
     terms : dict of str to FieldDraws
     added : frozenset of str
         Names of those that come in addition to the solution.
@@ -287,22 +287,23 @@ def draw_errors(
     Raises
     ------
     InputError
-        For fewer than two draws, or two field terms that the solution holds already.
+        For fewer than two draws, or field terms that the solution holds already and that name
+        different solutions without them.
     """
     if n_draws < 2:
         raise InputError(f"the number of draws is {n_draws}", do="ask for at least 2")
     held = [term.without for term in fields if term.without is not None]
-    if len(held) > 1:
+    if any(one is not held[0] for one in held):
         raise InputError(
-            f"{len(held)} field terms are among the errors of the solution, and each names the "
-            "solution that lacks it alone",
+            f"{len(held)} field terms are among the errors of the solution, and they name "
+            "different solutions that lack them",
             where="fields",
-            do="give one of them",
+            do="name the solution that lacks all of them",
         )
     whole = _drawn(solution, n_draws, rng, aligned)
     shown = _drawn(held[0], n_draws, rng, aligned) if held else whole
     terms = {term.name: term.draws(n_draws, rng) for term in fields}
-    added = frozenset(term.name for term in fields if term.without is None)
+    added = frozenset(t.name for t in fields if t.without is None and not part_of(t))
     return ErrorDraws(whole, shown, terms, added, aligned)
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.holdout_bins import Bin, partitions_of
+from bayesdist.assess.holdout_deviations import deviation_tests
+from bayesdist.assess.holdout_frames import frames_for
 from bayesdist.assess.holdout_predictive import Predictive, predictive_of
-from bayesdist.assess.holdout_rows import frames_for
 from bayesdist.assess.holdout_spread import scale_of
 from bayesdist.assess.holdout_sums import held_sums
 from bayesdist.assess.holdout_tests import HeldTest, all_tests, holm
@@ -25,7 +26,7 @@ Float = NDArray[np.float64]
 LEAST_HELD = 50  # stars, without which nothing can be said
 SAMPLE = 200_000  # stars that say where bins end
 UNUSUAL, DOUBTFUL = 0.01, 1e-3  # probability, over all tests together
-ORDER = ("offset", "spread", "tails", "distribution")  # of what tells most
+ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what tells most
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,19 +96,25 @@ class HeldOutTruth:
     def _telling(self, level: float) -> HeldTest | None:
         """The test that tells most of those that matter."""
         found = [t for t in self.tests if t.p_corrected < level and t.matters]
-        places = [t for t in found if t.name in ("offset", "spread")]
+        places = [t for t in found if t.name in ("offset", "spread", "deviation")]
         return min(places or found, key=_rank, default=None)
 
     def _words(self, test: HeldTest) -> str:
+        where = f"{test.where}," if "held out whole" in test.where else test.where
         if test.name == "offset":
             return (
-                f"{test.where} held-out stars lie {test.value:.2g} {self.unit} from where they are "
+                f"{where} held-out stars lie {test.value:.2g} {self.unit} from where they are "
                 "predicted"
             )
         if test.name == "spread":
             return (
-                f"{test.where} the residuals of held-out stars are {test.value:.2g} times as large "
+                f"{where} the residuals of held-out stars are {test.value:.2g} times as large "
                 "as predicted"
+            )
+        if test.name == "deviation":
+            return (
+                f"{where} deviates by {test.value:.2g} from the other exposures, which scatter"
+                f" by {test.limit:.2g}"
             )
         if test.name == "tails":
             return (
@@ -117,9 +124,13 @@ class HeldOutTruth:
         return f"the residuals {test.where} of held-out stars are not distributed as predicted"
 
 
-def _rank(test: HeldTest) -> tuple[float, int, float]:
-    """Where a test stands among others: tails of distributions underflow together."""
-    return test.p_value, ORDER.index(test.name), -abs(test.value - test.expected)
+def _rank(test: HeldTest) -> tuple[float, int, float, bool]:
+    """Where a test stands among others: tails of distributions underflow together.
+
+    Of an exposure that is alone at its date it is the exposure that is told.
+    """
+    size = -abs(test.value - test.expected)
+    return test.p_value, ORDER.index(test.name), size, test.part == "epoch"
 
 
 def _chance(p: float) -> str:
@@ -146,15 +157,15 @@ def held_out_truth(
     Raises
     ------
     InputError
-        For too few stars, and for a solution that has frames of a kind that cannot be predicted.
+        For too few stars, and for a campaign's posterior of which only the draws are given.
     """
     predictive = solution if isinstance(solution, Predictive) else predictive_of(solution)
     where = ", ".join(held.sources)
-    if predictive.model.gauge != "first":
+    if predictive.model.gauge != "first" and predictive.deviations is None:
         raise InputError(
-            "held-out stars cannot be predicted by a model of a campaign",
+            "the posterior of a campaign does not say how exposures scatter",
             where=where,
-            do="give matched stars",
+            do="give a Predictive with deviations",
         )
     pieces = held.pieces()
     partitions = partitions_of(predictive.model, held, held.sample(SAMPLE), whole)
@@ -166,7 +177,7 @@ def held_out_truth(
             where=where,
             do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
         )
-    tests = all_tests(sums, predictive, partitions)
+    tests = [*all_tests(sums, predictive, partitions), *deviation_tests(predictive, frames)]
     corrected = holm(np.array([t.p_value for t in tests]))
     tests = [replace(t, p_corrected=float(p)) for t, p in zip(tests, corrected, strict=True)]
     regions = next(p for p in partitions if p.kind == "region")

@@ -1,4 +1,8 @@
-"""How held-out stars are divided: by place, magnitude, date and exposure."""
+"""How held-out stars are divided: by place, magnitude, date and exposure.
+
+An exposure that was held out whole is also divided by place: what bends it alone leaves its mean
+where it was.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,8 @@ ALL = "all"
 STARS_PER_BIN = 60
 MOST_CELLS = 8  # along each side of a chip
 MOST_BINS = 8  # of magnitudes, and of dates
+MOST_PLACES = 4  # along each side of a chip of one exposure
+MOST_CELLS_IN_ALL = 512  # of all such exposures
 MOST_EXPOSURES = 60  # beyond it only those that were held out whole are looked at one by one
 
 
@@ -51,7 +57,7 @@ class Partition:
     Parameters
     ----------
     kind : str
-        'all', 'region', 'magnitude', 'epoch' or 'exposure'.
+        'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
     bins : tuple of Bin
     code : callable
         Of a table and some of its rows: bin of each, negative where there is none.
@@ -86,12 +92,13 @@ def partitions_of(
     """
     n = len(held)
     out = [Partition(ALL, (Bin("over the whole detector"),), lambda _, rows: rows * 0)]
-    out.append(_regions(model, n))
+    out.append(_regions(model, _cells(model, n, MOST_CELLS)))
     share = n // STARS_PER_BIN
     if sample.mag is not None:
         out += _quantiles("magnitude", "mag", sample.mag, min(share, MOST_BINS))
     if sample.epoch is not None:
         out += _quantiles("epoch", "epoch", sample.epoch, min(share, MOST_BINS))
+    out += _places(model, sample, n / len(sample), whole)
     names = held.exposure_names
     if len(names) > MOST_EXPOSURES:
         names = tuple(name for name in names if name in set(whole))
@@ -100,8 +107,43 @@ def partitions_of(
     return tuple(out)
 
 
-def _regions(model: DistortionModel, n: int) -> Partition:
-    side = int(np.clip(np.sqrt(n / len(model.chips) / STARS_PER_BIN), 1, MOST_CELLS))
+def _cells(model: DistortionModel, n: float, most: int) -> int:
+    """Cells along each side of a chip, for so many stars."""
+    return int(np.clip(np.sqrt(n / len(model.chips) / STARS_PER_BIN), 1, most))
+
+
+def _places(
+    model: DistortionModel, sample: MatchTable, share: float, whole: Sequence[str]
+) -> list[Partition]:
+    """Cells of each exposure that was held out whole; none where stars are few."""
+    if len(np.unique(sample.exposure)) < 2:
+        return []  # its places are those of all stars
+    names = tuple(name for name in sample.exposure_names if name in set(whole))[:MOST_EXPOSURES]
+    if not names:
+        return []
+    codes = [sample.exposure_names.index(name) for name in names]
+    n = min(float((sample.exposure == k).sum()) * share for k in codes)
+    few = np.sqrt(MOST_CELLS_IN_ALL / (len(model.chips) * len(names)))
+    side = _cells(model, n, min(MOST_PLACES, int(few)))
+    if side * len(model.chips) < 2:
+        return []
+    cells = _regions(model, side)
+    number = {name: k for k, name in enumerate(names)}
+
+    def code(table: MatchTable, rows: Int) -> Int:
+        of_code = np.array([number.get(name, -1) for name in table.exposure_names], np.int64)
+        mine = of_code[table.exposure[rows]]
+        return np.where(mine < 0, -1, mine * len(cells.bins) + cells.codes(table, rows))
+
+    bins = [
+        Bin(f"in exposure {name}, held out whole, {cell.words}", cell.chip, cell.limits)
+        for name in names
+        for cell in cells.bins
+    ]
+    return [Partition("place in exposure", tuple(bins), code)]
+
+
+def _regions(model: DistortionModel, side: int) -> Partition:
     several = len(model.chips) > 1
     bins = []
     for chip in model.chips:

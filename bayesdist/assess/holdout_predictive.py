@@ -3,6 +3,8 @@
     p(r) = (1 - f) N(r; 0, S) + f p_out(r)      S = diag(s_u^2 + j^2, s_v^2 + j^2) + J C J^T
 
 with the star's quoted errors s, the jitter j, and the solution's own covariance C at its place.
+Of a campaign S has, beside these, what the errors of the look-up tables leave at the place; and
+more is known: how exposures scatter, and which part of s is an error of the star in the catalogue.
 """
 
 from __future__ import annotations
@@ -14,14 +16,44 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from bayesdist.infer.posterior import Posterior
-from bayesdist.model import DistortionModel
+from bayesdist.infer.star_influence import StarInfluence
+from bayesdist.model import DistortionModel, LookupTable
 
-__all__ = ["Predictive", "Scores", "predictive_of", "scores_of", "uniforms_of"]
+__all__ = [
+    "ExposureDeviations",
+    "Predictive",
+    "Scores",
+    "predictive_of",
+    "scores_of",
+    "uniforms_of",
+]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 NEVER = 1e-300
 SCALES = np.geomspace(0.5, 4.0, 13)  # of the errors, at which scores are taken
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureDeviations:
+    """How the exposures of a campaign deviate from what they have in common.
+
+    Parameters
+    ----------
+    kinds : tuple of str, length k
+        As an exposure's parameters are named: 'scale', ...
+    tau : ndarray, shape (m, k)
+        Draws of the scatter of each.
+    """
+
+    kinds: tuple[str, ...]
+    tau: Float
+
+    def precision(self, names: tuple[str, ...]) -> Float:
+        """Inverse variances (q,) of an exposure's parameters; zero for those that are free."""
+        variance = dict(zip(self.kinds, (self.tau**2).mean(axis=0), strict=True))
+        return np.array([1 / variance[name] if name in variance else 0.0 for name in names])
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +77,16 @@ class Predictive:
         Those of 'j', 'f', 's_out' that are not known exactly.
     free_cov : ndarray, shape (h, h)
         Their covariance, as squared jitter, fraction and log scale.
+    deviations : ExposureDeviations or None
+        None where exposures that were held out whole have frames of which nothing is known.
+    stars : StarInfluence or None
+        Errors of the catalogue, which the quoted errors contain; None where each match has an
+        error of its own.
+    local : tuple of LookupTable
+        Standard errors of positions by those of the look-up tables, in the unit of u and v; none
+        where there are no tables.
+    cell : tuple of float or None
+        Pixels along x and y over which stars share these errors.
     """
 
     model: DistortionModel
@@ -56,6 +98,19 @@ class Predictive:
     scale: float = 1.0
     free: tuple[str, ...] = ()
     free_cov: Float = field(default_factory=lambda: np.zeros((0, 0)))
+    deviations: ExposureDeviations | None = None
+    stars: StarInfluence | None = None
+    local: tuple[LookupTable, ...] = ()
+    cell: tuple[float, float] | None = None
+
+    def local_variance(self, x: Float, y: Float, chip: Int) -> Float:
+        """Variance (n,) on each axis of positions by the errors of the look-up tables."""
+        out = np.zeros(len(x))
+        for table in self.local:
+            here = chip == table.chip
+            # frames turn the axes, and the errors on both are nearly equal
+            out[here] = (table.evaluate(x[here], y[here]) ** 2).mean(axis=1)
+        return out
 
     def hyper(self) -> Float:
         """Squared jitter, fraction and log scale."""

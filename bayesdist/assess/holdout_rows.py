@@ -3,50 +3,27 @@
 A star of an exposure that was fitted is predicted by itself.  An exposure that was held out whole
 has no frame yet: one is fitted to its own stars, and what these have lost to it is taken off the
 covariance of their residuals.
+
+Polynomials that belong to no exposure lie along the detector's axes, and so do the residuals then:
+what is wrong on the detector would average away over exposures of many roll angles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.holdout_predictive import Predictive, scores_of
+from bayesdist.assess.holdout_frames import AT_ONCE, Frame, framed, noise_of
+from bayesdist.assess.holdout_predictive import Predictive
 from bayesdist.data import MatchTable
-from bayesdist.data.pieces import Piece
-from bayesdist.infer.stars import errors_of
-from bayesdist.model import DistortionModel
-from bayesdist.model.frames import frame_matrix, frame_names, frame_tangent, nearest_frame
 
-__all__ = ["Frame", "Rows", "frames_for", "predicted_rows"]
+__all__ = ["Rows", "predicted_rows"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-AT_ONCE = 2**14
-SOFT, EXACT = 10, 6  # steps with weights that reach far, and with those of the mixture
-REACH = 4.0  # chi-square at which the former are one half
-STARS_PER_FRAME = 20
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """The frame of an exposure that was held out whole.
-
-    Parameters
-    ----------
-    values : ndarray, shape (q,)
-    information : ndarray, shape (q, q)
-        What its stars say of it.
-    shared : ndarray, shape (q, n)
-        What they say of it and of the solution's polynomials and drift together.
-    """
-
-    values: Float
-    information: Float
-    shared: Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +45,8 @@ class Rows:
     by_frame : ndarray, shape (n, 2, q) or None
         By those of a frame of their own.
     frame : Frame or None
+    with_solution : ndarray, shape (n, 2, m) or None
+        Covariance of the catalogue's errors of these stars with those of the parameters.
     """
 
     index: Int
@@ -77,6 +56,7 @@ class Rows:
     jacobian: Float
     by_frame: Float | None = None
     frame: Frame | None = None
+    with_solution: Float | None = None
 
 
 def predicted_rows(
@@ -126,7 +106,6 @@ def _known(
     )
     effective = model.effective(predictive.mean, groups)
     jacobians = model.effective_jacobian(predictive.mean, groups)
-    sigma = np.stack(errors_of(table), axis=1)
     data = np.stack([table.u, table.v], axis=1)
     for g, members in enumerate(groups.members()):
         columns, d = jacobians[g]
@@ -137,13 +116,36 @@ def _known(
             phi = basis.evaluate(table.x[index], table.y[index])
             part = np.einsum("nk,akm->nam", phi, d)
             residual = data[index] - phi @ effective[g].T
-            cov = _noise(predictive, sigma[index]) + _squares(part, C)
-            yield Rows(index, residual, cov, columns, part)
+            cov = noise_of(predictive, table, index) + _squares(part, C)
+            found = Rows(index, residual, cov, columns, part)
+            if model.gauge == "held":
+                found = _turned_back(
+                    found, model.frame(predictive.mean, int(groups.exposure[g]))[0]
+                )
+            yield found
 
 
-def _noise(predictive: Predictive, sigma: Float) -> Float:
-    var = sigma**2 + predictive.jitter2
-    return np.column_stack([var, np.zeros(len(var))])
+def _framed(predictive: Predictive, table: MatchTable, index: Int, frame: Frame) -> Iterator[Rows]:
+    """Rows of an exposure with a frame of its own."""
+    n = predictive.model.n_distortion
+    C = predictive.cov[:n, :n]
+    for bare in framed(predictive, table, index, frame.values):
+        # what the frame takes up of the solution's errors is no error of the prediction
+        own = bare.by_solution - bare.by_frame @ (frame.spent @ frame.shared)
+        noise = noise_of(predictive, table, bare.index)
+        cov = noise + _squares(own, C) - _squares(bare.by_frame, frame.spent)
+        common = None
+        if predictive.stars is not None and table.star is not None:
+            epoch = None if table.epoch is None else table.epoch[bare.index]
+            common = predictive.stars.with_solution(table.star[bare.index], epoch)
+            both = np.einsum("nam,nbm->nab", common, own)
+            cov -= np.stack(
+                [2 * both[:, 0, 0], 2 * both[:, 1, 1], both[:, 0, 1] + both[:, 1, 0]], axis=1
+            )
+        cov[:, :2] = np.maximum(cov[:, :2], 0.05 * noise[:, :2])
+        rows = Rows(bare.index, bare.residual, cov, np.arange(n), own, bare.by_frame, frame, common)
+        held = predictive.model.gauge == "held"
+        yield _turned_back(rows, bare.matrix) if held else rows
 
 
 def _squares(J: Float, C: Float) -> Float:
@@ -152,141 +154,25 @@ def _squares(J: Float, C: Float) -> Float:
     return np.stack([(JC[:, i] * J[:, k]).sum(axis=1) for i, k in ((0, 0), (1, 1), (0, 1))], axis=1)
 
 
-def _turned(predictive: Predictive, rows: Rows, w: Float, values: Float) -> Rows:
-    """Rows of the bare polynomial, which predicts w (n, 2), under a frame."""
-    model, kind = predictive.model, predictive.model.frames
-    o = np.asarray(model.origin)
-    M, d = frame_matrix(kind, values)
-    about = w - o
-    tangent = np.einsum("mab,nb->nam", frame_tangent(kind, values), about)
-    eye = np.broadcast_to(np.eye(2), (len(w), 2, 2))
+def _turned_back(rows: Rows, matrix: Float) -> Rows:
+    """Rows along the axes before a frame of this linear part, by the rotation in it."""
+    angle = np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, s], [-s, c]])  # the inverse of the rotation
+    uu, vv, uv = rows.cov.T
+    cov = np.stack([np.stack([uu, uv], axis=1), np.stack([uv, vv], axis=1)], axis=1)
+    cov = R @ cov @ R.T
+
+    def turned(values: Float | None) -> Float | None:
+        return None if values is None else np.asarray(R @ values)
+
     return Rows(
         rows.index,
-        rows.residual + w - (o + d + about @ M.T),
-        rows.cov,
-        np.arange(model.n_distortion),
-        np.einsum("ab,nbm->nam", M, _all_columns(model, rows)),
-        np.concatenate([eye, tangent], axis=2),
+        rows.residual @ R.T,
+        np.stack([cov[:, 0, 0], cov[:, 1, 1], cov[:, 0, 1]], axis=1),
+        rows.columns,
+        R @ rows.jacobian,
+        turned(rows.by_frame),
+        rows.frame,
+        turned(rows.with_solution),
     )
-
-
-def _all_columns(model: DistortionModel, rows: Rows) -> Float:
-    """Derivatives (n, 2, n_distortion) by all polynomials and drifts."""
-    out = np.zeros((len(rows.index), 2, model.n_distortion))
-    out[:, :, rows.columns] = rows.jacobian
-    return out
-
-
-def _framed(predictive: Predictive, table: MatchTable, index: Int, frame: Frame) -> Iterator[Rows]:
-    """Rows of an exposure with a frame of its own."""
-    sigma = np.stack(errors_of(table), axis=1)
-    spent = np.linalg.pinv(frame.information)
-    n = predictive.model.n_distortion
-    C = predictive.cov[:n, :n]
-    for bare in _known(predictive, table, index, None):
-        w = np.stack([table.u, table.v], axis=1)[bare.index] - bare.residual
-        rows = _turned(predictive, bare, w, frame.values)
-        assert rows.by_frame is not None
-        # what the frame takes up of the solution's errors is no error of the prediction
-        own = rows.jacobian - rows.by_frame @ (spent @ frame.shared)
-        noise = _noise(predictive, sigma[bare.index])
-        cov = noise + _squares(own, C) - _squares(rows.by_frame, spent)
-        cov[:, :2] = np.maximum(cov[:, :2], 0.05 * noise[:, :2])
-        yield Rows(bare.index, rows.residual, cov, rows.columns, own, rows.by_frame, frame)
-
-
-def frames_for(
-    predictive: Predictive, pieces: Sequence[Piece], names: Sequence[str]
-) -> dict[str, Frame]:
-    """Frames of exposures that the solution does not know, fitted to their own stars.
-
-    Parameters
-    ----------
-    predictive : Predictive
-    pieces : sequence of Piece
-        Of the held-out stars; they are gone through once for every step.
-    names : sequence of str
-
-    Returns
-    -------
-    dict of str to Frame
-        Of the exposures that have enough stars.
-    """
-    unknown = [name for name in names if name not in set(predictive.model.exposures)]
-    if not predictive.model.n_frame or not unknown:
-        return {}
-    values = _first_guess(predictive, pieces, unknown)
-    for step in range(SOFT + EXACT):
-        sums = _frame_sums(predictive, pieces, values, soft=step < SOFT)
-        for name, (gradient, curvature, *_) in sums.items():
-            values[name] = values[name] + np.linalg.lstsq(curvature, gradient)[0]
-    final = _frame_sums(predictive, pieces, values, soft=False)
-    return {name: Frame(values[name], one[2], one[3]) for name, one in final.items()}
-
-
-def _bare_of(
-    predictive: Predictive, pieces: Sequence[Piece], names: Sequence[str]
-) -> Iterator[tuple[str, Rows, Float, Float]]:
-    """Name, rows of the bare polynomial, its prediction and the data, of some exposures."""
-    for piece in pieces:
-        table = piece.read()
-        data = np.stack([table.u, table.v], axis=1)
-        for k, name in enumerate(table.exposure_names):
-            if name in names:
-                for rows in _known(predictive, table, np.flatnonzero(table.exposure == k), None):
-                    yield name, rows, data[rows.index] - rows.residual, data[rows.index]
-
-
-def _first_guess(
-    predictive: Predictive, pieces: Sequence[Piece], names: Sequence[str]
-) -> dict[str, Float]:
-    """Frames nearest to the linear maps that least squares finds."""
-    kind, o = predictive.model.frames, np.asarray(predictive.model.origin)
-    normal = {name: np.zeros((3, 3)) for name in names}
-    right = {name: np.zeros((3, 2)) for name in names}
-    for name, _, w, data in _bare_of(predictive, pieces, names):
-        A = np.column_stack([np.ones(len(w)), w - o])
-        normal[name] += A.T @ A
-        right[name] += A.T @ (data - o)
-    out = {}
-    for name, N in normal.items():
-        if N[0, 0] < STARS_PER_FRAME:
-            continue
-        found = np.linalg.lstsq(N, right[name])[0]
-        out[name] = nearest_frame(kind, found[1:].T, found[0])
-        if kind == "shift":
-            out[name] = (right[name][0] - N[0, 1:]) / N[0, 0]
-    return out
-
-
-def _frame_sums(
-    predictive: Predictive, pieces: Sequence[Piece], values: Mapping[str, Float], *, soft: bool
-) -> dict[str, tuple[Float, Float, Float, Float]]:
-    """Gradient, curvature, information, and what is shared with the solution, by exposure."""
-    q, D = len(frame_names(predictive.model.frames)), predictive.model.n_distortion
-    out = {n: (np.zeros(q), np.zeros((q, q)), np.zeros((q, q)), np.zeros((q, D))) for n in values}
-    for name, bare, w, _ in _bare_of(predictive, pieces, list(values)):
-        rows = _turned(predictive, bare, w, values[name])
-        assert rows.by_frame is not None
-        a, b = rows.cov[:, 0], rows.cov[:, 1]
-        var = np.stack([a, b], axis=1)
-        if soft:
-            weight = 1 / (1 + (rows.residual**2 / var).sum(axis=1) / REACH)
-            score = weight[:, None] * rows.residual / var
-        else:
-            score = scores_of(predictive, rows.residual, rows.cov).place
-        # curvature as of a Gaussian of the same weights: steps never overshoot
-        share = np.clip(
-            (score * rows.residual).sum(axis=1)
-            / np.maximum((rows.residual**2 / var).sum(axis=1), 1e-300),
-            0.0,
-            1.0,
-        )
-        A = rows.by_frame
-        along = np.einsum("na,nam->nm", score, A)
-        gradient, curvature, information, shared = out[name]
-        gradient += along.sum(axis=0)
-        curvature += np.einsum("n,na,nam,nak->mk", share, 1 / var, A, A)
-        information += along.T @ along
-        shared += along.T @ np.einsum("na,nam->nm", score, rows.jacobian)
-    return out

@@ -7,17 +7,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
 from bayesdist.assess.holdout_bins import Partition
+from bayesdist.assess.holdout_frames import Frame
 from bayesdist.assess.holdout_predictive import (
     SCALES,
     Predictive,
     scores_of,
     uniforms_of,
 )
-from bayesdist.assess.holdout_rows import Frame, Rows, predicted_rows
+from bayesdist.assess.holdout_rows import Rows, predicted_rows
+from bayesdist.assess.holdout_shared import SharedErrors
 from bayesdist.assess.holdout_spread import SpreadMoments
 from bayesdist.data import MatchTable
 from bayesdist.data.pieces import Piece
@@ -39,11 +42,17 @@ class BinSums:
     ----------
     n : ndarray, shape (B,)
     place : ndarray, shape (B, 2)
-        Scores of the position, and their squares (B, 2, 2).
+        Scores of the position.
+    place_2 : ndarray, shape (B, 2, 2)
+        Their squares.
+    place_cov : ndarray, shape (2 B, 2 B) or None
+        Covariance of all sums where matches share errors, in place of these squares.
     weight : ndarray, shape (B, 2)
         Inverse variances, each times the share that its star counts.
     place_by : ndarray, shape (B, 2, D)
         What they have in common with the solution's parameters.
+    place_with : ndarray, shape (B, 2, D)
+        Covariance of their sums with these parameters, by way of the catalogue's errors.
     lost : dict of str to ndarray, shape (B, 2, q)
         ... and with the frames that were fitted to these stars.
     spread, spread_2, spread_3 : ndarray, shape (B,)
@@ -51,6 +60,8 @@ class BinSums:
     spread_by : ndarray, shape (B, h)
     scales : ndarray, shape (B, SCALES)
         Those scores for other errors.
+    independent : ndarray, shape (B,)
+        Stars, each once in however many exposures it is; as `n` where they share no errors.
     """
 
     n: Float
@@ -58,17 +69,28 @@ class BinSums:
     place_2: Float
     weight: Float
     place_by: Float
+    place_with: Float
     spread: Float
     spread_2: Float
     spread_3: Float
     spread_by: Float
     scales: Float
+    independent: Float
     lost: dict[str, Float] = field(default_factory=dict)
+    place_cov: Float | None = None
+
+    @property
+    def own_cov(self) -> Float:
+        """Covariance (2 B, 2 B) of the sums by what is the matches' own."""
+        if self.place_cov is not None:
+            return self.place_cov
+        return np.asarray(block_diag(*self.place_2))
 
     @classmethod
     def empty(cls, n_bins: int, n_params: int, n_free: int) -> BinSums:
         """Sums over nothing."""
-        shapes = ((), (2,), (2, 2), (2,), (2, n_params), (), (), (), (n_free,), (SCALES.size,))
+        by = (2, n_params)
+        shapes = ((), (2,), (2, 2), (2,), by, by, (), (), (), (n_free,), (SCALES.size,), ())
         return cls(*(np.zeros((n_bins, *shape)) for shape in shapes))
 
 
@@ -93,6 +115,8 @@ class HeldSums:
     frames : mapping of str to Frame
     pit_lost : dict of str to ndarray, shape (3, PIT_BINS, q)
         What the counts have in common with these frames.
+    shared : SharedErrors or None
+        What else matches have in common; None where each has an error of its own.
     """
 
     bins: dict[str, BinSums]
@@ -103,6 +127,7 @@ class HeldSums:
     expected: Float
     frames: Mapping[str, Frame]
     pit_lost: dict[str, Float] = field(default_factory=dict)
+    shared: SharedErrors | None = None
     n: int = 0
     n_left_out: int = 0
 
@@ -136,6 +161,8 @@ def held_sums(
         np.zeros((len(TAILS), 1 + 2 * h)),
         frames,
     )
+    if predictive.stars is not None:
+        out.shared = SharedErrors(predictive, PIT_BINS, TAILS)
     moments = SpreadMoments(predictive)
     around = [predictive, *_around(predictive)]
     for piece in pieces:
@@ -146,6 +173,10 @@ def held_sums(
             _add(out, predictive, moments, around, partitions, table, rows)
         out.n += seen
         out.n_left_out += len(table) - seen
+    for sums in out.bins.values():
+        sums.independent[:] = sums.n
+    if out.shared is not None:
+        out.shared.settle(out.bins)
     return out
 
 
@@ -182,12 +213,21 @@ def _add(
         (rows.residual**2 / rows.cov[:, :2]).sum(axis=1)[:, None] * rows.cov[:, :2],
     )
     lost = _Lost.of(table, rows, scores.place)
+    place = scores.place
+    if rows.frame is not None:  # as they would scatter if they had lost nothing to the frame
+        A = rows.by_frame
+        taken = np.einsum("nam,mk,nak->na", A, rows.frame.spent, A)
+        place = place * np.sqrt(1 + taken / rows.cov[:, :2])
+    shares = None
+    if rows.with_solution is not None:
+        shares = np.einsum("na,nam->nm", scores.place, rows.with_solution)
+    codes = {p.kind: p.codes(table, rows.index) for p in partitions}
     for partition in partitions:
         sums = out.bins[partition.kind]
-        member = _member(partition.codes(table, rows.index), len(partition.bins))
+        member = _member(codes[partition.kind], len(partition.bins))
         sums.n += _sum(member, np.ones(len(rows.index)))
         sums.place += member @ scores.place
-        outer = scores.place[:, :, None] * scores.place[:, None, :]
+        outer = place[:, :, None] * place[:, None, :]
         sums.place_2 += (member @ outer.reshape(-1, 4)).reshape(-1, 2, 2)
         sums.weight += member @ weight
         sums.spread += _sum(member, scores.one)
@@ -198,6 +238,9 @@ def _add(
         for axis in (0, 1):
             by = member @ (scores.place[:, axis, None] * along)
             sums.place_by[:, axis, rows.columns] += by
+            if shares is not None:
+                common = member @ (scores.place[:, axis, None] * shares)
+                sums.place_with[:, axis, rows.columns] += common
         if lost is not None:
             shared = lost.among(sums.lost, len(partition.bins), 2)
             for axis in (0, 1):
@@ -213,6 +256,8 @@ def _add(
             shared = lost.among(out.pit_lost, 3, PIT_BINS)
             shared[k] += member @ lost.along - lost.along.sum(axis=0) / PIT_BINS
     size = np.abs(rows.residual) / np.sqrt(rows.cov[:, :2])
+    if out.shared is not None:
+        out.shared.add(table, rows, place, uniforms, size.max(axis=1), codes)
     for k, limit in enumerate(TAILS):
         out.beyond[k] += (size.max(axis=1) > limit).sum()
         for m, one in enumerate(around):

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta, binom, chi2
+from scipy.special import betainc
+from scipy.stats import beta, chi2
 
 from bayesdist.assess.holdout_bins import ALL, Partition
 from bayesdist.assess.holdout_predictive import Predictive
@@ -25,7 +26,7 @@ Float = NDArray[np.float64]
 
 LEAST_STARS = 20  # of a bin that is judged by itself
 STARS_PER_PIT_BIN = 20
-SINGULAR = 1e-6  # of a variance: what frames have taken up whole
+SINGULAR = 0.05  # of a variance: what is left where frames have taken up nearly all
 RATIO = 1.05  # of predicted errors: less does not matter, however significant
 DEPARTURE = 0.02  # of a distribution function
 EXCESS = 1.5  # of stars in the tails
@@ -38,9 +39,9 @@ class HeldTest:
     Parameters
     ----------
     name : str
-        'offset', 'spread', 'distribution' or 'tails'.
+        'offset', 'spread', 'distribution', 'tails' or 'deviation'.
     part : str
-        'all', 'region', 'magnitude', 'epoch' or 'exposure'.
+        'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
     where : str
         In words.
     index : int
@@ -49,9 +50,10 @@ class HeldTest:
         Stars.
     value : float
         Distance from the prediction in the unit of u, v; factor on the predicted errors; largest
-        difference of distribution functions; fraction of stars beyond the limit.
+        difference of distribution functions; fraction of stars beyond the limit; deviation of an
+        exposure.
     expected : float
-        0, 1, 0, or the expected fraction.
+        0, 1, 0, the expected fraction, or 0.
     interval : tuple of float
         Of a fraction, 95 %; else NaN.
     p_value : float
@@ -88,7 +90,7 @@ class HeldTest:
             return self.value > RATIO
         if self.name == "distribution":
             return self.wider and self.value > DEPARTURE
-        return self.name == "offset" or self.value > EXCESS * self.expected
+        return self.name in ("offset", "deviation") or self.value > EXCESS * self.expected
 
 
 def all_tests(
@@ -132,29 +134,37 @@ def holm(p_values: Float) -> Float:
     return out
 
 
+def _of_clusters(t: float, dof: int, n: int) -> float:
+    """Probability of a larger chi-square whose covariance is the sum of squares of n stars.
+
+    Hotelling 1931, for squares about zero.
+    """
+    return float(beta.sf(min(t / n, 1.0), dof / 2, max(n - dof, 1) / 2))
+
+
 def _offsets(
     found: BinSums, sums: HeldSums, predictive: Predictive, partition: Partition
 ) -> list[HeldTest]:
     """Whether stars lie about their predictions: each bin, then all together."""
     n_bins = len(found.n)
     by = found.place_by.reshape(2 * n_bins, -1)
-    cov = by @ predictive.cov @ by.T
-    for b in range(n_bins):
-        cov[2 * b : 2 * b + 2, 2 * b : 2 * b + 2] += found.place_2[b]
+    common = found.place_with.reshape(2 * n_bins, -1) @ by.T
+    cov = by @ predictive.cov @ by.T - common - common.T + found.own_cov
     for name, lost in found.lost.items():
         along = lost.reshape(2 * n_bins, -1)
-        cov -= along @ np.linalg.pinv(sums.frames[name].information) @ along.T
+        cov -= along @ sums.frames[name].spent @ along.T
     out, good = [], []
     for b in range(n_bins):
         pair = slice(2 * b, 2 * b + 2)
         least = np.linalg.eigvalsh(cov[pair, pair])[0]
-        if found.n[b] < LEAST_STARS or least < SINGULAR * np.trace(found.place_2[b]):
+        n = found.independent[b]
+        if n < LEAST_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
             continue
         good.append(b)
         score = found.place[b]
         t = float(score @ np.linalg.solve(cov[pair, pair], score))
         # their variance is their own, as in Hotelling's test about zero
-        p = float(beta.sf(min(t / found.n[b], 1.0), 1.0, (found.n[b] - 2) / 2))
+        p = _of_clusters(t, 2, int(n))
         size = float(np.hypot(*(score / found.weight[b])))
         bin_ = partition.bins[b]
         out.append(HeldTest("offset", partition.kind, bin_.words, b, int(found.n[b]), size, 0.0, p))
@@ -164,7 +174,10 @@ def _offsets(
         values, vectors = np.linalg.eigh(cov[np.ix_(rows, rows)] / np.outer(root, root))
         along = vectors.T @ (found.place.ravel()[rows] / root)
         known = values > SINGULAR
-        p = float(chi2.sf((along[known] ** 2 / values[known]).sum(), known.sum()))
+        t, dof = float((along[known] ** 2 / values[known]).sum()), int(known.sum())
+        p = float(chi2.sf(t, dof))
+        if sums.shared is not None:
+            p = _of_clusters(t, dof, sums.shared.n_stars)
         worst = min(out, key=lambda one: (one.p_value, -one.value))
         out.append(
             HeldTest(
@@ -200,8 +213,9 @@ def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> li
 
 def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
     """Whether the predictive probabilities are uniform."""
-    merge = 1
-    while merge < PIT_BINS // 4 and sums.n * merge < STARS_PER_PIT_BIN * PIT_BINS:
+    merge, shared = 1, sums.shared
+    n = sums.n if shared is None else shared.n_stars
+    while merge < PIT_BINS // 4 and n * merge < STARS_PER_PIT_BIN * PIT_BINS:
         merge = {1: 2, 2: 4, 4: 5}[merge]
     m = PIT_BINS // merge
     wider = bool(sums.pit[2] @ (np.arange(PIT_BINS) + 0.5) > sums.n * PIT_BINS / 2)
@@ -211,12 +225,17 @@ def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
         by = sums.pit_by[k].reshape(m, merge, -1).sum(axis=1)
         free = sums.pit_free[k].reshape(m, merge, -1).sum(axis=1)
         cov = sums.n * (np.eye(m) / m - 1 / m**2)
+        if shared is not None:
+            cov = shared.pit_covariance(k, merge)
         cov += by @ predictive.cov @ by.T + free @ predictive.free_cov @ free.T
         for name, several in sums.pit_lost.items():
             along = several[k].reshape(m, merge, -1).sum(axis=1)
-            cov -= along @ np.linalg.pinv(sums.frames[name].information) @ along.T
+            cov -= along @ sums.frames[name].spent @ along.T
         rest = (counts - sums.n / m)[:-1]
-        p = float(chi2.sf(rest @ np.linalg.solve(cov[:-1, :-1], rest), m - 1))
+        t = float(rest @ np.linalg.solve(cov[:-1, :-1], rest))
+        p = float(chi2.sf(t, m - 1))
+        if shared is not None:
+            p = _of_clusters(t, m - 1, n)
         size = float(np.abs(np.cumsum(sums.pit[k]) / sums.n - np.arange(1, 21) / PIT_BINS).max())
         out.append(HeldTest("distribution", ALL, what, k, sums.n, size, 0.0, p, wider=wider))
     return out
@@ -235,8 +254,9 @@ def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
         spread = np.sqrt(max(slope @ predictive.free_cov @ slope, 0.0))
         share = np.minimum(middle * np.exp(spread * nodes) / sums.n, 1.0)
         seen = int(sums.beyond[k])
-        below = float(weights @ binom.cdf(seen, sums.n, share))
-        above = float(weights @ binom.sf(seen - 1, sums.n, share))
+        more = 1.0 if sums.shared is None else sums.shared.overdispersion(limit)
+        below = float(weights @ _at_most(seen / more, sums.n / more, share))
+        above = float(weights @ _at_least(seen / more, sums.n / more, share))
         interval = (
             float(beta.ppf(0.025, seen, sums.n - seen + 1)) if seen else 0.0,
             float(beta.ppf(0.975, seen + 1, sums.n - seen)) if seen < sums.n else 1.0,
@@ -257,3 +277,13 @@ def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
             )
         )
     return out
+
+
+def _at_least(k: float, n: float, share: Float) -> Float:
+    """Probability of k or more of n, of which neither need be whole."""
+    return np.asarray(betainc(k, n - k + 1, share)) if k > 0 else np.ones_like(share)
+
+
+def _at_most(k: float, n: float, share: Float) -> Float:
+    """Probability of k or fewer of n."""
+    return np.asarray(1 - betainc(k + 1, n - k, share)) if k < n else np.ones_like(share)

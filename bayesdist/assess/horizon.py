@@ -137,12 +137,9 @@ def horizon_of(
     (judged,) = judged_places(
         replace(requirement, epoch=float(at[0]), epochs=None), model, chip=chip
     )
-    met, value = np.empty(at.size), np.empty(at.size)
-    for k, epoch in enumerate(at):
-        (draws,) = errors.statistics(
-            replace(judged, epoch=float(epoch)), [requirement.statistic]
-        ).values()
-        met[k] = np.mean(factor * draws <= requirement.limit)
-        value[k] = factor * np.median(draws)
+    cases = [replace(judged, epoch=float(epoch)) for epoch in at]
+    name = requirement.statistic
+    draws = factor * np.array([found[name] for found in errors.course(cases, [name])])
+    met, value = np.mean(draws <= requirement.limit, axis=1), np.median(draws, axis=1)
     low, high = np.array([clopper_pearson(p, n, BAND) for p in met]).T
     return Horizon(requirement, at, met, low, high, value)

@@ -39,6 +39,8 @@ class LinearTerm:
     solution : Solution
         Whose positions it moves.
     source : str
+    part_of : str
+        Name of the term that holds this one, which is then shown and not added.
 
     Raises
     ------
@@ -51,6 +53,7 @@ class LinearTerm:
     sigma: float
     solution: Solution
     source: str = GIVEN
+    part_of: str = ""
     without: None = None
 
     def __post_init__(self) -> None:

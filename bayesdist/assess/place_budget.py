@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.budget import TOTAL, BudgetTerm
+from bayesdist.assess.budget import TOGETHER, TOTAL, BudgetTerm
 from bayesdist.assess.fields import MODEL
 from bayesdist.assess.position_errors import CENTROID, PositionErrors
+from bayesdist.assess.product_terms import PRODUCT, ProductTerm
 from bayesdist.assess.terms import LOCAL, MEASURED
 from bayesdist.errors import InputError
 
@@ -57,6 +59,7 @@ def place_budget(
     relative: bool = False,
     relative_error: float | None = None,
     sources: dict[str, str] | None = None,
+    products: Sequence[ProductTerm] = (),
 ) -> PlaceBudget:
     """What the errors of some positions are made of.
 
@@ -78,6 +81,8 @@ def place_budget(
         Monte-Carlo error of what is drawn.
     sources : dict of str to str, optional
         Where terms come from; 'measured in this run' by default.
+    products : sequence of ProductTerm
+        Shown beside the others, and in no total.
 
     Returns
     -------
@@ -133,6 +138,11 @@ def place_budget(
     if magnitude is not None:
         sigma = np.tile(errors.centroid_at(magnitude), (N, 1))
         others.append(_term(CENTROID, "random", single(sigma), MEASURED))
+    of_files = []
+    for product in products:
+        moved = product.at(*at, chip, fields.epoch)
+        moved = np.abs(moved[1:] - moved[:1] if relative else moved)
+        of_files.append(_term(product.name, PRODUCT, moved, product.source, 0.0))
     model_term = drawn(MODEL)
     total = np.sqrt(sum((np.stack([t.u, t.v], axis=1) ** 2 for t in others), model_term**2))
     kept = [a[1:] if relative else a for a in at]
@@ -143,7 +153,7 @@ def place_budget(
         magnitude=magnitude,
         relative=relative,
         unit=errors.unit,
-        terms=(*terms, *others, _term(TOTAL, TOTAL, total, "")),
+        terms=(*terms, *others, *of_files, _term(TOTAL, TOTAL, total, TOGETHER)),
     )
 
 

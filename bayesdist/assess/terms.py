@@ -22,6 +22,7 @@ __all__ = [
     "LocalTerm",
     "UserTerm",
     "combined_sigma",
+    "said_by_user",
 ]
 
 Float = NDArray[np.float64]
@@ -31,6 +32,18 @@ LOCAL = "local"
 
 MEASURED = "measured in this run"
 GIVEN = "given by the user"
+PUBLISHED = "published"
+
+
+def said_by_user(source: str) -> str:
+    """What a user says of where a number comes from, as a source of a budget's row.
+
+    It begins with one of the three kinds of source: a publication that is named so stays one.
+    """
+    text = source.strip()
+    if text.lower().startswith((GIVEN, PUBLISHED)):
+        return text[0].lower() + text[1:]
+    return f"{GIVEN}: {text}" if text else GIVEN
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ tell how much the structure has changed within a cell: the line through both is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +35,8 @@ Float = NDArray[np.float64]
 # Side of the cells in which stars are paired, in sides of the cells of the covariance: a quarter,
 # but not quite, lest all of them lie alike towards a pattern that repeats.
 SHARE = 0.23
-FEWEST = 30  # pairs of stars that say something
+FEWEST = 30  # pairs of stars that say something, and
+MANY = 100  # so many that larger cells are not needed
 SOME = 8  # exposures, and
 GRID = 9  # points of each axis over which variances of the model's position are averaged
 
@@ -56,6 +57,8 @@ class Unmodelled:
         deviations of these numbers; a variance may come out below zero.
     covariance, covariance_error : float
         Of u with v.
+    drawn : ndarray, shape (2,)
+        Of u and v: the part of the variance by which the fit was drawn towards it, on the mean.
     """
 
     chip: int
@@ -65,11 +68,22 @@ class Unmodelled:
     error: Float
     covariance: float
     covariance_error: float
+    drawn: Float = field(default_factory=lambda: np.zeros(2))
 
     @property
     def rms(self) -> Float:
         """Rms of both axes (2,): a term of an error budget, independent from place to place."""
         return np.sqrt(np.maximum(self.variance, 0.0))
+
+    @property
+    def rms_beside(self) -> Float:
+        """What has to be added (2,), in squares, to the errors of the model's positions.
+
+        Where the fit was drawn towards the structure its position errs by that much, and by that
+        much less is left out.  With d the variance of it, the sum v of the structure's and d are
+        too large by 2 d.
+        """
+        return np.sqrt(np.maximum(self.variance - 2 * self.drawn, 0.0))
 
     @property
     def rms_error(self) -> Float:
@@ -112,7 +126,7 @@ def unmodelled(
         Says what the fit took of the structure; without it the variances are too small by that.
     side : float, optional
         Side of the cells in which stars are paired, in pixels; by default about a
-        quarter of the shortest of `cells`.
+        quarter of the shortest of `cells`, and up to all of it where stars are few.
     compute : Compute, optional
 
     Returns
@@ -128,12 +142,16 @@ def unmodelled(
         For a chip with fewer than 30 pairs of stars in the same cell.
     """
     model = solution.model
+    given = side is not None
     side = SHARE * cells.sides(model)[0] if side is None else side
     if not 0 < side < np.inf:
         raise InputError(f"the side is {side} pixels", where="side", do="give a positive number")
     shapes, into = cells.merged(2)
     with opened(model, matches, compute) as shards:
         sums = shards.sum(pair_sums, scores_of(solution), side, cells)
+        while not given and sums.n_pairs.min() < MANY and 2 * side < cells.sides(model)[0]:
+            side *= 2
+            sums = shards.sum(pair_sums, scores_of(solution), side, cells)
     out = []
     for k, chip in enumerate(model.chips):
         if sums.n_pairs[k] < FEWEST:
@@ -146,8 +164,11 @@ def unmodelled(
         for part, whole in zip(parts, (sums.products[k], sums.weights[k]), strict=True):
             np.add.at(part, (slice(None), into[k]), whole[:, : len(into[k])])
         value, error = _jackknife(*parts)
+        drawn = np.zeros(2)
         if robust is not None:
-            value = value + _taken(robust, k)
+            taken, formal = _taken(robust, k)
+            value = value + taken
+            drawn = np.maximum(taken - formal, 0.0)[:2]
         found = Unmodelled(
             chip.number,
             side,
@@ -156,6 +177,7 @@ def unmodelled(
             error[:2],
             float(value[2]),
             float(error[2]),
+            drawn,
         )
         out.append(found)
     return tuple(out)
@@ -177,9 +199,13 @@ def _jackknife(products: Float, weights: Float) -> tuple[Float, Float]:
     return at_zero(top, bottom), np.sqrt(spread)
 
 
-def _taken(robust: RobustCovariance, chip: int) -> Float:
-    """Mean variance of the model's positions on a chip (by code), in its exposures: uu, vv, uv."""
+def _taken(robust: RobustCovariance, chip: int) -> tuple[Float, Float]:
+    """Mean variances of the model's positions on a chip (by code), in its exposures: uu, vv, uv.
+
+    As measured, and of independent stars.
+    """
     model, groups = robust.model, robust.groups
+    whole = robust.formal if robust.whole is None else robust.whole
     x, y = (
         z.ravel()
         for z in np.meshgrid(
@@ -199,9 +225,14 @@ def _taken(robust: RobustCovariance, chip: int) -> Float:
             chip=model.chips[chip].number,
         )
         J = np.linalg.solve(model.frame(robust.mean, exposure)[0], J)
-        out.append(np.einsum("nad,de,nbe->ab", J, robust.measured, J, optimize=True) / len(x))
-    mean = np.mean(out, axis=0)
-    return np.array([mean[a, b] for a, b in AXES])
+        out.append(
+            [
+                np.einsum("nad,de,nbe->ab", J, cov, J, optimize=True) / len(x)
+                for cov in (robust.of_all, whole)
+            ]
+        )
+    measured, formal = (np.array([mean[a, b] for a, b in AXES]) for mean in np.mean(out, axis=0))
+    return measured, formal
 
 
 def total_errors(
@@ -215,9 +246,8 @@ def total_errors(
 ) -> PositionSigmas:
     """Errors of the model as a prediction of where a pixel truly lies.
 
-    Its coefficients err, and what it leaves out is there beside.  That the fit has been drawn
-    towards what it leaves out at the place is not counted: the errors are a few per cent too large
-    near corners.
+    Its coefficients err, and what it leaves out is there beside.  The fit has been drawn towards
+    what it leaves out: by how much is known on the mean, and more near corners.
 
     Parameters
     ----------
@@ -237,7 +267,7 @@ def total_errors(
     number = model.chips[0].number if chip is None else chip
     here = next(one for one in left_out if one.chip == number)
     errors = robust.at(x, y, epoch=epoch, chip=chip)
-    variance = errors.sigma**2 + here.rms**2
+    variance = errors.sigma**2 + here.rms_beside**2
     of_variance = 2 * errors.sigma**4 / errors.dof + here.error**2
     dof = np.maximum(2 * variance**2 / of_variance, 1.0)
     return replace(errors, sigma=np.sqrt(variance), dof=dof)

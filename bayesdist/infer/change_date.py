@@ -172,21 +172,26 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
         for k, code in enumerate(codes):
             own, shift = new.model.frame(new.theta, int(code))
             frame = nearest_frame(model.frames, own @ M, own @ d + shift)
-            theta[model.frame_slice(k + 1)] = frame
+            single = new.theta[new.model.frame_slice(int(code))][len(frame) - model.n_frame :]
+            theta[model.frame_slice(k + 1)] = [*frame, *(single if model.chip_deviations else ())]
     n = model.n_polynomial
+    # exposures that deviate do so as they scatter
+    scatter = new.scatter if len(new.scatter) else np.zeros(model.n_frame)
     equations = replace(equations, groups=groups, cross=equations.cross[:, :0])
     for last in (False, False, True):
         here = equations.moved(model.effective(theta, groups))
         matrix, right = here.assemble(model, theta)
         if not model.n_frame:
             return matrix.border[:n, :n], right[:n]
-        local = matrix.split(right)[1]
+        blocks = matrix.blocks + np.diag(scatter)
+        values = theta[model.n_global :].reshape(len(codes), -1)
+        local = matrix.split(right)[1] - scatter * values
         if last:
             break
         # frames settle with the polynomials held at the release
-        step = np.linalg.solve(matrix.blocks, local[..., None])[..., 0]
+        step = np.linalg.solve(blocks, local[..., None])[..., 0]
         theta[model.n_global :] += step.ravel()
-    gain = np.linalg.solve(matrix.blocks, np.swapaxes(matrix.edge[:, :n], 1, 2))
+    gain = np.linalg.solve(blocks, np.swapaxes(matrix.edge[:, :n], 1, 2))
     normal = matrix.border[:n, :n] - np.einsum("ebq,eqc->bc", matrix.edge[:, :n], gain)
     score = right[:n] - np.einsum("eqb,eq->b", gain, local)
     return (normal + normal.T) / 2, score

@@ -4,12 +4,14 @@ The new matches are fitted by themselves, with the polynomial order of the relea
 own for every exposure, the drift held at its released rates, and the outlier mixture with its
 jitter anew.  Their polynomials at their mean date, laid on the released ones by the one frame that
 no data can tell, differ by a change whose covariance is that of the fit plus that of the release at
-this date, extrapolated rates included.
+this date, extrapolated rates included.  Exposures of a campaign deviate from their polynomials as
+those of the release scatter, and what no data can tell are then their shifts and rotations alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +20,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.field_test import FieldTest, field_test
 from bayesdist.infer.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.grid import build_proposal
+from bayesdist.infer.hierarchy import held_in_reference
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.prior import GaussianPriors
@@ -55,6 +58,12 @@ class NewFit:
         The mode in sampled coordinates.
     epoch : float or None
         Mean date of the matches, where the model depends on time.
+    scatter : ndarray, shape (q,)
+        Inverse variances of the parameters of an exposure; zero for those that are free.
+    extra : ndarray, shape (n, n) or None
+        What errors that all the matches of a star share add to the covariance of the polynomials.
+    common : ndarray, shape (n_distortion, n) or None
+        Covariance of the release with these polynomials, by stars that both have.
     """
 
     released: View
@@ -65,11 +74,27 @@ class NewFit:
     target: Target
     psi: Float
     epoch: float | None
+    scatter: Float = field(default_factory=lambda: np.zeros(0))
+    extra: Float | None = None
+    common: Float | None = None
 
     @property
     def model(self) -> DistortionModel:
         """Of the new matches: the released structure with their exposures."""
         return self.fit.model
+
+    @property
+    def open(self) -> DistortionModel:
+        """A model whose frames are those that no data can tell."""
+        if self.model.gauge == "first":
+            return self.model
+        return replace(
+            self.model,
+            frames="shift_rotation",
+            gauge="first",
+            held=(0.0, 0.0, 0.0),
+            chip_deviations=False,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +114,8 @@ class Change:
     cov : ndarray, shape (n, n)
         Of the difference, n = 2 K chips.
     released_cov : ndarray, shape (n, n)
-        Of the released polynomials at that date.
+        Of the released polynomials at that date, and of whatever else is common to all the new
+        matches.
     taken : ndarray, shape (n, q)
         Fields that frames take up.
     test : FieldTest
@@ -117,6 +143,7 @@ def fit_new(
     clip_chi2: float = 25.0,
     clip_abs: float | None = 2.0,
     compute: Compute | None = None,
+    scatter: Mapping[str, float] | None = None,
 ) -> NewFit:
     """Fit new matches by themselves.
 
@@ -132,6 +159,9 @@ def fit_new(
     clip_chi2, clip_abs
         As of `fit_linear`.
     compute : Compute, optional
+    scatter : mapping of str to float, optional
+        Standard deviations by which exposures of a campaign deviate, as their parameters are named:
+        'scale', ...  Of such a release they have to be given.
 
     Returns
     -------
@@ -146,9 +176,15 @@ def fit_new(
     """
     bare = without_frames(released)
     model = new_model(released.model, matches)
+    scattering = np.zeros(model.n_frame)
+    if scatter is not None:
+        model = held_in_reference(matches, model, model.chips[0].number)
+        model = replace(model, chip_deviations=released.model.chip_deviations)
+        names = model.free_frame_names(1)
+        scattering = np.array([scatter[k] ** -2.0 if k in scatter else 0.0 for k in names])
     shards = load(model, matches, compute)
     mixture = mixture or getattr(released, "mixture", None) or OutlierMixture()
-    priors = _held_drift(bare, model)
+    priors = _with_scatter(_held_drift(bare, model), model, scatter or {})
     fit = fit_linear(shards, model, clip_chi2=clip_chi2, clip_abs=clip_abs, priors=priors)
     target = Target(shards, mixture, priors)
     proposal = build_proposal(target, fit)
@@ -164,6 +200,7 @@ def fit_new(
         target=target,
         psi=psi,
         epoch=None if epoch is None else float(np.mean(epoch)),
+        scatter=scattering,
     )
 
 
@@ -221,7 +258,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     # the rates are the same on both sides, and their error counts once: with the release
     own = new.cov[:n, :n]
     origin = np.asarray(new.model.origin)
-    M, d = frame_between(old, now, new.model)
+    M, d = frame_between(old, now, new.open)
     back = np.linalg.inv(M)
     constant = np.zeros((C, 2, K))
     constant[:, :, 0] = origin
@@ -230,8 +267,13 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     moved = np.einsum("ab,cbk->cak", back, now - shift) + constant
     turn = np.kron(np.eye(C), np.kron(back, np.eye(K)))
     released_cov = at @ released.cov @ at.T
+    if new.extra is not None:
+        released_cov = released_cov + turn @ new.extra @ turn.T
+    if new.common is not None:
+        common = at @ new.common @ turn.T
+        released_cov = released_cov - common - common.T
     cov = turn @ own @ turn.T + released_cov
-    taken = frame_fields(model, new.model.frames, old, origin)
+    taken = frame_fields(model, new.open.frames, old, origin)
     norm = mean_squares(model)
     difference = (moved - old).ravel()
     projector = without(taken, norm)
@@ -263,6 +305,19 @@ def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
     least = 1e-12 * np.abs(released.mean).max(initial=1.0)
     precision[rows] = np.maximum(HELD * sigma, least) ** -2.0
     return GaussianPriors(centre, precision)
+
+
+def _with_scatter(
+    priors: GaussianPriors, model: DistortionModel, scatter: Mapping[str, float]
+) -> GaussianPriors:
+    """The priors with those of the deviations of all exposures."""
+    precision = priors.precision.copy()
+    for code in range(len(model.exposures)):
+        first = model.frame_slice(code).start
+        for k, name in enumerate(model.free_frame_names(code)):
+            if name in scatter:
+                precision[first + k] = scatter[name] ** -2.0
+    return GaussianPriors(priors.centre, precision)
 
 
 def _at_epoch(model: DistortionModel, epoch: float | None) -> Float:

@@ -44,10 +44,13 @@ class StarCovariance:
     counted : ndarray, shape (D, D)
         The part of it that is in the solution's covariance: that of errors which are independent
         from match to match.  Zero where the quoted errors are without the catalogue's.
+    motions : ndarray, shape (D, D), optional
+        The part of `total` that the errors of the proper motions cause; None where there are none.
     """
 
     total: Float
     counted: Float
+    motions: Float | None = None
 
     @property
     def extra(self) -> Float:
@@ -153,7 +156,7 @@ def star_covariance(
     pairs = _Pairs.of(stars, code[order], weight[order], [lever[order] for lever in levers])
     D = solution.model.n_params if frames else solution.model.n_distortion
     influence = _influence(solution, stars, D)
-    total = np.zeros((D, D))
+    parts = np.zeros((len(levers), D, D))
     step = max(1, SCRATCH // (16 * D * len(levers)))
     for first in range(0, n_stars, step):
         sums = pairs.sums(influence, first, min(first + step, n_stars))
@@ -161,15 +164,16 @@ def star_covariance(
             for axis in (0, 1):
                 part = sums[c, axis]
                 part *= np.sqrt(variance[first : first + step, axis])[:, None]
-                total += part.T @ part
+                parts[c] += part.T @ part
     counted = np.zeros((D, D))
     if included:
         counted = pairs.diagonal(influence, variances)
     if not frames:
         cov = np.asarray(solution.cov, float)
         follow = np.linalg.solve(cov[:D, :D], cov[:D]).T
-        total, counted = (follow @ c @ follow.T for c in (total, counted))
-    return StarCovariance((total + total.T) / 2, (counted + counted.T) / 2)
+        parts, counted = (follow @ c @ follow.T for c in (parts, counted))
+    positions, *motions = (parts + np.swapaxes(parts, 1, 2)) / 2
+    return StarCovariance(sum(motions, positions), (counted + counted.T) / 2, *motions)
 
 
 @dataclass(frozen=True, eq=False)

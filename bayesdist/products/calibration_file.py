@@ -11,11 +11,10 @@ from bayesdist.assess.calibration import Calibration, calibration_of_map
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
 from bayesdist.products.blocks import read_blocks
-from bayesdist.products.idctab import FILTER_COLUMNS, IdcTab
-from bayesdist.products.indices import idctab_column
+from bayesdist.products.idctab import IdcTab
+from bayesdist.products.idctab_row_covariance import covariance_of_row
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
 from bayesdist.products.sip_read import holds_sip, read_sip
-from bayesdist.products.tdd import RATES
 from bayesdist.products.wise_meta import holds_wise_meta, read_wise_meta
 
 __all__ = ["calibrations_of_idctab", "read_calibrations"]
@@ -102,7 +101,8 @@ def calibrations_of_idctab(
         row = tab.row(chip, names)
         record = tab.rows[row]
         notes = []
-        if epoch is None and tab.tdd_scheme == "2015" and any(tab.tdd.values()):
+        drifts = any(rate for key, rate in tab.tdd.items() if key != "TDD_DATE")
+        if epoch is None and tab.tdd_scheme == "2015" and drifts:
             notes.append(f"at the reference date {tab.tdd['TDD_DATE']:g} of its drift")
         if epoch is None and tab.tdd_scheme in ("2014", "order", "default"):
             notes.append("without the drift that stwcs applies to it")
@@ -113,58 +113,12 @@ def calibrations_of_idctab(
             size=(float(record["XSIZE"]), float(record["YSIZE"])),
             reference_pixel=(float(record["XREF"]), float(record["YREF"])),
             unit="arcsec",
-            monomial_cov=_idctab_covariance(tab, row, chip, epoch),
+            monomial_cov=covariance_of_row(tab, row, chip, epoch),
             chip=chip,
             epoch=epoch,
             notes=tuple(notes),
         )
     return out
-
-
-def _idctab_covariance(tab: IdcTab, row: int, chip: int, epoch: float | None) -> Float | None:
-    """Covariance (2 K, 2 K) of the monomials of one row at a date; None where there is none."""
-    entries = tab.covariance
-    if entries is None:
-        return None
-    listed = [str(name).strip() for name in entries["PARAM"]]
-    mine = np.flatnonzero(entries["DETCHIP"].astype(int) == chip)
-    own = [c for c in FILTER_COLUMNS if c in (entries.dtype.names or ())]
-    if own:
-        # numbers stand once for all filters that share them: found again by their values
-        sets = {tuple(str(entries[c][k]).strip() for c in own) for k in mine}
-        of_set = [
-            [k for k in mine if tuple(str(entries[c][k]).strip() for c in own) == one]
-            for one in sorted(sets)
-        ]
-        same = [s for s in of_set if _is_of_row(tab, row, entries, listed, s)]
-        if not same:
-            return None
-        mine = np.array(same[0])
-    place = {listed[k]: k for k in mine}
-    terms, years = tab.terms, 0.0
-    if epoch is not None and "TDD_DATE" in tab.tdd:
-        years = epoch - tab.tdd["TDD_DATE"]
-    jacobian = np.zeros((2 * len(terms), len(entries)))
-    for n in range(2 * len(terms)):
-        axis, (i, j) = "uv"[n // len(terms)], terms[n % len(terms)]
-        column = idctab_column(tab.prefixes[n // len(terms)], i, j)
-        rate = f"{RATES.get((axis, i, j), '')}{chip}"
-        for key, factor in ((column, 1.0), (rate, years)):
-            if key in place:
-                jacobian[n, place[key]] = factor
-    if not jacobian.any():
-        return None
-    return jacobian @ np.asarray(entries["COV"], float) @ jacobian.T
-
-
-def _is_of_row(
-    tab: IdcTab, row: int, entries: NDArray[np.void], listed: list[str], some: list[int]
-) -> bool:
-    return all(
-        float(entries["VALUE"][k]) == float(tab.rows[listed[k]][row])
-        for k in some
-        if listed[k] in tab.columns and listed[k][0] in "CAB"
-    )
 
 
 # -- SIP and WISE --------------------------------------------------------------------------------

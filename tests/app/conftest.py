@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesdist.app import stages
 from bayesdist.simulate import Truth
 from tests.app.support import Result, as_table, cli, simulated, write_job
 
@@ -47,3 +48,9 @@ def finished(tmp_path_factory) -> Finished:
     result = cli("run", config, "-o", folder / "run")
     assert result.code == 0, result.err
     return Finished(folder / "run", config, truth, result)
+
+
+@pytest.fixture
+def no_report(monkeypatch):
+    """Runs without the figures, which take seconds and are not the subject here."""
+    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)

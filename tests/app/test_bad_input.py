@@ -11,7 +11,6 @@ import pytest
 import xarray as xr
 from astropy.table import MaskedColumn, Table, vstack
 
-from bayesdist.app import stages
 from bayesdist.infer import load_posterior
 from tests.app.support import (
     as_table,
@@ -50,12 +49,6 @@ def begun(tmp_path, fitted) -> Path:
     """A copy of it that may be changed, with an input of its own."""
     shutil.copytree(fitted / "job", tmp_path / "job")
     return begin_stagewise(tmp_path / "run", tmp_path / "job" / "config.toml", "fit")
-
-
-@pytest.fixture
-def no_report(monkeypatch):
-    """Runs without the figures, which take seconds and are not the subject here."""
-    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)
 
 
 # -- the table of matches -------------------------------------------------------------------------

@@ -57,12 +57,6 @@ def job(tmp_path_factory) -> Path:
     )
 
 
-@pytest.fixture
-def no_report(monkeypatch):
-    """Runs without the figures, which take seconds and are not the subject here."""
-    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)
-
-
 def _refused(*arguments: object, words: tuple[str, ...]) -> None:
     done = process(*arguments, "-q", cwd=Path.cwd())
     assert done.returncode == 1, (done.returncode, done.stderr)

@@ -146,16 +146,3 @@ def test_whole_exposures_are_drawn_and_predicted(tmp_path):
 def test_what_makes_no_sense_is_refused_before_anything_is_written(tmp_path, holdout, words):
     config = job(tmp_path, holdout=holdout)
     refused(tmp_path, "run", config, "-o", tmp_path / "run", words=words)
-
-
-def test_campaigns_are_refused(tmp_path):
-    config = job(tmp_path)
-    text = config.read_text(encoding="utf-8").replace("[data]", "[campaign]")
-    config.write_text(
-        text.replace(
-            'matches = "stars.ecsv"',
-            'catalog = "c"\nexposures = "e"\nlists = "l"\nstart = "s"',
-        ),
-        encoding="utf-8",
-    )
-    refused(tmp_path, "run", config, "-o", tmp_path / "run", words=("[holdout]", "[campaign]"))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app import matches, stages
+from bayesdist.app import matches
 from bayesdist.data import RvbTransform, open_matches, read_rvb
 from bayesdist.infer import load_fit
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table
@@ -19,12 +19,6 @@ from tests.app.support import cli, good, refused, snapshot, summary_of
 
 RVB = {"colour": (-0.4, 0.9), "accept_centre": 1.0, "accept_corner": 2.5}
 STAGES = ("fit", "sample", "assess", "export")
-
-
-@pytest.fixture
-def no_report(monkeypatch):
-    """Runs without the figures, which take seconds and are not the subject here."""
-    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from astropy.table import Table, vstack
 
-from bayesdist.app import stages
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs
 from tests.app.support import cli, good, refused, summary_of
 
@@ -178,12 +177,6 @@ def believed(tmp_path, table: Table, **sections: Any) -> dict[str, Any]:
         tmp_path / "run" / "report.html"
     ).read_text(encoding="utf-8")
     return summary
-
-
-@pytest.fixture
-def no_report(monkeypatch):
-    """Runs without the figures, which take seconds and are not the subject here."""
-    monkeypatch.setitem(stages._FUNCTIONS, "report", lambda session: None)
 
 
 def test_pairs_in_the_centre_say_nothing_of_the_corners(tmp_path):

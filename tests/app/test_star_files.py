@@ -101,7 +101,7 @@ def test_one_part_for_each_piece(finished, matches, part, tmp_path, monkeypatch)
     assert sorted(snapshot(folder)) == ["notes.txt", "part-00000.parquet"]
 
 
-def test_force_removes_the_parts_and_nothing_else(finished, tmp_path):
+def test_force_removes_the_parts_and_nothing_else(finished, tmp_path, no_report):
     path = shutil.copytree(finished.path, tmp_path / "run")
     (path / "stars" / "part-00001.parquet").write_text("of a run of more stars")
     (path / "stars" / ".bayesdist-0a1b2c3d-part-00002.parquet").write_text("of a killed run")
@@ -110,7 +110,7 @@ def test_force_removes_the_parts_and_nothing_else(finished, tmp_path):
     assert sorted(snapshot(tmp_path / "other" / "stars")) == ["mine.parquet"]
     RunDirectory(shutil.copytree(finished.path, tmp_path / "third")).clear()
     assert not (tmp_path / "third" / "stars").exists()
-    config = write_job(tmp_path / "job", model={"order": 1})
+    config = write_job(tmp_path / "job")
     good("run", config, "-o", path, "--force")
     assert sorted(snapshot(path / "stars")) == ["mine.parquet", "part-00000.parquet"]
     assert (path / "stars" / "mine.parquet").read_text() == "precious"

@@ -9,7 +9,14 @@ import pytest
 from scipy import stats
 
 from bayesdist.app.campaign import systematics
-from bayesdist.app.campaign.systematics import catalogue_covariance, with_shared_stars
+from bayesdist.app.campaign.aberration import PERIOD, SWING, scale_error
+from bayesdist.app.campaign.systematics import (
+    catalogue_covariance,
+    catalogue_terms,
+    with_shared_stars,
+)
+from bayesdist.assess.field_terms import CATALOGUE as POSITIONS
+from bayesdist.assess.field_terms import MOTIONS
 from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.infer import Posterior, fit_linear
 from bayesdist.infer.mixture import OutlierMixture
@@ -121,3 +128,48 @@ def test_without_codes_or_errors_there_is_none(fit, matches, catalog, tmp_path):
         path = tmp_path / "c.h5"
         assert catalogue_covariance(path, fit, posterior, table, reference) is None
         assert not path.exists()
+
+
+# -- rows of the budget ---------------------------------------------------------------------------
+
+
+def test_motions_have_a_row_of_their_own_and_count_once(fit, matches, catalog, tmp_path):
+    """Positions and motions together are the whole, also when both come from the file."""
+    moving = replace(
+        catalog,
+        pm_u=np.zeros(STARS),
+        pm_v=np.zeros(STARS),
+        sigma_pm_u=np.full(STARS, 0.01),
+        sigma_pm_v=np.full(STARS, 0.01),
+        epoch=np.full(STARS, 2005.0),
+    )
+    # the matches' errors hold those of the catalogue: 0.01 over 2 years is less than the centroid's
+    dated = replace(matches, epoch=np.repeat(np.linspace(2004.0, 2006.0, EXPOSURES), STARS))
+    posterior = posterior_of(fit, n=50)
+    first, kept = (
+        catalogue_covariance(tmp_path / "m.h5", fit, posterior, dated, moving) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first.motions, kept.motions)
+    terms = catalogue_terms(posterior, kept, "/somewhere/stars.ecsv")
+    assert [t.name for t in terms] == [POSITIONS, MOTIONS]
+    np.testing.assert_allclose(sum(t.covariance for t in terms), first.total, atol=1e-15)
+    assert np.trace(terms[1].covariance) > 0
+    for term, what in zip(terms, ("positions", "proper motions"), strict=True):
+        assert term.source.startswith("given by the user: ") and "stars.ecsv" in term.source
+        assert f"errors of {what}" in term.source
+    still = catalogue_covariance(tmp_path / "s.h5", fit, posterior, matches, catalog)
+    again = catalogue_covariance(tmp_path / "s.h5", fit, posterior, matches, catalog)
+    assert still.motions is None and again.motions is None
+    assert [t.name for t in catalogue_terms(posterior, again, "stars.ecsv")] == [POSITIONS]
+
+
+@pytest.mark.parametrize("exptime", [30.0, 375.0, 1200.0])
+def test_the_scale_changes_while_an_exposure_lasts(exptime):
+    """Orbits at any phase: the factor of an instant against that of another in the exposure."""
+    rng = np.random.default_rng(4)
+    start, at = rng.uniform(0, PERIOD, 200_000), rng.uniform(0, exptime, 200_000)
+    factor = [SWING / 2 * np.sin(2 * np.pi * t / PERIOD) for t in (start + at, start + exptime / 2)]
+    seen = np.std(np.subtract(*factor))
+    # to first order in the exposure's part of an orbit: an arc is longer than its chord
+    assert scale_error(exptime) == pytest.approx(seen, rel=0.02 + (exptime / PERIOD) ** 2 * 2)
+    assert scale_error(exptime) < scale_error(None) == pytest.approx(np.std(factor[0]), rel=0.01)

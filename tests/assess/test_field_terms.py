@@ -9,8 +9,9 @@ import pytest
 
 from bayesdist.assess import LocalTerm, Requirement, UserTerm, check_requirements, error_fields
 from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.field_terms import CatalogueTerm, ExposureScatter
-from bayesdist.assess.fields import draw_errors
+from bayesdist.assess.field_terms import MOTIONS, CatalogueTerm, ExposureScatter
+from bayesdist.assess.fields import MODEL, draw_errors
+from bayesdist.assess.linear_term import LinearTerm
 from bayesdist.assess.rigid import without_rigid
 from bayesdist.errors import InputError
 from bayesdist.infer.views import reference_gauge, without_frames
@@ -100,10 +101,41 @@ def test_what_the_solution_holds_already_is_shown_and_not_added(shared):
             assert shown[row][name] < 0.4 * alone[row][name]
 
 
-def test_two_terms_that_the_solution_holds_are_refused(shared):
+def test_terms_that_the_solution_holds_name_one_solution_without_them(shared):
     solution, term = shared
+    other = replace(term, without=replace(solution), name="other")
     with pytest.raises(InputError, match="2 field terms are among the errors of the solution"):
-        error_fields(solution, X, Y, fields=[term, term], epoch=2003.0, rng=rng())
+        error_fields(solution, X, Y, fields=[term, other], epoch=2003.0, rng=rng())
+
+
+def test_the_parts_of_the_catalogue_make_its_row(shared):
+    """Positions and motions err independently: squares of their rows add up to the whole."""
+    solution, whole = shared
+    share = 0.3
+    parts = [
+        replace(whole, covariance=share * whole.covariance, name=MOTIONS),
+        replace(whole, covariance=(1 - share) * whole.covariance),
+    ]
+    options = {"epoch": 2003.0, "n_draws": N}
+    both = error_fields(solution, X, Y, fields=parts, rng=rng(), **options)
+    assert set(both.parts) >= {MOTIONS, whole.name}
+    one = error_fields(solution, X, Y, fields=[whole], rng=rng(), **options)
+    summed = sum(np.square(both.sigma(p.name)) for p in parts)
+    np.testing.assert_allclose(np.sqrt(summed), one.sigma(whole.name), rtol=2 * TOLERANCE)
+    np.testing.assert_allclose(both.sigma(MODEL), one.sigma(MODEL), rtol=1e-12)
+
+
+def test_a_part_of_another_term_is_shown_and_not_added(shared):
+    solution, _ = shared
+    scale = LinearTerm("aberration", "scale", 1e-4, solution, part_of="exposure scatter")
+    options = {"epoch": 2003.0, "n_draws": 200}
+    alone = error_fields(solution, X, Y, rng=rng(), **options)
+    beside = error_fields(solution, X, Y, fields=[scale], rng=rng(), **options)
+    np.testing.assert_array_equal(beside.sigma(MODEL), alone.sigma(MODEL))
+    assert np.max(beside.sigma("aberration")) > np.max(alone.sigma(MODEL))
+    free = replace(scale, part_of="")
+    added = error_fields(solution, X, Y, fields=[free], rng=rng(), **options)
+    assert np.max(added.sigma(MODEL)) > np.max(alone.sigma(MODEL))
 
 
 # -- a new exposure -------------------------------------------------------------------------------

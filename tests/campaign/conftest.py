@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tests.campaign.measures import Outcome, outcome
-from tests.campaign.support import ISR, LOOSE, MATERN, PUBLISHED_SIZE, Setting, over_seeds
+from tests.campaign.support import ISR, LOOSE, MATERN, PUBLISHED_SIZE, Setting
+from tests.seeds import over
 
 # how many seeds; what takes longest begins
 FULL = {PUBLISHED_SIZE: 1, ISR: 4, MATERN: 20, LOOSE: 12}
@@ -16,7 +17,7 @@ REDUCED = {MATERN: 2, LOOSE: 1}
 def campaigns(full: bool) -> dict[Setting, list[Outcome]]:
     jobs = [(s, seed + 1) for s, n in (FULL if full else REDUCED).items() for seed in range(n)]
     out: dict[Setting, list[Outcome]] = {}
-    for (setting, _), found in zip(jobs, over_seeds(outcome, jobs), strict=True):
+    for (setting, _), found in zip(jobs, over(outcome, jobs), strict=True):
         out.setdefault(setting, []).append(found)
     return out
 

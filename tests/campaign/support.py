@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -222,22 +219,3 @@ def _with_catalogue(bare: HierarchicalFit, session: CampaignSession) -> Recolour
         epoch0=by_code(catalog.epoch),
     )
     return with_star_errors(bare, stars)
-
-
-# -- many seeds -----------------------------------------------------------------------------------
-
-
-def _one_thread() -> None:
-    import numba
-    from threadpoolctl import threadpool_limits
-
-    numba.set_num_threads(1)
-    threadpool_limits(1)
-
-
-def over_seeds(function: Callable[..., Any], jobs: list[tuple[Any, ...]]) -> list[Any]:
-    """A function of each of these arguments, on all cores, one process for each."""
-    context = get_context("spawn")
-    workers = min(os.cpu_count() or 1, len(jobs))
-    with ProcessPoolExecutor(workers, context, initializer=_one_thread) as pool:
-        return list(pool.map(function, *zip(*jobs, strict=True)))

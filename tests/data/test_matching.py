@@ -66,9 +66,9 @@ def test_the_rate_of_false_matches_is_what_happens(rng):
 
 def test_a_million_detections_in_seconds(rng):
     catalog, found, mag, truth, _ = field(rng, 1_000_000, turn=1e-5)
-    start = time.perf_counter()
+    start = time.process_time()
     m = match_to_catalog(*found.T, catalog, mag=mag)
-    assert time.perf_counter() - start < 30.0
+    assert time.process_time() - start < 30.0
     assert (truth[m.index] == m.catalog_index).sum() > 0.99 * (truth >= 0).sum()
 
 

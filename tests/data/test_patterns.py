@@ -108,10 +108,10 @@ def test_it_takes_tenths_of_a_second(field, rng):
         for _ in range(5)
     ]
     find_similarity(frames[0][0], index, mag=frames[0][1])  # the index makes its triangles once
-    begin = time.perf_counter()
+    begin = time.process_time()
     for p, m, _ in frames:
         find_similarity(p, index, mag=m)
-    assert (time.perf_counter() - begin) / len(frames) < 0.3
+    assert (time.process_time() - begin) / len(frames) < 0.3
 
 
 def test_three_rolls_of_a_real_cluster_close_a_triangle(data_dir):

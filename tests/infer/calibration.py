@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-
 import numpy as np
 
 from bayesdist.infer import OutlierMixture, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
+from tests.seeds import over
 
 LEVELS = (0.683, 0.954)
 SIZE = (1016.0, 1016.0)
@@ -93,14 +90,6 @@ def ranks_of(seed: int) -> dict[str, float]:
     return out
 
 
-def _one_thread() -> None:
-    import numba
-
-    numba.set_num_threads(1)
-
-
 def over_seeds(function, n: int) -> list:
     """A function of the seed over n seeds, on all cores."""
-    context = get_context("spawn")
-    with ProcessPoolExecutor(os.cpu_count(), context, initializer=_one_thread) as pool:
-        return list(pool.map(function, range(n), chunksize=4))
+    return over(function, ((seed,) for seed in range(n)), lot=4)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -13,6 +16,9 @@ from bayesdist.infer.kernel import cluster_moments, products_of
 from bayesdist.infer.robust import robust_covariance
 from bayesdist.infer.robust.bootstrap import resampled_cells, wild_cells
 from bayesdist.infer.robust.cells import Cells, recommended_cells
+from bayesdist.infer.robust.gains import gains
+from bayesdist.infer.robust.level import level_of
+from bayesdist.infer.robust.leverage import FrameShare
 from bayesdist.infer.robust.scores import scores_of
 from bayesdist.infer.robust.sums import cluster_sums
 from bayesdist.model import Chip, DistortionModel
@@ -217,7 +223,11 @@ def test_exposures_and_cells_within_them_are_those_of_dense_matrices():
         expected = fit.cov @ scores[matches.exposure == e].sum(axis=0)
         np.testing.assert_allclose(found.exposures[e] / fit.sigma, expected / fit.sigma, atol=1e-7)
     w = matches.sigma_u**-2.0
-    for level, shape in zip(found.levels, ((8, 8), (4, 4)), strict=True):
+    sums = cluster_sums(stars_of(model, matches), scores_of(fit), found.cells)
+    gain = gains(sums, model, fit.mean, fit.cov, GaussianPriors.none(model))
+    gain = replace(gain, frame=[])  # as they are, before what the frames took is given back
+    for factor, shape in ((1, (8, 8)), (2, (4, 4))):
+        level = level_of(sums, found.cells, factor, gain, within=True)
         within = np.zeros_like(fit.cov)
         cell = dense_cells(model, matches, shape)
         for e in range(4):
@@ -233,6 +243,22 @@ def test_exposures_and_cells_within_them_are_those_of_dense_matrices():
     by_hand = cells.from_cells() + 4 / 3 * found.exposures.T @ found.exposures
     by_hand -= 2 * found.levels[1].within - found.levels[0].within
     close(found.from_cells(), by_hand)
+
+
+def test_what_a_frame_takes_of_the_scores_of_cells_is_given_back():
+    """Scores of covariance W - W F F^T W have W again, also where a cell holds nearly all."""
+    rng = np.random.default_rng(2)
+    C, width, q = 6, 12, 4
+    roots = rng.standard_normal((C, width, 3)) * np.array([1, 1, 1, 0.3, 0.3, 3])[:, None, None]
+    information = roots @ np.swapaxes(roots, 1, 2)
+    M = rng.standard_normal((width, q))
+    F = M @ np.linalg.inv(np.linalg.cholesky(M.T @ information.sum(axis=0) @ M)).T
+    share = FrameShare.of(SimpleNamespace(information=information), F)
+    for c in range(C):
+        W = information[c]
+        left = W - W @ F @ F.T @ W
+        B = share.given_back(np.broadcast_to(np.eye(width)[:, None], (width, C, width)))[:, c].T
+        np.testing.assert_allclose(B @ left @ B.T, W, atol=1e-9 * np.abs(W).max())
 
 
 def test_priors_keep_their_part():

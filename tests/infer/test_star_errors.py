@@ -92,6 +92,21 @@ def test_it_is_the_dense_formula(scratch, monkeypatch):
     np.testing.assert_allclose(found.extra / unit, (total - counted) / unit, atol=1e-10)
 
 
+@pytest.mark.parametrize("frames", [True, False])
+def test_motions_are_the_part_that_is_left_without_errors_of_positions(frames):
+    _, matches, fit, code, catalogue = some(3)
+    options = {"star": code, "frames": frames}
+    found = star_covariance(fit, matches, **options, **catalogue)
+    exact = catalogue | {"sigma_u": 0.0, "sigma_v": 0.0}
+    alone = star_covariance(fit, matches, **options, **exact).total
+    scale = np.sqrt(np.diag(found.total))
+    np.testing.assert_allclose(
+        found.motions / np.outer(scale, scale), alone / np.outer(scale, scale), atol=1e-10
+    )
+    still = catalogue | {"motion_u": 0.0, "motion_v": 0.0}
+    assert star_covariance(fit, matches, **options, **still).motions is None
+
+
 def test_without_the_frames_the_polynomials_are_the_same():
     """And the frames follow by regression: nothing else is said of them."""
     model, matches, fit, code, catalogue = some(11)

@@ -59,6 +59,10 @@ def run_match(session: CampaignSession) -> None:
         stale.unlink()
     write_partitioned([neutralise_aberration(found.table, inputs.log)], run / PAIRS)
     session.forget()
+    if session.config.holdout is not None:
+        _refuse_bare(session.pairs, session.config.chips(), "what is not held out")
+        some = inputs.log.select(names=session.pairs.exposure_names)
+        refuse_few(some.values("epoch"), session.config.time() if session.free_rates else None)
     false = float(np.sum(summary["false_share"] * summary["matched"]) / summary["matched"].sum())
     run.summarise(
         matching={

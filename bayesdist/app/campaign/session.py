@@ -11,15 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.config import CampaignBlock
+from bayesdist.app.campaign.holdout import predictive_of_campaign
 from bayesdist.app.campaign.inputs import Inputs, read_inputs
+from bayesdist.app.campaign.interpolation import interpolation_term
 from bayesdist.app.campaign.reference import FREE, rate_priors
+from bayesdist.app.campaign.shared import measured_shared_errors
 from bayesdist.app.campaign.systematics import systematics_of
 from bayesdist.app.campaign.table_file import KeptTables, read_tables, write_tables
+from bayesdist.app.correlated import keep_shared_errors
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
 from bayesdist.assess import LocalTerm
+from bayesdist.assess.between_nodes import BetweenNodes
+from bayesdist.assess.holdout_predictive import Predictive
+from bayesdist.assess.terms import GIVEN, MEASURED
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
 from bayesdist.errors import NotSettledError
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, fit_by_magnitude
@@ -69,9 +76,30 @@ class CampaignSession(Session):
         return read_inputs(self.block, self.base)
 
     @cached_property
+    def _all_matches(self) -> MatchTable:  # type: ignore[override]
+        """All pairs as matched, those that are held out among them."""
+        return read_matches(self.run / PAIRS, unit=self.inputs.catalog.unit)
+
+    @property
     def pairs(self) -> MatchTable:
         """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors."""
-        return read_matches(self.run / PAIRS, unit=self.inputs.catalog.unit)
+        kept = self._all_matches if self._split is None else self._split.kept
+        assert isinstance(kept, MatchTable)
+        return kept
+
+    @property
+    def held_pairs(self) -> MatchTable | None:
+        """The same of what is held out; None where nothing is."""
+        held = None if self._split is None else self._split.held
+        assert held is None or isinstance(held, MatchTable)
+        return held
+
+    needed_exposures = 1  # it defines the gauge
+
+    @property
+    def largest_vafactor(self) -> float:
+        """By which the catalogue's errors are divided: all factors are nearly the same."""
+        return float(self.inputs.log.values("vafactor").max())
 
     @cached_property
     def _kept_tables(self) -> KeptTables:
@@ -84,21 +112,53 @@ class CampaignSession(Session):
 
     @property
     def local_terms(self) -> tuple[LocalTerm, ...]:
-        """What the errors of the tables leave of the position, after the polynomial."""
-        sigma = self._kept_tables.position_sigma
-        return (LocalTerm("look-up tables", sigma),) if sigma else ()
+        """What the errors of the tables leave of the position, and what lies between nodes."""
+        kept, grid = self._kept_tables, self.config.assess.grid
+        between = interpolation_term(kept.between, self.posterior, grid=grid, epoch=self.epoch)
+        sigma, block = kept.position_sigma, self.config.tables
+        if not sigma:
+            return (*between, *super().local_terms)
+        source = MEASURED
+        if block.detector is not None:
+            given = f"{GIVEN}: errors of the detector's tables in {block.detector}"
+            source = given if block.method == "none" else f"{MEASURED}, and {given}"
+        return (LocalTerm("look-up tables", sigma, source=source), *between)
+
+    @property
+    def between_nodes(self) -> Mapping[int, BetweenNodes]:
+        """What the tables leave between their nodes, by chip, where it has been measured."""
+        return self._kept_tables.between
 
     def keep_tables(
-        self, tables: tuple[LookupTable, ...], position_sigma: Mapping[int, Float] | None = None
+        self,
+        tables: tuple[LookupTable, ...],
+        position_sigma: Mapping[int, Float] | None = None,
+        between: tuple[BetweenNodes, ...] = (),
     ) -> None:
-        """Write tables, and their error on the grid of the assessment, for the other stages."""
-        write_tables(self.run / TABLES, tables, position_sigma)
+        """Write tables, and their errors at nodes and between them, for the other stages."""
+        write_tables(self.run / TABLES, tables, position_sigma, between)
         self.forget()
 
     @cached_property
     def raw_matches(self) -> Matches:
         """Pairs at the pixels that the tables have corrected."""
-        pairs = self.pairs
+        return self._corrected(self.pairs)
+
+    @property
+    def held_matches(self) -> MatchTable | None:
+        """What is held out, in the same way, with its errors; None where nothing is."""
+        held, errors = self.held_pairs, self.magnitude_errors
+        if held is None:
+            return None
+        held = self._corrected(held)
+        return held if errors is None else with_centroid_errors(held, errors)
+
+    @property
+    def predictive(self) -> Predictive:
+        """The posterior as it predicts what is held out."""
+        return predictive_of_campaign(self)
+
+    def _corrected(self, pairs: MatchTable) -> MatchTable:
         if not self.tables:
             return pairs
         x, y = corrected(
@@ -132,12 +192,16 @@ class CampaignSession(Session):
         return self.kept_errors()
 
     def measure(self) -> None:
-        """Nothing: scatter of exposures, tables and catalogue are in the fit and its errors."""
+        """What stars have in common beyond scatter of exposures, tables and catalogue, anew."""
+        keep_shared_errors(self, measured_shared_errors(self))
+        for name in ("shared_errors", "systematics", "field_terms"):
+            self.__dict__.pop(name, None)
 
     @property
     def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
-        """The same: the catalogue's errors have been taken off."""
-        return self.magnitude_errors
+        """The same: the catalogue's errors have been taken off, and what is left out at a place."""
+        found = self.shared_errors
+        return self.magnitude_errors if found is None else found.of_centroids(self.magnitude_errors)
 
     @cached_property
     def matches(self) -> Matches:
@@ -176,7 +240,8 @@ class CampaignSession(Session):
         """What the stages found odd, and what the campaign cannot tell."""
         found = self.run.summary
         parts = ("matching", "tables", "time_dependence")
-        return [text for part in parts for text in found.get(part, {}).get("warnings", [])]
+        own = [text for part in parts for text in found.get(part, {}).get("warnings", [])]
+        return [*own, *super().doubts]
 
     @property
     def scatter(self) -> tuple[tuple[str, ...], Float]:
@@ -184,10 +249,14 @@ class CampaignSession(Session):
         arrays = read_arrays(self.run / HIERARCHY, "", do=_AGAIN)
         return tuple(str(t, "utf-8") for t in arrays["kinds"]), arrays["tau_draws"]
 
+    @property
+    def settling(self) -> Settling:
+        """What was done to the shifts of single chips."""
+        return Settling.from_arrays(read_arrays(self.run / HIERARCHY, "", do=_AGAIN))
+
     def settled(self, posterior: Posterior) -> Posterior:
         """The draws with the chips where the exposures have them on average."""
-        settling = Settling.from_arrays(read_arrays(self.run / HIERARCHY, "", do=_AGAIN))
-        _, tau = self.scatter
+        settling, (_, tau) = self.settling, self.scatter
         rng = self.rng("sample")
         some = tau[rng.integers(len(tau), size=len(posterior.flat))]
         theta = settling.draws(posterior.flat, some, rng).reshape(posterior.theta.shape)
@@ -236,13 +305,13 @@ class CampaignSession(Session):
     def fit_changed(self) -> None:
         """Forget what rests on the fit."""
         self.errors_changed()
-        for name in ("fit", "model", "priors", "terms", "systematics"):
+        for name in ("fit", "model", "priors", "terms", "systematics", "shared_errors"):
             self.__dict__.pop(name, None)
 
     def forget(self) -> None:
         """Forget what rests on pairs, tables and errors."""
         self.fit_changed()
-        for name in ("pairs", "_kept_tables", "raw_matches", "plain_model"):
+        for name in ("_all_matches", "_split", "_kept_tables", "raw_matches", "plain_model"):
             self.__dict__.pop(name, None)
 
 

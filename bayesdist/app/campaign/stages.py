@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bayesdist.app.campaign.fit import run_campaign_fit
+from bayesdist.app.campaign.holdout import check_named
 from bayesdist.app.campaign.lines import summarise_lines
 from bayesdist.app.campaign.matching import run_match
 from bayesdist.app.campaign.reference import rehearse_references
@@ -22,8 +23,8 @@ __all__ = ["CAMPAIGN_STAGES", "rehearse_campaign"]
 
 def _assess(session: CampaignSession) -> None:
     run_series(session)  # first: what it finds doubtful is among the warnings
-    summarise_lines(session, session.solution)
     run_assess(session)
+    summarise_lines(session, session.solution)  # with all errors that have been measured
 
 
 def _export(session: CampaignSession) -> None:
@@ -48,6 +49,7 @@ def rehearse_campaign(session: CampaignSession) -> None:
         For inputs that cannot be read or do not go together.
     """
     refuse_unsound(session)
+    check_named(session)
     read_idctab(session.base / session.block.start)
     rehearse_references(session.config, session.inputs.catalog.unit, session.base)
     if session.config.products.release is not None:

@@ -9,20 +9,33 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.campaign.aberration import aberration_term
 from bayesdist.app.fingerprint import fingerprint_of
 from bayesdist.app.systematics import Systematics
-from bayesdist.assess.field_terms import CatalogueTerm, ExposureScatter, FieldTerm
+from bayesdist.assess.field_terms import MOTIONS, CatalogueTerm, ExposureScatter, FieldTerm
+from bayesdist.assess.terms import GIVEN
 from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.recoloured import with_spread
 from bayesdist.infer.star_errors import StarCovariance, star_covariance
+from bayesdist.infer.star_influence import StarErrors
 
 if TYPE_CHECKING:
     from bayesdist.app.campaign.session import CampaignSession
 
-__all__ = ["CATALOGUE_ERRORS", "catalogue_covariance", "systematics_of", "with_shared_stars"]
+__all__ = [
+    "CATALOGUE_ERRORS",
+    "as_assessed",
+    "catalogue_covariance",
+    "catalogue_terms",
+    "covariance_of",
+    "errors_by_star",
+    "shared_stars_of",
+    "systematics_of",
+    "with_shared_stars",
+]
 
 Float = NDArray[np.float64]
 
@@ -39,19 +52,50 @@ def systematics_of(session: CampaignSession) -> Systematics:
     """
     posterior, fields = session.posterior, list[FieldTerm]()
     solution = posterior
-    stars = catalogue_covariance(
-        session.run / CATALOGUE_ERRORS,
-        session.fit,
-        posterior,
-        session.matches,
-        session.inputs.catalog,
-        float(session.inputs.log.values("vafactor").max()),
-    )
+    stars, shared = shared_stars_of(session), session.shared_errors
     if stars is not None:
         solution = with_shared_stars(posterior, session.fit, stars)
-        fields.append(CatalogueTerm(posterior, stars.total))
+        fields += catalogue_terms(posterior, stars, session.inputs.catalog.source)
+    if shared is not None:
+        solution = shared.widened(solution)
     scatter = ExposureScatter(posterior.model, posterior.mean, *session.scatter)
-    return Systematics(solution, (*fields, scatter), aligned=True)
+    aberration = aberration_term(session, solution)
+    return Systematics(solution, (*fields, scatter, aberration), aligned=True)
+
+
+def shared_stars_of(session: CampaignSession) -> StarCovariance | None:
+    """What the errors of the catalogue do to the parameters of a session's posterior."""
+    return catalogue_covariance(
+        session.run / CATALOGUE_ERRORS,
+        session.fit,
+        session.posterior,
+        session.matches,
+        session.inputs.catalog,
+        session.largest_vafactor,
+    )
+
+
+def catalogue_terms(
+    posterior: Posterior, stars: StarCovariance, catalogue: str
+) -> tuple[CatalogueTerm, ...]:
+    """What the errors of the catalogue do: of its positions, and of its motions where it has some.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        That takes them for independent.
+    stars : StarCovariance
+    catalogue : str
+        Name of the file that states the errors.
+    """
+    source = f"{GIVEN}: errors of {{}} in {Path(catalogue).name}"
+    if stars.motions is None:
+        return (CatalogueTerm(posterior, stars.total, source=source.format("positions")),)
+    positions = stars.total - stars.motions
+    return (
+        CatalogueTerm(posterior, positions, source=source.format("positions")),
+        CatalogueTerm(posterior, stars.motions, MOTIONS, source.format("proper motions")),
+    )
 
 
 def catalogue_covariance(
@@ -91,9 +135,8 @@ def catalogue_covariance(
     if matches.star is None or not errors:
         return None
     fingerprint = fingerprint_of(fit, posterior)
-    names = ("total", "counted")
     try:
-        return StarCovariance(**read_arrays(path, fingerprint, names, do=""))
+        return _kept(path, fingerprint)
     except InputError:
         pass  # not there yet, or of another posterior
     log.info("assess: errors of the catalogue, one for each star in all of its exposures")
@@ -107,8 +150,29 @@ def catalogue_covariance(
         epoch0=errors.get("epoch"),
         frames=False,
     )
-    write_arrays(path, fingerprint, {name: getattr(found, name) for name in names})
+    motions = np.empty((0, 0)) if found.motions is None else found.motions
+    kept = {"total": found.total, "counted": found.counted, "motions": motions}
+    write_arrays(path, fingerprint, kept)
     return found
+
+
+def as_assessed(session: CampaignSession) -> Posterior:
+    """The posterior with the errors of the catalogue as `assess` has kept them.
+
+    Neither catalogue nor pairs are needed; where nothing is kept it is the posterior alone.
+    """
+    posterior, path = session.posterior, session.run / CATALOGUE_ERRORS
+    if not path.exists():
+        return posterior
+    stars = _kept(path, fingerprint_of(session.fit, posterior))
+    return with_shared_stars(posterior, session.fit, stars)
+
+
+def _kept(path: Path, fingerprint: str) -> StarCovariance:
+    arrays = read_arrays(path, fingerprint, ("total", "counted", "motions"), do="")
+    if not arrays["motions"].size:
+        del arrays["motions"]
+    return StarCovariance(**arrays)
 
 
 def _by_star(catalog: ReferenceCatalog) -> dict[str, Float]:
@@ -122,6 +186,21 @@ def _by_star(catalog: ReferenceCatalog) -> dict[str, Float]:
             out[name] = np.zeros(int(catalog.star.max()) + 1)
             out[name][catalog.star] = values
     return out
+
+
+def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> StarErrors | None:
+    """Errors of the catalogue by code of the star; None where it has none."""
+    found = _by_star(catalog)
+    if not found:
+        return None
+    position, motion = (
+        np.stack([found[f"{name}_{a}"] for a in "uv"], axis=1) / largest_vafactor
+        if f"{name}_u" in found
+        else None
+        for name in ("sigma", "sigma_pm")
+    )
+    assert position is not None
+    return StarErrors(position, motion, found.get("epoch"))
 
 
 def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovariance) -> Posterior:
@@ -144,7 +223,14 @@ def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovarianc
     Posterior
         With other draws of theta and the same mean; all else is as it was.
     """
+    before = covariance_of(posterior, fit)
+    return with_spread(posterior, before, before + stars.extra)
+
+
+def covariance_of(
+    posterior: Posterior, fit: LinearFit, stars: StarCovariance | None = None
+) -> Float:
+    """Covariance of a posterior without the noise of its draws, and with a catalogue's errors."""
     formal = np.asarray(fit.cov, float)
     wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
-    before = wider * formal
-    return with_spread(posterior, before, before + stars.extra)
+    return wider * formal if stars is None else wider * formal + stars.extra

@@ -1,4 +1,4 @@
-"""tables.h5: the look-up tables of a run, and their errors on the grid of the assessment."""
+"""tables.h5: the look-up tables of a run, their errors, and what lies between their nodes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.assess.between_nodes import BetweenNodes
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.model import LookupTable
 
@@ -17,7 +18,7 @@ __all__ = ["KeptTables", "read_tables", "write_tables"]
 
 Float = NDArray[np.float64]
 
-ERRORS = "position_sigma"
+ERRORS, BETWEEN = "position_sigma", "between"
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +31,20 @@ class KeptTables:
         The detector's first.
     position_sigma : mapping of int to ndarray, shape (ny, nx, 2)
         By chip: errors of positions by those of all tables, in the unit of u, v.
+    between : mapping of int to BetweenNodes
+        By chip, where it has been measured: what all tables leave between their nodes.
     """
 
     tables: tuple[LookupTable, ...] = ()
     position_sigma: Mapping[int, Float] = field(default_factory=dict)
+    between: Mapping[int, BetweenNodes] = field(default_factory=dict)
 
 
 def write_tables(
-    path: Path, tables: Sequence[LookupTable], position_sigma: Mapping[int, Float] | None = None
+    path: Path,
+    tables: Sequence[LookupTable],
+    position_sigma: Mapping[int, Float] | None = None,
+    between: Sequence[BetweenNodes] = (),
 ) -> None:
     """Write the file; without tables there is none."""
     if not tables:
@@ -46,6 +53,9 @@ def write_tables(
     arrays: dict[str, Any] = {
         f"{chip}.{ERRORS}": sigma for chip, sigma in (position_sigma or {}).items()
     }
+    for one in between:
+        n = np.full(2, one.n_pairs)
+        arrays[f"{one.chip}.{BETWEEN}"] = np.stack([one.square, one.error, n])
     for table in tables:
         of = f"{table.chip}.{table.filter}." if table.filter else f"{table.chip}."
         arrays |= {
@@ -84,9 +94,13 @@ def read_tables(path: Path, *, do: str) -> KeptTables:
                 arrays.get(f"{of}sigma"),
             )
         )
-    errors = {
-        int(name.partition(".")[0]): values
-        for name, values in arrays.items()
-        if name.endswith(f".{ERRORS}")
-    }
-    return KeptTables(tuple(tables), errors)
+    errors, between = (
+        {
+            int(name.partition(".")[0]): values
+            for name, values in arrays.items()
+            if name.endswith(f".{kind}")
+        }
+        for kind in (ERRORS, BETWEEN)
+    )
+    told = {chip: BetweenNodes(chip, *v[:2], int(v[2, 0])) for chip, v in between.items()}
+    return KeptTables(tuple(tables), errors, told)

@@ -8,8 +8,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.campaign.interpolation import measured_between
 from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.assess.between_nodes import BetweenNodes
 from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.data import MatchTable
 from bayesdist.infer import LinearFit
@@ -36,11 +38,14 @@ def fit_tables(session: CampaignSession) -> TableFit | None:
     session.keep_tables(held)
     if block.method == "none":
         if held:
-            fit, _, _ = session.errors_by_magnitude(session.raw_matches)
-            session.keep_tables(held, _held_errors(session, fit, held))
+            fit, _, errors = session.errors_by_magnitude(session.raw_matches)
+            pairs = session.pairs.with_errors_by_magnitude(errors)
+            between = measured_between(pairs, fit, held, filter=session.inputs.filter, fitted=False)
+            session.keep_tables(held, _held_errors(session, fit, held), between)
         return None
+    pairs = _with_errors(session, held)
     found = fit_with_tables(
-        _with_errors(session, held),
+        pairs,
         session.plain_model,
         base=session.inputs.filter,
         detector=held,
@@ -54,7 +59,15 @@ def fit_tables(session: CampaignSession) -> TableFit | None:
         errors = _on_the_grid(session, lambda x, y, chip: found.table_sigma(x, y, chip=chip))
     else:
         errors = _held_errors(session, part.fit, found.tables)
-    session.keep_tables(found.tables, errors)
+    between = measured_between(
+        pairs,
+        part.fit,
+        found.tables,
+        filter=part.filter,
+        posteriors=part.posteriors,
+        trust=part.trust,
+    )
+    session.keep_tables(found.tables, errors, between)
     return found
 
 
@@ -113,12 +126,17 @@ def _doubts(session: CampaignSession, found: TableFit | None) -> Iterator[str]:
     block = session.config.tables
     if block.detector is not None and any(t.sigma is None for t in session.tables if not t.filter):
         yield "the detector's tables have no errors, and none are counted"
+    if session.tables and len(session.between_nodes) < len(session.config.chips()):
+        yield (
+            "too few stars lie near each other to tell what the look-up tables leave between "
+            "their nodes, and no error is counted for it"
+        )
     if found is None:
         return
     if block.method == "binned":
         yield (
-            "the tables are smoothed bins: their errors are those of the bins, without what "
-            "smoothing takes off the pattern"
+            "the tables are smoothed bins: their errors are those of the bins; what smoothing "
+            "takes off the pattern is among what lies between the nodes"
         )
     if not found.converged:
         yield (
@@ -133,6 +151,7 @@ def tables_summary(session: CampaignSession, found: TableFit | None) -> dict[str
         "method": session.config.tables.method,
         "detector": session.config.tables.detector,
         "chips": [_row(table) for table in session.tables],
+        "between_nodes": [_between(one) for one in session.between_nodes.values()],
         "warnings": list(_doubts(session, found)),
     }
     if found is not None:
@@ -152,4 +171,16 @@ def _row(table: LookupTable) -> Mapping[str, object]:
         "rms": float(np.sqrt((table.values**2).mean())),
         "largest": float(np.hypot(*table.values).max()),
         "sigma_median": None if table.sigma is None else float(np.median(table.sigma)),
+    }
+
+
+def _between(one: BetweenNodes) -> Mapping[str, object]:
+    """Pixels along x and y, as the budget has them, and mean squares as measured."""
+    return {
+        "chip": one.chip,
+        "rms_x": float(one.variance[0] ** 0.5),
+        "rms_y": float(one.variance[1] ** 0.5),
+        "square": one.square.tolist(),
+        "square_error": one.error.tolist(),
+        "n_pairs": one.n_pairs,
     }

@@ -6,10 +6,11 @@ import logging
 from collections.abc import Callable
 
 from bayesdist.app.judging import budget_of, margins_of
+from bayesdist.app.made_files import idctab_of, sip_of, wise_sip_of
 from bayesdist.app.periods import check_pairs
 from bayesdist.app.session import Session
 from bayesdist.app.stages.assess import run_assess
-from bayesdist.app.stages.export import idctab_of, run_export, sip_of, wise_sip_of
+from bayesdist.app.stages.export import run_export
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.report import run_report
 from bayesdist.app.stages.sample import run_sample

@@ -11,7 +11,7 @@ from bayesdist.app.campaign.report import campaign_results
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.horizon import kept_horizons
-from bayesdist.app.judging import budget_of, errors_of, margins_of
+from bayesdist.app.judging import budget_of, errors_of, margins_of, products_of
 from bayesdist.app.margins import judged_requirements
 from bayesdist.app.periods import periods_of
 from bayesdist.app.rundir import as_json
@@ -45,10 +45,8 @@ def run_report(session: Session) -> None:
         Check,
         Product,
         ReportInput,
-        all_figures,
-        drawn,
-        save_images,
-        save_pdfs,
+        drawn_report,
+        save_drawings,
         write_report,
     )
 
@@ -92,14 +90,13 @@ def run_report(session: Session) -> None:
     )
     if isinstance(session, CampaignSession):
         inputs = replace(inputs, campaign=campaign_results(session))
-    figures = all_figures(inputs)
-    names = [f"{name}.{kind}" for name in figures for kind in ("png", "pdf")]
+    drawings = drawn_report(inputs)
+    names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
     for stale in set(run.summary.get("figures", [])) - set(names):
         (run / "figures" / stale).unlink(missing_ok=True)
     run.summarise(figures=names)
-    images = drawn(figures)
-    save_images(images, run / "figures")
-    save_pdfs(figures, run / "figures")
+    save_drawings(drawings, run / "figures")
+    images = {name: one.png for name, one in drawings.items()}
     write_report(run / "report.html", inputs, images)
     log.info("report: %s", run / "report.html")
 
@@ -115,8 +112,14 @@ def _surface(session: Session) -> BudgetSurface | None:
     if session.solution.model.time is not None and epochs is not None:
         seen = [*epochs, session.epoch]
         years = float(min(seen)), float(max(seen)) + YEARS_AHEAD
-    sources = {t.name: t.source for t in session.field_terms if hasattr(t, "source")}
-    return budget_surface(errors, epoch=session.epoch, years=years, sources=sources)
+    sources = {t.name: t.source for t in session.field_terms}
+    return budget_surface(
+        errors,
+        epoch=session.epoch,
+        years=years,
+        sources=sources,
+        products=products_of(session),
+    )
 
 
 def _chip_results(session: Session) -> tuple[ChipResults, ...]:

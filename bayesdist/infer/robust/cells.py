@@ -62,6 +62,14 @@ class Cells:
         """Whether cells as many times larger are still enough on every chip."""
         return all(n // factor >= LEAST for shape in self.shapes for n in shape)
 
+    @property
+    def factors(self) -> tuple[int, ...]:
+        """1, 2, 4, ...: how many times larger cells are looked at; at least two of them."""
+        out = [1, 2]
+        while self.divisible(2 * out[-1]):
+            out.append(2 * out[-1])
+        return tuple(out)
+
     def merged(self, factor: int) -> tuple[list[tuple[int, int]], list[Int]]:
         """Numbers of cells that are as many times larger, and into which one each cell goes."""
         shapes, into = [], []

@@ -18,6 +18,10 @@ of two stars by a trapezium of their separation, as the flat-top kernels of spec
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError
@@ -28,10 +32,13 @@ from bayesdist.infer.robust.level import exposure_influence, level_of
 from bayesdist.infer.robust.result import RobustCovariance
 from bayesdist.infer.robust.scores import scores_of
 from bayesdist.infer.robust.sums import cluster_sums, require_room
+from bayesdist.infer.settling import Settling
 from bayesdist.infer.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.views import Solution
 
 __all__ = ["robust_covariance"]
+
+Float = NDArray[np.float64]
 
 
 # a second BLAS thread gains little here and loses much on a machine that has other work
@@ -43,6 +50,10 @@ def robust_covariance(
     *,
     exposures: bool = False,
     priors: GaussianPriors | None = None,
+    frames: bool = True,
+    settling: Settling | None = None,
+    detector: bool = True,
+    known: Sequence[Float] = (),
     compute: Compute | None = None,
 ) -> RobustCovariance:
     """Measure the covariance of a solution from its residuals: one pass over the stars.
@@ -60,7 +71,19 @@ def robust_covariance(
         Whether the stars of an exposure err together as well.  Stars are known to belong to
         different exposures where the model has frames, or dates.
     priors : GaussianPriors, optional
-        That the solution was made with.
+        That the solution was made with.  Deviations of exposures that scatter by them are errors of
+        the exposures, and count once.
+    frames : bool
+        Whether the covariance is that of all parameters, or of polynomials and drift alone: a
+        small part of the cost where there are a hundred exposures.
+    settling : Settling, optional
+        What was done to the shifts of single chips afterwards; for polynomials and drift.
+    detector : bool
+        Whether cells tell what stars of a place have in common.  They do not where the place itself
+        was fitted, as by look-up tables: these have taken it.
+    known : sequence of ndarray, shape (D, D)
+        By cells of each of `cells.factors`: what they add to the formal variance that is
+        counted elsewhere, as the error that a star of the catalogue has in all exposures.
     compute : Compute, optional
 
     Returns
@@ -85,8 +108,14 @@ def robust_covariance(
         sums = shards.sum(cluster_sums, scores, cells)
     priors = priors or GaussianPriors.none(model)
     matrix, _ = sums.equations.assemble(model, scores.theta)
-    formal = (matrix + priors.matrix(model)).factor().covariance()
-    gain = gains(sums, model, scores.theta, formal, priors)
+    inverse = (matrix + priors.matrix(model)).factor().covariance()
+    D = model.n_params if frames else model.n_distortion
+    rows, settled = inverse[:D], np.zeros(0, np.int64)
+    if settling is not None:
+        # predictions stay, so that only the rows that are asked for have to be settled
+        rows = settling.mean(inverse).T[:D]
+        settled = np.unique(np.concatenate([settled, *(p.constants for p in settling.places)]))
+    gain = gains(sums, model, scores.theta, rows, priors)
     by_exposure = exposure_influence(sums, gain) if exposures else None
     if by_exposure is not None and len(by_exposure) < 2:
         raise InputError(
@@ -94,16 +123,19 @@ def robust_covariance(
             where="exposures",
             do="fit frames, or leave exposures out",
         )
-    factors = [1, 2]
-    while cells.divisible(2 * factors[-1]):
-        factors.append(2 * factors[-1])
+    pulls = rows * priors.precision
     return RobustCovariance(
         model=model,
         mean=scores.theta,
-        formal=formal,
-        by_priors=(formal * priors.precision) @ formal,
+        formal=rows[:, :D] if settling is None else settling.mean(rows)[:, :D],
+        by_priors=pulls @ rows.T,
         cells=cells,
-        levels=tuple(level_of(sums, cells, f, gain, within=exposures) for f in factors),
+        levels=tuple(level_of(sums, cells, f, gain, within=exposures) for f in cells.factors),
         exposures=by_exposure,
         groups=sums.groups,
+        by_frames=pulls[:, model.n_distortion :] @ rows[:, model.n_distortion :].T,
+        whole=None if frames else inverse,
+        settled=settled,
+        detector=detector,
+        known=tuple(known),
     )

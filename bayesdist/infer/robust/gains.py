@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.field_test import determined
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.robust.sums import ClusterSums
 from bayesdist.model import DistortionModel, Groups
@@ -26,10 +27,18 @@ class Gains:
         By the score of each group of stars.
     without_frame : list of ndarray, shape (D, 2K)
         The same, less what the frame of the group's exposure takes upon itself.
+    by_exposure : list of ndarray, shape (D, 2K)
+        By the score of a whole exposure: that along its frame, which balances the pull of the
+        frame's prior, is left out.
+    frame : list of ndarray, shape (2K, q)
+        Of each chip a root F, for which F F^T is what frames take of the stars' errors: the same
+        for all exposures, were each a share of the whole.  Empty where there are no frames.
     """
 
     by_group: list[Float]
     without_frame: list[Float]
+    by_exposure: list[Float]
+    frame: list[Float]
 
 
 def gains(
@@ -47,8 +56,8 @@ def gains(
     sums : ClusterSums
     model : DistortionModel
     theta : ndarray, shape (D,)
-    inverse : ndarray, shape (D, D)
-        Of the normal matrix.
+    inverse : ndarray, shape (D, P)
+        Rows of the inverse of the normal matrix.
     priors : GaussianPriors
 
     Returns
@@ -56,9 +65,11 @@ def gains(
     Gains
     """
     groups = sums.groups
-    by_group = [inverse[:, c] @ d for c, d in _along_gauge(model, theta, groups)]
+    along, n = list(_along_gauge(model, theta, groups)), model.n_distortion
+    by_group = [inverse[:, c] @ d for c, d in along]
     if not model.n_frame or groups.exposure.max() < 1:
-        return Gains(by_group, by_group)
+        return Gains(by_group, by_group, by_group, [])
+    by_exposure = [inverse[:, c[c < n]] @ d[c < n] for c, d in along]
     code = np.where(groups.exposure > 0, groups.exposure, groups.exposure.max())
     moves = []
     for (columns, d), e in zip(
@@ -70,7 +81,7 @@ def gains(
         move[columns[own] - block.start] = d[own]
         moves.append(move)
     weights = [_weight(sums, model, theta, g) for g in range(len(groups))]
-    out = list(by_group)
+    out, total = list(by_group), np.zeros((model.n_frame, model.n_frame))
     for e in np.unique(groups.exposure):
         members = np.flatnonzero(groups.exposure == e)
         information = np.diag(priors.precision[model.frame_slice(int(code[members[0]]))])
@@ -79,9 +90,12 @@ def gains(
             information = information + moves[g] @ weights[g] @ moves[g].T
             answer += by_group[g] @ weights[g] @ moves[g].T
         share = answer @ _inverse(information)
+        total += information
         for g in members:
             out[g] = by_group[g] - share @ moves[g]
-    return Gains(by_group, out)
+    root = determined(total)
+    first = [int(np.argmax(groups.chip == c)) for c in range(len(model.chips))]
+    return Gains(by_group, out, by_exposure, [moves[g].T @ root for g in first])
 
 
 def _along_gauge(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.robust.cells import Cells
 from bayesdist.infer.robust.gains import Gains
-from bayesdist.infer.robust.leverage import Leverage, leverage_of
+from bayesdist.infer.robust.leverage import FrameShare, Leverage, leverage_of
 from bayesdist.infer.robust.sums import ClusterSums
 
 __all__ = ["Level", "exposure_influence", "level_of"]
@@ -86,6 +86,9 @@ def level_of(sums: ClusterSums, cells: Cells, factor: int, gains: Gains, *, with
         leverage_of(_merged(weight, code, n), order)
         for weight, code, n in zip(sums.weight, into, counts, strict=True)
     )
+    shares = []
+    if within:
+        shares = [FrameShare.of(*each) for each in zip(leverage, gains.frame, strict=False)]
     D = len(gains.by_group[0])
     influence = np.zeros((first[-1], D))
     squares = np.zeros((D, D)) if within else None
@@ -97,8 +100,9 @@ def level_of(sums: ClusterSums, cells: Cells, factor: int, gains: Gains, *, with
         influence[first[chip] : first[chip + 1]] += corrected @ gain.T
         if squares is not None:
             alone = gains.without_frame[g]
-            # one exposure's part of a cell has next to no leverage
-            squares += alone @ (score.T @ score) @ alone.T
+            # one exposure's part of a cell has leverage on the frame and next to none beside
+            own = shares[chip].given_back(score) if shares else score
+            squares += alone @ (own.T @ own) @ alone.T
         information = float(sums.equations.weight[g, 0, 0, 0])
         mean[chip] += information * gain
         total[chip] += information
@@ -113,7 +117,7 @@ def exposure_influence(sums: ClusterSums, gains: Gains) -> Float:
     exposures, code = np.unique(when, axis=0, return_inverse=True)
     out = np.zeros((len(exposures), len(gains.by_group[0])))
     for g, e in enumerate(code.ravel()):
-        out[e] += gains.by_group[g] @ sums.score[g].sum(axis=0).ravel()
+        out[e] += gains.by_exposure[g] @ sums.score[g].sum(axis=0).ravel()
     return out
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
 
-__all__ = ["Leverage", "leverage_of"]
+__all__ = ["FrameShare", "Leverage", "leverage_of"]
 
 Float = NDArray[np.float64]
 
@@ -44,7 +44,8 @@ class Leverage:
 
     def corrected(self, score: Float) -> Float:
         """Scores (..., C, 2K) as they were before the fit took its part."""
-        white = np.linalg.solve(self.root, score[..., None])[..., 0]
+        flat = score.reshape(-1, score.shape[-1])
+        white = np.linalg.solve(self.root, flat.T).T.reshape(score.shape)
         turned = np.einsum("...ck,ckl->...cl", white, self.vectors)
         turned = turned / np.sqrt(1 - self.values)
         return np.einsum("...cl,ckl,jk->...cj", turned, self.vectors, self.root, optimize=True)
@@ -97,3 +98,46 @@ def leverage_of(weight: Float, order: int) -> Leverage:
     values, vectors = np.linalg.eigh((white + np.swapaxes(white, -1, -2)) / 2)
     # the curvature of few doubtful stars may be negative
     return Leverage(information, root, np.clip(values, 0.0, MOST), vectors)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameShare:
+    """What the frames of exposures take of the scores of cells, alike in all exposures.
+
+    With W the information of a cell and F the root of what frames take, the score s after the fit
+    has the covariance W - W F F^T W; with h = F^T W F
+
+        s + W F [(1 - h)^(-1/2) - 1] h^-1 F^T s
+
+    has W again.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (2K, q)
+        F.
+    back : ndarray, shape (C, 2K, q)
+        What stands before F^T s.
+    """
+
+    frame: Float
+    back: Float
+
+    @classmethod
+    def of(cls, leverage: Leverage, frame: Float) -> FrameShare:
+        """Of the cells of a chip in all exposures, of which each one has its share.
+
+        Parameters
+        ----------
+        leverage : Leverage
+        frame : ndarray, shape (2K, q)
+        """
+        by_frame = leverage.information @ frame
+        values, vectors = np.linalg.eigh(frame.T @ by_frame)
+        values = np.clip(values, 1e-12, MOST)
+        factor = ((1 - values) ** -0.5 - 1) / values
+        middle = (vectors * factor[:, None]) @ np.swapaxes(vectors, -1, -2)
+        return cls(frame, by_frame @ middle)
+
+    def given_back(self, score: Float) -> Float:
+        """Scores (..., C, 2K) of one exposure as they were before its frame took its part."""
+        return np.asarray(score + np.einsum("ckq,...cq->...ck", self.back, score @ self.frame))

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.infer.robust.cells import Cells
-from bayesdist.infer.robust.level import Level
+from bayesdist.errors import InputError
+from bayesdist.infer.robust.evidence import Evidence
 from bayesdist.infer.robust.ratios import CellSize, PositionSigmas, Ratio
 from bayesdist.infer.star_errors import StarCovariance
-from bayesdist.model import DistortionModel, Groups
 
 __all__ = ["RobustCovariance"]
 
@@ -26,56 +24,10 @@ ALONE = 0.9  # leverage of a cell that next to nothing else says what it says
 AT_ONCE = 64  # positions whose degrees of freedom are found together
 
 
-@dataclass(frozen=True, eq=False)
-class RobustCovariance:
-    """A covariance that clusters of stars have shown, beside the formal one.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    mean : ndarray, shape (D,)
-    formal : ndarray, shape (D, D)
-        Inverse of the information at the mean.
-    by_priors : ndarray, shape (D, D)
-        The part of it that priors contribute; it has nothing to do with stars.
-    cells : Cells
-        The smallest ones.
-    levels : tuple of Level
-        These, and larger and larger ones.
-    exposures : ndarray, shape (E, D), or None
-        By what the errors of each exposure move the parameters.
-    groups : Groups
-        Of chip, exposure and epoch that have stars.
-    """
-
-    model: DistortionModel
-    mean: Float
-    formal: Float
-    by_priors: Float
-    cells: Cells
-    levels: tuple[Level, ...]
-    exposures: Float | None
-    groups: Groups
+class RobustCovariance(Evidence):
+    """A covariance that clusters of stars have shown, beside the formal one."""
 
     # -- the parameters' covariance ----------------------------------------------------------------
-
-    def from_cells(self, k: int = 0) -> Float:
-        """Covariance (D, D) by the cells of levels `k` and `k` + 1 alone, and the exposures'.
-
-        Chance may leave combinations of parameters with a variance below zero.
-        """
-        fine, coarse = self.levels[k], self.levels[k + 1]
-        out = self.by_priors + 2 * _squares(coarse.influence) - _squares(fine.influence)
-        if self.exposures is not None:
-            assert coarse.within is not None and fine.within is not None
-            out += self._of_exposures - (2 * coarse.within - fine.within)
-        return np.asarray(out)
-
-    @property
-    def _of_exposures(self) -> Float:
-        assert self.exposures is not None
-        n = len(self.exposures)
-        return n / (n - 1) * _squares(self.exposures)
 
     @cached_property
     def ratio(self) -> Ratio:
@@ -132,6 +84,15 @@ class RobustCovariance:
         return np.asarray((coloured * np.maximum(values, least)) @ coloured.T)
 
     @property
+    def of_all(self) -> Float:
+        """`measured` for all parameters (P, P): frames follow as far as they are correlated."""
+        if self.whole is None:
+            return self.measured
+        D = len(self.formal)
+        follow = np.linalg.solve(self.whole[:D, :D], self.whole[:D]).T
+        return np.asarray(self.whole + follow @ (self.measured - self.formal) @ follow.T)
+
+    @property
     def shared(self) -> StarCovariance:
         """What has to be added to a solution, as `with_star_errors` takes it."""
         return StarCovariance(self.cov, self.formal)
@@ -154,32 +115,6 @@ class RobustCovariance:
         out[:, self._own] = np.linalg.solve(root, np.eye(len(root)))
         return out
 
-    def _variance(self, rows: Float, k: int) -> tuple[Float, Float]:
-        """Variance of a measured variance (n,) and of all entries of a matrix (n,).
-
-        Parameters
-        ----------
-        rows : ndarray, shape (n, r, D)
-            Derivatives of the r quantities whose variances are added, or whose covariance it is.
-        k : int
-            Level.
-        """
-        near, far = (level.moments(rows) for level in self.levels[k : k + 2])
-        raw = self._ratio_to(near[0], rows, k)
-        # products of neighbours come to the squares that both have
-        cells = np.maximum(4 * far[1:] - 3 * near[1:], far[1:]) * raw**2
-        if self.exposures is not None:
-            own = rows @ self._of_exposures @ np.swapaxes(rows, -1, -2)
-            trace, square = np.einsum("nrr->n", own) ** 2, (own**2).sum(axis=(1, 2))
-            cells += np.stack([2 * square, trace + square]) / (len(self.exposures) - 1)
-        return cells[0], cells[1]
-
-    def _ratio_to(self, expected: Float, rows: Float, k: int) -> Float:
-        """What the cells alone show (n,), over what is expected of independent stars."""
-        fine, coarse = self.levels[k : k + 2]
-        found = 2 * _square(coarse.influence, rows) - _square(fine.influence, rows)
-        return np.maximum(found / expected, 1e-3)
-
     def _ratio(self, k: int) -> Ratio:
         rows = self._white[None]
         n = rows.shape[1]
@@ -194,7 +129,7 @@ class RobustCovariance:
         return tuple(
             CellSize(
                 side * level.factor,
-                float(_square(level.influence, self._white[None])[0]) / n,
+                float(self._square(level.influence, self._white[None])[0]) / n,
                 self._ratio(k),
             )
             for k, level in enumerate(self.levels[1:])
@@ -260,9 +195,20 @@ class RobustCovariance:
         Returns
         -------
         PositionSigmas
+
+        Raises
+        ------
+        InputError
+            For an exposure whose frame was left out of the covariance.
         """
+        if exposure is not None and self.whole is not None:
+            raise InputError(
+                "the covariance is that of the polynomials alone",
+                where="exposure",
+                do="measure it with frames, or leave the exposure out",
+            )
         J = self.model.jacobian(self.mean, x, y, epoch=epoch, exposure=exposure, chip=chip)
-        rows = J.reshape(-1, 1, J.shape[-1])
+        rows = J[..., : len(self.formal)].reshape(-1, 1, len(self.formal))
         formal = _form(self.formal, rows)
         value = _form(self.measured, rows)
         parts = [rows[a : a + AT_ONCE] for a in range(0, len(rows), AT_ONCE)]
@@ -274,15 +220,6 @@ class RobustCovariance:
         return PositionSigmas(
             np.sqrt(value).reshape(shape), np.sqrt(formal).reshape(shape), dof.reshape(shape)
         )
-
-
-def _squares(influence: Float) -> Float:
-    return influence.T @ influence
-
-
-def _square(influence: Float, rows: Float) -> Float:
-    """Sum (n,) of the squares of what all clusters do to quantities (n, r, D)."""
-    return np.asarray(((rows @ influence.T) ** 2).sum(axis=(1, 2)))
 
 
 def _form(cov: Float, rows: Float) -> Float:

@@ -1,0 +1,83 @@
+"""What a campaign predicts of stars and exposures that were set aside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bayesdist.app.campaign.systematics import errors_by_star
+from bayesdist.app.holdout import whole_exposures
+from bayesdist.assess.grid import grid_pixels
+from bayesdist.assess.holdout_predictive import ExposureDeviations, Predictive, predictive_of
+from bayesdist.data import MatchTable
+from bayesdist.data.holdout import refuse_strangers
+from bayesdist.infer.star_influence import star_influence
+from bayesdist.model import LookupTable
+
+if TYPE_CHECKING:
+    from bayesdist.app.campaign.session import CampaignSession
+
+__all__ = ["check_named", "predictive_of_campaign"]
+
+TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
+
+
+def check_named(session: CampaignSession) -> None:
+    """Refuse exposures to be held out that the log does not have, before anything is matched.
+
+    Raises
+    ------
+    InputError
+    """
+    block, log = session.config.holdout, session.inputs.log
+    if block is not None and not isinstance(block.exposures, int):
+        refuse_strangers(block.exposures, log.names, log.source)
+
+
+def predictive_of_campaign(session: CampaignSession) -> Predictive:
+    """The posterior with errors of catalogue and tables, and the scatter of the exposures.
+
+    The stars of exposures that are held out whole were in the fit, in other exposures: what their
+    errors in the catalogue did there is known and no part of their residuals.
+    """
+    kinds, tau = session.scatter
+    fitted, held = session.matches, session.held_pairs
+    assert isinstance(fitted, MatchTable)
+    errors = errors_by_star(session.inputs.catalog, session.largest_vafactor)
+    stars = None
+    if errors is not None and held is not None and held.star is not None:
+        whole = np.isin(held.exposure_names, whole_exposures(session, held.exposure_names))
+        codes = np.unique(held.star[whole[held.exposure]])
+        stars = star_influence(session.fit, fitted, errors, codes)
+    return replace(
+        predictive_of(session.solution),
+        deviations=ExposureDeviations(kinds, tau),
+        stars=stars,
+        local=_local_errors(session),
+        cell=_cell(session),
+    )
+
+
+def _cell(session: CampaignSession) -> tuple[float, float] | None:
+    """Pixels over which stars share the errors of the tables; None without tables."""
+    if not session.tables:
+        return None
+    across, up = session.tables[0].step
+    return TOGETHER * across, TOGETHER * up
+
+
+def _local_errors(session: CampaignSession) -> tuple[LookupTable, ...]:
+    """Errors of positions that belong to places on the detector, as tables of their own."""
+    terms, out = session.local_terms, []
+    for chip in session.config.chips():
+        parts = [term.sigma[chip.number] for term in terms if chip.number in term.sigma]
+        if not parts:
+            continue
+        x, y = grid_pixels(chip.size, session.config.assess.grid)
+        sigma = np.sqrt(sum(part**2 for part in parts))
+        step = (float(x[1] - x[0]), float(y[1] - y[0]))
+        values = np.moveaxis(np.asarray(sigma), 2, 0)
+        out.append(LookupTable(chip.number, values, first=(float(x[0]), float(y[0])), step=step))
+    return tuple(out)

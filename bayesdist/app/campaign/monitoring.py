@@ -1,0 +1,201 @@
+"""New exposures of a campaign, as `bayesdist monitor` confronts a release with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.systematics import as_assessed
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.star_files import PAIRS, part_files
+from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
+from bayesdist.errors import InputError
+from bayesdist.infer import Posterior
+from bayesdist.infer.monitoring import NewFit, fit_new
+from bayesdist.infer.monitoring_stars import with_star_errors_of
+from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
+from bayesdist.infer.star_influence import StarErrors
+from bayesdist.model import corrected
+
+__all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class NewExposures:
+    """Pairs of exposures that a release has not seen, and what is known of them.
+
+    Parameters
+    ----------
+    released : Posterior
+        With the errors of the catalogue.
+    matches : MatchTable
+        At the pixels that the release's tables have corrected, with errors.
+    errors : StarErrors or None
+        Of the catalogue; None where stars have no codes, or pairs no errors of it.
+    same_catalogue : bool
+        Whether it is that of the release, with the same codes of stars.
+    left_out : tuple of str
+        Exposures that the release has been made from.
+    """
+
+    released: Posterior
+    matches: MatchTable
+    errors: StarErrors | None
+    same_catalogue: bool
+    left_out: tuple[str, ...]
+
+
+def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
+    """Matched pairs of new exposures: those of another run, or a table.
+
+    Parameters
+    ----------
+    session : CampaignSession
+        The release.
+    new : Path
+        Run directory of a campaign whose stage 'match' has been run, or pairs in a file or folder
+        as a run keeps them.
+
+    Returns
+    -------
+    NewExposures
+
+    Raises
+    ------
+    InputError
+        For star lists, which have to be matched first; pairs in another unit or filter, without
+        epochs, or without a way to errors; when all exposures are those of the release.
+    """
+    released = as_assessed(session)
+    run = RunDirectory(new) if (new / "run.json").exists() else None
+    pairs = _pairs(run, new, released.model.unit)
+    where = ", ".join(pairs.sources)
+    if not pairs.has_epoch:
+        raise InputError("has no epochs", where=str(new), do="give a column 'epoch'")
+    _refuse_other_filters(session, pairs, where)
+    seen = np.isin(pairs.exposure_names, released.model.exposures)
+    left_out = tuple(np.asarray(pairs.exposure_names)[seen].tolist())
+    fresh = ~seen[pairs.exposure]
+    if not fresh.any():
+        raise InputError(
+            f"all of {len(left_out)} exposures are those that the release was made from",
+            where=str(new),
+            do="give pairs of other exposures",
+        )
+    pairs = pairs.select(fresh)
+    names = pairs.exposures
+    code = {name: k for k, name in enumerate(names)}
+    codes = np.array([code.get(name, -1) for name in pairs.exposure_names])[pairs.exposure]
+    pairs = replace(pairs, exposure=codes, exposure_names=names)
+    own = None if run is None else CampaignSession(run).kept_errors()
+    return NewExposures(
+        released,
+        prepared(session, pairs, own or session.kept_errors()),
+        _catalogue_errors(pairs),
+        run is not None and _catalogue_of(run) == _catalogue_of(session.run),
+        left_out,
+    )
+
+
+def prepared(
+    session: CampaignSession, pairs: MatchTable, errors: MagnitudeErrors | None
+) -> MatchTable:
+    """Pairs at the pixels that the release's tables have corrected, with errors of centroids."""
+    if session.tables:
+        names = np.asarray(pairs.filter_names)[pairs.filter]
+        own = next((table.filter for table in session.tables if table.filter), "")
+        x, y = corrected(
+            session.tables,
+            pairs.x,
+            pairs.y,
+            chip=pairs.chip_number,
+            filter=np.where(names == "", own, names),
+        )
+        pairs = on_the_chips(with_columns(pairs, x=x, y=y), session.fit.model)
+    if pairs.mag is None or errors is None:
+        return pairs
+    return with_centroid_errors(pairs, errors)
+
+
+def fit_exposures_of(session: CampaignSession, new: NewExposures) -> NewFit:
+    """The new exposures fitted by themselves, deviating as those of the release scatter.
+
+    What a star's error in the catalogue does to all its exposures is added, and where the release
+    has the same catalogue, what it did to the release is taken into account.
+    """
+    config = session.config
+    kinds, tau = session.scatter
+    found = fit_new(
+        new.released,
+        new.matches,
+        clip_chi2=config.fit.clip_chi2,
+        clip_abs=config.fit.clip_abs,
+        compute=config.resources(),
+        scatter=dict(zip(kinds, np.sqrt((tau**2).mean(axis=0)), strict=True)),
+    )
+    if new.errors is None:
+        return found
+    released = None
+    if new.same_catalogue:
+        old = session.matches
+        assert isinstance(old, MatchTable)
+        released = (session.fit, old)
+    return with_star_errors_of(new.errors, found, new.matches, released)
+
+
+def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
+    """Pairs as another run keeps them, or of a table."""
+    if run is None:
+        if new.suffix == ".toml":
+            raise InputError(
+                "is a configuration, whose star lists would have to be matched first",
+                where=str(new),
+                do="give the folder of its 'bayesdist run', or of 'bayesdist match'",
+            )
+        if not new.exists():
+            raise InputError("there is no such file", where=str(new), do="check the name")
+        found = read_matches(new, unit=unit)
+    else:
+        if run.config.campaign is None or not part_files(run / PAIRS):
+            raise InputError(
+                "is a run without matched pairs of a campaign",
+                where=str(run.path),
+                do="give one whose stage 'match' has been run, or a table of pairs",
+            )
+        found = read_matches(run / PAIRS, unit=unit)
+    return found
+
+
+def _refuse_other_filters(session: CampaignSession, pairs: MatchTable, where: str) -> None:
+    mine = session.config.campaign.filter if session.config.campaign is not None else None
+    others = sorted({name for name in pairs.filter_names if name} - {mine})
+    if mine is not None and others:
+        raise InputError(
+            f"the pairs are in filter {others[0]}, and the release is in {mine}",
+            where=where,
+            do="give pairs in the filter of the release",
+        )
+
+
+def _catalogue_errors(pairs: MatchTable) -> StarErrors | None:
+    """The least error that each star of the catalogue has in its pairs, by code of the star."""
+    if pairs.star is None or pairs.sigma_u is None or pairs.sigma_v is None or pairs.mag is None:
+        return None
+    sigma = np.full((int(pairs.star.max()) + 1, 2), np.inf)
+    for axis, values in enumerate((pairs.sigma_u, pairs.sigma_v)):
+        np.minimum.at(sigma[:, axis], pairs.star, values)
+    return StarErrors(np.where(np.isfinite(sigma), sigma, 0.0))
+
+
+def _catalogue_of(run: RunDirectory) -> str | None:
+    """Hash of a run's catalogue."""
+    block, base = run.config.campaign, Path(run.record["base"])
+    assert block is not None
+    found: str | None = run.record["inputs"].get(str(base / block.catalog))
+    return found

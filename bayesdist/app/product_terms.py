@@ -1,0 +1,238 @@
+"""What the files of a run differ by from its solution, read back from the files as written.
+
+A SIP header holds one chip at one date: drift is left out at any other, look-up tables always.  An
+IDCTAB lies along axes of its own and counts in its own pixels: the best shift, rotation and, once
+for all dates, scale are taken out; of a released set the look-up tables are applied as well.  An
+inverse is compared with the forward terms of its own file, between which a user goes to and fro.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.campaign.release import write_files
+from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.file_positions import ReleasedSet, sip_positions
+from bayesdist.app.made_files import idctab_of, sip_of, wise_sip_of
+from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.assess.product_terms import ProductTerm
+from bayesdist.assess.solution import place_of
+from bayesdist.assess.terms import MEASURED
+from bayesdist.model import Chip, LookupTable, corrected
+from bayesdist.products import (
+    SipHeader,
+    read_d2im,
+    read_idctab,
+    read_lookup_file,
+    read_sip,
+    read_wise_meta,
+    write_idctab,
+    write_sip,
+    write_wise_meta,
+)
+
+if TYPE_CHECKING:
+    from bayesdist.app.session import Session
+
+__all__ = ["product_terms"]
+
+Float = NDArray[np.float64]
+Positions = Callable[[Float, Float, int, float | None], Float]
+
+FORWARD, INVERSE = "forward", "inverse"
+GRID = (33, 33)  # points over which files are laid on the solution
+
+
+def product_terms(session: Session) -> tuple[ProductTerm, ...]:
+    """Terms of the files that the configuration asks for.
+
+    They are written into a folder of their own and read back, so that digits and orders are those
+    of the files; nothing of the run is touched.
+    """
+    asked, chips = session.config.products, session.solution.model.chips
+    out: list[ProductTerm] = []
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "file"
+        if asked.sip is not None:
+            headers = {}
+            for chip in chips:
+                write_sip(sip_of(session, session.solution, chip.number), path)
+                headers[chip.number] = read_sip(path)
+            out += _sip_terms(session, ", ".join(sip_names(chips)), headers)
+        if asked.idctab is not None:
+            name = idctab_name(session)
+            write_idctab(idctab_of(session, session.solution), path)
+            out += _idctab_terms(session, name, [ReleasedSet(read_idctab(path))])
+        if asked.wise_meta and session.config.wise_band is not None:
+            header = wise_sip_of(session, session.solution)
+            write_wise_meta(path, {session.config.wise_band: header})
+            [band] = read_wise_meta(path)
+            name = f"w{session.config.wise_band}.meta"
+            out += _sip_terms(session, name, {chips[0].number: band.sip}, like=header)
+        if asked.release is not None and isinstance(session, CampaignSession):
+            out += _idctab_terms(session, asked.release.name, _released(session, Path(folder)))
+    return tuple(out)
+
+
+def sip_names(chips: tuple[Chip, ...]) -> tuple[str, ...]:
+    """Names of the SIP headers that a run writes."""
+    return tuple(f"sip_{c.number}.hdr" for c in chips) if len(chips) > 1 else ("sip.hdr",)
+
+
+def idctab_name(session: Session) -> str:
+    """Name of the IDCTAB that a run writes."""
+    idc = session.config.products.idctab
+    assert idc is not None
+    return f"{idc.instrument}_{idc.detector}_idc.fits".lower()
+
+
+def _sip_terms(
+    session: Session, file: str, headers: Mapping[int, SipHeader], like: SipHeader | None = None
+) -> list[ProductTerm]:
+    """Forward and inverse of one header for each chip."""
+    unit, scale = session.solution.model.unit, session.scale_arcsec
+
+    def place(x: Float, y: Float, chip: int, _: float | None) -> Float:
+        return sip_positions(headers[chip], x, y, unit=unit, scale_arcsec=scale, like=like)
+
+    def missed(x: Float, y: Float, chip: int) -> Float:
+        sip = headers[chip]
+        back_x, back_y = sip.inverse(*sip.forward(x, y))
+        return np.stack([back_x - x, back_y - y], axis=-1)
+
+    rotates = session.systematics.aligned
+    turned = _Laid(session, place, scaled=False) if rotates else None
+    forward = turned or (lambda x, y, c, t: place(x, y, c, t) - _solution(session, x, y, c, t))
+    return [
+        _term(file, FORWARD, forward),
+        _term(file, INVERSE, _in_unit(session, missed)),
+    ]
+
+
+def _idctab_terms(session: Session, file: str, sets: Sequence[ReleasedSet]) -> list[ProductTerm]:
+    """Forward, and inverse where there are such rows; one set for each segment of the drift."""
+    time = session.solution.model.time
+
+    def of(epoch: float | None) -> ReleasedSet:
+        if time is None or epoch is None or len(sets) == 1:
+            return sets[0]
+        return sets[int(np.searchsorted(time.breaks, epoch, side="right"))]
+
+    def place(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        # a table without drift would refuse a date
+        return of(epoch)(x, y, chip, None if time is None else epoch)
+
+    out = [_term(file, FORWARD, _Laid(session, place, scaled=True))]
+    if all(one.has_inverse for one in sets):
+        back = _in_unit(session, lambda x, y, chip: sets[0].back(x, y, chip))
+        out.append(_term(file, INVERSE, back))
+    return out
+
+
+def _released(session: CampaignSession, folder: Path) -> list[ReleasedSet]:
+    """The files of a release, one set for each segment: of several periods of one, the first."""
+    block, filter = session.config.products.release, session.inputs.filter
+    assert block is not None
+    entries = write_files(session, folder, {filter: session.solution}, session.tables)
+    paths = {kind: folder / e["path"] for e in entries for kind in [e["kind"]]}
+    d2im = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
+    npol: dict[int, LookupTable] = {}
+    if "NPOLFILE" in paths:
+        after = read_lookup_file(paths["NPOLFILE"])
+        npol = {c: after.table(c, after.values(c), None) for c in after.chips}
+    tabs = {e["period"]: read_idctab(folder / e["path"]) for e in entries if e["kind"] == "IDCTAB"}
+    segments: dict[int, ReleasedSet] = {}
+    for period in block.period:
+        one = ReleasedSet(tabs[period.name], d2im, npol, filter)
+        segments.setdefault(period.segment, one)
+    time = session.solution.model.time
+    n = 1 if time is None else time.n_segments
+    last = segments[min(segments)]
+    return [segments.get(k, last) for k in range(n)]
+
+
+def _term(file: str, direction: str, shift: Positions) -> ProductTerm:
+    against = "the solution" if direction == FORWARD else "its forward terms"
+    source = f"{MEASURED}: as written, against {against}"
+    return ProductTerm(f"{file}, {direction}", file, direction, shift, source)
+
+
+def _solution(session: Session, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+    """Positions (N, 2) by the solution: tables where it has some, then the polynomials."""
+    solution = session.solution
+    if isinstance(session, CampaignSession) and session.tables:
+        x, y = corrected(session.tables, x, y, chip=chip, filter=session.inputs.filter)
+    place = place_of(solution.model, epoch=epoch, chip=chip)
+    return np.asarray(place.basis.evaluate(x, y) @ place.polynomial(solution.mean).T)
+
+
+def _in_unit(session: Session, missed: Callable[[Float, Float, int], Float]) -> Positions:
+    """Displacements of pixels as those of positions."""
+    solution = session.solution
+
+    def shift(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        place = place_of(solution.model, epoch=epoch, chip=chip)
+        P = place.polynomial(solution.mean)
+        J = np.stack([d @ P.T for d in place.gradient(x, y)], axis=-1)
+        return np.asarray(np.einsum("nab,nb->na", J, missed(x, y, chip)))
+
+    return shift
+
+
+class _Laid:
+    """Positions by a file, laid on those of the solution over all chips at once, less these.
+
+    Parameters
+    ----------
+    session : Session
+    place : callable
+        Positions by the file, in a unit of its own where `scaled`.
+    scaled : bool
+        Whether the file's scale is a convention of its own, found at the date of the assessment.
+    """
+
+    def __init__(self, session: Session, place: Positions, *, scaled: bool) -> None:
+        self.session, self.place, self.scaled = session, place, scaled
+        self._kept: dict[float | None, tuple[complex, complex, bool]] = {}
+
+    def __call__(self, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        zero, factor, mirrored = self._map(epoch)
+        w = self.place(x, y, chip, epoch) @ [1, -1j if mirrored else 1j]
+        at = zero + factor * w
+        return np.stack([at.real, at.imag], axis=-1) - _solution(self.session, x, y, chip, epoch)
+
+    def _map(self, epoch: float | None) -> tuple[complex, complex, bool]:
+        if epoch not in self._kept:
+            size = 1.0
+            date = self.session.epoch
+            if self.scaled:
+                size = abs(self._fitted(epoch)[1] if epoch == date else self._map(date)[1])
+            self._kept[epoch] = self._fitted(epoch, size)
+        return self._kept[epoch]
+
+    def _fitted(
+        self, epoch: float | None, size: float | None = None
+    ) -> tuple[complex, complex, bool]:
+        """Shift and factor, of a given size, by least squares; mirrored where that is nearer."""
+        z, w = [], []
+        for chip in self.session.solution.model.chips:
+            x, y = mesh(*grid_pixels(chip.size, GRID))
+            z.append(_solution(self.session, x, y, chip.number, epoch) @ [1, 1j])
+            w.append(self.place(x, y, chip.number, epoch) @ [1, 1j])
+        here, there = np.concatenate(z), np.concatenate(w)
+        found = []
+        for mirrored in (False, True):
+            v = there.conj() if mirrored else there
+            factor = np.vdot(v - v.mean(), here) / np.vdot(v - v.mean(), v)
+            if size is not None:
+                factor *= size / abs(factor)
+            zero = (here - factor * v).mean()
+            found.append((float(np.std(here - zero - factor * v)), zero, factor, mirrored))
+        _, zero, factor, mirrored = min(found, key=lambda one: one[0])
+        return complex(zero), complex(factor), mirrored

@@ -1,0 +1,140 @@
+"""What the error of a single star of the catalogue has in common with a solution.
+
+With the notation of `star_errors`, an error c_s of star s moves the parameters by H^-1 G_s c_s.  So
+a star that is seen again, in an exposure that was no part of the fit, has an error that the
+solution's own is correlated with: cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer.linear import LinearFit
+
+__all__ = ["StarErrors", "StarInfluence", "star_influence"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class StarErrors:
+    """Errors of a catalogue by code of the star.
+
+    Parameters
+    ----------
+    position : ndarray, shape (S, 2)
+        Standard errors, in the unit of u, v.
+    motion : ndarray, shape (S, 2), optional
+        In that unit per year.
+    epoch : ndarray, shape (S,), optional
+        Dates at which errors of positions and motions are uncorrelated.
+    """
+
+    position: Float
+    motion: Float | None = None
+    epoch: Float | None = None
+
+    def levers(self, star: Int, epoch: Float | None) -> Float:
+        """How the errors of position and motion move matches, shape (levers, n)."""
+        one = np.ones(len(star))
+        if self.motion is None or self.epoch is None or epoch is None:
+            return one[None]
+        return np.stack([one, epoch - self.epoch[star]])
+
+    @property
+    def variances(self) -> Float:
+        """Of positions, then of motions where there are any: shape (levers, S, 2)."""
+        parts = [self.position] if self.motion is None else [self.position, self.motion]
+        return np.asarray(np.stack(parts) ** 2)
+
+    def at(self, star: Int, epoch: Float | None) -> Float:
+        """Variances (n, 2) of the catalogue's positions of some matches."""
+        levers = self.levers(star, epoch)
+        variances = self.variances[: len(levers), star]
+        return np.asarray(np.einsum("ln,lna->na", levers**2, variances))
+
+
+@dataclass(frozen=True, eq=False)
+class StarInfluence:
+    """Errors of a catalogue, and what they have in common with polynomials and drift of a solution.
+
+    Parameters
+    ----------
+    errors : StarErrors
+    codes : ndarray of int, shape (k,)
+        Stars, rising, of which the following is known.  Of others there is none: no solution has
+        seen them.
+    by : ndarray, shape (levers, 2, k, n_distortion)
+        How the parameters move with the errors of these stars on either axis.
+    """
+
+    errors: StarErrors
+    codes: Int
+    by: Float
+
+    def with_solution(self, star: Int, epoch: Float | None) -> Float:
+        """Covariance (n, 2, n_distortion) of the stars' errors with those of the parameters."""
+        out = np.zeros((len(star), 2, self.by.shape[-1]))
+        if not len(self.codes):
+            return out
+        at = np.minimum(np.searchsorted(self.codes, star), len(self.codes) - 1)
+        known = np.flatnonzero(self.codes[at] == star)
+        star, at = star[known], at[known]
+        levers = self.errors.levers(star, None if epoch is None else epoch[known])
+        variances = self.errors.variances[: len(levers), star]
+        weight = levers[..., None] * variances  # (levers, n, 2)
+        out[known] = np.einsum("lna,land->nad", weight, self.by[: len(levers)][:, :, at])
+        return out
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def star_influence(
+    fit: LinearFit, matches: MatchTable, errors: StarErrors, codes: Int
+) -> StarInfluence:
+    """How single stars of a catalogue have moved a fit.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        Without extra weight in the corners.
+    matches : MatchTable
+        Those that it was made from, with errors and codes of the stars.
+    errors : StarErrors
+    codes : ndarray of int, shape (k,)
+        Stars that are asked for, rising.
+
+    Returns
+    -------
+    StarInfluence
+    """
+    assert matches.star is not None
+    model, D = fit.model, fit.model.n_distortion
+    n_levers = 1 if errors.motion is None else 2
+    by = np.zeros((n_levers, 2, len(codes), D))
+    wanted = np.isin(matches.star, codes) & fit.uses(matches)
+    if not wanted.any():
+        return StarInfluence(errors, codes, by)
+    table = matches.select(wanted)
+    assert table.star is not None and table.sigma_u is not None and table.sigma_v is not None
+    names = {name: k for k, name in enumerate(model.exposures)}
+    exposure = np.array([names[name] for name in table.exposure_names])[table.exposure]
+    groups = model.groups(len(table), epoch=table.epoch, exposure=exposure, chip=table.chip_number)
+    inverse = np.stack([table.sigma_u, table.sigma_v]) ** -2.0
+    levers = errors.levers(table.star, table.epoch)
+    at = np.searchsorted(codes, table.star)
+    cov = np.asarray(fit.cov, float)[:, :D]
+    jacobians = model.effective_jacobian(np.asarray(fit.mean), groups)
+    for g, rows in enumerate(groups.members()):
+        columns, d = jacobians[g]
+        phi = model.basis(model.chips[groups.chip[g]].number).evaluate(table.x[rows], table.y[rows])
+        for axis in (0, 1):
+            moved = (phi * inverse[axis, rows, None]) @ (d[axis] @ cov[columns])
+            for c, lever in enumerate(levers):
+                np.add.at(by[c, axis], at[rows], lever[rows, None] * moved)
+    return StarInfluence(errors, codes, by)

@@ -1,0 +1,211 @@
+"""What files differ by from the solution, against astropy.wcs and the model itself."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from astropy.wcs import WCS
+
+from bayesdist.app.campaign.session import session_of
+from bayesdist.app.file_positions import sip_positions
+from bayesdist.app.judging import products_of
+from bayesdist.app.product_terms import _Laid
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.systematics import Systematics
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
+from tests.app.support import good, summary_of
+
+SIZE, GRID, REFERENCE = (512, 256), (9, 5), (256.0, 128.0)
+DRIFT = 2e-5
+
+CONFIG = """
+[data]
+matches = "stars.ecsv"
+unit = "pix"
+[detector]
+name = "chip"
+size = [512, 256]
+[model]
+order = 3
+reference_pixel = [256.0, 128.0]
+[model.tdd]
+epoch0 = 2008.0
+terms = [["u", 1, 0], ["v", 1, 0]]
+[sampler]
+target_ess = 100
+[assess]
+epoch = 2008.0
+grid = [9, 5]
+draws = 400
+[[budget]]
+name = "catalogue"
+kind = "random"
+sigma_u = 0.004
+sigma_v = 0.004
+source = "a letter"
+[[budget]]
+name = "guiding"
+kind = "systematic"
+sigma_u = 0.001
+sigma_v = 0.001
+source = "Published: a handbook, Table 2"
+[products]
+sip = {inverse_order = 2}
+idctab = {instrument = "ACS", detector = "WFC"}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("products")
+    rng = np.random.default_rng(1)
+    epoch = np.repeat(np.linspace(2004.0, 2012.0, 4), 200)
+    x, y = rng.uniform(1, SIZE[0], epoch.size), rng.uniform(1, SIZE[1], epoch.size)
+    dx, dy = x - REFERENCE[0], y - REFERENCE[1]
+    drift = DRIFT * (epoch - 2008.0) * dx
+    u = dx + 4e-5 * dx**2 - 3e-5 * dx * dy + drift + 0.02 * rng.standard_normal(x.size)
+    v = dy + 5e-5 * dy**2 + 6e-8 * dx**3 - drift + 0.02 * rng.standard_normal(x.size)
+    columns = {"x": x, "y": y, "u": u, "v": v, "epoch": epoch}
+    for name in ("sigma_u", "sigma_v"):
+        columns[name] = np.full(x.size, 0.02)
+    Table(columns).write(folder / "stars.ecsv")
+    (folder / "config.toml").write_text(
+        # pixels of the handbook's size: an IDCTAB counts in arcseconds
+        CONFIG.replace('name = "chip"', 'name = "chip"\nscale_mas = 50.0'),
+        encoding="utf-8",
+    )
+    good("run", folder / "config.toml", "-o", folder / "run", "-q")
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def session(run):
+    with closing(session_of(RunDirectory.open(run))) as found:
+        yield found
+
+
+def rows_of(run):
+    return {row["name"]: row for row in summary_of(run)["budget"]}
+
+
+def test_the_inverse_row_is_what_astropy_leaves(run):
+    header = fits.Header.fromtextfile(run / "sip.hdr")
+    wcs = WCS(header)
+    x, y = (
+        a.ravel()
+        for a in np.meshgrid(*(np.linspace(1, n, k) for n, k in zip(SIZE, GRID, strict=True)))
+    )
+    pixel = np.column_stack([x, y])
+    back = wcs.sip_foc2pix(wcs.sip_pix2foc(pixel, 1), 1)
+    missed = np.sqrt(np.mean(np.sum((back - pixel) ** 2, axis=1)))
+    row = rows_of(run)["sip.hdr, inverse"]
+    assert missed > 1e-3  # an inverse of order 2 of a distortion of order 3
+    # pixels are those of u, v but for a distortion of some per cent
+    assert row["radial"] == pytest.approx(missed, rel=0.05)
+    [sip] = [p for p in summary_of(run)["products"] if p["path"] == "sip.hdr"]
+    assert sip["inverse_rms"] == row["radial"] <= sip["closure_pix"]
+
+
+def test_forward_it_is_exact_at_its_own_date_and_lacks_the_drift_at_others(run, session):
+    row = rows_of(run)["sip.hdr, forward"]
+    assert row["radial"] < 1e-10
+    [term] = [t for t in products_of(session) if t.name == "sip.hdr, forward"]
+    x, y = np.array([1.0, 300.0, 512.0]), np.array([200.0, 7.0, 256.0])
+    solution = session.solution
+    at = [solution.model.predict(solution.mean, x, y, epoch=t) for t in (2008.0, 2016.5)]
+    np.testing.assert_allclose(term.at(x, y, 1, 2016.5), at[0] - at[1], atol=1e-10)
+    assert np.abs(at[0] - at[1]).max() > 0.02
+    text = good("budget", run, "--at", 512, 256, "--epoch", 2016.5).out
+    assert "sip.hdr, forward" in text and "in no total" in text
+
+
+def test_an_idctab_holds_the_drift_too(run):
+    row = rows_of(run)["acs_wfc_idc.fits, forward"]
+    assert row["kind"] == "product" and row["radial"] < 1e-9
+    assert "acs_wfc_idc.fits, inverse" not in rows_of(run)  # it has no INVERSE rows
+
+
+def test_products_say_what_the_total_is_with_them(run):
+    found, total = summary_of(run), rows_of(run)["total"]["radial"]
+    for product in found["products"]:
+        assert product["total_rms"] == pytest.approx(np.hypot(total, product["forward_rms"]))
+
+
+def test_every_row_says_where_it_is_from(run):
+    rows = rows_of(run)
+    assert rows["catalogue"]["source"] == "given by the user: a letter"
+    assert rows["guiding"]["source"] == "published: a handbook, Table 2"
+    kinds = ("measured in this run", "given by the user", "published")
+    for name, row in rows.items():
+        assert name == "total" or row["source"].startswith(kinds), row
+    assert rows["total"]["source"]
+    table = Table.read(run / "budget.ecsv")
+    assert [str(s) for s in table["source"]] == [r["source"] for r in rows.values()]
+    report = (run / "report.html").read_text(encoding="utf-8")
+    for row in rows.values():
+        assert row["source"] in report
+
+
+def test_axes_and_size_of_a_file_are_its_own_and_a_wave_is_not():
+    """A field turned, mirrored, shifted and counted in other pixels; with a wave added."""
+    chips = tuple(Chip(k, f"C{k}", (256.0, 128.0), (128.0, 64.0)) for k in (1, 2))
+    model = DistortionModel(1, chips)
+    mean = np.zeros(model.n_params)
+    for chip in chips:
+        for axis, k, half in ((0, (1, 0), 128.0), (1, (0, 1), 64.0)):
+            at = model.basis(chip.number).terms.index(k)
+            mean[model.coefficient_slice(chip.number, axis)][at] = half
+    solution = SimpleNamespace(model=model, mean=mean)
+    session = SimpleNamespace(solution=solution, epoch=None, systematics=Systematics(solution))
+
+    def wave(x, y, chip, epoch):
+        return 0.01 * np.sin(np.stack([x, y], axis=-1) * 2 * np.pi / 32 + chip)
+
+    def other(x, y, chip, epoch):
+        u = model.predict(mean, x, y, chip=chip) + wave(x, y, chip, epoch)
+        z = 0.05 * np.exp(0.3j) * (u @ [1, -1j]) + 7 - 3j  # -1j: mirrored
+        return np.stack([z.real, z.imag], axis=-1)
+
+    found = _Laid(session, other, scaled=True)
+    x, y = np.random.default_rng(1).uniform(1, 128, (2, 50))
+    for chip in (1, 2):
+        # shift, turn and scale take up what they can of a wave: next to nothing
+        np.testing.assert_allclose(found(x, y, chip, None), wave(x, y, chip, None), atol=1e-3)
+
+
+def test_digits_of_wise_entries_are_what_is_left(tmp_path):
+    """Seven digits, and nothing said of scale and zero point: those of the header hold."""
+    side = 1016.0
+    chip = Chip(1, "W1", (side, side), (508.5, 508.5))
+    model = DistortionModel(2, (chip,), unit="arcsec")
+    basis = model.basis(1)
+    rng = np.random.default_rng(5)
+    monomial = np.zeros((2, model.n_terms))
+    monomial[:, 1:3] = 2.757 * (np.eye(2) + 1e-3 * rng.standard_normal((2, 2)))
+    monomial[:, 3:] = 1e-6 * rng.standard_normal((2, 3))
+    monomial[:, 0] = 0.3, -0.2
+    mean = basis.from_monomials(monomial).ravel()
+    solution = SimpleNamespace(model=model, mean=mean, cov=1e-12 * np.eye(len(mean)))
+    header = sip_from_solution(solution, linear="sip", inverse_order=2)
+    write_wise_meta(tmp_path / "w1.meta", {1: header})
+    [band] = read_wise_meta(tmp_path / "w1.meta")
+    x, y = rng.uniform(1, side, (2, 300))
+    options = {"unit": "arcsec", "scale_arcsec": None}
+    true = model.predict(mean, x, y)
+    exact = sip_positions(header, x, y, **options)
+    np.testing.assert_allclose(exact, true, atol=1e-9)
+    printed = sip_positions(band.sip, x, y, like=header, **options)
+    # half a unit of the seventh digit of each coefficient, times its power of the offset
+    lever = np.stack([np.abs(x - 508.5) ** i * np.abs(y - 508.5) ** j for i, j in basis.terms])
+    for axis, terms in enumerate((header.a, header.b)):
+        half = [5e-7 * 10 ** np.floor(np.log10(abs(terms[k]))) for k in basis.terms]
+        bound = np.hypot(*header.cd[axis]) * 3600 * (half @ lever)
+        off = np.abs(printed - true)[:, axis]
+        assert (off <= bound + 1e-9).all()
+        assert off.max() > 10 * np.abs(exact - true).max()  # the digits show

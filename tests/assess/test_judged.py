@@ -1,0 +1,66 @@
+"""Several epochs at once, blocks and threads: all give the statistics of one draw after another."""
+
+import numpy as np
+import pytest
+
+from bayesdist.assess import UserTerm
+from bayesdist.assess import position_errors as module
+from bayesdist.assess.judged import Judged
+from bayesdist.assess.position_errors import position_errors
+from bayesdist.model import Chip, DistortionModel, TimeDependence
+
+CHIPS = tuple(Chip(k, f"C{k}", (101.0, 81.0), (51.0, 41.0)) for k in (1, 2))
+MODEL = DistortionModel(2, CHIPS, time=TimeDependence((("u", 1, 0),), (2010.0, 2015.0), (2014.0,)))
+TERMS = (
+    UserTerm("noise", "random", 0.02, 0.03, "pix"),
+    UserTerm("offset", "systematic", 0.01, 0.0, "pix"),
+)
+EPOCHS = (2008.0, 2013.9, 2019.0)
+NAMES = ("max", "p90", "u_rms")
+
+
+@pytest.fixture
+def errors(solution_of):
+    rng = np.random.default_rng(3)
+    root = 0.01 * rng.normal(size=(MODEL.n_params, MODEL.n_params))
+    solution = solution_of(MODEL, cov=root @ root.T)
+    what = {"grid": (6, 5), "n_draws": 150}
+    return position_errors(solution, terms=TERMS, rng=np.random.default_rng(4), **what)
+
+
+def cases(**more):
+    return [Judged(CHIPS, epoch, "field", **more) for epoch in EPOCHS]
+
+
+@pytest.mark.parametrize("more", [{}, {"relative": True}, {"relative": True, "separation": 30.0}])
+def test_epochs_together_are_epochs_one_by_one(errors, more):
+    together = errors.course(cases(**more), NAMES)
+    for case, found in zip(cases(**more), together, strict=True):
+        alone = errors.statistics(case, NAMES)
+        for name in NAMES:
+            np.testing.assert_array_equal(found[name], alone[name])
+    assert np.mean(together[0]["max"] != together[2]["max"]) > 0.5
+
+
+def test_fewer_draws_are_the_first_ones(errors, monkeypatch):
+    every = errors.statistics(cases()[0], NAMES)
+    monkeypatch.setattr(module, "BLOCK", 1)
+    for n in (150, 37, 16, 1):
+        some = errors.statistics(cases()[0], NAMES, n_draws=n)
+        for name in NAMES:
+            np.testing.assert_allclose(some[name], every[name][:n], rtol=1e-12)
+
+
+def test_noise_has_its_size_and_belongs_to_a_place(solution_of):
+    """Without any other error the square of the rms is a mean of squares: chi-square of 2 N."""
+    still = solution_of(MODEL)
+    noise = (UserTerm("noise", "random", 0.02, 0.02, "pix"),)
+    n, places = 4000, 60
+    errors = position_errors(
+        still, terms=noise, grid=(6, 5), n_draws=n, rng=np.random.default_rng(5)
+    )
+    square = errors.statistics(cases()[0], ["rms"])["rms"] ** 2 / 0.02**2 * places
+    dof = 2 * places
+    assert np.mean(square) == pytest.approx(dof, abs=5 * np.sqrt(2 * dof / n))
+    # variance of chi-square 2 dof, of its estimate from n draws (2 + 12 / dof) / n relative
+    assert np.var(square) == pytest.approx(2 * dof, rel=5 * np.sqrt((2 + 12 / dof) / n))
