@@ -18,7 +18,15 @@ from bayesdist.data.partitioned import PartitionedMatches
 from bayesdist.data.pieces import Piece
 from bayesdist.errors import InputError
 
-__all__ = ["HELD_OUT", "ChosenMatches", "SetAside", "Split", "exposures_drawn", "split_matches"]
+__all__ = [
+    "HELD_OUT",
+    "ChosenMatches",
+    "SetAside",
+    "Split",
+    "exposures_drawn",
+    "refuse_strangers",
+    "split_matches",
+]
 
 Bits = NDArray[np.uint64]
 Matches = MatchTable | PartitionedMatches
@@ -166,14 +174,7 @@ def split_matches(matches: Matches, aside: SetAside) -> Split:
         For an unknown exposure, and when nothing would be left, or nothing set aside.
     """
     where = ", ".join(matches.sources)
-    for name in aside.exposures:
-        if name not in matches.exposure_names:
-            raise InputError(
-                f"there is no exposure {name!r} to be held out",
-                where=where,
-                do=f"name some of {', '.join(matches.exposure_names[:5])}, ... "
-                "in holdout.exposures",
-            )
+    refuse_strangers(aside.exposures, matches.exposure_names, where)
     if isinstance(matches, MatchTable):
         which = aside.which(matches)
         _refuse_nothing(int(which.sum()), len(which), where)
@@ -211,6 +212,22 @@ def split_matches(matches: Matches, aside: SetAside) -> Split:
         )
 
     return Split(chosen(False), chosen(True))
+
+
+def refuse_strangers(asked: Sequence[str], names: Sequence[str], where: str) -> None:
+    """Refuse exposures to be held out that there are not.
+
+    Raises
+    ------
+    InputError
+    """
+    for name in asked:
+        if name not in names:
+            raise InputError(
+                f"there is no exposure {name!r} to be held out",
+                where=where,
+                do=f"name some of {', '.join(names[:5])}, ... in holdout.exposures",
+            )
 
 
 def _refuse_nothing(held: int, n: int, where: str) -> None:

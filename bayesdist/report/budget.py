@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from bayesdist.assess.product_terms import PRODUCT
 from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.scales import display_scale
 from bayesdist.report.style import (
@@ -33,6 +35,7 @@ _KIND_COLORS = {
     "random": PALETTE["sky"],
     "systematic": PALETTE["blue"],
     "local": PALETTE["green"],
+    PRODUCT: "#9AA5B1",
 }
 # one above the other, as both axes are often equal
 _AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}
@@ -73,7 +76,7 @@ def budget_terms(budget: DetectorBudget, names: Sequence[str] = ()) -> Figure:
             ax.set_xlim(0, largest * scale.factor * room or 1.0)
             over = "the detector" if len(parts) == 1 else name
             ax.set_xlabel(f"rms over {over} [{scale.unit}]")
-        axes[0].set_yticks(np.arange(len(rows)), [_wrapped(str(r["name"])) for r in rows])
+        axes[0].set_yticks(np.arange(len(rows)), [fill(str(r["name"]), 26) for r in rows])
         axes[0].invert_yaxis()
         kinds = [k for k in _KIND_COLORS if any(r["kind"] == k and not is_total(r) for r in rows)]
         handles = [Patch(color=_KIND_COLORS[k], label=f"{k}, radial") for k in kinds]

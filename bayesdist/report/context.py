@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.report.numerals import count
+from bayesdist.report.scales import with_mas
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -213,6 +214,10 @@ class ReportInput:
     def several(self) -> bool:
         """Whether the detector has more than one chip."""
         return len(self.chips) > 1
+
+    def length(self, value: float) -> str:
+        """A length in the unit of u and v, and in mas where the size of a pixel is known."""
+        return with_mas(value, self.unit, self.scale_mas)
 
     def on_chip(self, chip: Chip) -> str:
         """' of WFC1' where there are several chips, else nothing."""

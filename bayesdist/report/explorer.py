@@ -12,9 +12,10 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from bayesdist.assess.budget_surface import BudgetSurface
+from bayesdist.assess.budget_surface import BudgetSurface, SurfaceProduct
 from bayesdist.assess.fields import MODEL
 from bayesdist.assess.position_errors import CENTROID
+from bayesdist.assess.product_terms import PRODUCT
 from bayesdist.assess.terms import LOCAL, MEASURED
 from bayesdist.report.context import ReportInput
 from bayesdist.report.scales import ladder
@@ -80,6 +81,7 @@ def budget_data(inputs: ReportInput) -> dict[str, Any] | None:
             for t, sigma in zip(s.terms, s.sigmas, strict=True)
         ],
         "centroid": _centroid(s),
+        "products": [_product(term) for term in s.products],
         "cycle": list(CYCLE),
     }
 
@@ -136,6 +138,18 @@ def _triangles(moments: Float) -> list[list[list[float | None]]]:
     i, j = np.triu_indices(K)
     values = moments[..., i, j] * np.where(i == j, 1.0, 2.0)
     return [[_short(v, MOMENT_DIGITS) for v in node] for node in values]
+
+
+def _product(term: SurfaceProduct) -> dict[str, Any]:
+    """Displacements on the grid, by span, chip, node and axis."""
+    spans = [
+        {
+            str(chip): [[_short(one[:, axis], MAP_DIGITS) for axis in (0, 1)] for one in nodes]
+            for chip, nodes in shifts.items()
+        }
+        for shifts in term.shifts
+    ]
+    return {"name": term.name, "kind": PRODUCT, "source": term.source, "spans": spans}
 
 
 def _short(values: Float, digits: int) -> list[float | None]:

@@ -87,6 +87,7 @@ def _question(test: HeldTest, unit: str) -> str:
         "spread": "residuals / predicted",
         "distribution": "largest difference of distributions",
         "tails": "fraction of stars",
+        "deviation": "deviation from other exposures",
     }[test.name]
 
 

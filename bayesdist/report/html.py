@@ -66,14 +66,17 @@ _PRINT_WORDS = (
 )
 # figures that a printed report shows: what a board signs, not what an analyst looks through
 _PRINTED = (
+    "residual_histogram",
     "residual_vectors",
     "distortion",
     "uncertainty_radius",
+    "pixel_area",
     "period_differences",
     "holdout",
     "margins",
     "horizon",
 )
+_CAMPAIGN_PRINTED = ("distortion", "uncertainty_radius", "margins", "horizon")
 
 
 @dataclass(frozen=True)
@@ -108,10 +111,18 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
         **_contents(inputs, images),
         budget_words=_BUDGET_WORDS,
         print_words=_PRINT_WORDS,
-        printed=_PRINTED,
+        printed=_printed(inputs),
+        # a campaign's matching says what its data are
+        unprinted=() if inputs.campaign is None else ("data",),
         map_data=embedded(map_data(inputs)),
         budget_data=None if inputs.surface is None else embedded(budget_data(inputs)),
     )
+
+
+def _printed(inputs: ReportInput) -> tuple[str, ...]:
+    """Figures on paper; of a campaign the first drift in place of the residuals."""
+    drifts = [one.name for one in plan_of_campaign(inputs).values() if one.part == "time"]
+    return _PRINTED if inputs.campaign is None else (*drifts[:1], *_CAMPAIGN_PRINTED)
 
 
 def render_markdown(inputs: ReportInput, images: Mapping[str, bytes]) -> str:

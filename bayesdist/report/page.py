@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import jinja2
 
 from bayesdist.report.caption import Caption
-from bayesdist.report.figures import DPI
+from bayesdist.report.drawing import DPI
 from bayesdist.report.numerals import number
 
 __all__ = ["Picture", "picture_of", "template"]

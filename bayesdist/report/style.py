@@ -74,7 +74,7 @@ _RC = {
     "axes.labelcolor": INK,
     "axes.prop_cycle": matplotlib.cycler(color=CYCLE),
     "axes.formatter.useoffset": False,
-    "axes.formatter.use_mathtext": True,
+    "axes.formatter.use_mathtext": False,  # see `ticks`
     "axes.formatter.limits": (-4, 5),
     "text.color": INK,
     "xtick.color": INK,

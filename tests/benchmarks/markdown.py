@@ -283,12 +283,25 @@ def _wise(part: dict[str, Any]) -> list[str]:
     return out + _table(head, body)
 
 
+def _budget(part: dict[str, Any]) -> list[str]:
+    nx, ny = part["grid"]
+    out = [
+        "## Error budget",
+        "",
+        f"Order 5, {part['chips']} chips with drift, a grid of {nx} x {ny} on each, "
+        f"{part['epochs']} epochs, {part['draws']:,} draws; drawing included.",
+        "",
+    ]
+    return out + _table(("what", "s"), [(r["what"], _number(r["seconds"])) for r in part["rows"]])
+
+
 _PARTS = {
     "samplers": _samplers,
     "kernel": _kernel,
     "linear": _linear,
     "scaling": _scaling,
     "wise": _wise,
+    "budget": _budget,
 }
 
 

@@ -116,7 +116,15 @@ def test_json_and_markdown_are_complete(quick):
     assert machine["cpu"] and machine["cores"] >= 1 and machine["libraries"]["numba"]
     text = (quick / "bench.md").read_text(encoding="utf-8")
     assert text == to_markdown(bench)
-    for name in ("stock emcee", "DEMove", "NUTS, whitened", "bayesdist", "lstsq", "GB/s"):
+    for name in (
+        "stock emcee",
+        "DEMove",
+        "NUTS, whitened",
+        "bayesdist",
+        "lstsq",
+        "GB/s",
+        "p95 of every draw",
+    ):
         assert name in text
     samplers = bench["parts"]["samplers"]["rows"]
     assert len(samplers) == 5
@@ -133,6 +141,8 @@ def test_json_and_markdown_are_complete(quick):
     assert all(
         row["converged"] and row["peak_mb"] > row["peak_before_mb"] - 1 for row in scaling["rows"]
     )
+    budget = bench["parts"]["budget"]["rows"]
+    assert len(budget) == 4 and all(row["seconds"] > 0 for row in budget)
     assert (quick / "figures" / "scaling.png").read_bytes().startswith(b"\x89PNG")
 
 

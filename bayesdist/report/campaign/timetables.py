@@ -67,6 +67,7 @@ def time_tables(r: CampaignResults) -> Iterator[TextTable]:
             ("Term", "Claim", "Why"),
             rows_of,
             words=(0, 1, 2),
+            detail=True,
         )
 
 
@@ -208,6 +209,7 @@ def _scatter(r: CampaignResults) -> TextTable:
         low, high = (factor * end for end in tau["interval_68"])
         span = interval(low, high, (high - low) / 2)
         rows.append((name_of_scatter(kind), "joint fit", unit, number(factor * tau["value"]), span))
+    n_joint = len(rows)
     for label, value in r.section("time_dependence").get("scatter", {}).items():
         if value is not None:
             factor, unit = _scale(label, r.unit)
@@ -217,4 +219,5 @@ def _scatter(r: CampaignResults) -> TextTable:
         ("Kind", "From", "Unit", "τ", "68 % interval"),
         tuple(rows),
         words=(0, 1, 2),
+        leading=n_joint,
     )

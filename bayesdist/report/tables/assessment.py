@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 from bayesdist.assess import Margin
+from bayesdist.assess.product_terms import PRODUCT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.gauge import gauge_mark, gauge_of_maps, gauge_of_new_exposure
-from bayesdist.report.numerals import MISSING, interval, number, rounded
+from bayesdist.report.numerals import MISSING, interval, number, percent, rounded
 from bayesdist.report.scales import with_mas
 from bayesdist.report.tables.text import TextTable, marked
+
+AS_ABOVE = "as above"  # of the rows of single chips
 
 __all__ = ["budget_table", "map_table", "margin_table"]
 
@@ -58,22 +64,42 @@ def budget_table(inputs: ReportInput) -> TextTable | None:
             str(r["name"]),
             *((names[str(r["chip"])],) if inputs.several else ()),
             str(r["kind"]),
-            str(r["source"]) or MISSING,
+            AS_ABOVE if str(r.get("chip", "all")) != "all" else str(r["source"]) or MISSING,
             *(marked(inputs, with_mas(float(r[k]), unit, mas)) for k in ("u", "v", "radial")),
+            _known_to(r),
         )
         for r in rows
     ]
-    heads = ("Term", *(("Chip",) if inputs.several else ()), "Kind", "Source", "u", "v", "Radial")
+    of_chip = ("Chip",) if inputs.several else ()
+    heads = ("Term", *of_chip, "Kind", "Source", "u", "v", "Radial", "Known to")
     epoch = inputs.budget.epoch
     when = "" if epoch is None else f" at epoch {epoch:.2f}"
     return TextTable(
         f"Error budget{when}: rms over the detector, 1 σ",
         heads,
         tuple(out),
-        words=tuple(range(len(heads) - 3)),
+        words=tuple(range(len(heads) - 4)),
+        leading=len(inputs.budget.rows()),  # those of all chips together
         note="The parts of the model are correlated and enter the total jointly, by draws;"
         " independent terms are added in quadrature. The total therefore need not be the root of"
-        f" the sum of squares. {gauge_of_new_exposure(inputs)}".rstrip(),
+        f" the sum of squares.{_of_products(rows)} {gauge_of_new_exposure(inputs)}".rstrip(),
+    )
+
+
+def _known_to(row: Mapping[str, Any]) -> str:
+    """How well a term is known itself."""
+    error, size = row["radial_error"], float(row["radial"])
+    if error is None or not size > 0:
+        return MISSING
+    return "exact" if error == 0 else percent(error / size, 2)
+
+
+def _of_products(rows: Sequence[Mapping[str, Any]]) -> str:
+    if all(r["kind"] != PRODUCT for r in rows):
+        return ""
+    return (
+        " Rows of kind product say what a file differs by from the solution, the same in every"
+        " draw: they come on top, in quadrature, for whoever uses that file, and are in no total."
     )
 
 

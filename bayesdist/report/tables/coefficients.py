@@ -14,6 +14,7 @@ from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, marked
 
 __all__ = ["coefficient_tables"]
 
+_ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
 _SMALL = 1e-3  # below it a number without a unit is shown in 10^-6
 
 
@@ -122,7 +123,9 @@ def _parameter_table(
         "ESS",
     )
     columns = (*heads, *(("Unit",) if with_unit else ()))
-    return TextTable(caption, columns, tuple(out), words=(0, len(heads)))
+    # where an interval is that of the sd and convergence was judged as a whole, paper does without
+    on_paper = tuple(k for k, name in enumerate(columns) if name not in _ON_SCREEN)
+    return TextTable(caption, columns, tuple(out), words=(0, len(heads)), on_paper=on_paper)
 
 
 def _monomial_table(inputs: ReportInput, chip: int) -> TextTable:

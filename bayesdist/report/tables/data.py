@@ -7,7 +7,7 @@ import numpy as np
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numerals import MISSING, count, number
 from bayesdist.report.scales import display_scale
-from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, listing, marked
+from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, listing, marked, short_paths
 
 __all__ = ["data_tables"]
 
@@ -17,7 +17,7 @@ def data_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
     m, fit = inputs.stars.table, inputs.fit
     partial = ", of the sample" if inputs.stars.partial else ""
     pairs = {
-        "Sources": ", ".join(m.sources),
+        "Sources": ", ".join(short_paths(m.sources)),
         "Rows read": count(m.n_rows),
         "Matched stars": count(inputs.stars.n_total),
         "Used by the least-squares fit": count(fit.n_used),

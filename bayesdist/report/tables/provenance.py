@@ -9,12 +9,13 @@ import numpy as np
 
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numerals import MISSING, count, number, percent
-from bayesdist.report.tables.text import TextTable, listing
+from bayesdist.report.tables.text import TextTable, listing, short_paths
 
 __all__ = ["config_table", "provenance_tables"]
 
 
 _DETAILS = ("stages", "timings")
+_PRINTED = {"inputs": 4, "versions": 3}  # rows on paper
 
 
 def _plain(value: Any) -> str:
@@ -44,11 +45,13 @@ def provenance_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
     for key, value in inputs.provenance.items():
         if isinstance(value, Mapping):
             unit = " [s]" if key == "timings" else ""
+            names = short_paths(value) if key == "inputs" else map(str, value)
             out.append(
                 listing(
                     f"{key.capitalize()}{unit}",
-                    {str(k): _plain(v) for k, v in value.items()},
+                    dict(zip(names, map(_plain, value.values()), strict=True)),
                     detail=key in _DETAILS,
+                    leading=_PRINTED.get(key, 0),
                 )
             )
     return tuple(out)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import PurePath
 
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numerals import MISSING
 
-__all__ = ["MOST_ROWS", "TextTable", "further", "listing", "marked"]
+__all__ = ["MOST_ROWS", "TextTable", "further", "listing", "marked", "short_paths"]
 
+_FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room beside it
 MOST_ROWS = 60  # of frames and exposures; hundreds of them belong in the files
 
 
@@ -29,6 +31,10 @@ class TextTable:
         Below the table.
     detail : bool
         Whether the page leaves the table out when it is printed.
+    on_paper : tuple of int
+        Columns that are printed; all of them where it is empty.
+    leading : int
+        Rows that are printed, the first so many; 0 for all of them.
     """
 
     caption: str
@@ -37,6 +43,15 @@ class TextTable:
     words: tuple[int, ...] = (0,)
     note: str = ""
     detail: bool = False
+    on_paper: tuple[int, ...] = ()
+    leading: int = 0
+
+    @property
+    def is_small(self) -> bool:
+        """Whether another table has room beside it on paper."""
+        rows = self.rows[: self.leading or None]
+        widths = (max(map(len, column)) for column in zip(self.columns, *rows, strict=True))
+        return len(rows) <= _FEW_ROWS and sum(widths) <= _FEW_LETTERS
 
 
 def marked(inputs: ReportInput, text: str) -> str:
@@ -45,13 +60,27 @@ def marked(inputs: ReportInput, text: str) -> str:
 
 
 def listing(
-    caption: str, pairs: Mapping[str, str], note: str = "", *, detail: bool = False
+    caption: str,
+    pairs: Mapping[str, str],
+    note: str = "",
+    *,
+    detail: bool = False,
+    leading: int = 0,
 ) -> TextTable:
     """A plain list of names and values."""
     rows = tuple(pairs.items())
-    return TextTable(caption, ("", ""), rows, words=(0, 1), note=note, detail=detail)
+    words = (0, 1)
+    return TextTable(caption, ("", ""), rows, words, note, detail=detail, leading=leading)
 
 
 def further(n: int) -> str:
     """How many of n rows the page leaves to the files; empty where it shows all."""
     return "" if n <= MOST_ROWS else f"{n - MOST_ROWS} more rows are in the run's tables."
+
+
+def short_paths(paths: Iterable[str]) -> list[str]:
+    """Paths without the folder that all of them are in, which is in run.json."""
+    every = [PurePath(p) for p in paths]
+    most = min((len(p.parts) - 1 for p in every), default=0)
+    shared = next((k for k in range(most) if len({p.parts[k] for p in every}) > 1), most)
+    return [str(PurePath(*p.parts[shared:])) for p in every]

@@ -45,12 +45,14 @@ class Budget {
     for (const one of spans) if (one.nodes.length && epoch >= one.nodes[0]) span = one;
     const t = span.nodes;
     const weights = t.map((a, k) => t.reduce((w, b, m) => m === k ? w : w * (epoch - b) / (a - b), 1));
+    const between = nodes => nodes.length === 1 ? nodes[0] : [0, 1].map(axis =>
+      nodes[0][axis].map((_, k) => nodes.reduce((sum, node, n) => sum + weights[n] * node[axis][k], 0)));
+    this.moved = this.data.products.map(p => this.data.chips.map(({ number: chip }) =>
+      between(p.spans[spans.indexOf(span)][chip])));
     this.moments = this.data.chips.map(({ number: chip }) => {
       const out = {};
       for (const [part, nodes] of Object.entries(span.moments[chip]))
-        out[part] = nodes.length === 1 ? nodes[0]
-          : [0, 1].map(axis => nodes[0][axis].map((_, k) =>
-            nodes.reduce((sum, node, n) => sum + weights[n] * node[axis][k], 0)));
+        out[part] = between(nodes);
       return out;
     });
   }
@@ -76,6 +78,16 @@ class Budget {
     return term.sigma[name].map(sigma => places.length
       ? places.reduce((sum, [x, y]) => sum + bilinear(sigma, this.data.grid, size, x, y) ** 2, 0)
       : sigma.reduce((sum, s) => sum + s * s, 0) / sigma.length);
+  }
+
+  /** What files differ by: known displacements, squared; in no total. */
+  files(chip, places) {
+    const { size } = this.data.chips[chip], { grid } = this.data;
+    const at = (values, [x, y]) => bilinear(values, grid, size, x, y);
+    return this.data.products.map((p, k) => ({ name: p.name, kind: p.kind, source: p.source,
+      variance: this.moved[k][chip].map(values => !places.length
+        ? values.reduce((sum, s) => sum + s * s, 0) / values.length
+        : (at(values, places[0]) - (places[1] ? at(values, places[1]) : 0)) ** 2) }));
   }
 
   centroid(magnitude) {
@@ -118,6 +130,7 @@ class Budget {
     const shared = [0, 1].map(axis => joint[axis] - add(parts, axis));
     return [...parts, ...others,
       { name: "correlation of the parts", kind: "shared", source: "", variance: shared },
+      ...this.files(chip || 0, places),
       { name: "total", kind: "total", source: "", variance: [0, 1].map(a => joint[a] + add(others, a)) }];
   }
 
@@ -126,6 +139,8 @@ class Budget {
       const [u, v] = this.drawn(chip, name, this.form(chip, places));
       return Math.sqrt(u + v);
     }
+    const file = this.files(chip, places).find(p => p.name === name);
+    if (file) return Math.sqrt(file.variance[0] + file.variance[1]);
     const own = this.independent(chip, places, magnitude).filter(t => name === "total" || t.name === name);
     const joint = name === "total" ? this.drawn(chip, this.data.joint, this.form(chip, places)) : [0, 0];
     return Math.sqrt(own.reduce((sum, t) => sum + t.variance[0] + t.variance[1], joint[0] + joint[1]));
@@ -212,13 +227,14 @@ function budgetToAsk() {
     const signed = v => v < 0 ? `${MINUS}${length(Math.sqrt(-v), data)}` : length(Math.sqrt(v), data);
     const few = terms.filter(t => t.kind !== "shared" || Math.abs(share(t)) >= 5e-4);
     rows.replaceChildren(...few.map(t => {
-      const k = terms.indexOf(t), key = t.kind === "total" ? [] : [make("span", {
+      const k = terms.indexOf(t), key = ["total", "product"].includes(t.kind) ? [] : [make("span", {
         class: t.kind === "shared" ? "key shared" : "key", style: t.kind === "shared" ? "" : `background:${tint(k)}` })];
       const values = [...t.variance, t.variance[0] + t.variance[1]].map(v => make("td", { class: "n" }, signed(v)));
       return make("tr", t.kind === "total" ? { class: "total" } : {}, make("th", { scope: "row", title: [t.kind, t.source].filter(Boolean).join(", ") },
-        ...key, t.name), ...values, make("td", { class: "n" }, `${plain((100 * share(t)).toFixed(1))}${THIN}%`));
+        ...key, t.name), ...values, make("td", { class: "n" },
+          t.kind === "product" ? "in no total" : `${plain((100 * share(t)).toFixed(1))}${THIN}%`));
     }));
-    const stacked = terms.slice(0, -1).map((t, k) => ({ ...t, k, share: share(t) }));
+    const stacked = terms.slice(0, -1).map((t, k) => ({ ...t, k, share: share(t) })).filter(t => t.kind !== "product");
     const longest = stacked.reduce((s, t) => s + Math.max(t.share, 0), 0) || 1;
     const pieces = stacked.filter(t => t.share > 0).map(t => make("span", {
       class: t.kind === "shared" ? "shared" : "", title: `${t.name}: ${(100 * t.share).toFixed(1)} %`,

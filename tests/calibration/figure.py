@@ -1,0 +1,55 @@
+"""Reliability: how often requirements are met, against how often it is said."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bayesdist.report.style import CYCLE, WIDTH, figure_style, new_figure
+
+from .summary import reliability
+
+TITLES = {
+    "drift": "Drift, extrapolated by five years",
+    "pattern": "A pattern that the model leaves out",
+}
+
+
+def reliability_figure(found: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """One panel for each kind of calibration."""
+    with figure_style():
+        fig = new_figure(WIDTH, 3.9)
+        axes = fig.subplots(1, len(found), sharey=True, squeeze=False)[0]
+        for ax, (kind, (said, met)) in zip(axes, found.items(), strict=True):
+            ax.plot([0, 1], [0, 1], color="#9AA5B1", lw=0.8, zorder=1)
+            for one in reliability(said, met):
+                low, high = one.band()
+                ax.plot(
+                    [one.said] * 2,
+                    [low, high],
+                    color=CYCLE[0],
+                    lw=7,
+                    alpha=0.22,
+                    zorder=2,
+                    solid_capstyle="butt",
+                )
+                ax.plot(one.said, one.met, "o", color=CYCLE[1], ms=5, zorder=3)
+                ax.annotate(
+                    str(one.n),
+                    (one.said, one.met),
+                    xytext=(6, -9),
+                    fontsize=7,
+                    textcoords="offset points",
+                )
+            ax.set_title(f"{TITLES.get(kind, kind)}: {said.size} calibrations")
+            ax.set_xlabel("probability that is said (mean of a bin)")
+            ax.set_xlim(-0.03, 1.06)
+            ax.set_ylim(-0.03, 1.06)
+            ax.set_aspect("equal")
+        axes[0].set_ylabel("share that meets its limit in truth")
+        axes[0].plot([], [], "o", color=CYCLE[1], ms=5, label="met (number: calibrations)")
+        axes[0].plot([], [], color=CYCLE[0], lw=7, alpha=0.22, label="99 % binomial band")
+        axes[0].legend(loc="upper left")
+    return fig

@@ -1,0 +1,43 @@
+"""The campaigns of the suite, one after the other or on all cores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+from .limits import limits_from, pilot, said_and_true
+from .places import covered
+
+CAMPAIGNS = {True: 24, False: 6}  # of each kind, in full and reduced
+CALIBRATIONS = {True: 200, False: 12}
+JUDGED = ("drift", "pattern")
+PILOTS = {True: 8, False: 2}
+
+
+def over(function: Callable, arguments: Iterable[tuple], *, full: bool) -> list[Any]:
+    """Results in order; a few are made here, as workers take seconds to begin."""
+    if not full:
+        return [function(*a) for a in arguments]
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        return list(pool.map(function, *zip(*arguments, strict=True), chunksize=4))
+
+
+def coverage(kind: str, *, full: bool) -> list[dict]:
+    return over(partial(covered, kind), [(k,) for k in range(CAMPAIGNS[full])], full=full)
+
+
+def probabilities(kind: str, *, full: bool) -> tuple[np.ndarray, np.ndarray]:
+    """What is said, and whether it is met, (n,) each."""
+    pilots = over(partial(pilot, kind), [(k,) for k in range(PILOTS[full])], full=full)
+    n = CALIBRATIONS[full]
+    limits = limits_from(pilots, n)
+    seeds = range(10_000, 10_000 + n)  # not those of the coverage
+    found = over(partial(said_and_true, kind), list(zip(limits, seeds, strict=True)), full=full)
+    said, met = np.array(found, float).T
+    return said, met
