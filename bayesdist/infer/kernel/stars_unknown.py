@@ -287,11 +287,14 @@ def _to_mode(z, W, var, j2, ratio, time, factor, centre, precision, p, S, A, b, 
 
 
 @nb.njit(cache=True)
-def _star_value(z, W, var, j2, ratio, log_out, time, factor, centre, precision, p, S, A):
-    """Log density with a star's parameters integrated out, from the factor of its curvature."""
+def _star_value(z, W, var, j2, ratio, log_out, least, time, factor, centre, precision, p, S, A):
+    """Log density with a star's parameters integrated out, from the factor of its curvature.
+
+    Without members a star may be anywhere; it is not, for its detections lie in one circle.
+    """
     q, value = len(p), 0.0
     for k in range(q):
-        value -= math.log(A[k, k])
+        value -= math.log(max(A[k, k], least) if k < 2 else A[k, k])
         for l in range(q):
             value -= 0.5 * (centre[k] - p[k]) * precision[k, l] * (centre[l] - p[l])
     for i in range(len(z)):
@@ -328,12 +331,13 @@ def weighted_stars(
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def log_marginals(
     first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars,
-    middles, coef, order, rows,
+    middles, coef, order, rows, least,
 ):  # fmt: skip
     """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
 
     middles (S, 2): mean place of a star's detections where `stars` are its modes.
     rows (D, 3): squared jitter, log of the core's share, log density of outliers.
+    least: root of the least curvature that a star's place may have.
     """
     q, n_draws = stars.shape[1], len(rows)
     sums = np.zeros((PIECES, n_draws))
@@ -370,7 +374,20 @@ def log_marginals(
                     at, own, wide, j2, odds, when, where, centre[s], precision[s], p, S, A, b, True
                 )
                 sums[piece, d] += _star_value(
-                    at, own, wide, j2, odds, log_out, when, where, centre[s], precision[s], p, S, A
+                    at,
+                    own,
+                    wide,
+                    j2,
+                    odds,
+                    log_out,
+                    least,
+                    when,
+                    where,
+                    centre[s],
+                    precision[s],
+                    p,
+                    S,
+                    A,
                 )
     return sums
 
@@ -378,7 +395,7 @@ def log_marginals(
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def eliminate_stars(
     first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars,
-    coef, chip, linear, extra, columns, n_params, order, j2, log_core, log_out, seen,
+    coef, chip, linear, extra, columns, n_params, order, j2, log_core, log_out, least, seen,
 ):  # fmt: skip
     """Sums of a second-order expansion over stars first..last, these moved to their modes.
 
@@ -423,7 +440,20 @@ def eliminate_stars(
                 at, mine, wide, j2, odds, when, where, centre[s], precision[s], p, S, A, b, seen
             )
             scalars[piece, 0] += _star_value(
-                at, mine, wide, j2, odds, log_out, when, where, centre[s], precision[s], p, S, A
+                at,
+                mine,
+                wide,
+                j2,
+                odds,
+                log_out,
+                least,
+                when,
+                where,
+                centre[s],
+                precision[s],
+                p,
+                S,
+                A,
             )
             row = (s - first) * q
             for k in range(q):

@@ -360,7 +360,8 @@ def _directions(
             NamedDirection(
                 name,
                 model.unit if length else "",
-                *sigmas,
+                sigmas[0],
+                sigmas[1],
                 edge_pix=1.0 / pixel if length else half,
             )
         )

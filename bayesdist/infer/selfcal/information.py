@@ -6,6 +6,7 @@ Every piece is Gaussian in the parameters, linearised at a solution.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +108,7 @@ def pointing_information(
     E, chip = len(model.exposures), model.chips[0]
     x, y = (np.full(E, c) for c in chip.reference_pixel)
     codes = np.arange(E)
-    where = {"exposure": codes, "chip": chip.number}
+    where: dict[str, Any] = {"exposure": codes, "chip": chip.number}
     if model.time is not None:
         where["epoch"] = np.full(E, model.time.epoch0[0])
     rows = model.jacobian(theta, x, y, **where)

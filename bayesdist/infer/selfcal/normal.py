@@ -207,6 +207,7 @@ def _passes(
             j2,
             log_core,
             log_out,
+            p.least_root,
             observed,
         )
 
@@ -275,6 +276,7 @@ def log_marginal(
             p.powers(theta[some]),
             p.model.order,
             rows[some],
+            p.least_root,
         )
         out[some] = sums.sum(axis=0)
     return out

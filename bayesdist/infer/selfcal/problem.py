@@ -112,7 +112,7 @@ class Problem:
     @property
     def counts(self) -> Int:
         """Detections of each star."""
-        return np.diff(self.starts)
+        return np.asarray(np.diff(self.starts), np.int64)
 
     @cached_property
     def star(self) -> Int:
@@ -123,6 +123,12 @@ class Problem:
     def log_outlier(self) -> float:
         """Log density of a false detection per square pixel, without the share of such."""
         return -float(np.log(np.pi * self.match_radius**2))
+
+    @cached_property
+    def least_root(self) -> float:
+        """Root of the curvature at which a star may be anywhere in its match circle."""
+        pixel = float(np.median(np.linalg.det(_square(self.W))) ** -0.25)
+        return float(np.sqrt(2.0) / (self.match_radius * pixel))
 
     @cached_property
     def sigma(self) -> float:
@@ -190,6 +196,10 @@ class Problem:
     def with_sigma(self, sigma: Float) -> Problem:
         """The same with other errors (N,), in the order of this object."""
         return replace(self, var=sigma**2)
+
+
+def _square(W: Float) -> Float:
+    return np.asarray(W[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
 
 
 def prepared(
