@@ -68,6 +68,7 @@ def self_calibrate(
     start_radius: float | None = None,
     least: int = 2,
     motion: str = "none",
+    dilation: Float | None = None,
     jitter: float | None = None,
     references: References | None = None,
     log: Callable[[str], None] = lambda text: None,
@@ -91,6 +92,8 @@ def self_calibrate(
         Fewest detections of a star.
     motion : str
         As `prepared`.
+    dilation : ndarray, shape (E,), optional
+        VAFACTOR of each exposure.
     jitter : float, optional
         Held at this, pixels.
     references : callable, optional
@@ -120,10 +123,12 @@ def self_calibrate(
     before = None
     for turn in range(MOST_ROUNDS):
         friends = friends_of_friends(
-            places_of(model, detections, theta), detections.exposure, radius * pixel
+            places_of(model, detections, theta, dilation), detections.exposure, radius * pixel
         )
         found = replace(detections, star=friends.star)
-        problem = prepared(model, found, theta, match_radius=radius, least=least, motion=motion)
+        problem = prepared(
+            model, found, theta, match_radius=radius, least=least, motion=motion, dilation=dilation
+        )
         if references is not None:
             problem = replace(problem, priors=references(problem))
         gauge = _gauge(problem, theta, information)
@@ -161,12 +166,14 @@ def self_calibrate(
     )
 
 
-def places_of(model: DistortionModel, detections: Detections, theta: Float) -> Float:
+def places_of(
+    model: DistortionModel, detections: Detections, theta: Float, dilation: Float | None = None
+) -> Float:
     """Where on the sky the model has each detection, (N, 2)."""
     when = None
     if model.time is not None and detections.epoch is not None:
         when = detections.epoch[detections.exposure]
-    return model.predict(
+    out = model.predict(
         theta,
         detections.x,
         detections.y,
@@ -174,6 +181,10 @@ def places_of(model: DistortionModel, detections: Detections, theta: Float) -> F
         chip=detections.chip,
         epoch=when,
     )
+    if dilation is None:
+        return out
+    o = np.asarray(model.origin)
+    return np.asarray(o + (out - o) * dilation[detections.exposure, None])
 
 
 def _gauge(

@@ -77,8 +77,8 @@ class Structure:
     @classmethod
     def at(cls, problem: Problem, theta: Float) -> Structure:
         """That of a problem at theta (D,)."""
-        model, groups, K = problem.model, problem.groups, problem.model.n_terms
-        found = model.effective_jacobian(theta, groups)
+        groups, K = problem.groups, problem.model.n_terms
+        found = problem.effective_jacobian(theta)
         m = max(len(columns) for columns, _ in found) - 2 * K
         extra, columns = np.zeros((len(groups), 2, K, m)), np.full((len(groups), m), -1)
         linear = np.empty((len(groups), 2, 2))
@@ -87,7 +87,7 @@ class Structure:
             n = len(which) - 2 * K
             columns[g, :n] = which[2 * K :]
             extra[g, ..., :n] = derivative[..., 2 * K :]
-        return cls(model.effective(theta, groups), linear, extra, columns)
+        return cls(problem.effective(theta), linear, extra, columns)
 
 
 @dataclass(frozen=True, eq=False)

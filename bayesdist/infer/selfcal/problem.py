@@ -78,6 +78,8 @@ class Problem:
         Within which detections were taken for one star, pixels: the reach of false ones.
     epoch0 : float
         Date of the stars' positions.
+    dilation : ndarray, shape (E,), optional
+        Known scale of the sky in each exposure, about the frames' origin: VAFACTOR.
     """
 
     model: DistortionModel
@@ -95,6 +97,7 @@ class Problem:
     rows: Int
     match_radius: float
     epoch0: float = 0.0
+    dilation: Float | None = None
 
     def __len__(self) -> int:
         return len(self.X)
@@ -135,10 +138,32 @@ class Problem:
         """Median quoted error, pixels."""
         return float(np.sqrt(np.median(self.var)))
 
+    @cached_property
+    def _factors(self) -> Float:
+        """Dilation of each group (G,)."""
+        if self.dilation is None:
+            return np.ones(len(self.groups))
+        return np.asarray(self.dilation[self.groups.exposure], float)
+
+    def effective(self, theta: Float) -> Float:
+        """Effective Legendre coefficients (..., G, 2, K), the sky's dilation included."""
+        out = self.model.effective(theta, self.groups)
+        if self.dilation is None:
+            return out
+        o = np.asarray(self.model.origin)
+        out = out * self._factors[:, None, None]
+        out[..., 0] += o * (1.0 - self._factors[:, None])
+        return out
+
+    def effective_jacobian(self, theta: Float) -> list[tuple[Int, Float]]:
+        """Derivatives of these, as `DistortionModel.effective_jacobian`."""
+        found = self.model.effective_jacobian(theta, self.groups)
+        return [(columns, k * d) for (columns, d), k in zip(found, self._factors, strict=True)]
+
     def powers(self, theta: Float) -> Float:
         """Effective coefficients (..., G, 2, K) of the scaled powers."""
         basis = self.model.basis(self.model.chips[0].number)
-        return basis.to_scaled_powers(self.model.effective(theta, self.groups))
+        return basis.to_scaled_powers(self.effective(theta))
 
     def places(self, theta: Float) -> Float:
         """Where on the sky the model has each detection, (N, 2)."""
@@ -171,7 +196,7 @@ class Problem:
     def at(self, theta: Float, stars: Float) -> Problem:
         """The same, linearised about a solution: theta (D,) and stars (S, q)."""
         model, groups = self.model, self.groups
-        E = model.effective(theta, groups)
+        E = self.effective(theta)
         bases = [model.basis(model.chips[c].number) for c in groups.chip]
         half = np.array([basis.half_size for basis in bases])
         scaled = bases[0].to_scaled_powers
@@ -211,6 +236,7 @@ def prepared(
     motion: str = "none",
     epoch0: float | None = None,
     parallax_factors: Float | None = None,
+    dilation: Float | None = None,
     least: int = LEAST_DETECTIONS,
 ) -> Problem:
     """Sort detections for the passes.
@@ -231,6 +257,8 @@ def prepared(
         Date of the stars' positions; the mean of the exposures' by default.
     parallax_factors : ndarray, shape (E, 2), optional
         Of each exposure, along u and v; needed by 'parallax'.
+    dilation : ndarray, shape (E,), optional
+        VAFACTOR of each exposure.
     least : int
         Fewest detections of a star.
 
@@ -296,5 +324,6 @@ def prepared(
         rows=rows,
         match_radius=match_radius,
         epoch0=epoch0 or 0.0,
+        dilation=None if dilation is None else np.asarray(dilation, float),
     )
     return problem.at(theta, problem.mean_places(theta))

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayesdist.infer.selfcal.errors import squares
 from bayesdist.infer.selfcal.normal import Mixture, expand, log_marginal
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
+from bayesdist.simulate.dithers import pixels_of
 from tests.infer.selfcal.fields import field, problem_of
 
 NO_FALSE = Mixture(0.0, 1e-300)
@@ -175,3 +177,27 @@ def test_a_larger_sky_is_no_better_than_a_smaller_one():
     # of 2 n squared residuals a thousandth would be 2; what is left is of second order
     assert len(problem) > 500
     assert abs(values[1] - values[0]) < 0.2
+
+
+def test_aberration_is_undone():
+    """Exposures whose sky is dilated by known factors have the same residuals as the others."""
+    simulated = field(7, 8, 150, sigma=0.001)
+    model, theta, d = simulated.model, simulated.theta, simulated.detections
+    dilation = 1.0 + 1e-4 * np.random.default_rng(1).normal(size=8)
+    dilation /= dilation[0]
+    # the telescope points where it did and the sky about the frames' origin is larger
+    o, moved = np.asarray(model.origin), theta.copy()
+    sky = o + (simulated.sky - o)
+    x, y = d.x.copy(), d.y.copy()
+    for e, k in enumerate(dilation):
+        rows = d.exposure == e
+        stars = sky[d.star[rows]]
+        found = pixels_of(model, theta, o + (stars - o) / k, e, model.chips[0])
+        x[rows], y[rows] = found[:2]
+    seen = replace(simulated, detections=replace(d, x=x, y=y))
+    with_factor, stars = problem_of(seen, dilation=dilation)
+    without, _ = problem_of(seen)
+    found = expand(with_factor, moved, NO_FALSE, stars)
+    assert np.sqrt(squares(with_factor, moved, found.stars).mean()) < 1e-6
+    other = expand(without, moved, Mixture(1.0, 1e-300), without.mean_places(moved))
+    assert np.sqrt(squares(without, moved, other.stars).mean()) > 0.01
