@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.arrow import Arrow
-from bayesdist.infer.coordinates import Split, from_cube_root, to_cube_root
+from bayesdist.infer.coordinates import Split
 from bayesdist.infer.laplace import Node
 from bayesdist.infer.proposal import GridProposal
 from bayesdist.infer.selfcal.normal import Mixture, expand
@@ -22,12 +22,11 @@ __all__ = ["propose"]
 Float = NDArray[np.float64]
 
 DROP = 18.0  # how far below the top (in log density) the nodes reach
-MOST_NODES = 25
+MOST_NODES, FEWEST_NODES = 25, 9
 CLOSE = 1e-4  # decrement at which a node is found
 MOST_STEPS = 12
 FLAT = 0.02  # change of the log density beyond which the jitter is felt
 LEAST = 1e-3  # of the median error: no jitter
-SPACING = 1.5  # standard deviations between nodes
 
 
 def propose(target: SelfTarget) -> GridProposal:
@@ -38,17 +37,46 @@ def propose(target: SelfTarget) -> GridProposal:
     DegenerateError
         When a node has no mode.
     """
-    solution, n = target.solution, target.n_theta
-    split = Split(n, target.mixture.hyper, tuple(k for k in target.mixture.hyper if k == "j"))
-    z = float(np.cbrt(solution.mixture.fraction))
+    split = Split(
+        target.n_theta, target.mixture.hyper, tuple(k for k in target.mixture.hyper if k == "j")
+    )
     if not split.held:
-        return GridProposal(split, (_node(target, split, np.zeros(0), z),))
-    at = _nodes_at(target)
-    return GridProposal(split, tuple(_node(target, split, np.array([x]), z) for x in at))
+        z, bend = _share(target, split, np.zeros(0))
+        return GridProposal(split, (_node(target, split, np.zeros(0), z, bend),))
+    at, top = _nodes_at(target)
+    z, bend = _share(target, split, np.array([top]))
+    return GridProposal(split, tuple(_node(target, split, np.array([x]), z, bend) for x in at))
 
 
-def _nodes_at(target: SelfTarget) -> Float:
-    """Where on log j the nodes go, from the density along it, all else held."""
+def _share(target: SelfTarget, split: Split, at: Float) -> tuple[float, float]:
+    """Cube root of the share of false detections where it is most probable, and its curvature.
+
+    From the density with the stars integrated out: at their modes the share would come out too
+    small, for a detection that may be false leaves its star more room.  It hardly depends on the
+    jitter.
+    """
+    solution = target.solution
+    n = len(target.problem)
+    z = float(np.cbrt(max(solution.mixture.fraction, 0.3 / n)))
+    step = z / (3 * max(np.sqrt(n * z**3), 1.0))  # about a standard deviation
+    for _ in range(4):
+        mesh = np.clip(z + step * np.linspace(-2.0, 2.0, 5), z / 5, 0.98)
+        y = np.column_stack([np.tile(solution.theta[solution.free], (5, 1)), mesh])
+        psi = split.to_psi(y, np.tile(at, (5, 1)))
+        value = target.log_density(psi) + split.log_jacobian(y)
+        a, b, _ = np.polyfit(mesh - z, value - value[2], 2)
+        if a >= 0:  # still on the slope
+            z = float(mesh[int(np.argmax(value))])
+            continue
+        move = float(np.clip(-b / (2 * a), -2 * step, 2 * step))
+        z, step = float(np.clip(z + move, z / 5, 0.98)), float(1 / np.sqrt(-2 * a))
+        if abs(move) < 0.2 * step:
+            break
+    return z, step**-2
+
+
+def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
+    """Where on log j the nodes go, and its top, from the density along it, all else held."""
     solution = target.solution
     rest = solution.theta[solution.free]
     f = solution.mixture.fraction
@@ -70,41 +98,30 @@ def _nodes_at(target: SelfTarget) -> Float:
             break
         mesh = np.linspace(mesh[begin], mesh[end], 16)
     fine = np.linspace(mesh[begin], mesh[end], 400)
-    smooth = np.interp(fine, mesh, value)
-    if begin == 0 and mesh[0] <= low + 1e-9:
+    open_end = begin == 0 and mesh[0] <= low + 1e-9
+    if open_end:
         # at the left end is nothing but the prior's tail: one node in it is enough
         likelihood = value - value[0] - (mesh - mesh[0])
         felt = np.flatnonzero(np.abs(likelihood) > FLAT)
         if len(felt):
             fine = fine[fine >= mesh[max(felt[0] - 2, 0)]]
-            smooth = np.interp(fine, mesh, value)
-    weight = np.exp(smooth - smooth.max())
-    mean = weight @ fine / weight.sum()
-    sd = float(np.sqrt(weight @ (fine - mean) ** 2 / weight.sum()))
-    count = int(np.clip((fine[-1] - fine[0]) / (SPACING * sd) + 1, 7, MOST_NODES))
-    return np.linspace(fine[0], fine[-1], count)
+    # a peak is nearly Gaussian; a shoulder that falls off from a plateau is not
+    count = MOST_NODES if open_end else FEWEST_NODES
+    return np.linspace(fine[0], fine[-1], count), float(mesh[np.argmax(value)])
 
 
-def _node(target: SelfTarget, split: Split, at: Float, z: float) -> Node:
-    """Mode and curvature of everything else at one jitter."""
+def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) -> Node:
+    """Mode and curvature of everything else at one jitter; the share's are given."""
     solution, problem, free = target.solution, target.problem, target.solution.free
     theta, stars = solution.theta.copy(), solution.stars
     held = float(np.exp(at[0])) if len(at) else float(target.jitter or 0.0)
     middles = problem.middles(theta)
     for _ in range(MOST_STEPS):
         found = expand(problem, theta, Mixture(held, z**3), stars)
-        h, h1, h2, g1, g2 = (float(part[0]) for part in from_cube_root(("f",), np.array([z])))
-        hyper = np.array([at[0], h]) if len(at) else np.array([h])
-        prior_gradient, prior_curvature = target.hyper.prior_terms(hyper)
-        n, f = len(problem), z**3
-        by_f = (n - found.n_members) - n * f + prior_gradient[-1]
-        bend = n * f * (1 - f) - found.n_doubtful + prior_curvature[-1]
-        gradient = np.append(
-            (found.gradient + target.information.pull(theta))[free], by_f * h1 + g1
-        )
+        gradient = (found.gradient + target.information.pull(theta))[free]
         H = np.zeros((len(free) + 1,) * 2)
         H[:-1, :-1] = (found.curvature + target.information.precision)[np.ix_(free, free)]
-        H[-1, -1] = max(bend * h1**2 - by_f * h2 - g2, 1.0)
+        H[-1, -1] = bend
         try:
             factor = Arrow(H, np.zeros((0, len(H), 0)), np.zeros((0, 0, 0)), n_tail=1).factor()
         except np.linalg.LinAlgError as error:
@@ -113,17 +130,17 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float) -> Node:
                 where="self-calibration",
                 do="look at the gauge: dither more, add roll angles, or give priors",
             ) from error
-        step = factor.solve(gradient)
+        step = factor.solve(np.append(gradient, 0.0))[:-1]
         if gradient @ step < CLOSE:
             break
-        theta[free] += step[:-1]
-        z = float(np.clip(z + step[-1], z / 2, 1 - (1 - z) / 2))
+        theta[free] += step
         after = problem.middles(theta)
         stars = found.stars.copy()
         stars[:, :2] += after - middles
         middles = after
+    y = np.append(theta[free], z)
+    hyper = split.to_psi(y, at)[len(free) :]
     value = found.value + float(target.information.log_density(theta))
     value += float(target.hyper.log_prior(hyper))
-    y = np.append(theta[free], to_cube_root(("f",), np.array([h])))
     log_marginal = value + float(split.log_jacobian(y)) - 0.5 * factor.logdet
     return Node(at, y, factor, log_marginal)
