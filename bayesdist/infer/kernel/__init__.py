@@ -19,6 +19,13 @@ with kept_by_content():
         mixture_moments,
     )
     from bayesdist.infer.kernel.stars import memberships, residuals
+    from bayesdist.infer.kernel.stars_unknown import (
+        eliminate_stars,
+        linearised,
+        log_marginals,
+        positions,
+        weighted_stars,
+    )
 
 __all__ = [
     "BLOCK",
@@ -29,12 +36,17 @@ __all__ = [
     "Constants",
     "Moments",
     "cluster_moments",
+    "eliminate_stars",
     "least_squares_moments",
+    "linearised",
     "log_likelihood",
+    "log_marginals",
     "memberships",
     "mixture_moments",
     "pieces_of",
+    "positions",
     "products_of",
     "residuals",
     "set_threads",
+    "weighted_stars",
 ]

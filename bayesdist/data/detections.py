@@ -1,0 +1,148 @@
+"""Detections of stars on many exposures, where nobody knows the stars' positions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.starlists import StarList
+from bayesdist.errors import InputError
+
+__all__ = ["NO_STAR", "Detections", "detections_of"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+NO_STAR = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Raw positions of all exposures, arrays of length N unless said otherwise.
+
+    Parameters
+    ----------
+    x, y : ndarray
+        FITS 1-based pixels of the chip.
+    exposure : ndarray of int
+        Codes, from 0.
+    exposure_names : tuple of str, length E
+    chip : ndarray of int, optional
+        Chip numbers; 1 by default.
+    epoch : ndarray, shape (E,), optional
+        Decimal years.
+    sigma : ndarray, optional
+        Error of x and of y, pixels.
+    mag : ndarray, optional
+        Instrumental magnitudes.
+    star : ndarray of int, optional
+        Which detections are of one star; `NO_STAR` where it is not known.
+    source : str
+
+    Raises
+    ------
+    InputError
+        For no detections, unequal lengths, values that are not finite, or errors that are not
+        positive.
+    """
+
+    x: Float
+    y: Float
+    exposure: Int
+    exposure_names: tuple[str, ...]
+    chip: Int = None  # type: ignore[assignment]
+    epoch: Float | None = None
+    sigma: Float | None = None
+    mag: Float | None = None
+    star: Int = None  # type: ignore[assignment]
+    source: str = "detections"
+
+    def __post_init__(self) -> None:
+        n = len(self.x)
+        if n == 0:
+            raise InputError("holds no detections", where=self.source, do="give lists with stars")
+        if self.chip is None:
+            object.__setattr__(self, "chip", np.ones(n, np.int64))
+        if self.star is None:
+            object.__setattr__(self, "star", np.full(n, NO_STAR))
+        for name in ("x", "y", "sigma", "mag", "exposure", "chip", "star"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            kind = np.float64 if name in ("x", "y", "sigma", "mag") else np.int64
+            values = np.ascontiguousarray(values, kind)
+            object.__setattr__(self, name, values)
+            if values.shape != (n,):
+                raise InputError(
+                    f"column {name!r} has shape {values.shape}, but 'x' has {n} rows",
+                    where=self.source,
+                    do="give columns of one length",
+                )
+            good = np.isfinite(values) if name != "sigma" else (values > 0) & np.isfinite(values)
+            if not good.all():
+                bad = int(np.argmin(good))
+                raise InputError(
+                    f"value is {values[bad]:g}",
+                    where=f"{self.source}, row {bad + 1}, column {name!r}",
+                    do="correct the row or drop it",
+                )
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @property
+    def n_stars(self) -> int:
+        """One more than the largest star code."""
+        return int(self.star.max()) + 1
+
+    def select(self, which: NDArray[Any]) -> Detections:
+        """Some of the detections, by mask or indices; the exposures stay."""
+        names = ("x", "y", "exposure", "chip", "sigma", "mag", "star")
+        return replace(
+            self, **{k: getattr(self, k)[which] for k in names if getattr(self, k) is not None}
+        )
+
+
+def detections_of(
+    lists: Sequence[StarList],
+    *,
+    epoch: Sequence[float] | None = None,
+    sigma: float | None = None,
+) -> Detections:
+    """All detections of star lists, one list for each exposure.
+
+    Parameters
+    ----------
+    lists : sequence of StarList
+    epoch : sequence of float, optional
+        Decimal year of each.
+    sigma : float, optional
+        Error of all positions, pixels.
+
+    Raises
+    ------
+    InputError
+        As `Detections`, and for lists of which only some have magnitudes.
+    """
+    with_mag = [one.mag is not None for one in lists]
+    if any(with_mag) and not all(with_mag):
+        bare = lists[with_mag.index(False)]
+        raise InputError("has no magnitudes, and others have", where=bare.source)
+    n = [len(one) for one in lists]
+    return Detections(
+        np.concatenate([one.x for one in lists]),
+        np.concatenate([one.y for one in lists]),
+        np.repeat(np.arange(len(lists)), n),
+        tuple(one.exposure for one in lists),
+        np.concatenate([one.chip for one in lists]),
+        None if epoch is None else np.asarray(epoch, float),
+        None if sigma is None else np.full(sum(n), sigma),
+        np.concatenate([one.mag for one in lists if one.mag is not None])
+        if all(with_mag)
+        else None,
+        source=lists[0].source if len(lists) == 1 else f"{len(lists)} star lists",
+    )

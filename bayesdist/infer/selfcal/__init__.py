@@ -1,0 +1,36 @@
+"""Self-calibration: distortion, exposures' frames and stars' positions from detections alone.
+
+The stars' parameters are eliminated star by star, so that nothing is dense in their number; what
+is left are the parameters of a `DistortionModel`.
+
+    problem     detections sorted by star, linearised about a solution
+    normal      one pass: normal equations with the stars eliminated, or log densities of draws
+    solve       the mode of everything together
+    gauge       what detections leave free, by name, and what fixes it
+    information what is known beside them: commanded offsets, ties, priors
+    calibrate   grouping and solving in turn
+    errors      of detections, by magnitude
+    target, proposal, sampling      the posterior
+    catalogue   the stars
+"""
+
+from bayesdist.infer.selfcal.calibrate import SelfCalibration, self_calibrate
+from bayesdist.infer.selfcal.catalogue import StarCatalogue, star_catalogue
+from bayesdist.infer.selfcal.gauge import Gauge, NamedDirection
+from bayesdist.infer.selfcal.information import Information, pointing_information, tie
+from bayesdist.infer.selfcal.sampling import sample_selfcal
+from bayesdist.infer.selfcal.solve import Solution
+
+__all__ = [
+    "Gauge",
+    "Information",
+    "NamedDirection",
+    "SelfCalibration",
+    "Solution",
+    "StarCatalogue",
+    "pointing_information",
+    "sample_selfcal",
+    "self_calibrate",
+    "star_catalogue",
+    "tie",
+]

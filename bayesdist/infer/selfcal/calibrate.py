@@ -1,0 +1,223 @@
+"""Detections grouped into stars, solved, grouped again: until nothing changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.detections import Detections
+from bayesdist.data.friends import Friends, friends_of_friends
+from bayesdist.errors import NotSettledError
+from bayesdist.infer.selfcal.errors import scatter_by_magnitude
+from bayesdist.infer.selfcal.gauge import Gauge, find_gauge
+from bayesdist.infer.selfcal.information import Information
+from bayesdist.infer.selfcal.normal import expand
+from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepared
+from bayesdist.infer.selfcal.solve import Solution, solve, wide_mixture
+from bayesdist.model import DistortionModel
+
+__all__ = ["SelfCalibration", "places_of", "self_calibrate"]
+
+Float = NDArray[np.float64]
+
+MOST_ROUNDS = 12
+SHRINK = 0.5  # of the linking length from round to round, at most
+REACH = 12.0  # errors that a linking length has to span
+SETTLED = 1e-3  # share of the detections that may change their star
+GUESS = 0.02  # pixels: error where none is quoted, until it is measured
+FROM_DATA = "by_magnitude"
+
+References = Callable[[Problem], StarPriors]
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCalibration:
+    """A solution and how it came about.
+
+    Parameters
+    ----------
+    solution : Solution
+    gauge : Gauge
+    friends : Friends
+        Of the last round; its `star` is of the detections given.
+    detections : Detections
+        With star codes and errors.
+    magnitude_errors : tuple of ndarray, or None
+        Magnitudes and errors in pixels, where these were measured.
+    rounds : int
+    """
+
+    solution: Solution
+    gauge: Gauge
+    friends: Friends
+    detections: Detections
+    magnitude_errors: tuple[Float, Float] | None
+    rounds: int
+
+
+def self_calibrate(
+    model: DistortionModel,
+    detections: Detections,
+    theta: Float,
+    *,
+    information: Information | None = None,
+    match_radius: float,
+    start_radius: float | None = None,
+    least: int = 2,
+    motion: str = "none",
+    dilation: Float | None = None,
+    jitter: float | None = None,
+    references: References | None = None,
+    log: Callable[[str], None] = lambda text: None,
+) -> SelfCalibration:
+    """Calibrate a detector from detections alone.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    detections : Detections
+        Without errors these are measured, by magnitude where magnitudes are given.
+    theta : ndarray, shape (D,)
+        A start by which detections of a star lie closer than `start_radius`.
+    information : Information, optional
+        What is known beside the detections.
+    match_radius : float
+        Linking length of the last round, pixels: how far false detections reach.
+    start_radius : float, optional
+        Of the first one.
+    least : int
+        Fewest detections of a star.
+    motion : str
+        As `prepared`.
+    dilation : ndarray, shape (E,), optional
+        VAFACTOR of each exposure.
+    jitter : float, optional
+        Held at this, pixels.
+    references : callable, optional
+        What is known of the stars of a problem beforehand.
+    log : callable, optional
+        Called with a sentence for each round.
+
+    Returns
+    -------
+    SelfCalibration
+
+    Raises
+    ------
+    InputError, DegenerateError
+        As `prepared` and `solve`.
+    NotSettledError
+        When the groups go on changing.
+    """
+    theta = np.array(theta, float)
+    information = information or Information.none(theta)
+    measured = detections.sigma is None
+    if measured:
+        detections = replace(detections, sigma=np.full(len(detections), GUESS))
+    radius = max(start_radius or match_radius, match_radius)
+    pixel = model.pixel_size(theta)
+    errors: tuple[Float, Float] | None = None
+    before = None
+    for turn in range(MOST_ROUNDS):
+        friends = friends_of_friends(
+            places_of(model, detections, theta, dilation), detections.exposure, radius * pixel
+        )
+        found = replace(detections, star=friends.star)
+        problem = prepared(
+            model, found, theta, match_radius=radius, least=least, motion=motion, dilation=dilation
+        )
+        if references is not None:
+            problem = replace(problem, priors=references(problem))
+        gauge = _gauge(problem, theta, information)
+        free = np.setdiff1d(np.arange(model.n_params), gauge.held)
+        solution = solve(problem, theta, free, information, jitter=jitter)
+        theta = solution.theta
+        log(
+            f"round {turn + 1}: linking length {radius:.3g} pix, {friends.n_stars} stars, "
+            f"{len(problem)} detections, error "
+            f"{np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2):.3g} pix"
+        )
+        last = radius <= match_radius
+        if measured:
+            detections, errors = _with_errors(detections, solution)
+        if last and before is not None and _changed(before, friends) < SETTLED:
+            if measured:  # with the errors of this round
+                sigma = detections.sigma
+                assert sigma is not None
+                problem = solution.problem.with_sigma(sigma[solution.problem.rows])
+                solution = solve(
+                    problem, theta, free, information, stars=solution.stars, jitter=jitter,
+                    mixture=solution.mixture,
+                )  # fmt: skip
+            gauge = _gauge(solution.problem, solution.theta, information, solution)
+            return SelfCalibration(
+                solution, gauge, friends, replace(detections, star=friends.star), errors, turn + 1
+            )
+        before = friends
+        scatter = float(np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2))
+        radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
+    raise NotSettledError(
+        f"stars and solution still change after {MOST_ROUNDS} rounds",
+        where="self-calibration",
+        do="give a better start, another match radius, or a lower order",
+    )
+
+
+def places_of(
+    model: DistortionModel, detections: Detections, theta: Float, dilation: Float | None = None
+) -> Float:
+    """Where on the sky the model has each detection, (N, 2)."""
+    when = None
+    if model.time is not None and detections.epoch is not None:
+        when = detections.epoch[detections.exposure]
+    out = model.predict(
+        theta,
+        detections.x,
+        detections.y,
+        exposure=detections.exposure,
+        chip=detections.chip,
+        epoch=when,
+    )
+    if dilation is None:
+        return out
+    o = np.asarray(model.origin)
+    return np.asarray(o + (out - o) * dilation[detections.exposure, None])
+
+
+def _gauge(
+    problem: Problem, theta: Float, information: Information, solution: Solution | None = None
+) -> Gauge:
+    if solution is None:
+        stars = problem.mean_places(theta)
+        problem = problem.at(theta, stars)
+        mixture = wide_mixture(problem, theta, stars)
+    else:
+        stars, mixture = solution.stars, solution.mixture
+    found = expand(problem, theta, mixture, stars, observed=False)
+    return find_gauge(problem, theta, found.curvature, information)
+
+
+def _with_errors(
+    detections: Detections, solution: Solution
+) -> tuple[Detections, tuple[Float, Float]]:
+    """Detections with errors by magnitude, or one for all."""
+    problem = solution.problem
+    mag = np.zeros(len(detections)) if detections.mag is None else detections.mag
+    middles, sigma = scatter_by_magnitude(
+        problem, solution.theta, solution.mixture, solution.stars, mag[problem.rows]
+    )
+    of_each = np.exp(np.interp(mag, middles, np.log(sigma)))
+    return replace(detections, sigma=of_each), (middles, sigma)
+
+
+def _changed(before: Friends, after: Friends) -> float:
+    """Share of the detections whose neighbours in the list of their star are others."""
+    if before.n_stars != after.n_stars:
+        # codes follow the first detections: they shift where a star has come or gone
+        return abs(before.n_stars - after.n_stars) / max(after.n_stars, 1) + float(
+            np.mean((before.star < 0) != (after.star < 0))
+        )
+    return float(np.mean(before.star != after.star))

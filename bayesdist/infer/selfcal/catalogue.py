@@ -1,0 +1,80 @@
+"""The stars of a self-calibration, with the covariance of their parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.selfcal.errors import memberships
+from bayesdist.infer.selfcal.normal import eliminated_rows
+from bayesdist.infer.selfcal.solve import Solution
+
+__all__ = ["StarCatalogue", "star_catalogue"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class StarCatalogue:
+    """Stars on the sky of the solution.
+
+    Parameters
+    ----------
+    values : ndarray, shape (S, q)
+        Position at `epoch`, then motion per year, then parallax.
+    cov : ndarray, shape (S, q, q)
+        With the errors of distortion and frames, in the gauge of the solution.
+    own : ndarray, shape (S, q, q)
+        Without these: of the star's own detections alone.
+    n : ndarray of int, shape (S,)
+        Detections.
+    n_members : ndarray, shape (S,)
+        Expected number of those that are the star's.
+    epoch : float
+    unit : str
+    """
+
+    values: Float
+    cov: Float
+    own: Float
+    n: Int
+    n_members: Float
+    epoch: float
+    unit: str
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+def star_catalogue(solution: Solution) -> StarCatalogue:
+    """Stars at their modes, with Laplace covariances.
+
+    The covariance of a star is that of its own detections for a known distortion, and what the
+    error of the distortion adds: A^-1 + A^-1 B Sigma B^T A^-1.
+    """
+    problem = solution.problem
+    S, q = problem.n_stars, problem.n_star
+    cov, own = np.empty((S, q, q)), np.empty((S, q, q))
+    root = np.zeros((len(solution.theta), len(solution.free)))
+    root[solution.free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
+    for some, rows, factors in eliminated_rows(
+        problem, solution.theta, solution.mixture, solution.stars
+    ):
+        back = np.linalg.inv(np.tril(factors))  # L^-1
+        own[some] = np.swapaxes(back, 1, 2) @ back
+        # A^-1 B = L^-T (L^-1 B)
+        spread = np.swapaxes(back, 1, 2) @ (rows @ root)
+        cov[some] = own[some] + spread @ np.swapaxes(spread, 1, 2)
+    w = memberships(problem, solution.theta, solution.mixture, solution.stars)
+    return StarCatalogue(
+        solution.stars,
+        cov,
+        own,
+        problem.counts,
+        np.asarray(np.bincount(problem.star, w, minlength=S), float),
+        problem.epoch0,
+        problem.model.unit,
+    )

@@ -1,0 +1,82 @@
+"""Errors of the detections by magnitude, from how they scatter about their stars."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer import kernel
+from bayesdist.infer.selfcal.normal import Mixture
+from bayesdist.infer.selfcal.problem import Problem
+
+__all__ = ["memberships", "scatter_by_magnitude", "squares"]
+
+Float = NDArray[np.float64]
+
+LEAST = 200  # detections of a bin
+MOST_BINS = 20
+
+
+def squares(problem: Problem, theta: Float, stars: Float) -> Float:
+    """Squared distances (N,) of detections from their stars, in square pixels."""
+    r, W = problem.places(theta) - problem.star_places(stars), problem.W
+    return np.asarray(
+        W[:, 0] * r[:, 0] ** 2 + 2 * W[:, 1] * r[:, 0] * r[:, 1] + W[:, 2] * r[:, 1] ** 2
+    )
+
+
+def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:
+    """Probability (N,) that a detection is its star's."""
+    p = problem
+    j2, log_core, log_out = mixture.constants(p.log_outlier)
+    return np.asarray(
+        kernel.weighted_stars(
+            p.starts,
+            p.places(theta),
+            p.W,
+            p.var,
+            j2,
+            log_core,
+            log_out,
+            p.time,
+            p.factor,
+            p.priors.centre,
+            p.priors.precision,
+            stars.copy(),
+        )
+    )
+
+
+def scatter_by_magnitude(
+    problem: Problem, theta: Float, mixture: Mixture, stars: Float, mag: Float
+) -> tuple[Float, Float]:
+    """Error on one axis by magnitude.
+
+    A star is placed by its own detections; what they scatter less for that is put back.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta, mixture, stars
+        A solution.
+    mag : ndarray, shape (N,)
+        In the order of the problem.
+
+    Returns
+    -------
+    middles, sigma : ndarray, shape (bins,)
+        Median magnitude of each bin, and error in pixels.
+    """
+    w = memberships(problem, theta, mixture, stars)
+    precision = w / (problem.var + mixture.jitter**2)
+    total = np.bincount(problem.star, precision, minlength=problem.n_stars)[problem.star]
+    # of each axis a star costs q / 2 numbers, shared by weight
+    left = 1.0 - np.minimum(precision / np.maximum(total, 1e-300) * problem.n_star / 2, 0.99)
+    square = squares(problem, theta, stars)
+    n_bins = int(np.clip(len(mag) // LEAST, 1, MOST_BINS))
+    edges = np.quantile(mag, np.linspace(0, 1, n_bins + 1))
+    bin_of = np.clip(np.searchsorted(edges, mag, side="right") - 1, 0, n_bins - 1)
+    number = np.bincount(bin_of, w * left, n_bins)
+    variance = np.bincount(bin_of, w * square, n_bins) / (2 * np.maximum(number, 1e-9))
+    middles = np.array([np.median(mag[bin_of == k]) for k in range(n_bins)])
+    return middles, np.sqrt(variance)

@@ -1,0 +1,138 @@
+"""What is known of the solution beside the detections: it fixes what these leave open.
+
+Every piece is Gaussian in the parameters, linearised at a solution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.prior import GaussianPriors
+from bayesdist.model import DistortionModel
+
+__all__ = ["Information", "linear_part", "pointing_information", "tie"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """log p = -d^T P d / 2 + r^T d with d = theta - reference.
+
+    Parameters
+    ----------
+    reference : ndarray, shape (D,)
+        Near the solution, so that no digits are lost.
+    precision : ndarray, shape (D, D)
+        P.
+    right : ndarray, shape (D,)
+        r.
+    """
+
+    reference: Float
+    precision: Float
+    right: Float
+
+    @classmethod
+    def none(cls, reference: Float) -> Information:
+        """Nothing is known."""
+        D = len(reference)
+        return cls(reference, np.zeros((D, D)), np.zeros(D))
+
+    @classmethod
+    def of_priors(cls, priors: GaussianPriors, reference: Float) -> Information:
+        """Priors on single parameters."""
+        return cls(reference, np.diag(priors.precision), priors.pull(reference))
+
+    def __add__(self, other: Information) -> Information:
+        """Both; the pieces are independent."""
+        shift = self.reference - other.reference
+        return Information(
+            self.reference,
+            self.precision + other.precision,
+            self.right + other.right - other.precision @ shift,
+        )
+
+    def pull(self, theta: Float) -> Float:
+        """Gradient (D,)."""
+        return np.asarray(self.right - self.precision @ (theta - self.reference))
+
+    def log_density(self, theta: Float) -> Float:
+        """Of parameter vectors (..., D), up to a constant."""
+        d = theta - self.reference
+        return np.asarray(d @ self.right - 0.5 * np.einsum("...d,...d->...", d @ self.precision, d))
+
+
+def tie(reference: Float, row: Float, value: float, sigma: float) -> Information:
+    """One measured linear combination of the parameters.
+
+    Parameters
+    ----------
+    reference : ndarray, shape (D,)
+    row : ndarray, shape (D,)
+    value : float
+        Measured `row @ (theta - reference)`.
+    sigma : float
+    """
+    return Information(reference, np.outer(row, row) / sigma**2, row * value / sigma**2)
+
+
+def pointing_information(
+    model: DistortionModel,
+    theta: Float,
+    offsets: Float,
+    sigma: Float,
+    *,
+    group: NDArray[np.int64] | None = None,
+) -> Information:
+    """Commanded offsets: where the reference pixel of the first chip is on the sky.
+
+    The pointings of a group of exposures have one unknown origin and independent errors.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+        At which it is linearised.
+    offsets : ndarray, shape (E, 2)
+        Along u and v; NaN where there is none.
+    sigma : ndarray, shape (E,)
+        Error of each on one axis.
+    group : ndarray of int, shape (E,), optional
+        Exposures with the same guide stars; all of them by default.
+    """
+    E, chip = len(model.exposures), model.chips[0]
+    x, y = (np.full(E, c) for c in chip.reference_pixel)
+    codes = np.arange(E)
+    where: dict[str, Any] = {"exposure": codes, "chip": chip.number}
+    if model.time is not None:
+        where["epoch"] = np.full(E, model.time.epoch0[0])
+    rows = model.jacobian(theta, x, y, **where)
+    places = model.predict(theta, x, y, **where)
+    precision, right = np.zeros((model.n_params,) * 2), np.zeros(model.n_params)
+    known = np.isfinite(offsets).all(axis=1)
+    group = np.zeros(E, np.int64) if group is None else group
+    for one in np.unique(group[known]):
+        here = np.flatnonzero(known & (group == one))
+        weight = np.diag(sigma[here] ** -2.0)
+        mean = weight.sum(axis=1)
+        weight -= np.outer(mean, mean) / mean.sum()  # the origin is not known
+        for axis in range(2):
+            J = rows[here, axis]
+            precision += J.T @ weight @ J
+            right += J.T @ weight @ (offsets[here, axis] - places[here, axis])
+    return Information(np.array(theta, float), precision, right)
+
+
+def linear_part(model: DistortionModel, chip: int | None = None) -> Float:
+    """Rows (2, 2, D): derivatives of u and v by x and y at a chip's reference pixel."""
+    basis = model.basis(chip)
+    by = basis.monomial_matrix[1:3]
+    out = np.zeros((2, 2, model.n_params))
+    for axis in range(2):
+        out[axis, :, model.coefficient_slice(chip, axis)] = by
+    return out

@@ -1,0 +1,282 @@
+"""Normal equations of the distortion with the stars eliminated.
+
+For star s, with A_s the curvature of the log density by its own parameters and B_s that by its own
+and the distortion's, elimination leaves
+
+    N = sum_i J_i^T H_i J_i - sum_s B_s^T A_s^-1 B_s
+
+dense in the parameters of the distortion and of the exposures alone.  B_s of some thousand stars at
+a time is one matrix, so that the second sum is a product of matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer import kernel
+from bayesdist.infer.selfcal.problem import Problem
+
+__all__ = ["Expansion", "Mixture", "Structure", "eliminated_rows", "expand", "log_marginal"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+STARS = 4096  # eliminated at a time
+SCRATCH = 16_000_000  # bytes of coefficients of draws held at a time
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """How detections scatter about their stars.
+
+    Parameters
+    ----------
+    jitter : float
+        Pixels, in addition to the quoted errors.
+    fraction : float
+        Share of false detections.
+    """
+
+    jitter: float = 0.0
+    fraction: float = 0.01
+
+    def constants(self, log_outlier: float) -> tuple[float, float, float]:
+        """Squared jitter, log of the core's share, log density of false detections."""
+        with np.errstate(divide="ignore"):
+            shares = np.log([1.0 - self.fraction, self.fraction])
+        return self.jitter**2, float(shares[0]), float(max(shares[1] + log_outlier, -1e300))
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """How places on the sky depend on the parameters, linearised at a solution.
+
+    By the coefficients of a chip's polynomials, M (kron) phi; by everything else, `extra` phi.
+
+    Parameters
+    ----------
+    coef : ndarray, shape (G, 2, K)
+        Effective coefficients.
+    linear : ndarray, shape (G, 2, 2)
+        M.
+    extra : ndarray, shape (G, 2, K, m)
+        Derivatives by drift and frames; zero where a group has fewer than m of them.
+    columns : ndarray of int, shape (G, m)
+        Which parameters these are; -1 for none.
+    """
+
+    coef: Float
+    linear: Float
+    extra: Float
+    columns: Int
+
+    @classmethod
+    def at(cls, problem: Problem, theta: Float) -> Structure:
+        """That of a problem at theta (D,)."""
+        groups, K = problem.groups, problem.model.n_terms
+        found = problem.effective_jacobian(theta)
+        m = max(len(columns) for columns, _ in found) - 2 * K
+        extra, columns = np.zeros((len(groups), 2, K, m)), np.full((len(groups), m), -1)
+        linear = np.empty((len(groups), 2, 2))
+        for g, (which, derivative) in enumerate(found):
+            linear[g] = derivative[:, 0, [0, K]]
+            n = len(which) - 2 * K
+            columns[g, :n] = which[2 * K :]
+            extra[g, ..., :n] = derivative[..., 2 * K :]
+        return cls(problem.effective(theta), linear, extra, columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """Second-order expansion of the log density at a solution, the stars eliminated.
+
+    Parameters
+    ----------
+    value : float
+        Log density with the stars integrated out (Laplace), up to a constant.
+    gradient : ndarray, shape (D,)
+        At the stars' modes.
+    curvature : ndarray, shape (D, D)
+        Minus the Hessian.
+    stars : ndarray, shape (S, q)
+        Modes.
+    n_members : float
+        Expected number of detections that are of their stars.
+    n_doubtful : float
+        Sum of w (1 - w) over them.
+    chi2 : float
+        Sum of w times the squared normalised residual.
+    """
+
+    value: float
+    gradient: Float
+    curvature: Float
+    stars: Float
+    n_members: float
+    n_doubtful: float
+    chi2: float
+
+
+def expand(
+    problem: Problem, theta: Float, mixture: Mixture, stars: Float, *, observed: bool = True
+) -> Expansion:
+    """One pass over the detections.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : ndarray, shape (D,)
+    mixture : Mixture
+    stars : ndarray, shape (S, q)
+        Where the search for their modes begins.
+    observed : bool
+        Curvature of the mixture itself; otherwise with EM weights, which is never indefinite.
+    """
+    structure, D = Structure.at(problem, theta), problem.model.n_params
+    curvature, gradient = np.zeros((D, D)), np.zeros(D)
+    found, scalars = stars.copy(), np.zeros(4)
+    chips = problem.groups.chip
+    for sums in _passes(problem, structure, mixture, found, observed):
+        direct, edge, own, pull_direct, pull_own, some, rows, _ = sums
+        _assemble(curvature, structure, chips, direct, edge, own)
+        curvature -= rows.T @ rows
+        K = structure.coef.shape[2]
+        for c in range(pull_direct.shape[1]):
+            gradient[2 * K * c : 2 * K * (c + 1)] += pull_direct[:, c].sum(axis=0).ravel()
+        used = structure.columns >= 0
+        np.add.at(gradient, structure.columns[used], pull_own.sum(axis=0)[used])
+        scalars += some.sum(axis=0)
+    curvature = (curvature + curvature.T) / 2
+    value, members, doubtful, chi2 = scalars
+    return Expansion(float(value), gradient, curvature, found, members, doubtful, chi2)
+
+
+def eliminated_rows(
+    problem: Problem, theta: Float, mixture: Mixture, stars: Float
+) -> Iterator[tuple[slice, Float, Float]]:
+    """What ties stars to the distortion, some stars at a time.
+
+    Yields
+    ------
+    stars : slice
+    rows : ndarray, shape (n, q, D)
+        L^-1 B of each star, A = L L^T.
+    factors : ndarray, shape (n, q, q)
+        L.
+    """
+    structure, D, q = Structure.at(problem, theta), problem.model.n_params, problem.n_star
+    first = 0
+    for *_, rows, factors in _passes(problem, structure, mixture, stars.copy(), True):
+        n = len(factors)
+        yield slice(first, first + n), rows.reshape(n, q, D), factors
+        first += n
+
+
+def _passes(
+    problem: Problem, structure: Structure, mixture: Mixture, stars: Float, observed: bool
+) -> Iterator[tuple[Float, ...]]:
+    p = problem
+    j2, log_core, log_out = mixture.constants(p.log_outlier)
+    for first in range(0, p.n_stars, STARS):
+        yield kernel.eliminate_stars(
+            first,
+            min(first + STARS, p.n_stars),
+            p.starts,
+            p.groups.index,
+            p.X,
+            p.Y,
+            p.offset,
+            p.W,
+            p.var,
+            p.time,
+            p.factor,
+            p.priors.centre,
+            p.priors.precision,
+            stars,
+            structure.coef,
+            p.groups.chip,
+            structure.linear,
+            structure.extra,
+            structure.columns,
+            p.model.n_params,
+            p.model.order,
+            j2,
+            log_core,
+            log_out,
+            p.least_root,
+            observed,
+        )
+
+
+def _assemble(
+    N: Float, structure: Structure, chips: Int, direct: Float, edge: Float, own: Float
+) -> None:
+    """Add the sums of J^T H J to N (D, D)."""
+    K = structure.coef.shape[2]
+    for c, low in enumerate(direct.sum(axis=0)):
+        uu, uv, vv = (one + np.tril(one, -1).T for one in np.tril(low))
+        at = 2 * K * c
+        N[at : at + 2 * K, at : at + 2 * K] += np.block([[uu, uv], [uv, vv]])
+    edges, owns = edge.sum(axis=0), own.sum(axis=0)
+    for g, columns in enumerate(structure.columns):
+        used = columns >= 0
+        which, at = columns[used], 2 * K * chips[g]
+        block = edges[g].reshape(2 * K, -1)[:, used]
+        N[at : at + 2 * K, which] += block
+        N[which, at : at + 2 * K] += block.T
+        N[np.ix_(which, which)] += owns[g][np.ix_(used, used)]
+
+
+def log_marginal(
+    problem: Problem, theta: Float, mixtures: Float, stars: Float, middles: Float
+) -> Float:
+    """Log density of parameter vectors, the stars integrated out (Laplace), up to a constant.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : ndarray, shape (n, D)
+    mixtures : ndarray, shape (n, 2)
+        Jitter in pixels, share of false detections.
+    stars : ndarray, shape (S, q)
+        Modes at some theta.
+    middles : ndarray, shape (S, 2)
+        Mean places of the stars' detections at the same.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    p = problem
+    rows = np.array([Mixture(j, f).constants(p.log_outlier) for j, f in mixtures])
+    out = np.empty(len(theta))
+    step = max(1, SCRATCH // (16 * p.model.n_terms * len(p.groups)))
+    for a in range(0, len(theta), step):
+        some = slice(a, a + step)
+        sums = kernel.log_marginals(
+            0,
+            p.n_stars,
+            p.starts,
+            p.groups.index,
+            p.X,
+            p.Y,
+            p.offset,
+            p.W,
+            p.var,
+            p.time,
+            p.factor,
+            p.priors.centre,
+            p.priors.precision,
+            stars,
+            middles,
+            p.powers(theta[some]),
+            p.model.order,
+            rows[some],
+            p.least_root,
+        )
+        out[some] = sums.sum(axis=0)
+    return out

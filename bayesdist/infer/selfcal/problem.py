@@ -1,0 +1,329 @@
+"""Detections sorted by star, with all that a pass over them needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.detections import Detections
+from bayesdist.errors import InputError
+from bayesdist.infer import kernel
+from bayesdist.model import DistortionModel
+from bayesdist.model.grouping import Groups
+
+__all__ = ["LEAST_DETECTIONS", "MOTIONS", "Problem", "StarPriors", "prepared"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+LEAST_DETECTIONS = 2  # of a star that says anything about the distortion
+MOTIONS = {"none": 2, "proper_motion": 4, "parallax": 5}
+VAGUE = (
+    1e-12  # precision, in the unit of u, v, that keeps a star's matrix positive and says nothing
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StarPriors:
+    """What is known of the stars beforehand: reference stars with their errors.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (S, q)
+    precision : ndarray, shape (S, q, q)
+        Zero for stars of which nothing is known.
+    """
+
+    centre: Float
+    precision: Float
+
+    @classmethod
+    def none(cls, n: int, q: int) -> StarPriors:
+        """Nothing is known of any star."""
+        return cls(np.zeros((n, q)), np.tile(VAGUE * np.eye(q), (n, 1, 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Detections sorted by star.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    groups : Groups
+        Of equal effective coefficients; `index` is that of each detection here.
+    starts : ndarray of int, shape (S + 1,)
+        First detection of each star.
+    seen : ndarray, shape (2, N)
+        Scaled positions of the detections.
+    X, Y : ndarray, shape (N,)
+        Scaled positions at which the model is taken: where the star lies by a solution at hand.
+    offset : ndarray, shape (N, 2)
+        From there to the detection, on the sky.
+    W : ndarray, shape (N, 3)
+        uu, uv, vv of the matrix that turns residuals on the sky into squared pixels.
+    var : ndarray, shape (N,)
+        Square of the quoted errors, square pixels.
+    time : ndarray, shape (N,)
+        Years since `epoch0`; empty where stars do not move.
+    factor : ndarray, shape (N, 2)
+        Parallax factors; empty where there is no parallax.
+    priors : StarPriors
+    rows : ndarray of int, shape (N,)
+        Which detection of the input each one is.
+    match_radius : float
+        Within which detections were taken for one star, pixels: the reach of false ones.
+    epoch0 : float
+        Date of the stars' positions.
+    dilation : ndarray, shape (E,), optional
+        Known scale of the sky in each exposure, about the frames' origin: VAFACTOR.
+    """
+
+    model: DistortionModel
+    groups: Groups
+    starts: Int
+    seen: Float
+    X: Float
+    Y: Float
+    offset: Float
+    W: Float
+    var: Float
+    time: Float
+    factor: Float
+    priors: StarPriors
+    rows: Int
+    match_radius: float
+    epoch0: float = 0.0
+    dilation: Float | None = None
+
+    def __len__(self) -> int:
+        return len(self.X)
+
+    @property
+    def n_stars(self) -> int:
+        """Number of stars."""
+        return len(self.starts) - 1
+
+    @property
+    def n_star(self) -> int:
+        """Parameters of a star."""
+        return self.priors.centre.shape[1]
+
+    @property
+    def counts(self) -> Int:
+        """Detections of each star."""
+        return np.asarray(np.diff(self.starts), np.int64)
+
+    @cached_property
+    def star(self) -> Int:
+        """Which star each detection is of."""
+        return np.repeat(np.arange(self.n_stars), self.counts)
+
+    @property
+    def log_outlier(self) -> float:
+        """Log density of a false detection per square pixel, without the share of such."""
+        return -float(np.log(np.pi * self.match_radius**2))
+
+    @cached_property
+    def least_root(self) -> float:
+        """Root of the curvature at which a star may be anywhere in its match circle."""
+        pixel = float(np.median(np.linalg.det(_square(self.W))) ** -0.25)
+        return float(np.sqrt(2.0) / (self.match_radius * pixel))
+
+    @cached_property
+    def sigma(self) -> float:
+        """Median quoted error, pixels."""
+        return float(np.sqrt(np.median(self.var)))
+
+    @cached_property
+    def _factors(self) -> Float:
+        """Dilation of each group (G,)."""
+        if self.dilation is None:
+            return np.ones(len(self.groups))
+        return np.asarray(self.dilation[self.groups.exposure], float)
+
+    def effective(self, theta: Float) -> Float:
+        """Effective Legendre coefficients (..., G, 2, K), the sky's dilation included."""
+        out = self.model.effective(theta, self.groups)
+        if self.dilation is None:
+            return out
+        o = np.asarray(self.model.origin)
+        out = out * self._factors[:, None, None]
+        out[..., 0] += o * (1.0 - self._factors[:, None])
+        return out
+
+    def effective_jacobian(self, theta: Float) -> list[tuple[Int, Float]]:
+        """Derivatives of these, as `DistortionModel.effective_jacobian`."""
+        found = self.model.effective_jacobian(theta, self.groups)
+        return [(columns, k * d) for (columns, d), k in zip(found, self._factors, strict=True)]
+
+    def powers(self, theta: Float) -> Float:
+        """Effective coefficients (..., G, 2, K) of the scaled powers."""
+        basis = self.model.basis(self.model.chips[0].number)
+        return basis.to_scaled_powers(self.effective(theta))
+
+    def places(self, theta: Float) -> Float:
+        """Where on the sky the model has each detection, (N, 2)."""
+        found = kernel.positions(
+            self.groups.index, self.X, self.Y, self.powers(theta), self.model.order
+        )
+        return np.asarray(found + self.offset)
+
+    def star_places(self, stars: Float) -> Float:
+        """Where on the sky the star of each detection is at its date, (N, 2)."""
+        out = stars[self.star, :2]
+        if self.n_star >= 4:
+            out = out + stars[self.star, 2:4] * self.time[:, None]
+        if self.n_star == 5:
+            out = out + stars[self.star, 4:] * self.factor
+        return np.asarray(out)
+
+    def middles(self, theta: Float) -> Float:
+        """Mean place (S, 2) of each star's detections."""
+        z = self.places(theta)
+        sums = [np.bincount(self.star, z[:, axis]) / self.counts for axis in (0, 1)]
+        return np.stack(sums, axis=1)
+
+    def mean_places(self, theta: Float) -> Float:
+        """Stars (S, q) at the means of their detections: where a search may begin."""
+        out = np.zeros((self.n_stars, self.n_star))
+        out[:, :2] = self.middles(theta)
+        return out
+
+    def at(self, theta: Float, stars: Float) -> Problem:
+        """The same, linearised about a solution: theta (D,) and stars (S, q)."""
+        model, groups = self.model, self.groups
+        E = self.effective(theta)
+        bases = [model.basis(model.chips[c].number) for c in groups.chip]
+        half = np.array([basis.half_size for basis in bases])
+        scaled = bases[0].to_scaled_powers
+        by_X, by_Y = (
+            np.stack([E[g] @ basis.derivatives[k].T * half[g, k] for g, basis in enumerate(bases)])
+            for k in (0, 1)
+        )
+        X, Y, offset, W = kernel.linearised(
+            groups.index,
+            *self.seen,
+            self.X,
+            self.Y,
+            self.star_places(stars),
+            scaled(E),
+            scaled(by_X),
+            scaled(by_Y),
+            half,
+            model.order,
+        )
+        return replace(self, X=X, Y=Y, offset=offset, W=W)
+
+    def with_sigma(self, sigma: Float) -> Problem:
+        """The same with other errors (N,), in the order of this object."""
+        return replace(self, var=sigma**2)
+
+
+def _square(W: Float) -> Float:
+    return np.asarray(W[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+
+
+def prepared(
+    model: DistortionModel,
+    detections: Detections,
+    theta: Float,
+    *,
+    match_radius: float,
+    motion: str = "none",
+    epoch0: float | None = None,
+    parallax_factors: Float | None = None,
+    dilation: Float | None = None,
+    least: int = LEAST_DETECTIONS,
+) -> Problem:
+    """Sort detections for the passes.
+
+    Parameters
+    ----------
+    model : DistortionModel
+        Its exposures are those of the detections.
+    detections : Detections
+        With star codes; those without, and stars with too few detections, are left out.
+    theta : ndarray, shape (n_params,)
+        A solution that is good enough for the size and shape of pixels on the sky.
+    match_radius : float
+        Pixels.
+    motion : str
+        What a star's parameters are: one of `MOTIONS`.
+    epoch0 : float, optional
+        Date of the stars' positions; the mean of the exposures' by default.
+    parallax_factors : ndarray, shape (E, 2), optional
+        Of each exposure, along u and v; needed by 'parallax'.
+    dilation : ndarray, shape (E,), optional
+        VAFACTOR of each exposure.
+    least : int
+        Fewest detections of a star.
+
+    Raises
+    ------
+    InputError
+        When no star is left, for a motion without dates, or parallax without factors.
+    """
+    q = MOTIONS[motion]
+    counts = np.bincount(detections.star[detections.star >= 0], minlength=1)
+    kept = (detections.star >= 0) & (counts[detections.star] >= max(least, LEAST_DETECTIONS))
+    if not kept.any():
+        raise InputError(
+            f"no star is seen {max(least, LEAST_DETECTIONS)} times",
+            where=detections.source,
+            do="give exposures that overlap, a better start, or a larger match radius",
+        )
+    if detections.sigma is None:
+        raise InputError(
+            "the detections carry no errors", where=detections.source, do="give sigma in pixels"
+        )
+    rows = np.flatnonzero(kept)
+    rows = rows[np.argsort(detections.star[rows], kind="stable")]
+    star = np.unique(detections.star[rows], return_inverse=True)[1]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(star))]).astype(np.int64)
+    exposure, chip = detections.exposure[rows], detections.chip[rows]
+    time, factor, when = np.zeros(0), np.zeros((0, 2)), None
+    if q > 2 or model.time is not None:
+        if detections.epoch is None:
+            raise InputError(
+                "the exposures have no dates, and stars or detector move",
+                where=detections.source,
+                do="give an exposure log with epochs",
+            )
+        when = detections.epoch[exposure]
+        epoch0 = float(np.mean(detections.epoch)) if epoch0 is None else epoch0
+        time = when - epoch0 if q > 2 else time
+    if q == MOTIONS["parallax"]:
+        if parallax_factors is None:
+            raise InputError("parallax needs its factors for each exposure", do="give them")
+        factor = np.asarray(parallax_factors, float)[exposure]
+    groups = model.groups(len(rows), epoch=when, exposure=exposure, chip=chip)
+    X, Y = np.empty(len(rows)), np.empty(len(rows))
+    for one in model.chips:
+        of_chip = chip == one.number
+        scaled = model.basis(one.number).scaled(
+            detections.x[rows[of_chip]], detections.y[rows[of_chip]]
+        )
+        X[of_chip], Y[of_chip] = scaled
+    problem = Problem(
+        model=model,
+        groups=groups,
+        starts=starts,
+        seen=np.stack([X, Y]),
+        X=X,
+        Y=Y,
+        offset=np.zeros((len(rows), 2)),
+        W=np.empty((0, 3)),
+        var=detections.sigma[rows] ** 2,
+        time=time,
+        factor=factor,
+        priors=StarPriors.none(len(starts) - 1, q),
+        rows=rows,
+        match_radius=match_radius,
+        epoch0=epoch0 or 0.0,
+        dilation=None if dilation is None else np.asarray(dilation, float),
+    )
+    return problem.at(theta, problem.mean_places(theta))

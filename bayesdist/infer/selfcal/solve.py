@@ -1,0 +1,182 @@
+"""The mode of distortion, frames, stars and memberships together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import DegenerateError, NotSettledError
+from bayesdist.infer.selfcal.information import Information
+from bayesdist.infer.selfcal.normal import Expansion, Mixture, expand
+from bayesdist.infer.selfcal.problem import Problem
+
+__all__ = ["Solution", "newton_step", "solve", "wide_mixture"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+MOST_PASSES = 80
+CLOSE = 1e-5  # decrement (expected gain in log density) at which the mode is found
+NEAR = 1.0  # decrement below which the curvature of the mixture is used
+SETTLED = 1e-4  # relative change of errors and of the share of false detections
+LEAST_SHARE = 1e-5
+START = 3.0  # of the robust scatter: errors begin as large as this, so that no star is lost
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A mode.
+
+    Parameters
+    ----------
+    problem : Problem
+        Linearised there.
+    theta : ndarray, shape (D,)
+    stars : ndarray, shape (S, q)
+    mixture : Mixture
+        Errors by moments; share of false detections at its mode.
+    free : ndarray of int, shape (F,)
+        Parameters that were fitted; the others are held by the gauge.
+    expansion : Expansion
+    information : Information
+    """
+
+    problem: Problem
+    theta: Float
+    stars: Float
+    mixture: Mixture
+    free: Int
+    expansion: Expansion
+    information: Information
+
+    @property
+    def precision(self) -> Float:
+        """Curvature (F, F) of the free parameters, with what is known beside the detections."""
+        total = self.expansion.curvature + self.information.precision
+        return np.asarray(total[np.ix_(self.free, self.free)])
+
+    @property
+    def cov(self) -> Float:
+        """Covariance (D, D); zero for what is held."""
+        out = np.zeros((len(self.theta),) * 2)
+        out[np.ix_(self.free, self.free)] = np.linalg.inv(self.precision)
+        return out
+
+
+def solve(
+    problem: Problem,
+    theta: Float,
+    free: Int,
+    information: Information,
+    *,
+    stars: Float | None = None,
+    mixture: Mixture | None = None,
+    jitter: float | None = None,
+) -> Solution:
+    """Newton's method with the stars eliminated in each pass.
+
+    Errors begin as large as the scatter of the start and shrink with it, so that a start that is
+    far off loses no star.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : ndarray, shape (D,)
+        Where to begin.
+    free : ndarray of int
+        Parameters that are fitted.
+    information : Information
+    stars : ndarray, shape (S, q), optional
+    mixture : Mixture, optional
+        Where to begin; found by default.
+    jitter : float, optional
+        Held at this; fitted by default.
+
+    Raises
+    ------
+    DegenerateError
+        When the free parameters are not determined.
+    NotSettledError
+        When it does not converge.
+    """
+    stars = problem.mean_places(theta) if stars is None else stars
+    problem = problem.at(theta, stars)
+    mixture = mixture or wide_mixture(problem, theta, stars)
+    near = False
+    for _ in range(MOST_PASSES):
+        found = expand(problem, theta, mixture, stars, observed=near)
+        stars = found.stars
+        gradient = found.gradient + information.pull(theta)
+        step = newton_step(found.curvature + information.precision, gradient, free)
+        if step is None and near:
+            near = False
+            continue
+        if step is None:
+            raise DegenerateError(
+                "the detections do not determine the parameters that are free",
+                where="self-calibration",
+                do="look at the gauge: dither more, add roll angles, or give priors",
+            )
+        decrement = float(gradient @ step)
+        before = problem.middles(theta)
+        theta = theta + step
+        stars = stars.copy()
+        stars[:, :2] += problem.middles(theta) - before
+        problem = problem.at(theta, stars)
+        after = _mixture(problem, mixture, found, len(free), jitter)
+        change = abs(after.fraction / mixture.fraction - 1.0) + abs(
+            (problem.var + after.jitter**2).mean() / (problem.var + mixture.jitter**2).mean() - 1.0
+        )
+        if near and decrement < CLOSE and change < SETTLED:
+            found = expand(problem, theta, mixture, stars)
+            return Solution(problem, theta, found.stars, mixture, free, found, information)
+        near = decrement < NEAR and change < 0.1
+        mixture = after
+    raise NotSettledError(
+        f"the solution still moves after {MOST_PASSES} passes",
+        where="self-calibration",
+        do="give a better start, or lower the order",
+    )
+
+
+def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
+    """Step (D,) of the free parameters; None where the curvature is not positive."""
+    H = curvature[np.ix_(free, free)]
+    scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    try:
+        L = np.linalg.cholesky(H / np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        return None
+    out = np.zeros(len(gradient))
+    half = np.linalg.solve(L, gradient[free] / scale)
+    out[free] = np.linalg.solve(L.T, half) / scale
+    return out
+
+
+def wide_mixture(problem: Problem, theta: Float, stars: Float) -> Mixture:
+    """Errors as large as a start is wrong."""
+    r = problem.places(theta) - problem.star_places(stars)
+    square = np.einsum("n,n->n", problem.W[:, 0], r[:, 0] ** 2)
+    square += 2 * problem.W[:, 1] * r[:, 0] * r[:, 1] + problem.W[:, 2] * r[:, 1] ** 2
+    # the median of r^2 is 1.386 sigma^2
+    return Mixture(START * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)
+
+
+def _mixture(
+    problem: Problem, mixture: Mixture, found: Expansion, n_free: int, jitter: float | None
+) -> Mixture:
+    """Share of false detections by EM, and the jitter by which chi-square is as it should be."""
+    n = len(problem)
+    share = float(np.clip((n - found.n_members) / n, LEAST_SHARE, 0.9))
+    if jitter is not None:
+        return replace(mixture, fraction=share, jitter=jitter)
+    lost = (problem.n_star * problem.n_stars + n_free) / n  # of each detection's two numbers
+    dof = max((2.0 - lost) * found.n_members, 1.0)
+    s2 = problem.var + mixture.jitter**2
+    # chi-square changes by jitter^2 as the mean of 1 / s^2 does
+    new = mixture.jitter**2 + (found.chi2 / dof - 1.0) / float(np.mean(1.0 / s2))
+    new = min(max(new, mixture.jitter**2 / 4), 4 * mixture.jitter**2 + float(np.median(s2)))
+    floor = (1e-2 * problem.sigma) ** 2
+    return Mixture(float(np.sqrt(max(new, floor))), share)

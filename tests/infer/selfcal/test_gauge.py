@@ -1,0 +1,102 @@
+"""Free directions: how many, what they are called, and what fixes them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bayesdist.infer.selfcal import pointing_information, tie
+from bayesdist.infer.selfcal.gauge import POINTS, find_gauge, functionals, moves
+from bayesdist.infer.selfcal.information import Information
+from bayesdist.infer.selfcal.normal import Mixture, expand
+from tests.infer.selfcal.fields import field, problem_of
+
+ALWAYS = {*POINTS, "scale", "rotation"}
+SKEW = {"skew_plus", "skew_cross"}
+
+
+def _gauge(simulated, information=None):
+    problem, stars = problem_of(simulated)
+    found = expand(problem, simulated.theta, Mixture(0.0, 0.01), stars, observed=False)
+    information = information or Information.none(simulated.theta)
+    return find_gauge(problem, simulated.theta, found.curvature, information), found
+
+
+@pytest.mark.parametrize(
+    ("rolls", "free"),
+    [
+        ((0, 60, 130), ALWAYS),
+        ((0, 0, 0), ALWAYS | SKEW),
+        ((0, 180), ALWAYS | SKEW),  # half a turn brings a skew back onto itself
+        ((0, 90), ALWAYS),
+    ],
+)
+@pytest.mark.parametrize("n_chips", [1, 2])
+def test_free_directions_by_roll(rolls, free, n_chips):
+    gauge, found = _gauge(field(1, 9, 300, rolls=rolls, n_chips=n_chips))
+    assert set(gauge.free_names) == free
+    assert gauge.null.shape[1] == gauge.held.size == len(free)
+    assert not gauge.unnamed
+    # held parameters leave nothing free
+    rest = np.setdiff1d(np.arange(len(found.gradient)), gauge.held)
+    H = found.curvature[np.ix_(rest, rest)]
+    scale = np.sqrt(np.diag(H))
+    assert np.linalg.eigvalsh(H / np.outer(scale, scale))[0] > 1e-8
+    told = " ".join(gauge.sentences)
+    assert ("one roll angle" in told) == (SKEW <= free)
+
+
+def test_moves_of_the_sky_change_no_residual():
+    simulated = field(2, 9, 300)
+    _, found = _gauge(simulated)
+    known = moves(simulated.model, simulated.theta)
+    for name in ALWAYS:
+        row = known[name]
+        power = row @ found.curvature @ row
+        assert power < 1e-9 * (row**2 @ np.diag(found.curvature))
+    for name in SKEW:  # the rolls tell
+        row = known[name]
+        assert row @ found.curvature @ row > 1e-4 * (row**2 @ np.diag(found.curvature))
+
+
+def test_without_dithers_the_distortion_itself_is_free():
+    from bayesdist.simulate.dithers import simulate_dithers, smooth_distortion
+    from tests.infer.selfcal.fields import chips
+
+    rng = np.random.default_rng(3)
+    simulated = simulate_dithers(
+        chips(), smooth_distortion(3, chips(), 3.0, rng), np.zeros((5, 2)), np.zeros(5),
+        n_stars=200, rng=rng, sigma=0.02,
+    )  # fmt: skip
+    gauge, _ = _gauge(simulated)
+    assert gauge.null.shape[1] == 20  # all coefficients of both axes
+    assert any(name[2:] not in ("0_0", "1_0", "0_1") for name in gauge.unnamed)
+    assert "dither more" in " ".join(gauge.sentences)
+
+
+def test_scale_from_commanded_offsets():
+    """Offsets of known error fix the scale as a regression through their mean does."""
+    simulated = field(4, 10, 300, sigma=0.001)
+    model, theta = simulated.model, simulated.theta
+    x, y = (np.full(10, c) for c in model.chips[0].reference_pixel)
+    true = model.predict(theta, x, y, exposure=np.arange(10))
+    sigma = 0.3
+    information = pointing_information(model, theta, true, np.full(10, sigma))
+    gauge, _ = _gauge(simulated, information)
+    scale = next(d for d in gauge.directions if d.name == "scale")
+    rotation = next(d for d in gauge.directions if d.name == "rotation")
+    assert scale.free
+    lever = np.sqrt(((true - true.mean(axis=0)) ** 2).sum())
+    for one in (scale, rotation):
+        assert one.sigma_fixed == pytest.approx(sigma / lever, rel=1e-3)
+    assert set(model.names[k] for k in gauge.held) == {"u_0_0", "v_0_0"}
+    assert "fixed by what is given" in " ".join(gauge.sentences)
+
+
+def test_a_tie_of_the_scale():
+    simulated = field(5, 9, 300)
+    row = functionals(simulated.model, simulated.theta)["scale"]
+    gauge, _ = _gauge(simulated, tie(simulated.theta, row, 0.0, 3e-5))
+    scale = next(d for d in gauge.directions if d.name == "scale")
+    assert scale.sigma_fixed == pytest.approx(3e-5, rel=1e-6)
+    assert gauge.open.shape[1] == 3

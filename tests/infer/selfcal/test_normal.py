@@ -1,0 +1,203 @@
+"""Elimination of the stars against dense linear algebra, and the density against integrals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bayesdist.infer.selfcal.errors import squares
+from bayesdist.infer.selfcal.normal import Mixture, expand, log_marginal
+from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.model import TimeDependence
+from bayesdist.simulate.dithers import pixels_of
+from tests.infer.selfcal.fields import field, problem_of
+
+NO_FALSE = Mixture(0.0, 1e-300)
+
+
+def _dense(problem: Problem, theta):
+    """Normal matrix of the distortion, from the full design of distortion and stars."""
+    p, model = problem, problem.model
+    exposure = p.groups.exposure[p.groups.index]
+    chip = np.array([c.number for c in model.chips])[p.groups.chip[p.groups.index]]
+    x, y = np.empty(len(p)), np.empty(len(p))
+    for one in model.chips:
+        rows = chip == one.number
+        x[rows] = (p.X[rows] * one.size[0] + one.size[0] + 1) / 2
+        y[rows] = (p.Y[rows] * one.size[1] + one.size[1] + 1) / 2
+    epoch = p.groups.epoch[p.groups.index] if model.time is not None else None
+    J = model.jacobian(theta, x, y, exposure=exposure, chip=chip, epoch=epoch)
+    H = p.W[:, [0, 1, 1, 2]].reshape(-1, 2, 2) / p.var[:, None, None]
+    S = np.zeros((len(p), 2, p.n_star))
+    S[:, 0, 0] = S[:, 1, 1] = 1.0
+    if p.n_star >= 4:
+        S[:, 0, 2] = S[:, 1, 3] = p.time
+    if p.n_star == 5:
+        S[:, :, 4] = p.factor
+    N = np.einsum("nad,nab,nbe->de", J, H, J)
+    for s in range(p.n_stars):
+        rows = slice(p.starts[s], p.starts[s + 1])
+        A = np.einsum("nap,nab,nbq->pq", S[rows], H[rows], S[rows]) + p.priors.precision[s]
+        B = np.einsum("nap,nab,nbe->pe", S[rows], H[rows], J[rows])
+        N -= B.T @ np.linalg.solve(A, B)
+    return N
+
+
+@pytest.mark.parametrize("motion", ["none", "proper_motion", "parallax"])
+@pytest.mark.parametrize("kind", ["one chip", "two chips", "scale", "drift"])
+def test_elimination_is_the_schur_complement(kind, motion):
+    simulated = field(
+        1,
+        9,
+        120,
+        n_chips=2 if kind == "two chips" else 1,
+        frames="shift_rotation_scale" if kind == "scale" else "shift_rotation",
+        epochs=np.linspace(2002.0, 2006.0, 9),
+    )
+    theta, model = simulated.theta, simulated.model
+    if kind == "drift":
+        time = TimeDependence((("u", 1, 0), ("v", 0, 1)), (2004.0,), ())
+        model = replace(model, time=time)
+        at = model.n_polynomial
+        theta = np.concatenate([theta[:at], [0.002, -0.003], theta[at:]])
+        simulated = replace(simulated, model=model, theta=theta)
+    factors = np.random.default_rng(0).normal(size=(9, 2))
+    problem, stars = problem_of(
+        simulated, motion=motion, parallax_factors=factors, least=5 if motion != "none" else 2
+    )
+    found = expand(problem, theta, NO_FALSE, stars)
+    dense = _dense(problem, theta)
+    assert np.abs(found.curvature - dense).max() < 1e-9 * np.abs(dense).max()
+
+
+def test_gradient_is_that_of_the_density():
+    simulated = field(2, 8, 150)
+    problem, stars = problem_of(simulated)
+    theta = simulated.theta
+    found = expand(problem, theta, NO_FALSE, stars)
+    rng, scale = np.random.default_rng(0), 1 / np.sqrt(np.diag(found.curvature))
+    middles = problem.middles(theta)
+    for _ in range(4):
+        step = scale * rng.normal(size=len(theta))
+        near = theta + np.outer([0.03, -0.03], step)
+        value = log_marginal(problem, near, np.tile([0.0, 1e-300], (2, 1)), found.stars, middles)
+        slope = (value[0] - value[1]) / 0.06
+        assert slope == pytest.approx(found.gradient @ step, rel=1e-4, abs=1e-3)
+        bend = (2 * found.value - value.sum()) / 0.03**2
+        assert bend == pytest.approx(step @ found.curvature @ step, rel=1e-3)
+
+
+def test_expansion_and_density_agree():
+    simulated = field(3, 8, 150, disturbed=0.03)
+    problem, stars = problem_of(simulated)
+    found = expand(problem, simulated.theta, Mixture(0.01, 0.03), stars)
+    value = log_marginal(
+        problem,
+        simulated.theta[None],
+        np.array([[0.01, 0.03]]),
+        found.stars,
+        problem.middles(simulated.theta),
+    )
+    assert value[0] == pytest.approx(found.value, abs=1e-8)
+
+
+def test_star_integral():
+    """The mixture integrated over the place of one star, against quadrature."""
+    simulated = field(4, 6, 60, disturbed=0.1)
+    problem, _ = problem_of(simulated, least=4)
+    theta, mixture = simulated.theta, Mixture(0.005, 0.05)
+    z = problem.places(theta)
+    j2, log_core, log_out = mixture.constants(problem.log_outlier)
+    checked = 0
+    for s in range(0, problem.n_stars, 3):
+        rows = slice(problem.starts[s], problem.starts[s + 1])
+        s2 = problem.var[rows] + j2
+        W = problem.W[rows]
+
+        def density(v, u, s2=s2, W=W, z=z[rows]):
+            r = z - [u, v]
+            square = (
+                W[:, 0] * r[:, 0] ** 2 + 2 * W[:, 1] * r[:, 0] * r[:, 1] + W[:, 2] * r[:, 1] ** 2
+            )
+            core = log_core - np.log(2 * np.pi * s2) - 0.5 * square / s2
+            return np.logaddexp(core, log_out).sum()
+
+        one = replace(
+            problem,
+            starts=np.array([0, rows.stop - rows.start]),
+            groups=replace(problem.groups, index=problem.groups.index[rows]),
+            **{k: getattr(problem, k)[rows] for k in ("X", "Y", "offset", "W", "var", "rows")},
+            seen=problem.seen[:, rows],
+            priors=replace(
+                problem.priors,
+                centre=problem.priors.centre[s : s + 1],
+                precision=problem.priors.precision[s : s + 1],
+            ),
+        )
+        true = simulated.detections.star[problem.rows[rows.start]]
+        found = expand(one, theta, mixture, simulated.sky[true][None])
+        (u, v), width = found.stars[0], 8 * np.sqrt(s2.max())
+        top = density(v, u)
+        at = np.linspace(-width, width, 801)
+        grid = np.array([[density(v + b, u + a) - top for a in at[::4]] for b in at[::4]])
+        exact = np.exp(grid).sum() * (at[4] - at[0]) ** 2
+        laplace = found.value + np.log(2 * np.pi)
+        # detections that are neither clearly true nor clearly false skew the integrand
+        assert laplace == pytest.approx(np.log(exact) + top, abs=0.05)
+        checked += 1
+    assert checked > 5
+
+
+def test_a_larger_sky_is_no_better_than_a_smaller_one():
+    """Scale is no parameter that detections know: errors are those on the detector."""
+    simulated = field(5, 8, 200)
+    problem, stars = problem_of(simulated)
+    theta, model = simulated.theta, simulated.model
+    found = expand(problem, theta, Mixture(0.0, 0.01), stars)
+    grown = theta.copy()
+    for e in range(1, len(model.exposures)):
+        shift = model.frame_slice(e).start
+        grown[shift : shift + 2] *= 1.001
+    K = model.n_terms
+    o = np.asarray(model.origin)
+    for axis in range(2):
+        at = model.coefficient_slice(1, axis)
+        grown[at] *= 1.001
+        grown[at.start] -= 0.001 * o[axis]
+    assert K == 10
+    values = log_marginal(
+        problem,
+        np.stack([theta, grown]),
+        np.tile([0.0, 0.01], (2, 1)),
+        found.stars,
+        problem.middles(theta),
+    )
+    # of 2 n squared residuals a thousandth would be 2; what is left is of second order
+    assert len(problem) > 500
+    assert abs(values[1] - values[0]) < 0.2
+
+
+def test_aberration_is_undone():
+    """Exposures whose sky is dilated by known factors have the same residuals as the others."""
+    simulated = field(7, 8, 150, sigma=0.001)
+    model, theta, d = simulated.model, simulated.theta, simulated.detections
+    dilation = 1.0 + 1e-4 * np.random.default_rng(1).normal(size=8)
+    dilation /= dilation[0]
+    # the telescope points where it did and the sky about the frames' origin is larger
+    o, moved = np.asarray(model.origin), theta.copy()
+    sky = o + (simulated.sky - o)
+    x, y = d.x.copy(), d.y.copy()
+    for e, k in enumerate(dilation):
+        rows = d.exposure == e
+        stars = sky[d.star[rows]]
+        found = pixels_of(model, theta, o + (stars - o) / k, e, model.chips[0])
+        x[rows], y[rows] = found[:2]
+    seen = replace(simulated, detections=replace(d, x=x, y=y))
+    with_factor, stars = problem_of(seen, dilation=dilation)
+    without, _ = problem_of(seen)
+    found = expand(with_factor, moved, NO_FALSE, stars)
+    assert np.sqrt(squares(with_factor, moved, found.stars).mean()) < 1e-6
+    other = expand(without, moved, Mixture(1.0, 1e-300), without.mean_places(moved))
+    assert np.sqrt(squares(without, moved, other.stars).mean()) > 0.01
