@@ -21,6 +21,7 @@ from bayesdist.app.holdout_config import HoldoutBlock
 from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.section import Section
 from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.assess.linear_term import LINEAR_KINDS, LinearTerm
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms import GIVEN, said_by_user
@@ -265,6 +266,13 @@ class Products(Section):
     release: ReleaseBlock | None = None
 
 
+# rows of every budget, and what its totals are called
+MEASURED_TERMS = (
+    *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME),
+    *("total", "model", "unmodelled structure", "look-up tables"),
+)
+
+
 class Config(Section):
     """The whole file."""
 
@@ -306,6 +314,25 @@ class Config(Section):
             )
         if self.campaign is not None and len(self.chip) == 0:
             raise ValueError("a [campaign] has no [[chip]] blocks; give them, one as the reference")
+        return self
+
+    @model_validator(mode="after")
+    def _names_of_their_own(self) -> Config:
+        for what, names in (
+            ("budget", [b.name for b in self.budget]),
+            ("requirement", [r.name for r in self.requirement]),
+        ):
+            twice = next((name for name in names if names.count(name) > 1), None)
+            if twice is not None:
+                raise ValueError(
+                    f"two [[{what}]] blocks have the name {twice!r}; give each its own"
+                )
+        taken = next((b.name for b in self.budget if b.name in MEASURED_TERMS), None)
+        if taken is not None:
+            raise ValueError(
+                f"a [[budget]] block has the name {taken!r}, which is that of a measured row; "
+                "give it another"
+            )
         return self
 
     @model_validator(mode="after")

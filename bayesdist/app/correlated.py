@@ -208,7 +208,8 @@ def facts_of(
     model, doubts, left = robust.model, list(robust.doubts), tuple[Unmodelled, ...]()
     try:
         if at_place:
-            left = unmodelled(session.shards, session.posterior, robust.cells, robust=robust)
+            cells = recommended_cells(model)
+            left = unmodelled(session.shards, session.posterior, cells, robust=robust)
     except DegenerateError:
         if robust.exceeds:
             doubts.append("stars are too far apart to show what the model leaves out at a place")

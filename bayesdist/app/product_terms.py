@@ -47,6 +47,7 @@ Positions = Callable[[Float, Float, int, float | None], Float]
 
 FORWARD, INVERSE = "forward", "inverse"
 GRID = (33, 33)  # points over which files are laid on the solution
+ROUNDING = 1e-9  # of a pixel
 
 
 def product_terms(session: Session) -> tuple[ProductTerm, ...]:
@@ -101,7 +102,7 @@ def _sip_terms(
     def place(x: Float, y: Float, chip: int, _: float | None) -> Float:
         return sip_positions(headers[chip], x, y, unit=unit, scale_arcsec=scale, like=like)
 
-    def missed(x: Float, y: Float, chip: int) -> Float:
+    def missed(x: Float, y: Float, chip: int, _: float | None) -> Float:
         sip = headers[chip]
         back_x, back_y = sip.inverse(*sip.forward(x, y))
         return np.stack([back_x - x, back_y - y], axis=-1)
@@ -110,8 +111,8 @@ def _sip_terms(
     turned = _Laid(session, place, scaled=False) if rotates else None
     forward = turned or (lambda x, y, c, t: place(x, y, c, t) - _solution(session, x, y, c, t))
     return [
-        _term(file, FORWARD, forward),
-        _term(file, INVERSE, _in_unit(session, missed)),
+        _term(session, file, FORWARD, forward),
+        _term(session, file, INVERSE, _in_unit(session, missed)),
     ]
 
 
@@ -128,10 +129,10 @@ def _idctab_terms(session: Session, file: str, sets: Sequence[ReleasedSet]) -> l
         # a table without drift would refuse a date
         return of(epoch)(x, y, chip, None if time is None else epoch)
 
-    out = [_term(file, FORWARD, _Laid(session, place, scaled=True))]
+    out = [_term(session, file, FORWARD, _Laid(session, place, scaled=True))]
     if all(one.has_inverse for one in sets):
-        back = _in_unit(session, lambda x, y, chip: sets[0].back(x, y, chip))
-        out.append(_term(file, INVERSE, back))
+        back = _in_unit(session, lambda x, y, chip, epoch: of(epoch).back(x, y, chip))
+        out.append(_term(session, file, INVERSE, back))
     return out
 
 
@@ -140,7 +141,7 @@ def _released(session: CampaignSession, folder: Path) -> list[ReleasedSet]:
     block, filter = session.config.products.release, session.inputs.filter
     assert block is not None
     entries = write_files(session, folder, {filter: session.solution}, session.tables)
-    paths = {kind: folder / e["path"] for e in entries for kind in [e["kind"]]}
+    paths = {e["kind"]: folder / e["path"] for e in entries}
     d2im = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
     npol: dict[int, LookupTable] = {}
     if "NPOLFILE" in paths:
@@ -157,10 +158,12 @@ def _released(session: CampaignSession, folder: Path) -> list[ReleasedSet]:
     return [segments.get(k, last) for k in range(n)]
 
 
-def _term(file: str, direction: str, shift: Positions) -> ProductTerm:
+def _term(session: Session, file: str, direction: str, shift: Positions) -> ProductTerm:
+    solution = session.solution
+    least = ROUNDING * solution.model.pixel_size(solution.mean)
     against = "the solution" if direction == FORWARD else "its forward terms"
     source = f"{MEASURED}: as written, against {against}"
-    return ProductTerm(f"{file}, {direction}", file, direction, shift, source)
+    return ProductTerm(f"{file}, {direction}", file, direction, shift, source, least)
 
 
 def _solution(session: Session, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
@@ -172,7 +175,7 @@ def _solution(session: Session, x: Float, y: Float, chip: int, epoch: float | No
     return np.asarray(place.basis.evaluate(x, y) @ place.polynomial(solution.mean).T)
 
 
-def _in_unit(session: Session, missed: Callable[[Float, Float, int], Float]) -> Positions:
+def _in_unit(session: Session, missed: Positions) -> Positions:
     """Displacements of pixels as those of positions."""
     solution = session.solution
 
@@ -180,7 +183,7 @@ def _in_unit(session: Session, missed: Callable[[Float, Float, int], Float]) -> 
         place = place_of(solution.model, epoch=epoch, chip=chip)
         P = place.polynomial(solution.mean)
         J = np.stack([d @ P.T for d in place.gradient(x, y)], axis=-1)
-        return np.asarray(np.einsum("nab,nb->na", J, missed(x, y, chip)))
+        return np.asarray(np.einsum("nab,nb->na", J, missed(x, y, chip, epoch)))
 
     return shift
 

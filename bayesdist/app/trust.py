@@ -18,7 +18,13 @@ def warnings_of(session: Session) -> list[str]:
     if session.majority:
         out.append(session.majority)
     if session.misfit.significant:
-        out.append(session.misfit.sentence)
+        shared = session.shared_errors
+        held = shared is not None and shared.trusted
+        out.append(
+            f"{session.misfit.finding}; the budget holds what was measured of it"
+            if held
+            else session.misfit.sentence
+        )
     ratio = fit.chi2 / max(fit.dof, 1)
     if ratio < LEAST_CHI2:
         out.append(

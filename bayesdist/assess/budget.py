@@ -131,8 +131,7 @@ class ErrorBudget:
 def budget_rows(terms: Sequence[BudgetTerm]) -> list[dict[str, Any]]:
     """Rows of a budget: root mean squares of the standard deviations; the total is the last one.
 
-    The error of the total is that of the terms of which it is known: all but those that were given
-    without one.
+    The total is known as well as its terms are: not where one of them was given without an error.
     """
     rows = []
     for t in terms:
@@ -152,13 +151,12 @@ def budget_rows(terms: Sequence[BudgetTerm]) -> list[dict[str, Any]]:
         )
     total = rows[-1]
     if total["kind"] == TOTAL and total["radial"] > 0:
-        known = [
-            (r["radial"], r["radial_error"])
-            for r in rows[:-1]
-            if r["radial_error"] is not None and r["kind"] != PRODUCT
-        ]
+        parts = [(r["radial"], r["radial_error"]) for r in rows[:-1] if r["kind"] != PRODUCT]
+        known = [(radial, error) for radial, error in parts if error is not None]
         spread = sum((radial * error) ** 2 for radial, error in known) ** 0.5
-        total["radial_error"] = spread / total["radial"] if known else None
+        # a term of nothing needs no error
+        whole = len(known) == sum(radial > 0 or error is not None for radial, error in parts)
+        total["radial_error"] = spread / total["radial"] if whole else None
     return rows
 
 

@@ -60,13 +60,17 @@ class Misfit:
     @property
     def sentence(self) -> str:
         """What it means, as a clause."""
+        return f"{self.finding}, so that errors are larger than the posterior says"
+
+    @property
+    def finding(self) -> str:
+        """The same without the consequence."""
         part = "the detector" if self.chip is None else f"chip {self.chip.name}"
         # tails underflow: no probability is zero
         p = "p < 1e-300" if self.p_value < 1e-300 else f"p = {self.p_value:.1g}"
         return (
             f"the residuals hold structure that the model does not describe ({self.structure:.2g} "
-            f"{self.unit} rms in {self.partition} of {part}, {p}), so "
-            "that errors are larger than the posterior says"
+            f"{self.unit} rms in {self.partition} of {part}, {p})"
         )
 
 

@@ -55,7 +55,7 @@ class PositionErrors:
         Standard normal: of the systematic terms, one for the whole field.
     seed : int
         Of the errors that are independent from place to place.
-    sizes : ndarray, shape (n_draws, terms)
+    sizes : ndarray, shape (n_draws, terms, 2)
         By which the local terms are multiplied: they are not known better than their errors say.
     """
 

@@ -38,6 +38,8 @@ class ProductTerm:
         Takes pixels x, y (N,), a chip number and an epoch (or None) to (N, 2): position by the
         file less that of the solution, in the unit of u, v.
     source : str
+    rounding : float
+        Displacements below this are none: they are digits of the arithmetic.
     """
 
     name: str
@@ -45,10 +47,12 @@ class ProductTerm:
     direction: str
     shift: Callable[[Float, Float, int, float | None], Float]
     source: str = MEASURED
+    rounding: float = 0.0
 
     def at(self, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
         """Displacements (N, 2) at pixels (N,) of a chip."""
-        return np.asarray(self.shift(x, y, chip, epoch), float)
+        found = np.asarray(self.shift(x, y, chip, epoch), float)
+        return np.where(np.abs(found) < self.rounding, 0.0, found)
 
 
 def with_product(total: float, product: float) -> float:

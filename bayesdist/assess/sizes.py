@@ -15,11 +15,12 @@ Float = NDArray[np.float64]
 
 
 def drawn_sizes(local: Sequence[LocalTerm], n: int, rng: np.random.Generator) -> Float:
-    """Factors (n, terms), log-normal and of mean square 1."""
+    """Factors (n, terms, 2) of both axes, log-normal and of mean square 1."""
     relative = np.array([term.relative_error or 0.0 for term in local])
     if not relative.any():
-        return np.ones((n, relative.size))
-    return np.exp(relative * rng.standard_normal((n, relative.size)) - relative**2)
+        return np.ones((n, relative.size, 2))
+    relative = relative[:, None]  # what is known of one axis says nothing of the other
+    return np.exp(relative * rng.standard_normal((n, relative.size, 2)) - relative**2)
 
 
 def resized(single: Float, own: Sequence[Float], sizes: Float) -> Float:
@@ -31,7 +32,7 @@ def resized(single: Float, own: Sequence[Float], sizes: Float) -> Float:
         With the local terms as large as they were found.
     own : sequence of ndarray, shape (N, 2)
         Those of the local terms.
-    sizes : ndarray, shape (n, terms)
+    sizes : ndarray, shape (n, terms, 2)
 
     Returns
     -------
@@ -39,6 +40,6 @@ def resized(single: Float, own: Sequence[Float], sizes: Float) -> Float:
     """
     if not own or np.all(sizes == 1.0):
         return single
-    factors = sizes[:, :, None, None] ** 2 - 1.0
+    factors = sizes[:, :, None] ** 2 - 1.0
     more = sum(factors[:, k] * sigma**2 for k, sigma in enumerate(own))
     return np.sqrt(np.maximum(single**2 + more, 0.0))

@@ -11,12 +11,13 @@ from bayesdist.infer.robust.cells import Cells
 from bayesdist.infer.robust.scores import Scores
 from bayesdist.infer.stars import Stars
 
-__all__ = ["AXES", "PairSums", "pair_sums"]
+__all__ = ["AXES", "WIDER", "PairSums", "pair_sums"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 AXES = ((0, 0), (1, 1), (0, 1))  # u with u, v with v, u with v
+WIDER = (1, 2, 4)  # sides of the cells, in those of the smallest
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +27,10 @@ class PairSums:
     Parameters
     ----------
     n_pairs : ndarray of int, shape (chips,)
-        In the smaller cells.
-    products, weights : ndarray, shape (chips, 2, C, 3)
-        sum g_i g_j and sum h_i h_j for uu, vv, uv in cells of the smaller and the larger kind, by
-        block of the chip; C is that of the chip with most blocks.
+        In the smallest cells.
+    products, weights : ndarray, shape (chips, 3, C, 3)
+        sum g_i g_j and sum h_i h_j for uu, vv, uv in cells of each size, by block of the chip; C is
+        that of the chip with most blocks.
     """
 
     n_pairs: Int
@@ -52,7 +53,7 @@ def pair_sums(stars: Stars, scores: Scores, side: float, blocks: Cells) -> PairS
     stars : Stars
     scores : Scores
     side : float
-        Of the smaller cells, in pixels.
+        Of the smallest cells, in pixels.
     blocks : Cells
         By which sums are kept apart.
 
@@ -62,7 +63,8 @@ def pair_sums(stars: Stars, scores: Scores, side: float, blocks: Cells) -> PairS
     """
     model = stars.model
     n, C = len(model.chips), blocks.most
-    out = PairSums(np.zeros(n, np.int64), np.zeros((n, 2, C, 3)), np.zeros((n, 2, C, 3)))
+    empty = np.zeros((n, len(WIDER), C, 3))
+    out = PairSums(np.zeros(n, np.int64), empty, empty.copy())
     columns = scores.of(stars)
     for g, (chip, exposure) in enumerate(
         zip(stars.groups.chip, stars.groups.exposure, strict=True)
@@ -75,8 +77,8 @@ def pair_sums(stars: Stars, scores: Scores, side: float, blocks: Cells) -> PairS
         gradient = turn.T @ columns[:2, rows]
         curvature = np.einsum("ab,as->bs", turn**2, columns[[2, 4], rows])
         block = blocks.codes(X, Y, int(chip))
-        for k, wide in enumerate((side, 2 * side)):
-            cell, first, n_stars = _cells(X, Y, model.chips[chip].size, wide)
+        for k, times in enumerate(WIDER):
+            cell, first, n_stars = _cells(X, Y, model.chips[chip].size, times * side)
             if k == 0:
                 out.n_pairs[chip] += int((n_stars * (n_stars - 1) // 2).sum())
             home = block[first]

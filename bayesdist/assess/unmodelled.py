@@ -7,8 +7,9 @@ model gives g the mean h d, so that over pairs of different stars in the same sm
     sum g_i g_j / sum h_i h_j
 
 is the mean square of what is left out, without the noise and without its error.  What the fit has
-taken of it, the variance of the model's position, is added again.  Pairs in cells twice as wide
-tell how much the structure has changed within a cell: the line through both is taken at zero.
+taken of it, the variance of the model's position, is added again.  Pairs in cells twice and four
+times as wide tell how much the structure has changed within a cell: the parabola through the three
+is taken at zero.  It is a line for structure with edges, and begins flat for smooth structure.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
-from bayesdist.assess.star_pairs import AXES, pair_sums
+from bayesdist.assess.star_pairs import AXES, WIDER, pair_sums
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.robust.cells import Cells
 from bayesdist.infer.robust.ratios import PositionSigmas
@@ -121,9 +122,10 @@ def unmodelled(
     matches : MatchTable, PartitionedMatches or Shards
     solution : Posterior, LinearFit or HierarchicalFit
     cells : Cells
-        As of `robust_covariance`: the error is that of a jackknife over cells of two by two.
+        The smallest that `robust_covariance` is given: they set the side.
     robust : RobustCovariance, optional
         Says what the fit took of the structure; without it the variances are too small by that.
+        The error is that of a jackknife over its cells, or else `cells`, two by two.
     side : float, optional
         Side of the cells in which stars are paired, in pixels; by default about a
         quarter of the shortest of `cells`, and up to all of it where stars are few.
@@ -146,12 +148,13 @@ def unmodelled(
     side = SHARE * cells.sides(model)[0] if side is None else side
     if not 0 < side < np.inf:
         raise InputError(f"the side is {side} pixels", where="side", do="give a positive number")
-    shapes, into = cells.merged(2)
+    blocks = cells if robust is None else robust.cells
+    shapes, into = blocks.merged(2)
     with opened(model, matches, compute) as shards:
-        sums = shards.sum(pair_sums, scores_of(solution), side, cells)
+        sums = shards.sum(pair_sums, scores_of(solution), side, blocks)
         while not given and sums.n_pairs.min() < MANY and 2 * side < cells.sides(model)[0]:
             side *= 2
-            sums = shards.sum(pair_sums, scores_of(solution), side, cells)
+            sums = shards.sum(pair_sums, scores_of(solution), side, blocks)
     out = []
     for k, chip in enumerate(model.chips):
         if sums.n_pairs[k] < FEWEST:
@@ -160,7 +163,7 @@ def unmodelled(
                 where=f"chip {chip.number}",
                 do="take a larger side",
             )
-        parts = np.zeros((2, 2, shapes[k][0] * shapes[k][1], 3))
+        parts = np.zeros((2, len(WIDER), shapes[k][0] * shapes[k][1], 3))
         for part, whole in zip(parts, (sums.products[k], sums.weights[k]), strict=True):
             np.add.at(part, (slice(None), into[k]), whole[:, : len(into[k])])
         value, error = _jackknife(*parts)
@@ -184,13 +187,13 @@ def unmodelled(
 
 
 def _jackknife(products: Float, weights: Float) -> tuple[Float, Float]:
-    """Mean products at zero distance (3,) and their errors, from blocks (2, C, 3)."""
+    """Mean products at zero distance (3,) and their errors, from blocks (3, C, 3)."""
     has = (weights[0] > 0).all(axis=1)
     products, weights = products[:, has], weights[:, has]
 
     def at_zero(top: Float, bottom: Float) -> Float:
-        near, far = top / bottom
-        return np.asarray(2 * near - far)
+        near, far, farthest = top / bottom
+        return np.asarray((8 * near - 6 * far + farthest) / 3)
 
     top, bottom = products.sum(axis=1), weights.sum(axis=1)
     without = at_zero(top[:, None] - products, bottom[:, None] - weights)

@@ -6,6 +6,7 @@ makes and draws every second figure; should it fail, they are drawn here.
 
 from __future__ import annotations
 
+import logging
 import os
 import pickle
 import subprocess
@@ -20,6 +21,8 @@ from bayesdist.report.drawing import Drawing, pdf_of, png_of
 from bayesdist.report.figures import plan_of_figures
 
 __all__ = ["drawn_report"]
+
+log = logging.getLogger("bayesdist")
 
 MANY = 24  # figures: fewer are drawn sooner than another process has started
 
@@ -38,11 +41,18 @@ def drawn_report(inputs: ReportInput) -> dict[str, Drawing]:
     names = list(plan_of_figures(inputs))
     if len(names) < MANY or (os.cpu_count() or 1) < 2 or not sys.executable:
         return _drawings(inputs, names)
-    with _helper(inputs, names[1::2]) as helper:
-        found = _drawings(inputs, names[::2])
-        answer, _ = helper.communicate()
-    theirs = pickle.loads(answer) if helper.returncode == 0 else _drawings(inputs, names[1::2])
-    return {name: (found | theirs)[name] for name in names}
+    found: dict[str, Drawing] = {}
+    try:
+        with _helper(inputs, names[1::2]) as helper:
+            found = _drawings(inputs, names[::2])
+            answer, _ = helper.communicate()
+        if helper.returncode:
+            raise OSError(f"it ended with exit code {helper.returncode}")
+        found |= pickle.loads(answer)
+    except (OSError, EOFError, pickle.PickleError, AttributeError, TypeError) as error:
+        log.warning("report: figures are drawn by one process, the other failed: %s", error)
+    found |= _drawings(inputs, [name for name in names if name not in found])
+    return {name: found[name] for name in names}
 
 
 def _drawings(inputs: ReportInput, names: Iterable[str]) -> dict[str, Drawing]:
@@ -61,7 +71,7 @@ def _helper(inputs: ReportInput, names: list[str]) -> Iterator[subprocess.Popen[
         question = Path(folder) / "inputs"
         question.write_bytes(pickle.dumps((inputs, names)))
         helper = subprocess.Popen(
-            [sys.executable, "-c", code, str(question)],
+            [sys.executable, "-P", "-c", code, str(question)],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},

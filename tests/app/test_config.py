@@ -290,9 +290,19 @@ def test_the_reference_chip_stands_first():
 
 def test_a_requirement_may_name_a_chip():
     block = {"name": "n", "statistic": "p95", "limit": 1.0}
-    of_all, of_one = parsed(config_text(requirement=[block, block | {"chip": 2}])).requirements()
+    other = block | {"name": "m", "chip": 2}
+    of_all, of_one = parsed(config_text(requirement=[block, other])).requirements()
     assert (of_all.chip, of_one.chip) == (None, 2)
     assert "chip" in str(refusal(config_text(requirement=[block | {"chip": "WFC2"}])))
+
+
+def test_names_are_each_of_one_block():
+    block = {"name": "n", "statistic": "p95", "limit": 1.0}
+    assert "name 'n'" in str(refusal(config_text(requirement=[block, block])))
+    term = {"name": "total", "kind": "random", "sigma_u": 0.1, "sigma_v": 0.1}
+    assert "name 'total'" in str(refusal(config_text(budget=[term])))
+    term["name"] = "mine"
+    assert "name 'mine'" in str(refusal(config_text(budget=[term, term])))
 
 
 def test_text_is_kept_as_written(tmp_path):

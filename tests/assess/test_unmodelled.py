@@ -40,7 +40,7 @@ def test_pairs_are_those_of_different_stars_of_one_exposure():
     g = w * residual_of(model, fit.mean, matches)
     for chip in (0, 1):
         size = np.array(model.chips[chip].size)
-        for k, wide in enumerate((side, 2 * side)):
+        for k, wide in enumerate((side, 2 * side, 4 * side)):
             n_cells = np.round(size / wide)
             place = np.column_stack([matches.x, matches.y]) - 0.5
             cell = (place / size * n_cells).astype(int)
@@ -122,9 +122,7 @@ def test_the_rms_of_a_pattern_is_found():
     values, errors = np.array(values), np.array(errors)
     expected = np.array([0.01, 0.0025, 0.0])
     of_mean = np.sqrt((errors**2).mean(axis=0) / 20)
-    # blocks of 64 pixels as seen by pairs of 15 and 30 pixels: a line through
-    # (1 - s / 192)^2 at both, taken at zero, is below 1 by 2 (s / 192)^2
-    expected *= 1 - 2 * (0.23 * 64 / 192) ** 2
+    # pairs in cells of s pixels see (1 - s / 192)^2 of blocks of 64 pixels, a parabola in s
     assert (np.abs(values.mean(axis=0) - expected) < 3.5 * of_mean).all()
     scatter = values.var(axis=0, ddof=1) / (errors**2).mean(axis=0)
     low, high = stats.chi2.ppf([0.001, 0.999], 19) / 19

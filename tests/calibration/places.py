@@ -156,7 +156,7 @@ def _drawn(
     if UNMODELLED in said:
         (relative,) = (one.relative_error or 0.0 for one in errors.local)
         dof = 1 / (2 * max(relative, 1e-3) ** 2)
-        size = np.sqrt(dof / rng.chisquare(dof, (shape[0], 1, 1)))
+        size = np.sqrt(dof / rng.chisquare(dof, (shape[0], 1, 2)))
         out[UNMODELLED] = rng.standard_normal(shape) * size * said[UNMODELLED]
     out[CENTROID] = rng.standard_normal(shape) * said[CENTROID]
     offset = OFFSET * rng.standard_normal((shape[0], 1, 2))

@@ -36,7 +36,7 @@ def probabilities(kind: str, *, full: bool) -> tuple[np.ndarray, np.ndarray]:
     """What is said, and whether it is met, (n,) each."""
     pilots = over(partial(pilot, kind), [(k,) for k in range(PILOTS[full])], full=full)
     n = CALIBRATIONS[full]
-    limits = limits_from(pilots, n)
+    limits = limits_from(kind, pilots, n)
     seeds = range(10_000, 10_000 + n)  # not those of the coverage
     found = over(partial(said_and_true, kind), list(zip(limits, seeds, strict=True)), full=full)
     said, met = np.array(found, float).T

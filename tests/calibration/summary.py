@@ -11,7 +11,7 @@ from scipy.stats import binom
 from .places import LEVELS
 
 CONFIDENCE = 0.99
-BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)
+BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
 
 
 def band(share: float, n: float, tests: int = 1) -> tuple[float, float]:

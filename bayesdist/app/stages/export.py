@@ -87,7 +87,9 @@ def _compare(product: dict[str, Any], budget: Sequence[dict[str, Any]]) -> None:
     for row in budget:
         files, _, direction = row["name"].rpartition(", ")
         path = product["path"]
-        if row["kind"] != PRODUCT or not (path in files.split(", ") or path.startswith(files)):
+        if row["kind"] != PRODUCT or not (
+            path in files.split(", ") or path.startswith(f"{files}_")
+        ):
             continue
         product[f"{direction}_rms"] = row["radial"]
         total = budget[-1]["radial"]
