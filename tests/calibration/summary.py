@@ -11,6 +11,7 @@ from scipy.stats import binom
 from .places import LEVELS
 
 CONFIDENCE = 0.99
+MOST = 20.0
 BINS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
 
 
@@ -38,7 +39,7 @@ class Covered:
         Independent errors that they are worth: the claimed errors of a campaign's places are
         correlated, and draws of them say by how much the share would scatter.
     pull : float
-        Root mean square of errors in units of what is claimed.
+        Root mean square of errors in units of what is claimed, none counted above `MOST`.
     """
 
     kind: str
@@ -59,7 +60,7 @@ def covered_by_term(kind: str, campaigns: Sequence[dict]) -> list[Covered]:
     out = []
     for term in sorted({term for one in campaigns for term in one}):
         found = [one[term] for one in campaigns if term in one]
-        pull = np.concatenate([one["pull"].ravel() for one in found])
+        pull = np.concatenate([one["pull"].ravel() for one in found]).clip(-MOST, MOST)
         for k, level in enumerate(LEVELS):
             expected = np.array([one["expected"][k] for one in found])  # campaigns, draws
             scatter = expected.var(axis=1).sum() / pull.size**2
