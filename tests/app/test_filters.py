@@ -121,7 +121,7 @@ def test_the_detectors_tables_are_held_and_the_filters_are_fitted(sessions):
 
 def test_the_error_of_the_held_tables_stays_in_the_budget(sessions):
     other = sessions["F814W"]
-    [term] = other.local_terms
+    [term] = [one for one in other.local_terms if one.name == "look-up tables"]
     for chip in other.plain_model.chips:
         x, y = np.meshgrid(
             *(np.linspace(1, n, m) for n, m in zip(chip.size, (33, 17), strict=True))
