@@ -23,8 +23,10 @@ EXPOSURES = 14
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, full):
     """The simulation's pattern of 64 pixels, and no tables for it; stages until 'assess'."""
+    if not full:
+        pytest.skip("minutes of processor time: set BAYESDIST_FULL=1")
     folder = tmp_path_factory.mktemp("shared")
     good("simulate", "acs", "-o", folder / "in", "--exposures", EXPOSURES, "--stars", 5000, "-q")
     config = folder / "in" / "campaign_f606w.toml"
