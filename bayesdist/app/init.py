@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesdist.app.config import parse_config
 from bayesdist.app.matches import load_matches
+from bayesdist.app.output import refuse_existing
 from bayesdist.app.rvb_init import is_rvb, rvb_template
 from bayesdist.data import MatchTable, atomic_path
 from bayesdist.errors import InputError
@@ -124,8 +125,7 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> int:
     InputError
     """
     path = Path(path)
-    if path.exists() and not force:
-        raise InputError("this file exists", where=str(path), do="replace it by --force")
+    refuse_existing(path, force)
     relative = _toml(os.path.relpath(Path(matches), path.resolve().parent))
     rvb = rvb_template(matches) if is_rvb(matches) else None
     n, values = _of_matches(matches) if rvb is None else rvb

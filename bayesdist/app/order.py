@@ -12,6 +12,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.config import load_config
+from bayesdist.app.output import refuse_existing
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import Session, write_table
@@ -59,8 +60,7 @@ def order(
     """
     targets = [Path(name) for name in (output, figure) if name is not None]
     for target in targets:
-        if target.exists() and not force:
-            raise InputError("this file exists", where=str(target), do="replace it by --force")
+        refuse_existing(target, force)
     low, high = orders
     if not 1 <= low < high <= MAX_ORDER:
         raise InputError(

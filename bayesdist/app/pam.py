@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.applied import applied, images_of
+from bayesdist.app.output import refuse_existing
 from bayesdist.app.screen import number
 from bayesdist.errors import InputError
 from bayesdist.products.pam import PixelAreaMap, pixel_area_map, write_pam
@@ -60,8 +61,7 @@ def write_area_maps(
             where=str(output),
             do="choose a name that ends in .fits",
         )
-    if output.exists() and not force:
-        raise InputError("this file exists", where=str(output), do="replace it by --force")
+    refuse_existing(output, force)
     found = applied(path, filter=filter, epoch=epoch, scale=scale)
     images = images_of(found, image=image)
     numbers = list(images or found.chips)

@@ -9,6 +9,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bayesdist.app.output import refuse_existing
 from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
 from bayesdist.products.application import Positions
@@ -36,8 +37,7 @@ def check_output(output: Path, force: bool) -> None:
             where=str(output),
             do=f"choose one of {', '.join(_FORMATS)}",
         )
-    if output.exists() and not force:
-        raise InputError("this file exists", where=str(output), do="replace it by --force")
+    refuse_existing(output, force)
 
 
 def position_column(table: Table, name: str, where: str) -> Float:

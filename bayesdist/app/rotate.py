@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bayesdist.app.output import refuse_existing
 from bayesdist.app.screen import number
 from bayesdist.errors import InputError
 from bayesdist.products import (
@@ -53,8 +54,7 @@ def rotate(
         WISE meta-data one that is no multiple of 90 degrees, or a skew.
     """
     path, output = Path(path), Path(output)
-    if output.exists() and not force:
-        raise InputError("this file exists", where=str(output), do="replace it by --force")
+    refuse_existing(output, force)
     if holds_sip(path):
         turned = rotated_sip(read_sip(path), degrees, mirror=mirror)
         write_sip(turned, output)

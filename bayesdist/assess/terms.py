@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +20,6 @@ __all__ = [
     "TERM_KINDS",
     "LocalTerm",
     "UserTerm",
-    "combined_sigma",
     "said_by_user",
 ]
 
@@ -157,11 +155,3 @@ class LocalTerm:
         return np.asarray(
             RegularGridInterpolator(axes[::-1], self.sigma[chip])(np.column_stack(points[::-1]))
         )
-
-
-def combined_sigma(
-    terms: Iterable[UserTerm], kind: str, unit: str, pixel_scale: float | None = None
-) -> tuple[float, float]:
-    """Quadrature sum (u, v) of all terms of one kind, in a unit: they are independent."""
-    sigmas = [t.sigma(unit, pixel_scale) for t in terms if t.kind == kind]
-    return math.hypot(*(s[0] for s in sigmas)), math.hypot(*(s[1] for s in sigmas))

@@ -8,6 +8,9 @@ import pytest
 from bayesdist.data.mutual import mutual_frames, refuse_duplicates
 from bayesdist.errors import InputError
 
+SIGMA = 0.02  # px
+DENSITY = 6000 / 3000.0**2  # stars in a square pixel
+
 
 def _lists(rng, pointings, n=6000, half=300.0):
     """Stars of one field seen through square windows at some pointings (x, y, roll)."""
@@ -18,9 +21,18 @@ def _lists(rng, pointings, n=6000, half=300.0):
         c, s = np.cos(roll), np.sin(roll)
         own = (stars - [x, y]) @ np.array([[c, -s], [s, c]])
         seen = (np.abs(own) < half).all(axis=1)
-        planes.append(own[seen] + 0.02 * rng.normal(size=(seen.sum(), 2)))
+        planes.append(own[seen] + SIGMA * rng.normal(size=(seen.sum(), 2)))
         mags.append(mag[seen])
     return planes, mags
+
+
+def _near_first(rng, x, y, roll, half=300.0):
+    """Points that the first window, about zero, and another see: on the sky, and in the other."""
+    sky = rng.uniform(-half, half, (2000, 2))
+    c, s = np.cos(roll), np.sin(roll)
+    own = (sky - [x, y]) @ np.array([[c, -s], [s, c]])
+    seen = (np.abs(own) < half).all(axis=1)
+    return sky[seen], own[seen]
 
 
 def test_shift_and_roll_are_found(rng):
@@ -30,8 +42,12 @@ def test_shift_and_roll_are_found(rng):
     for e, (x, y, roll) in enumerate(pointings):
         turned = np.angle(np.exp(1j * (found.rotations[e] - roll)))
         assert abs(turned) < 1e-4
-        # good enough to link detections within a pixel, wherever the overlap lies
-        assert np.hypot(*(found.shifts[e] - [x, y])) < 0.2
+        # three numbers for each axis from stars of the overlap that both lists have with their
+        # errors: mean square 2 sigma^2 3 / n there; the others' stars it has by way of others
+        sky, own = _near_first(rng, x, y, roll)
+        off = own @ found.matrices[e].T + found.shifts[e] - sky
+        n = DENSITY * 600.0**2 * len(sky) / 2000
+        assert np.sqrt((off**2).mean()) < 3 * SIGMA * np.sqrt(6 / n)
 
 
 def test_groups_without_common_stars_are_named(rng):

@@ -399,7 +399,15 @@ def eliminate_stars(
 ):  # fmt: skip
     """Sums of a second-order expansion over stars first..last, these moved to their modes.
 
-    See `sums` of `bayesdist.infer.selfcal.normal`, which gives shapes and meanings.
+    Besides what `log_marginals` takes: coef (G, 2, K) of the Legendre products, and of each group
+    its chip (G,), the linear part (G, 2, 2) of its frame, the derivatives (G, 2, K, m) by its other
+    parameters and which these are (G, m), -1 for none; `seen`: curvature of the mixture itself.
+
+    Returns direct (P, chips, 3, K, K), edge (P, G, 2, K, m), own (P, G, m, m): curvature by
+    coefficients (uu, uv, vv, lower halves), by these and the rest, by the rest; pull_direct (P,
+    chips, 2, K), pull_own (P, G, m): gradients; scalars (P, 4): log density, sums of w, of
+    w (1 - w), and of w times the squared normalised residual; rows (S q, D): L^-1 B of each star;
+    factors (S, q, q): L.
     """
     q, K, m = stars.shape[1], coef.shape[2], extra.shape[3]
     n_chips, n_groups = chip.max() + 1, len(coef)

@@ -28,7 +28,6 @@ SHRINK = 0.5  # of the linking length from round to round, at most
 REACH = 12.0  # errors that a linking length has to span
 SETTLED = 1e-3  # share of the detections that may change their star
 GUESS = 0.02  # pixels: error where none is quoted, until it is measured
-FROM_DATA = "by_magnitude"
 
 References = Callable[[Problem], StarPriors]
 

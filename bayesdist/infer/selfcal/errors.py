@@ -9,20 +9,12 @@ from bayesdist.infer import kernel
 from bayesdist.infer.selfcal.normal import Mixture
 from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = ["memberships", "scatter_by_magnitude", "squares"]
+__all__ = ["memberships", "scatter_by_magnitude"]
 
 Float = NDArray[np.float64]
 
 LEAST = 200  # detections of a bin
 MOST_BINS = 20
-
-
-def squares(problem: Problem, theta: Float, stars: Float) -> Float:
-    """Squared distances (N,) of detections from their stars, in square pixels."""
-    r, W = problem.places(theta) - problem.star_places(stars), problem.W
-    return np.asarray(
-        W[:, 0] * r[:, 0] ** 2 + 2 * W[:, 1] * r[:, 0] * r[:, 1] + W[:, 2] * r[:, 1] ** 2
-    )
 
 
 def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:
@@ -72,7 +64,7 @@ def scatter_by_magnitude(
     total = np.bincount(problem.star, precision, minlength=problem.n_stars)[problem.star]
     # of each axis a star costs q / 2 numbers, shared by weight
     left = 1.0 - np.minimum(precision / np.maximum(total, 1e-300) * problem.n_star / 2, 0.99)
-    square = squares(problem, theta, stars)
+    square = problem.squares(theta, stars)
     n_bins = int(np.clip(len(mag) // LEAST, 1, MOST_BINS))
     edges = np.quantile(mag, np.linspace(0, 1, n_bins + 1))
     bin_of = np.clip(np.searchsorted(edges, mag, side="right") - 1, 0, n_bins - 1)

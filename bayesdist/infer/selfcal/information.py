@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.prior import GaussianPriors
 from bayesdist.model import DistortionModel
 
 __all__ = ["Information", "linear_part", "pointing_information", "tie"]
@@ -42,11 +41,6 @@ class Information:
         """Nothing is known."""
         D = len(reference)
         return cls(reference, np.zeros((D, D)), np.zeros(D))
-
-    @classmethod
-    def of_priors(cls, priors: GaussianPriors, reference: Float) -> Information:
-        """Priors on single parameters."""
-        return cls(reference, np.diag(priors.precision), priors.pull(reference))
 
     def __add__(self, other: Information) -> Information:
         """Both; the pieces are independent."""

@@ -103,6 +103,14 @@ class Problem:
         return len(self.X)
 
     @property
+    def columns(self) -> tuple[Int | Float, ...]:
+        """What the compiled passes take of detections and stars, in their order."""
+        return (
+            *(self.starts, self.groups.index, self.X, self.Y, self.offset, self.W, self.var),
+            *(self.time, self.factor, self.priors.centre, self.priors.precision),
+        )
+
+    @property
     def n_stars(self) -> int:
         """Number of stars."""
         return len(self.starts) - 1
@@ -180,6 +188,13 @@ class Problem:
         if self.n_star == 5:
             out = out + stars[self.star, 4:] * self.factor
         return np.asarray(out)
+
+    def squares(self, theta: Float, stars: Float) -> Float:
+        """Squared distances (N,) of detections from their stars, in square pixels."""
+        r, W = self.places(theta) - self.star_places(stars), self.W
+        return np.asarray(
+            W[:, 0] * r[:, 0] ** 2 + 2 * W[:, 1] * r[:, 0] * r[:, 1] + W[:, 2] * r[:, 1] ** 2
+        )
 
     def middles(self, theta: Float) -> Float:
         """Mean place (S, 2) of each star's detections."""

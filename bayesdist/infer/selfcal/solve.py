@@ -157,9 +157,7 @@ def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
 
 def wide_mixture(problem: Problem, theta: Float, stars: Float) -> Mixture:
     """Errors as large as a start is wrong."""
-    r = problem.places(theta) - problem.star_places(stars)
-    square = np.einsum("n,n->n", problem.W[:, 0], r[:, 0] ** 2)
-    square += 2 * problem.W[:, 1] * r[:, 0] * r[:, 1] + problem.W[:, 2] * r[:, 1] ** 2
+    square = problem.squares(theta, stars)
     # the median of r^2 is 1.386 sigma^2
     return Mixture(START * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)
 

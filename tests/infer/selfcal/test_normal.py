@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.infer.selfcal.errors import squares
 from bayesdist.infer.selfcal.normal import Mixture, expand, log_marginal
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
@@ -160,13 +159,11 @@ def test_a_larger_sky_is_no_better_than_a_smaller_one():
     for e in range(1, len(model.exposures)):
         shift = model.frame_slice(e).start
         grown[shift : shift + 2] *= 1.001
-    K = model.n_terms
     o = np.asarray(model.origin)
     for axis in range(2):
         at = model.coefficient_slice(1, axis)
         grown[at] *= 1.001
         grown[at.start] -= 0.001 * o[axis]
-    assert K == 10
     values = log_marginal(
         problem,
         np.stack([theta, grown]),
@@ -198,6 +195,6 @@ def test_aberration_is_undone():
     with_factor, stars = problem_of(seen, dilation=dilation)
     without, _ = problem_of(seen)
     found = expand(with_factor, moved, NO_FALSE, stars)
-    assert np.sqrt(squares(with_factor, moved, found.stars).mean()) < 1e-6
+    assert np.sqrt(with_factor.squares(moved, found.stars).mean()) < 1e-6
     other = expand(without, moved, Mixture(1.0, 1e-300), without.mean_places(moved))
-    assert np.sqrt(squares(without, moved, other.stars).mean()) > 0.01
+    assert np.sqrt(without.squares(moved, other.stars).mean()) > 0.01
