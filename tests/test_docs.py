@@ -143,7 +143,7 @@ def _models(annotation: object) -> list[type[BaseModel]]:
 def _documented() -> tuple[set[tuple[str, str]], set[tuple[str, str]]]:
     """Section and key of all rows of the tables, and of all words in the text of these rows."""
     keys, words = set(), set()
-    for name in ("configuration.md", "campaign.md"):
+    for name in ("configuration.md", "campaign.md", "self_calibration.md"):
         section = ""
         for line in (DOCS / name).read_text(encoding="utf-8").splitlines():
             first, _, text = line.strip().strip("|").partition("|")

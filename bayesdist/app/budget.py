@@ -7,11 +7,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.campaign.session import session_of
 from bayesdist.app.judging import errors_of, products_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
+from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
 from bayesdist.assess.budget import TOTAL
 from bayesdist.assess.place_budget import PlaceBudget, place_budget

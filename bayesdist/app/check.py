@@ -7,12 +7,12 @@ from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bayesdist.app.campaign.check import campaign_lines
-from bayesdist.app.campaign.session import CampaignSession, session_of
 from bayesdist.app.config import load_config
+from bayesdist.app.dates import idle_dates
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number
 from bayesdist.app.session import Session
+from bayesdist.app.sessions import own_lines, session_of
 from bayesdist.app.stages import rehearse
 from bayesdist.app.trust import warnings_of
 from bayesdist.infer import Limits
@@ -51,8 +51,7 @@ def check(path: str | Path) -> str:
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
     with closing(session_of(run)) as session:
-        campaign = isinstance(session, CampaignSession)
-        return "\n".join(campaign_lines(session) if campaign else _lines(session))
+        return "\n".join(own_lines(session) or _lines(session))
 
 
 def _lines(session: Session) -> Iterator[str]:
@@ -82,7 +81,8 @@ def _lines(session: Session) -> Iterator[str]:
         f"chi2/dof {number(fit.chi2 / max(fit.dof, 1))}; {fit.n_rejected} rows rejected"
     )
     yield _cost(session)
-    for text in warnings_of(session):
+    idle = idle_dates(session.config, session.config.requirements())
+    for text in (*warnings_of(session), *([idle] if idle else [])):
         yield f"WARNING      {text}"
 
 

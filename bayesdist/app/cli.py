@@ -6,10 +6,9 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import closing
 
 from bayesdist.app.screen import start_logging
-from bayesdist.errors import BayesdistError
+from bayesdist.errors import BayesdistError, InputError
 
 __all__ = ["main"]
 
@@ -134,10 +133,14 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--epoch", type=float, metavar="T", help="decimal years")
     sub.add_argument("--magnitude", type=float, metavar="M", help="adds the centroid's error")
 
-    sub = add("plan", _plan, "how many more exposures, and when, would meet the requirements")
-    sub.add_argument("run", metavar="RUN")
+    text = "how many more exposures would meet the requirements, or which dither pattern is best"
+    sub = add("plan", _plan, text)
+    text = "a run; or a file of dither patterns, to be compared without data"
+    sub.add_argument("run", metavar="RUN | PATTERNS.toml", help=text)
     sub.add_argument("--requirement", metavar="NAME", help="one of them; all by default")
     sub.add_argument("--epochs", nargs="+", type=float, default=[], metavar="T", help="dates")
+    text = "a new folder for the comparison of patterns"
+    sub.add_argument("-o", "--output", metavar="DIR", help=text)
 
     sub = add("inspect", _inspect, "what a product or a posterior holds, and what is wrong in it")
     sub.add_argument("file", metavar="FILE")
@@ -359,34 +362,11 @@ def _order(options: argparse.Namespace) -> None:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    from bayesdist.app.campaign.session import session_of
-    from bayesdist.app.config import load_requirements
-    from bayesdist.app.demo import margins_text
-    from bayesdist.app.horizon import write_horizons
-    from bayesdist.app.judging import assessed_horizons, margins_of
-    from bayesdist.app.margins import margin_rows, write_margins
-    from bayesdist.app.rundir import RunDirectory
-    from bayesdist.app.stages import require
+    from bayesdist.app.validate import validate
 
-    requirements = load_requirements(options.requirements)
-    with closing(session_of(RunDirectory.open(options.run))) as session:
-        require(session, "validate", ("fit", "sample"))
-        margins = margins_of(session, requirements)
-        horizons = assessed_horizons(session, requirements)
-        write_margins(session, margins)
-        write_horizons(session, horizons)
-        label = session.posterior.approximation
-    print(margins_text(margin_rows(margins)))
-    for m in margins:
-        if m.verdict != "met":
-            print(f"{m.requirement.name}: {m.verdict}: {m.reason}")
-        if m.remedy is not None:
-            print(f"{m.requirement.name}: {m.remedy.sentence}")
-    for one in horizons:
-        print(one.sentence)
-    if label:
-        print(f"WARNING: {label}")
-    return 0 if all(m.verdict == "met" for m in margins) else MISSED
+    text, met = validate(options.run, options.requirements)
+    print(text)
+    return 0 if met else MISSED
 
 
 def _budget(options: argparse.Namespace) -> None:
@@ -405,8 +385,24 @@ def _budget(options: argparse.Namespace) -> None:
 
 
 def _plan(options: argparse.Namespace) -> None:
+    from bayesdist.app.patterns.command import plan_patterns
     from bayesdist.app.plan import plan
 
+    if options.run.endswith(".toml"):
+        if options.requirement or options.epochs:
+            raise InputError(
+                "dither patterns are compared without requirements and dates",
+                where=options.run,
+                do="leave --requirement and --epochs out, or give a run",
+            )
+        print(plan_patterns(options.run, options.output, options.line))
+        return
+    if options.output:
+        raise InputError(
+            "the plan of a run writes no files",
+            where=options.run,
+            do="leave -o out, or give a file of dither patterns (PATTERNS.toml)",
+        )
     print(plan(options.run, name=options.requirement, epochs=options.epochs))
 
 

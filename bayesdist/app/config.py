@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +21,7 @@ from bayesdist.app.config_errors import as_config_error
 from bayesdist.app.holdout_config import HoldoutBlock
 from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.section import Section
+from bayesdist.app.selfcal.config import GaugeBlock, SelfcalBlock
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.assess.linear_term import LINEAR_KINDS, LinearTerm
@@ -31,7 +33,20 @@ from bayesdist.infer.period_dates import check_periods, mjd_periods
 from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
 from bayesdist.products.wise_meta import ARRAYS
 
-__all__ = ["Config", "load_config", "load_requirements", "load_text", "parse_config"]
+__all__ = [
+    "ChipBlock",
+    "Config",
+    "Detector",
+    "chips_of",
+    "load_config",
+    "load_requirements",
+    "load_text",
+    "parse_config",
+    "reference_first",
+    "require_detector",
+    "require_own_names",
+    "validated",
+]
 
 Pair = tuple[PositiveFloat, PositiveFloat]
 Unit = Literal["pix", "arcsec", "mas", "deg"]
@@ -83,6 +98,56 @@ class ChipBlock(Section):
     size: Pair
     reference_pixel: Pair
     reference: bool = False
+
+
+def require_detector(
+    chips: Sequence[ChipBlock], detector: Detector, reference_pixel: Pair | None
+) -> None:
+    """Refuse chips that contradict each other, or no detector at all.
+
+    Raises
+    ------
+    ValueError
+        As validators raise it.
+    """
+    if sum(c.reference for c in chips) > 1:
+        raise ValueError("reference = true stands in several [[chip]] blocks; keep it in one")
+    for key in ("number", "name"):
+        values = [getattr(c, key) for c in chips]
+        twice = next((v for v in values if values.count(v) > 1), None)
+        if twice is not None:
+            raise ValueError(f"two [[chip]] blocks have the {key} {twice!r}; give each its own")
+    if chips and (detector.size or reference_pixel):
+        raise ValueError(
+            "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
+            "give one of the two"
+        )
+    if not chips and detector.size is None:
+        raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
+
+
+def reference_first(chips: Sequence[ChipBlock]) -> list[ChipBlock]:
+    """The blocks with the reference chip in front: it defines the frame."""
+    return sorted(chips, key=lambda c: not c.reference)
+
+
+def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
+    """Chips of the model."""
+    blocks = reference_first(chips)
+    return tuple(Chip(c.number, c.name, c.size, c.reference_pixel) for c in blocks)
+
+
+def require_own_names(block: str, names: Sequence[str]) -> None:
+    """Refuse blocks of one name.
+
+    Raises
+    ------
+    ValueError
+        As validators raise it.
+    """
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"two [[{block}]] blocks have the name {twice!r}; give each its own")
 
 
 class Tdd(Section):
@@ -278,6 +343,8 @@ class Config(Section):
 
     data: Data | None = None
     campaign: CampaignBlock | None = None
+    selfcal: SelfcalBlock | None = None
+    gauge: GaugeBlock = GaugeBlock()
     tables: TablesBlock = TablesBlock()
     model: ModelBlock
     detector: Detector = Detector()
@@ -296,9 +363,10 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _data_or_campaign(self) -> Config:
-        if (self.data is None) == (self.campaign is None):
+        if sum(one is not None for one in (self.data, self.campaign, self.selfcal)) != 1:
             raise ValueError(
-                "a run begins with [data], matched stars, or with [campaign], star lists; give one"
+                "a run begins with [data], matched stars, with [campaign], star lists and a "
+                "catalogue, or with [selfcal], star lists alone; give one"
             )
         if self.campaign is None and self.products.release is not None:
             raise ValueError("products.release is of a [campaign]; ask for sip or idctab")
@@ -317,16 +385,61 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _alone_without_catalogue(self) -> Config:
+        if self.selfcal is None:
+            if self.gauge != GaugeBlock():
+                raise ValueError("[gauge] is of a [selfcal]; leave it out")
+            return self
+        if self.model.frames != "none":
+            raise ValueError(
+                "a [selfcal] has frames of its own; leave model.frames out and set selfcal.frames"
+            )
+        # what a self-calibration does otherwise or not at all
+        others: dict[str, tuple[object, object, str]] = {
+            "tables": (self.tables, TablesBlock(), "leave it out"),
+            "periods": (self.periods, None, "leave it out"),
+            "holdout": (self.holdout, None, "leave it out"),
+            "fit": (self.fit, Fit(), "leave it out"),
+            "compute": (self.compute, ComputeBlock(), "leave it out"),
+            "products.wise_meta": (self.products.wise_meta, False, "ask for sip or idctab"),
+            "outliers.match_radius": (
+                self.outliers.match_radius,
+                None,
+                "set selfcal.match_radius",
+            ),
+            "sampler.method": (self.sampler.method, "exact", "leave it out"),
+            "sampler.walkers": (self.sampler.walkers, None, "leave it out"),
+        }
+        for key, (value, default, do) in others.items():
+            if value != default:
+                raise ValueError(f"{key} has no meaning in a [selfcal]; {do}")
+        if self.outliers.model == "none":
+            raise ValueError(
+                "outliers.model is 'none', and in a [selfcal] false detections are uniform within "
+                "the match radius; leave it out"
+            )
+        if self.gauge.exposure_scale_sigma is not None and "scale" not in self.selfcal.frames:
+            raise ValueError(
+                "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
+                "selfcal.frames to 'shift_rotation_scale'"
+            )
+        if self._needs_scale and self.detector.scale_mas is None:
+            raise ValueError(
+                "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
+            )
+        return self
+
+    @property
+    def _needs_scale(self) -> bool:
+        """Whether a self-calibration has to know what a pixel is on the sky."""
+        assert self.selfcal is not None
+        angles = self.gauge.scale is not None or self.gauge.reference is not None
+        return angles or self.selfcal.unit != "pix"
+
+    @model_validator(mode="after")
     def _names_of_their_own(self) -> Config:
-        for what, names in (
-            ("budget", [b.name for b in self.budget]),
-            ("requirement", [r.name for r in self.requirement]),
-        ):
-            twice = next((name for name in names if names.count(name) > 1), None)
-            if twice is not None:
-                raise ValueError(
-                    f"two [[{what}]] blocks have the name {twice!r}; give each its own"
-                )
+        require_own_names("budget", [b.name for b in self.budget])
+        require_own_names("requirement", [r.name for r in self.requirement])
         taken = next((b.name for b in self.budget if b.name in MEASURED_TERMS), None)
         if taken is not None:
             raise ValueError(
@@ -355,20 +468,7 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _chips_or_detector(self) -> Config:
-        if sum(c.reference for c in self.chip) > 1:
-            raise ValueError("reference = true stands in several [[chip]] blocks; keep it in one")
-        for key in ("number", "name"):
-            values = [getattr(c, key) for c in self.chip]
-            twice = next((v for v in values if values.count(v) > 1), None)
-            if twice is not None:
-                raise ValueError(f"two [[chip]] blocks have the {key} {twice!r}; give each its own")
-        if self.chip and (self.detector.size or self.model.reference_pixel):
-            raise ValueError(
-                "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
-                "give one of the two"
-            )
-        if not self.chip and self.detector.size is None:
-            raise ValueError("detector.size is missing; give it, or [[chip]] blocks")
+        require_detector(self.chip, self.detector, self.model.reference_pixel)
         return self
 
     @model_validator(mode="after")
@@ -398,9 +498,7 @@ class Config(Section):
 
     def chips(self) -> tuple[Chip, ...]:
         """Chips of the model; empty for a detector of one chip."""
-        # the reference chip stands first: it defines the frame
-        blocks = sorted(self.chip, key=lambda c: not c.reference)
-        return tuple(Chip(c.number, c.name, c.size, c.reference_pixel) for c in blocks)
+        return chips_of(self.chip)
 
     def time(self) -> TimeDependence | None:
         """Time dependence of the model."""
@@ -461,6 +559,11 @@ class Config(Section):
         held = {b.name for b in self.budget if b.in_residuals}
         return tuple(t for t in self.user_terms() if t.name in held)
 
+    def held_in_residuals(self, unit: str) -> list[tuple[str, float, float]]:
+        """Name and standard deviation on each axis of these terms, in the unit of u and v."""
+        scale = self.detector.scale_mas
+        return [(t.name, *t.sigma(unit, scale)) for t in self.in_residuals()]
+
     def requirements(self) -> tuple[Requirement, ...]:
         """The requirements."""
         return tuple(Requirement(**r.model_dump()) for r in self.requirement)
@@ -494,7 +597,7 @@ def load_config(path: str | Path) -> tuple[Config, str]:
 
 def parse_config(text: str, where: str) -> Config:
     """A configuration from the text of a file; `where` names it in errors."""
-    config = _validated(Config, text, where)
+    config = validated(Config, text, where, begin="write one by 'bayesdist init'")
     try:
         config.time()
         config.mixture()
@@ -513,7 +616,8 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
     ------
     ConfigError
     """
-    blocks = _validated(_RequirementFile, load_text(path), str(path)).requirement
+    text, begin = load_text(path), "give it [[requirement]] blocks"
+    blocks = validated(_RequirementFile, text, str(path), begin=begin).requirement
     try:
         return tuple(Requirement(**r.model_dump()) for r in blocks)
     except InputError as error:
@@ -537,13 +641,30 @@ def load_text(path: str | Path) -> str:
         ) from error
 
 
-def _validated(kind: type[Section], text: str, where: str) -> Any:
+def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
+    """A file of sections from its text.
+
+    Parameters
+    ----------
+    kind : type of Section
+    text : str
+    where : str
+        The file, for errors.
+    begin : str
+        What to do about an empty one.
+
+    Raises
+    ------
+    ConfigError
+    """
     try:
         raw = tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(
             f"is not valid TOML ({error})", where=where, do="correct it there"
         ) from error
+    if not raw:
+        raise ConfigError("holds no settings", where=where, do=begin)
     try:
         # by way of JSON: there arrays may become tuples, but no text a number
         return kind.model_validate_json(json.dumps(raw, default=str), strict=True)

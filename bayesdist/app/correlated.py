@@ -7,6 +7,7 @@ common, make errors of coefficients that no posterior of independent stars shows
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.fingerprint import fingerprint_of
 from bayesdist.assess.centroid import without
+from bayesdist.assess.mean_square import MeanSquare
 from bayesdist.assess.residual_correlation import residual_correlation
 from bayesdist.assess.terms import LocalTerm
 from bayesdist.assess.unmodelled import Unmodelled, unmodelled
@@ -29,6 +31,7 @@ from bayesdist.infer.robust import (
     recommended_cells,
     robust_covariance,
 )
+from bayesdist.model import DistortionModel
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
@@ -65,9 +68,9 @@ class SharedErrors:
     formal : ndarray, shape (D, D)
     facts : dict
         As in summary.json: ratio {value, error, p_value}, exceeds, statement, doubts, cells_pix,
-        reach_pix, unmodelled [{chip, rms_u, rms_v, error_u, error_v, beside_u,
-        beside_v, found}]: what comes beside the coefficients' errors is less than the structure, as
-        the fit was drawn towards it.
+        reach_pix, patch_pix, unmodelled [{chip, rms_u, rms_v, error_u, error_v, beside {square_u,
+        square_v, error_u, error_v}, found}]: the mean squares that come beside the coefficients'
+        errors are less than the structure's, as the fit was drawn towards it.
     """
 
     cov: Float
@@ -80,9 +83,14 @@ class SharedErrors:
         return bool(self.facts["exceeds"])
 
     @property
+    def at_place(self) -> bool:
+        """Whether the model leaves something out at a place."""
+        return any(one["found"] for one in self.facts["unmodelled"])
+
+    @property
     def found(self) -> bool:
         """Whether stars have errors in common, of either kind."""
-        return self.exceeds or any(one["found"] for one in self.facts["unmodelled"])
+        return self.exceeds or self.at_place
 
     @property
     def trusted(self) -> bool:
@@ -120,24 +128,25 @@ class SharedErrors:
 
     def of_centroids(self, errors: MagnitudeErrors | None) -> MagnitudeErrors | None:
         """Scatter by magnitude without what is left out at a place, which is a term of its own."""
-        found = [one for one in self.facts["unmodelled"] if one["found"]]
-        if errors is None or not found:
+        if errors is None or not self.at_place:
             return errors
-        n = len(self.facts["unmodelled"])  # stars are on all chips
-        u, v = (np.sqrt(sum(one[f"rms_{axis}"] ** 2 for one in found) / n) for axis in "uv")
+        left = self.facts["unmodelled"]  # stars are on all chips
+        u, v = (np.sqrt(np.mean([one[f"rms_{axis}"] ** 2 for one in left])) for axis in "uv")
         return without(errors, u, v)
 
     def local_term(self, grid: tuple[int, int]) -> tuple[LocalTerm, ...]:
         """What is left out at a place, as a term of the budget; nothing where none is found."""
-        if not any(one["found"] for one in self.facts["unmodelled"]):
+        if not self.at_place:
             return ()
-        sigma, relative = {}, []
+        squares = {}
         for one in self.facts["unmodelled"]:
-            rms = np.array([one.get(f"beside_{a}", one[f"rms_{a}"]) for a in "uv"]) * one["found"]
-            sigma[one["chip"]] = np.tile(rms, (grid[1], grid[0], 1))
-            if rms.any():
-                relative.append(np.hypot(one["error_u"], one["error_v"]) / np.hypot(*rms))
-        return (LocalTerm(UNMODELLED, sigma, float(max(relative, default=0.0))),)
+            beside = one["beside"]
+            square, error = (
+                np.array([beside[f"{kind}_{a}"] for a in "uv"]) for kind in ("square", "error")
+            )
+            squares[one["chip"]] = MeanSquare(square, error)
+        sigma = {c: np.tile(np.sqrt(s.mean), (grid[1], grid[0], 1)) for c, s in squares.items()}
+        return (LocalTerm(UNMODELLED, sigma, squares=squares),)
 
 
 def measure_shared_errors(session: Session) -> None:
@@ -225,6 +234,7 @@ def facts_of(
         "doubts": doubts,
         "cells_pix": list(robust.cells.sides(model)),
         "reach_pix": _reach(session),
+        "patch_pix": _patch(model, left),
         "unmodelled": [_row(one, robust.exceeds) for one in left],
     }
 
@@ -244,18 +254,35 @@ def _reach(session: Session) -> float:
     return max(out)
 
 
+def _patch(model: DistortionModel, left: Sequence[Unmodelled]) -> float:
+    """Side of patches that err as one and draw the fit as far as was measured; 0 where unknown.
+
+    With P terms, independent patches of side a and mean square S draw positions on an area A by
+    S P a^2 / A on the mean.
+    """
+    found = [0.0]
+    for one in left:
+        chip, structure = model.chips[model.chip_code(one.chip)], one.variance.sum()
+        if structure > 0:
+            area = np.prod(chip.size) / model.basis(chip.number).n_terms
+            found.append(float(np.sqrt(one.drawn.sum() / structure * area)))
+    return max(found)
+
+
 def _row(one: Unmodelled, exceeds: bool) -> dict[str, Any]:
     u, v = (float(r) for r in one.rms)
     error_u, error_v = (float(e) for e in one.rms_error)
-    beside_u, beside_v = (float(r) for r in one.rms_beside)
     return {
         "chip": one.chip,
         "rms_u": u,
         "rms_v": v,
         "error_u": error_u,
         "error_v": error_v,
-        "beside_u": beside_u,
-        "beside_v": beside_v,
+        "beside": {
+            f"{kind}_{axis}": float(value)
+            for kind, values in (("square", one.beside.measured), ("error", one.beside.error))
+            for axis, value in zip("uv", values, strict=True)
+        },
         # where cells have shown that there is something, it is as large as it was measured
         "found": bool(one.found.any() or (exceeds and one.rms.any())),
     }

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import QTable
 
+from bayesdist.app.margins import requirement_of
 from bayesdist.app.run import run
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
@@ -202,11 +203,13 @@ def results_text(session: Session) -> str:
 
 
 def margins_text(rows: list[dict]) -> str:
-    """Margins as a table for the screen."""
+    """Margins as a table for the screen; what the statistic is of, where that is said of one."""
+    scopes = [requirement_of(r).scope for r in rows]
     shown = [
         {
             "requirement": r["name"],
             "statistic": r["statistic"],
+            **({"scope": scope or "-"} if any(scopes) else {}),
             "value": r["value"],
             "limit": r["limit"],
             "unit": r["unit"],
@@ -214,6 +217,6 @@ def margins_text(rows: list[dict]) -> str:
             "asked": r["probability"],
             "verdict": r["verdict"],
         }
-        for r in rows
+        for r, scope in zip(rows, scopes, strict=True)
     ]
     return table_text(shown, 3)

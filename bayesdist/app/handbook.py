@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from astropy.table import Table
 
 from bayesdist.app.applied import Applied, applied
-from bayesdist.app.campaign.session import session_of
 from bayesdist.app.folder import whole_folder
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
+from bayesdist.app.sessions import session_of
 from bayesdist.assess.detector_numbers import detector_numbers
 from bayesdist.assess.whole_detector import WholeDetector
 from bayesdist.errors import InputError

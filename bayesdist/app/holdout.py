@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.kept import kept
+from bayesdist.assess.grid import grid_pixels
 from bayesdist.assess.holdout import LEAST_HELD, HeldOutTruth, held_out_truth
+from bayesdist.assess.holdout_predictive import Predictive, predictive_of
 from bayesdist.data.holdout import SetAside, Split, exposures_drawn, split_matches
 from bayesdist.errors import InputError
+from bayesdist.model import LookupTable
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
     from bayesdist.infer import Matches
 
-__all__ = ["held_out_of", "holdout_summary", "holdout_table", "split_of", "whole_exposures"]
+__all__ = [
+    "held_out_of",
+    "holdout_summary",
+    "holdout_table",
+    "local_errors",
+    "predictive_of_run",
+    "split_of",
+    "whole_exposures",
+]
 
 
 def whole_exposures(session: Session, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -87,6 +99,34 @@ def held_out_of(session: Session, *, anew: bool = False) -> HeldOutTruth | None:
         return held_out_truth(session.predictive, held, whole=whole)
 
     return kept(session, "held_out_truth", judged, anew=anew)
+
+
+def predictive_of_run(session: Session) -> Predictive:
+    """The solution as it is assessed, as it predicts.
+
+    Quoted errors and jitter hold what the model leaves out at a place, as each star errs by it;
+    neighbours err by it together.
+    """
+    found, shared = predictive_of(session.solution), session.shared_errors
+    if shared is None or not shared.at_place or not shared.facts["patch_pix"]:
+        return found
+    side = shared.facts["patch_pix"]
+    return replace(found, local=local_errors(session), cell=(side, side), local_in_noise=True)
+
+
+def local_errors(session: Session) -> tuple[LookupTable, ...]:
+    """Errors of positions that belong to places on the detector, as tables of their own."""
+    terms, out = session.local_terms, []
+    for chip in session.posterior.model.chips:
+        parts = [term.sigma[chip.number] for term in terms if chip.number in term.sigma]
+        if not parts:
+            continue
+        x, y = grid_pixels(chip.size, session.config.assess.grid)
+        sigma = np.sqrt(sum(part**2 for part in parts))
+        step = (float(x[1] - x[0]), float(y[1] - y[0]))
+        values = np.moveaxis(np.asarray(sigma), 2, 0)
+        out.append(LookupTable(chip.number, values, first=(float(x[0]), float(y[0])), step=step))
+    return tuple(out)
 
 
 def holdout_table(found: HeldOutTruth) -> Table:

@@ -21,6 +21,7 @@ def sip_of(session: Session, solution: Solution, chip: int) -> SipHeader:
         linear=sip.linear,
         crval=sip.crval,
         scale_arcsec=session.scale_arcsec,
+        notes=_notes(session),
     )
 
 
@@ -39,5 +40,13 @@ def idctab_of(session: Session, solution: Solution) -> IdcTab:
     idc = session.config.products.idctab
     assert idc is not None
     return idctab_from_solution(
-        solution, scale_arcsec=session.scale_arcsec, **idc.model_dump(exclude_none=True)
+        solution,
+        scale_arcsec=session.scale_arcsec,
+        history=_notes(session),
+        **idc.model_dump(exclude_none=True),
     )
+
+
+def _notes(session: Session) -> list[str]:
+    """What a file has to say of the run it is from."""
+    return [session.gauge_words] if session.gauge_words else []

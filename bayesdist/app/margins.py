@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from bayesdist.app.session import Session, write_table
 from bayesdist.app.trust import labelled, trust
 from bayesdist.assess import Margin, Requirement
 
-__all__ = ["judged_requirements", "margin_rows", "write_margins"]
+__all__ = ["judged_requirements", "margin_rows", "requirement_of", "write_margins"]
 
 # of what a requirement is, beside chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
@@ -69,12 +70,14 @@ def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
 
 def judged_requirements(run: RunDirectory) -> tuple[Requirement, ...]:
     """The requirements behind the margins in summary.json."""
+    return tuple(requirement_of(row) for row in run.summary.get("margins", []))
+
+
+def requirement_of(row: Mapping[str, Any]) -> Requirement:
+    """The requirement behind one row of the margins in summary.json."""
     keys = ("name", "statistic", "limit", "unit", "probability", "epoch", "chip", *SCOPE)
-    out = []
-    for row in run.summary.get("margins", []):
-        # runs of earlier versions had one chip and named none, and no part of it
-        known = {k: row[k] for k in keys if row.get(k) is not None}
-        if "epochs" in known:
-            del known["epoch"]  # the worst one of them
-        out.append(Requirement(**known))
-    return tuple(out)
+    # runs of earlier versions had one chip and named none, and no part of it
+    known = {k: row[k] for k in keys if row.get(k) is not None}
+    if "epochs" in known:
+        del known["epoch"]  # the worst one of them
+    return Requirement(**known)

@@ -23,8 +23,9 @@ from bayesdist.assess.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison_table import comparison_table, difference_table
 from bayesdist.assess.misfit import Misfit, worst_misfit
 from bayesdist.assess.units import convert, pixel_scale_of
+from bayesdist.data import input_files, sha256_of
 from bayesdist.errors import InputError
-from bayesdist.infer import Matches, Posterior, load_posterior
+from bayesdist.infer import Matches, Posterior
 from bayesdist.infer.change_date import PeriodScore, period_scores, scan_dates
 from bayesdist.infer.membership import count_outliers
 from bayesdist.infer.monitoring import NewFit, change_of, fit_new
@@ -61,12 +62,12 @@ def monitor(
     Raises
     ------
     InputError
-        For a run that is none, or has no posterior; as `read_matches`, `read_new_exposures` and
-        `fit_new`.
+        For a run that is none, or has no posterior; for matches that this was made from; as
+        `read_matches`, `read_new_exposures` and `fit_new`.
     """
     directory = RunDirectory(run)
     if not (directory / "run.json").exists():
-        raise InputError("is no run", where=str(run), do="give the folder of 'bayesdist run'")
+        raise directory.no_run()
     config = directory.config
     posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
     try:
@@ -106,7 +107,13 @@ def _fitted(
         exposures = read_new_exposures(session, new)
         found = fit_exposures_of(session, exposures)
         return exposures.released, exposures.matches, found, exposures.left_out
-    posterior = load_posterior(run / "posterior.nc")
+    if config.selfcal is not None:
+        raise InputError(
+            "is a run of a self-calibration, whose sky no new matches are on",
+            where=str(run.path),
+            do="calibrate the new exposures by themselves, and use 'bayesdist compare'",
+        )
+    posterior = Session(run).signed
     matches = _new_matches(run, config, new)
     found = fit_new(
         posterior,
@@ -133,7 +140,15 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
         data, path, size = config.data, new, config.detector.size
         if not new.exists():
             raise InputError("there is no such file", where=str(new), do="check the name")
+        if (new / "run.json").exists():
+            itself = new.resolve() == run.path.resolve()
+            raise InputError(
+                "is the released run itself" if itself else "is a run, and not matches",
+                where=str(new),
+                do="give a file of new matches, or a configuration whose [data] names it",
+            )
     assert data is not None
+    _refuse_the_same(run, path)
     if data.format == "rvb" and size is not None:
         matches: Matches = load_rvb(path, data, size)
     else:
@@ -148,6 +163,18 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
             do="give data.sigma another value",
         )
     return matches.with_errors_by_magnitude(errors)
+
+
+def _refuse_the_same(run: RunDirectory, path: Any) -> None:
+    """Refuse matches that the release was made from, under whatever name: they cannot test it."""
+    seen = set(run.record["inputs"].values())
+    for file in input_files(path):
+        if sha256_of(file) in seen:
+            raise InputError(
+                "these are matches that the release was made from, and say nothing new of it",
+                where=str(file),
+                do="give matches that were not in its fit",
+            )
 
 
 def _reading(data: Data) -> dict[str, Any]:

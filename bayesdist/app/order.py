@@ -69,9 +69,10 @@ def order(
             do=f"give the lowest and the highest, between 1 and {MAX_ORDER}",
         )
     config, text = load_config(path)
-    if config.campaign is not None:
+    if config.data is None:
+        kind = "campaign" if config.campaign is not None else "selfcal"
         raise InputError(
-            "orders are compared on matched stars, and this is a [campaign]",
+            f"orders are compared on matched stars, and this is a [{kind}]",
             where=str(path),
             do="give a configuration with [data]",
         )

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.campaign.session import session_of
 from bayesdist.app.horizon import last_epoch
 from bayesdist.app.judging import probability_met
 from bayesdist.app.margins import judged_requirements
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
+from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
 from bayesdist.assess.planning import Schedule, exposures_needed
 from bayesdist.assess.requirement import Requirement
@@ -51,6 +51,12 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
     """
     with closing(session_of(RunDirectory.open(run))) as session:
         require(session, "plan", ("fit", "sample", "assess"))
+        if session.config.selfcal is not None:
+            raise InputError(
+                "is a run of a self-calibration, where an exposure is worth what it overlaps",
+                where=str(run),
+                do="plan with matched stars",
+            )
         requirements = judged_requirements(session.run)
         chosen = [r for r in requirements if name is None or r.name == name]
         if not chosen:

@@ -12,11 +12,12 @@ import numpy as np
 from bayesdist.app.campaign.filter_figures import draw_filters
 from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.campaign.release import write_files
-from bayesdist.app.campaign.session import CampaignSession, session_of
+from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.folder import whole_folder
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
+from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError

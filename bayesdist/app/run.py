@@ -6,13 +6,12 @@ import logging
 from contextlib import closing
 from pathlib import Path
 
-from bayesdist.app.campaign.session import CampaignSession, session_of
-from bayesdist.app.campaign.stages import CAMPAIGN_STAGES, rehearse_campaign
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import log_file, progress_bar
 from bayesdist.app.session import STAGES, Session
-from bayesdist.app.stages import NEEDS, rehearse, require, run_stage
+from bayesdist.app.sessions import own_stages, rehearse_run, session_of
+from bayesdist.app.stages import NEEDS, require, run_stage
 from bayesdist.errors import InputError, NotConvergedError
 
 __all__ = ["continue_stage", "run"]
@@ -74,7 +73,7 @@ def run(
         with log_file(directory / "bayesdist.log"):
             redo = False
             for stage in STAGES:
-                if stage == "match" and settings.campaign is None:
+                if stage == "match" and stage not in own_stages(session):
                     continue
                 if directory.done(stage) and not redo:
                     log.info("%s: done before", stage)
@@ -94,12 +93,12 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     """
     directory = RunDirectory.open(path)
     with closing(session_of(directory)) as session:
-        campaign = session.config.campaign is not None
-        if stage == "match" and not campaign:
+        listed = "match" in own_stages(session)
+        if stage == "match" and not listed:
             raise InputError(
                 "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
             )
-        require(session, stage, ("match",) if campaign and stage == "fit" else NEEDS[stage])
+        require(session, stage, ("match",) if listed and stage == "fit" else NEEDS[stage])
         _begin(session)
         with log_file(directory / "bayesdist.log"):
             _run_stage(session, stage)
@@ -113,10 +112,7 @@ def _begin(session: Session) -> None:
     if session.run.begun:
         session.run.follow()
         return
-    if isinstance(session, CampaignSession):
-        rehearse_campaign(session)
-    else:
-        rehearse(session)
+    rehearse_run(session)
     session.run.begin()
     session.begun()
 
@@ -124,8 +120,7 @@ def _begin(session: Session) -> None:
 def _run_stage(session: Session, stage: str) -> None:
     with progress_bar(stage) as progress:
         session.progress = progress if stage == "sample" else None
-        campaign = isinstance(session, CampaignSession)
-        run_stage(session, stage, CAMPAIGN_STAGES.get(stage) if campaign else None)
+        run_stage(session, stage, own_stages(session).get(stage))
 
 
 def _judge(session: Session, strict: bool) -> None:

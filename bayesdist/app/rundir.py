@@ -20,6 +20,7 @@ import numpy as np
 from bayesdist import __version__
 from bayesdist.app.campaign.files import campaign_files
 from bayesdist.app.config import Config, load_config, load_text
+from bayesdist.app.selfcal.files import selfcal_files
 from bayesdist.app.star_files import FOLDER, PAIRS, part_files
 from bayesdist.data import atomic_path, input_files, is_leftover, remove_leftovers, sha256_of
 from bayesdist.data.files import made_folder
@@ -34,8 +35,9 @@ PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 # and nothing else
 OWN_FILES = re.compile(
     r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
-    r"posterior\.nc|(coefficients|budget|margins|periods|holdout|matching|series|drift)\.ecsv|maps\.fits|"
-    r"(tables|hierarchy|exposure_terms|catalogue_errors)\.h5|summary\.json|report\.(html|md)"
+    r"posterior\.nc|(coefficients|budget|margins|periods|holdout|matching|series|drift|gauge|stars)\.ecsv|maps\.fits|"
+    r"(tables|hierarchy|exposure_terms|catalogue_errors|detections|solution)\.h5|stars\.parquet|"
+    r"summary\.json|report\.(html|md)"
 )
 
 
@@ -220,10 +222,22 @@ class RunDirectory:
         if (run / "config.toml").exists():
             config, text = load_config(run / "config.toml")
             return cls.plan(path, config, text, run.path)
-        raise InputError(
-            "is no run: it has neither run.json nor config.toml",
-            where=str(path),
-            do="make one with 'bayesdist run CONFIG.toml -o RUN'",
+        raise run.no_run()
+
+    def no_run(self) -> InputError:
+        """What to say of a place that holds no run; a demo has its run in a folder of its own."""
+        within = self / "run"
+        cause = "is no run: it has neither run.json nor config.toml"
+        if not self.path.exists():
+            cause = "there is no such folder"
+        elif not self.path.is_dir():
+            cause = "is a file, not the folder of a run"
+        return InputError(
+            cause,
+            where=str(self.path),
+            do=f"give {within}, which is one"
+            if (within / "run.json").exists()
+            else "make one with 'bayesdist run CONFIG.toml -o RUN'",
         )
 
     def _refuse_inside_input(self, config: Config, base: Path) -> None:
@@ -356,6 +370,12 @@ class RunDirectory:
         """Whether a stage has ended well."""
         return stage in self.record["stages"]
 
+    def outdate(self, stage: str) -> None:
+        """Note that a stage has to be run again, as what it shows has changed."""
+        record = self.record
+        if record["stages"].pop(stage, None) is not None:
+            self.write_record(record)
+
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Time a stage, and note it as done when the block ends well."""
@@ -390,6 +410,8 @@ class RunDirectory:
 def _named(config: Config, base: Path) -> Path | list[Path]:
     if config.campaign is not None:
         return campaign_files(config, base)
+    if config.selfcal is not None:
+        return selfcal_files(config, base)
     assert config.data is not None
     names = config.data.matches
     return base / names if isinstance(names, str) else [base / name for name in names]

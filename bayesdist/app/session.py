@@ -14,7 +14,7 @@ from astropy.table import Table
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.app.correlated import SharedErrors, kept_shared_errors, measure_shared_errors
-from bayesdist.app.holdout import split_of
+from bayesdist.app.holdout import predictive_of_run, split_of
 from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.rvb import RvbInput
@@ -34,9 +34,10 @@ from bayesdist.assess import (
 from bayesdist.assess.centroid import centroid_scatter
 from bayesdist.assess.coverage import Coverage, coverage_of
 from bayesdist.assess.field_terms import FieldTerm
-from bayesdist.assess.holdout_predictive import Predictive, predictive_of
+from bayesdist.assess.holdout_predictive import Predictive
 from bayesdist.assess.majority import majority_sentence
 from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
+from bayesdist.assess.solution import Solution
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.data.holdout import Split
 from bayesdist.infer import (
@@ -94,8 +95,8 @@ class Session:
 
     @property
     def predictive(self) -> Predictive:
-        """The posterior as it predicts stars that are held out."""
-        return predictive_of(self.posterior)
+        """The solution as it predicts stars that are held out."""
+        return predictive_of_run(self)
 
     @property
     def held_matches(self) -> Matches | None:
@@ -249,6 +250,11 @@ class Session:
         """What is assessed, exported and shown: all errors of the parameters are in its draws."""
         return self.systematics.solution
 
+    @property
+    def signed(self) -> Posterior:
+        """The same, from what the run's folder holds: data are not needed."""
+        return self.solution
+
     @cached_property
     def field_terms(self) -> tuple[FieldTerm, ...]:
         """Errors that are fields over the detector: those of the run, then the user's."""
@@ -257,8 +263,7 @@ class Session:
     @cached_property
     def centroid(self) -> MagnitudeErrors | None:
         """Errors of the centroids by magnitude, where the stars have magnitudes."""
-        unit, scale = self.posterior.model.unit, self.config.detector.scale_mas
-        held = [(t.name, *t.sigma(unit, scale)) for t in self.config.in_residuals()]
+        held = self.config.held_in_residuals(self.posterior.model.unit)
         errors = centroid_scatter(self.stars, held, n_params=self.posterior.model.n_params)
         found = self.shared_errors
         return errors if found is None else found.of_centroids(errors)
@@ -268,6 +273,16 @@ class Session:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
         found = self.shared_errors
         return [found.sentence] if found is not None and found.sentence else []
+
+    @property
+    def gauge_words(self) -> str:
+        """In which gauge the products stand, as a sentence; empty where that is no question."""
+        return ""
+
+    @property
+    def relative(self) -> Solution | None:
+        """The solution of relative positions, where the gauge is no part of it."""
+        return None
 
     @property
     def local_terms(self) -> tuple[LocalTerm, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.periods import periods_of
 from bayesdist.app.session import Session
+from bayesdist.errors import InputError
 
 __all__ = ["labelled", "posterior_warnings", "trust", "warnings_of"]
 
@@ -46,8 +47,8 @@ def trust(session: Session) -> dict[str, bool]:
 
 def labelled(session: Session) -> dict[str, str]:
     """What must be said of draws that are not exact, for the head of a file."""
-    label = session.posterior.approximation
-    return {"posterior": label} if label else {}
+    label, gauge = session.posterior.approximation, session.gauge_words
+    return ({"posterior": label} if label else {}) | ({"gauge": gauge} if gauge else {})
 
 
 def posterior_warnings(session: Session) -> list[str]:
@@ -60,5 +61,17 @@ def posterior_warnings(session: Session) -> list[str]:
     out = [label[0].upper() + label[1:]] if label else []
     if held is not None and held.level != "pass":
         out.append(held.verdict[0].upper() + held.verdict[1:])
-    out += warnings_of(session)
+    out += [*warnings_of(session), *_contradictions(session)]
     return [*out, periods.verdict.rstrip(".")] if periods and periods.matters else out
+
+
+def _contradictions(session: Session) -> list[str]:
+    """What the user says of the residuals, and they contradict."""
+    if not session.config.in_residuals():
+        return []
+    try:
+        _ = session.centroid
+    except InputError as error:
+        what = f"{error.where}: {error.cause}, so that no budget of single positions can be made"
+        return [what[0].upper() + what[1:]]
+    return []

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
+from bayesdist.assess.mean_square import MeanSquare
 from bayesdist.assess.node_cells import NodeCells
 from bayesdist.errors import DegenerateError
 from bayesdist.model import Chip
@@ -58,26 +58,9 @@ class BetweenNodes:
     n_pairs: int
 
     @property
-    def variance(self) -> Float:
-        """What the mean square is expected to be (2,), given that it is not negative.
-
-        The mean of N(square, error^2) cut off below zero.
-        """
-        return self._moments[0]
-
-    @property
-    def relative_error(self) -> float:
-        """How well the radial rms is known, relative to its size."""
-        mean, variance = self._moments
-        return float(np.sqrt(variance.sum()) / (2 * mean.sum()))
-
-    @property
-    def _moments(self) -> tuple[Float, Float]:
-        z = self.square / self.error
-        # density over probability, in logarithms: z is far below zero where errors are too small
-        ratio = np.exp(norm.logpdf(z) - norm.logcdf(z))
-        mean = self.error * (z + ratio)
-        return mean, self.error**2 * np.maximum(1 - ratio * (z + ratio), 0.0)
+    def left(self) -> MeanSquare:
+        """What the mean squares may be, given that they are not negative."""
+        return MeanSquare(self.square, self.error)
 
 
 def between_nodes(

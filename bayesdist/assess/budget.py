@@ -307,7 +307,9 @@ def _budget(
     ]
     n_parts = len(entries)
     entries += [
-        BudgetTerm(t.name, LOCAL, *t.on(fields.chip, shape), t.source, t.relative_error)
+        BudgetTerm(
+            t.name, LOCAL, *t.on(fields.chip, shape), t.source, t.relative_error(fields.chip)
+        )
         for t in local
     ]
     for t, (su, sv) in zip(terms, sigmas, strict=True):

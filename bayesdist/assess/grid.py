@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["DEFAULT_GRID", "grid_pixels", "mesh", "position_of_largest"]
+__all__ = ["DEFAULT_GRID", "grid_pixels", "mesh", "outline_pixels", "position_of_largest"]
 
 Float = NDArray[np.float64]
 
@@ -49,6 +49,15 @@ def mesh(x: Float, y: Float) -> tuple[Float, Float]:
     """Pixel of every grid point, (ny * nx,) each, in the order of a flattened [iy, ix] array."""
     X, Y = np.meshgrid(x, y)
     return X.ravel(), Y.ravel()
+
+
+def outline_pixels(size: tuple[float, float]) -> tuple[Float, Float]:
+    """Pixels once around a chip: its edges are not straight on the sky."""
+    nx, ny = size
+    t = np.linspace(0, 1, 9)
+    x = 0.5 + nx * np.concatenate([t, 1 + 0 * t, 1 - t, 0 * t])
+    y = 0.5 + ny * np.concatenate([0 * t, t, 1 + 0 * t, 1 - t])
+    return x, y
 
 
 def position_of_largest(values: Float, x: Float, y: Float) -> tuple[float, float]:

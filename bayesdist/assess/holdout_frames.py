@@ -87,7 +87,7 @@ class Bare:
 def noise_of(predictive: Predictive, table: MatchTable, index: Int) -> Float:
     """uu, vv and uv (n, 3) of the errors of stars without those of the solution's parameters."""
     var = np.stack(errors_of(table), axis=1)[index] ** 2 + predictive.jitter2
-    if predictive.local:
+    if predictive.local and not predictive.local_in_noise:
         place = (table.x[index], table.y[index], table.chip_number[index])
         var = var + predictive.local_variance(*place)[:, None]
     return np.column_stack([var, np.zeros(len(var))])

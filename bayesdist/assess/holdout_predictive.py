@@ -83,10 +83,12 @@ class Predictive:
         Errors of the catalogue, which the quoted errors contain; None where each match has an
         error of its own.
     local : tuple of LookupTable
-        Standard errors of positions by those of the look-up tables, in the unit of u and v; none
-        where there are no tables.
+        Standard errors of positions that belong to places on the detector, in the unit of u and v:
+        of look-up tables, or what the model leaves out.
     cell : tuple of float or None
         Pixels along x and y over which stars share these errors.
+    local_in_noise : bool
+        Whether quoted errors and jitter hold them already.
     """
 
     model: DistortionModel
@@ -102,9 +104,10 @@ class Predictive:
     stars: StarInfluence | None = None
     local: tuple[LookupTable, ...] = ()
     cell: tuple[float, float] | None = None
+    local_in_noise: bool = False
 
     def local_variance(self, x: Float, y: Float, chip: Int) -> Float:
-        """Variance (n,) on each axis of positions by the errors of the look-up tables."""
+        """Variance (n,) on each axis of positions by errors that belong to places."""
         out = np.zeros(len(x))
         for table in self.local:
             here = chip == table.chip

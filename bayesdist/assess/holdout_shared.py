@@ -1,8 +1,9 @@
-"""What matches of a campaign have in common: the star, and the place in the look-up tables.
+"""What matches have in common: the star, and the place on the detector.
 
-A star of the catalogue has one error in all of its exposures, and a cell of a table one on all of
-the stars that fall into it.  Sums over matches then vary by more than those of independent ones:
-scores of the position by the squares of their sums over each star, those of the spread by
+A star of the catalogue has one error in all of its exposures, and a place on the detector, be it a
+cell of a look-up table or a patch of what the model leaves out, one on all stars there.  Sums over
+matches then vary by more than those of independent ones: scores of the position by the squares of
+their sums over each star, those of the spread by
 
     cov(q_i, q_j) = 4 c_i c_j      c = (error that is shared)^2 / (whole error)^2
 
@@ -25,19 +26,21 @@ from bayesdist.data import MatchTable
 if TYPE_CHECKING:
     from bayesdist.assess.holdout_sums import BinSums
 
-__all__ = ["SharedErrors"]
+__all__ = ["ClusterSums"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-class SharedErrors:
-    """Collects matches, and changes their sums once all are there.
+class ClusterSums:
+    """Sums of matches over stars and cells, which take the place of those of single matches.
+
+    Collects matches, and changes their sums once all are there.
 
     Parameters
     ----------
     predictive : Predictive
-        With errors of the catalogue.
+        With errors of the catalogue, of places, or both.
     n_bins : int
         Of the predictive probabilities.
     tails : sequence of float
@@ -50,6 +53,7 @@ class SharedErrors:
         self._parts: list[dict[str, NDArray[np.generic]]] = []
         self._codes: dict[str, list[Int]] = {}
         self._step = predictive.cell if predictive.local else None
+        self._n = 0
 
     def add(
         self,
@@ -62,14 +66,14 @@ class SharedErrors:
     ) -> None:
         """Some matches, with their scores and the bins that they lie in."""
         stars, index = self._predictive.stars, rows.index
-        assert stars is not None
-        if table.star is None:
-            star = np.full(len(index), -1)
+        if stars is None or table.star is None:
+            star = -1 - self._n - np.arange(len(index))  # each by itself
             variance = np.zeros(len(index))
         else:
             star = table.star[index]
             epoch = None if table.epoch is None else table.epoch[index]
             variance = stars.errors.at(star, epoch).mean(axis=1)
+        self._n += len(index)
         whole = rows.cov[:, :2].mean(axis=1)
         part: dict[str, NDArray[np.generic]] = {
             "star": star,
@@ -81,8 +85,9 @@ class SharedErrors:
         if self._step is not None:
             chip = table.chip_number[index]
             x, y = table.x[index], table.y[index]
-            local = np.sqrt(self._predictive.local_variance(x, y, chip))
-            part["local"] = (1 - self._predictive.fraction) * local / whole
+            local = self._predictive.local_variance(x, y, chip)
+            part["local"] = (1 - self._predictive.fraction) * np.sqrt(local) / whole
+            part["local_share"] = np.minimum(local / whole, 1.0)
             across, up = (
                 np.maximum(a // s, 0).astype(np.int64)
                 for a, s in zip((x, y), self._step, strict=True)
@@ -106,18 +111,13 @@ class SharedErrors:
     def _settle_bins(self, sums: BinSums, code: Int) -> None:
         inside = np.flatnonzero(code >= 0)
         n_bins, at = len(sums.n), code[inside]
-        owner, of = _clusters(at, self._star[inside])
         sums.place_cov = _product(at, self._star[inside], self._all["place"][inside], n_bins)
         for b in range(n_bins):
             sums.place_2[b] = sums.place_cov[2 * b : 2 * b + 2, 2 * b : 2 * b + 2]
+        owner = _spread_together(sums, at, self._star[inside], self._all["share"][inside])
         sums.independent[:] = np.bincount(owner, minlength=n_bins)
-        share = self._all["share"][inside]
-        p1, p2, p3 = (_sums(of, share**k) for k in (1, 2, 3))
-        pairs = np.maximum(p1**2 - p2, 0.0)
-        triples = np.maximum(p1**3 - 3 * p1 * p2 + 2 * p3, 0.0)
-        sums.spread_2 += np.bincount(owner, 4 * pairs, n_bins)
-        sums.spread_3 += np.bincount(owner, 16 * (3 * pairs + triples), n_bins)
         if self._cell is not None:
+            _spread_together(sums, at, self._cell[inside], self._all["local_share"][inside])
             local = self._all["local"][inside]
             extra = _product(at, self._cell[inside], local[:, None], n_bins)
             extra[np.diag_indices(n_bins)] -= np.bincount(at, local**2, n_bins)
@@ -151,6 +151,18 @@ def _clusters(code: Int, member: Int) -> tuple[Int, Int]:
     n = int(member.max(initial=0)) + 1
     keys, of = np.unique(code * n + member, return_inverse=True)
     return keys // n, of
+
+
+def _spread_together(sums: BinSums, code: Int, member: Int, share: Float) -> Int:
+    """Add what members of a cluster scatter together; the bin of each cluster."""
+    n_bins = len(sums.n)
+    owner, of = _clusters(code, member)
+    p1, p2, p3 = (_sums(of, share**k) for k in (1, 2, 3))
+    pairs = np.maximum(p1**2 - p2, 0.0)
+    triples = np.maximum(p1**3 - 3 * p1 * p2 + 2 * p3, 0.0)
+    sums.spread_2 += np.bincount(owner, 4 * pairs, n_bins)
+    sums.spread_3 += np.bincount(owner, 16 * (3 * pairs + triples), n_bins)
+    return owner
 
 
 def _product(code: Int, member: Int, values: Float, n_bins: int) -> Float:

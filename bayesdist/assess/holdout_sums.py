@@ -20,7 +20,7 @@ from bayesdist.assess.holdout_predictive import (
     uniforms_of,
 )
 from bayesdist.assess.holdout_rows import Rows, predicted_rows
-from bayesdist.assess.holdout_shared import SharedErrors
+from bayesdist.assess.holdout_shared import ClusterSums
 from bayesdist.assess.holdout_spread import SpreadMoments
 from bayesdist.data import MatchTable
 from bayesdist.data.pieces import Piece
@@ -115,7 +115,7 @@ class HeldSums:
     frames : mapping of str to Frame
     pit_lost : dict of str to ndarray, shape (3, PIT_BINS, q)
         What the counts have in common with these frames.
-    shared : SharedErrors or None
+    shared : ClusterSums or None
         What else matches have in common; None where each has an error of its own.
     """
 
@@ -127,7 +127,7 @@ class HeldSums:
     expected: Float
     frames: Mapping[str, Frame]
     pit_lost: dict[str, Float] = field(default_factory=dict)
-    shared: SharedErrors | None = None
+    shared: ClusterSums | None = None
     n: int = 0
     n_left_out: int = 0
 
@@ -161,8 +161,8 @@ def held_sums(
         np.zeros((len(TAILS), 1 + 2 * h)),
         frames,
     )
-    if predictive.stars is not None:
-        out.shared = SharedErrors(predictive, PIT_BINS, TAILS)
+    if predictive.stars is not None or predictive.cell is not None:
+        out.shared = ClusterSums(predictive, PIT_BINS, TAILS)
     moments = SpreadMoments(predictive)
     around = [predictive, *_around(predictive)]
     for piece in pieces:

@@ -11,9 +11,11 @@ from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_l
 from bayesdist.assess.moments import position_moments
 from bayesdist.assess.solution import Solution, kind_of, place_of
 
-__all__ = ["SigmaMap", "UncertaintyMap", "uncertainty_map"]
+__all__ = ["RELATIVE", "SigmaMap", "UncertaintyMap", "uncertainty_map"]
 
 Float = NDArray[np.float64]
+
+RELATIVE = "relative positions"
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ class UncertaintyMap(SigmaMap):
     epoch : float or None
         Decimal years.
     kind : str
-        'least squares' or 'posterior'.
+        'least squares', 'posterior', or `RELATIVE`: the posterior without what the gauge decides.
     """
 
     correlation: Float

@@ -127,7 +127,7 @@ def place_budget(
     others = []
     for local in errors.local:
         sigma = single(local.at(chip, size, *at))
-        others.append(_term(local.name, LOCAL, sigma, local.source, local.relative_error))
+        others.append(_term(local.name, LOCAL, sigma, local.source, local.relative_error(chip)))
     for term, sigma in zip(errors.terms, errors.sigmas, strict=True):
         wide = np.tile(sigma, (N, 1))
         if term.kind == "random":

@@ -17,7 +17,7 @@ from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.fields import MODEL, ErrorDraws, draw_errors
 from bayesdist.assess.judged import Judged, JudgedFields, Place, judged_fields
 from bayesdist.assess.judged_statistics import ErrorsOf, drawn_statistics
-from bayesdist.assess.sizes import drawn_sizes, resized
+from bayesdist.assess.sizes import drawn_squares, resized
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms import LocalTerm, UserTerm
 from bayesdist.data.magnitude_errors import MagnitudeErrors
@@ -55,8 +55,9 @@ class PositionErrors:
         Standard normal: of the systematic terms, one for the whole field.
     seed : int
         Of the errors that are independent from place to place.
-    sizes : ndarray, shape (n_draws, terms, 2)
-        By which the local terms are multiplied: they are not known better than their errors say.
+    squares : ndarray, shape (n_draws, terms, chips, 2)
+        By which the squares of the local terms are multiplied: they are not known better than
+        their errors say.
     """
 
     fields: ErrorDraws
@@ -69,7 +70,7 @@ class PositionErrors:
     unit: str
     offsets: Float
     seed: int
-    sizes: Float
+    squares: Float
     _kept: dict[Judged, JudgedFields] = field(default_factory=dict, repr=False)
 
     def names(self, judged: Judged) -> tuple[str, ...]:
@@ -212,13 +213,15 @@ class PositionErrors:
         exact = {name: s for name, s in shrink.items() if self._beside(name)}
         factor = fields.factor({k: s for k, s in shrink.items() if k not in exact})
         own = [s for _, s in added[2 + len(self.terms) :][: len(self.local)]]
+        model = self.fields.whole.solution.model
+        chip = np.array([model.chip_code(number) for number in fields.places[0]])
 
         def error_of(rows: slice, noise: Float) -> Float:
             error = fields.joint(rows, exact)
             error *= factor
             error += self.offsets[rows, None, :] * shared
             if np.any(single):
-                error += noise * resized(single, own, self.sizes[rows])
+                error += noise * resized(single, own, self.squares[rows], chip)
             return error
 
         return error_of
@@ -300,5 +303,5 @@ def position_errors(
         unit=unit,
         offsets=rng.standard_normal((n_draws, 2)),
         seed=int(rng.integers(2**63)),
-        sizes=drawn_sizes(local, n_draws, rng),
+        squares=drawn_squares(local, [chip.number for chip in solution.model.chips], n_draws, rng),
     )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
+from bayesdist.assess.mean_square import MeanSquare
 from bayesdist.assess.names import require_known
 from bayesdist.assess.units import UNITS, convert
 from bayesdist.errors import InputError
@@ -105,15 +107,19 @@ class LocalTerm:
     name : str
     sigma : dict of int to ndarray, shape (ny, nx, 2)
         By chip number: standard deviations of u and v on that grid, in the unit of the solution.
-    relative_error : float, optional
-        How well they are known themselves.
     source : str
+    squares : mapping of int to MeanSquare
+        By chip number: how well their mean squares are known themselves, where that is known.
     """
 
     name: str
     sigma: dict[int, Float]
-    relative_error: float | None = None
     source: str = MEASURED
+    squares: Mapping[int, MeanSquare] = field(default_factory=dict)
+
+    def relative_error(self, chip: int) -> float | None:
+        """How well the sizes on a chip are known, relative to them; None where it is not known."""
+        return self.squares[chip].relative_error if chip in self.squares else None
 
     def on(self, chip: int, shape: tuple[int, int]) -> tuple[Float, Float]:
         """Standard deviations (u, v), each (ny, nx), on a chip.

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import norm
 
+from bayesdist.assess.mean_square import MeanSquare
 from bayesdist.assess.star_pairs import AXES, WIDER, pair_sums
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.robust.cells import Cells
@@ -77,14 +78,14 @@ class Unmodelled:
         return np.sqrt(np.maximum(self.variance, 0.0))
 
     @property
-    def rms_beside(self) -> Float:
-        """What has to be added (2,), in squares, to the errors of the model's positions.
+    def beside(self) -> MeanSquare:
+        """What has to be added to the errors of the model's positions.
 
         Where the fit was drawn towards the structure its position errs by that much, and by that
         much less is left out.  With d the variance of it, the sum v of the structure's and d are
         too large by 2 d.
         """
-        return np.sqrt(np.maximum(self.variance - 2 * self.drawn, 0.0))
+        return MeanSquare(self.variance - 2 * self.drawn, self.error)
 
     @property
     def rms_error(self) -> Float:
@@ -270,7 +271,7 @@ def total_errors(
     number = model.chips[0].number if chip is None else chip
     here = next(one for one in left_out if one.chip == number)
     errors = robust.at(x, y, epoch=epoch, chip=chip)
-    variance = errors.sigma**2 + here.rms_beside**2
+    variance = errors.sigma**2 + here.beside.mean
     of_variance = 2 * errors.sigma**4 / errors.dof + here.error**2
     dof = np.maximum(2 * variance**2 / of_variance, 1.0)
     return replace(errors, sigma=np.sqrt(variance), dof=dof)

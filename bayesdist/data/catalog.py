@@ -142,6 +142,12 @@ class ReferenceCatalog:
             arrays["epoch"] = self.epoch[which]
         return replace(self, **arrays, star=self.star[which])
 
+    def rescaled(self, factor: float, unit: str) -> ReferenceCatalog:
+        """The same in another unit, of which the present one is `factor`."""
+        lengths = ("u", "v", *(name for pair in _PAIRS for name in pair))
+        known = {k: getattr(self, k) for k in lengths if getattr(self, k) is not None}
+        return replace(self, **{k: factor * values for k, values in known.items()}, unit=unit)
+
     def at(self, epoch: float) -> ReferenceCatalog:
         """The catalogue as it is at another epoch.
 

@@ -27,7 +27,8 @@ Bool = NDArray[np.bool_]
 Limit: TypeAlias = "float | Callable[[Float], ArrayLike]"
 
 _LIST_ALIASES = {key: ALIASES[key] for key in ("x", "y", "exposure", "chip", "mag")} | {
-    "q": ("q", "qfit", "quality")
+    "q": ("q", "qfit", "quality"),
+    "epoch": ALIASES["epoch"],
 }
 _LIST_ALIASES["mag"] = (*_LIST_ALIASES["mag"], "m")
 
@@ -47,6 +48,8 @@ class StarList:
         Instrumental magnitudes, -2.5 log10(flux / exposure time).
     q : ndarray, optional
         Quality of the PSF fit: 0 is perfect, large is poor.
+    epoch : float, optional
+        Decimal year of the exposure.
     source : str
         File.
     row : ndarray of int, optional
@@ -64,6 +67,7 @@ class StarList:
     chip: Int = None  # type: ignore[assignment]
     mag: Float | None = None
     q: Float | None = None
+    epoch: float | None = None
     source: str = "list"
     row: Int = None  # type: ignore[assignment]
 
@@ -203,7 +207,7 @@ def read_star_lists(
         of hst1pass.  A table with a column of exposures may hold several of them; any other file is
         one exposure, named for the file.
     columns : mapping of str to str, optional
-        Column of each quantity: x y exposure chip mag q.  Lists of hst1pass know theirs.
+        Column of each quantity: x y exposure chip mag q epoch.  Lists of hst1pass know theirs.
     chip : int, optional
         Chip of files that have no such column; by default 1.
 
@@ -282,14 +286,20 @@ def _of_table(
         q=values.get("q"),
         source=source,
     )
+    years = column("epoch").years() if "epoch" in found else None
     if len(names) == 1:
-        return [replace(whole, exposure=names[0])]
+        return [replace(whole, exposure=names[0], epoch=_mean(years, slice(None)))]
     order = np.argsort(codes, kind="stable")
     edges = np.searchsorted(codes[order], np.arange(len(names) + 1))
     return [
-        replace(whole.select(order[edges[k] : edges[k + 1]]), exposure=one)
-        for k, one in enumerate(names)
+        replace(whole.select(rows), exposure=one, epoch=_mean(years, rows))
+        for one, rows in zip(names, np.split(order, edges[1:-1]), strict=True)
     ]
+
+
+def _mean(years: Float | None, rows: Any) -> float | None:
+    """Date of an exposure, of which every detection has it."""
+    return None if years is None else float(years[rows].mean())
 
 
 def star_list_of_hst1pass(

@@ -131,7 +131,11 @@ class LinearFit:
     @cached_property
     def _root(self) -> Float:
         scale = self.sigma
-        return np.linalg.cholesky(self.cov / np.outer(scale, scale)) * scale[:, None]
+        free = np.flatnonzero(scale > 0)  # what a gauge holds has no error
+        out = np.zeros_like(self.cov)
+        inner = self.cov[np.ix_(free, free)] / np.outer(scale[free], scale[free])
+        out[np.ix_(free, free)] = np.linalg.cholesky(inner) * scale[free, None]
+        return out
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors from the Gaussian with this mean and covariance.

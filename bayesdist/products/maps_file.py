@@ -10,11 +10,12 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.assess import AreaMap, UncertaintyMap
+from bayesdist.assess.maps import RELATIVE
 from bayesdist.data import atomic_path
 
 __all__ = ["write_maps"]
 
-PREFIX = {"least squares": "LSQ", "posterior": "MIX"}
+PREFIX = {"least squares": "LSQ", "posterior": "MIX", RELATIVE: "REL"}
 
 
 def write_maps(
@@ -23,14 +24,16 @@ def write_maps(
     areas: Sequence[AreaMap] = (),
     *,
     converged: bool = True,
-    note: str = "",
+    notes: Sequence[str] = (),
 ) -> None:
     """Write uncertainty maps of all chips of a detector.
 
     Extensions LSQ_SIGMA_U, LSQ_SIGMA_V, LSQ_CORR hold the least-squares ones (outliers rejected),
-    MIX_SIGMA_U, MIX_SIGMA_V, MIX_CORR those of the mixture posterior; AREA and AREA_SIGMA the
-    relative pixel area.  Where there are several chips, the number of the chip follows each name,
-    as in MIX_SIGMA_U_2.  A linear WCS gives the detector pixel of each grid point.
+    MIX_SIGMA_U, MIX_SIGMA_V, MIX_CORR those of the mixture posterior, REL_SIGMA_U and so on those
+    of its relative positions, whatever the gauge, where the gauge is a question; AREA and
+    AREA_SIGMA the relative pixel area.  Where there are several chips, the number of the chip
+    follows each name, as in MIX_SIGMA_U_2.  A linear WCS gives the detector pixel of each grid
+    point.
 
     Parameters
     ----------
@@ -40,14 +43,15 @@ def write_maps(
     areas : sequence of AreaMap
     converged : bool
         Whether the posterior may be relied on; noted in the primary header.
-    note : str
+    notes : sequence of str
         What else has to be said of the posterior there.
     """
     hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU()]
     hdus[0].header["CREATOR"] = "bayesdist"
     hdus[0].header["BDCONV"] = (converged, "has the sampler converged?")
-    if note:
-        hdus[0].header["COMMENT"] = note
+    for note in notes:
+        if note:
+            hdus[0].header["COMMENT"] = note
     chips = list(dict.fromkeys(m.chip for m in maps))
     ends = {chip: f"_{chip}" if len(chips) > 1 else "" for chip in chips}
     for m in sorted(maps, key=lambda m: chips.index(m.chip)):  # which keeps the order within a chip

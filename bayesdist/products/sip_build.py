@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from textwrap import wrap
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,7 @@ def sip_from_solution(
     crval: tuple[float, float] = (0.0, 0.0),
     scale_arcsec: float | None = None,
     origin: tuple[float, float] | None = None,
+    notes: Sequence[str] = (),
 ) -> SipHeader:
     """SIP header of one chip at one epoch.
 
@@ -64,6 +67,8 @@ def sip_from_solution(
         the reference pixel, and the reference pixel where they are positions on the detector: of
         the two, the one that leaves the smaller constant terms.  The header states it in BDU0,
         BDV0.
+    notes : sequence of str
+        Sentences for COMMENT.
 
     Returns
     -------
@@ -112,6 +117,7 @@ def sip_from_solution(
     cards = _cards(
         poly, linear, epoch if model.time is not None else None, model.unit, scale_arcsec
     )
+    cards += tuple(text_card("COMMENT", part) for note in notes for part in wrap(note, 70))
     cards += tuple(convergence_cards(solution))
     size = (int(poly.chip.size[0]), int(poly.chip.size[1]))
     sip = SipHeader(

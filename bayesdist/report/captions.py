@@ -24,12 +24,14 @@ from bayesdist.report.map_captions import (
 )
 from bayesdist.report.numerals import count, percent
 from bayesdist.report.periods import period_caption
+from bayesdist.report.selfcal import selfcal_caption
 
 __all__ = ["SECTIONS", "Caption", "caption"]
 
 SECTIONS: dict[str, tuple[str, ...]] = {
     "holdout": ("holdout",),
     "data": ("residuals_by_magnitude",),
+    "selfcal": ("selfcal",),
     "fit": ("residual_histogram", "residual_vectors"),
     "outliers": ("outliers_corner",),
     "coefficients": ("coefficients_corner", "traces"),
@@ -105,4 +107,5 @@ _WRITERS = {
     "margins": _margins,
     "horizon": horizon_caption,
     "holdout": holdout_caption,
+    "selfcal": selfcal_caption,
 }

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.model import Chip
     from bayesdist.report.campaign.context import CampaignResults
+    from bayesdist.report.selfcal import SelfcalResults
 
 __all__ = ["Check", "ChipResults", "Product", "ReportInput"]
 
@@ -95,6 +96,8 @@ class ChipResults:
     binned : BinnedResiduals
     place : tuple of int
         Row (0 on top) and column of the chip among the others.
+    relative_map : UncertaintyMap or None
+        Of the posterior's relative positions, where the gauge is a question.
     """
 
     chip: Chip
@@ -105,16 +108,21 @@ class ChipResults:
     area: AreaMap
     binned: BinnedResiduals
     place: tuple[int, int] = (0, 0)
+    relative_map: UncertaintyMap | None = None
 
     @property
     def maps(self) -> tuple[UncertaintyMap, ...]:
-        """The uncertainty maps that there are, least squares first."""
-        return tuple(m for m in (self.formal_map, self.posterior_map) if m is not None)
+        """The two uncertainty maps that are shown, or one where there is no other.
+
+        Least squares and posterior; or posterior and relative positions, where there are such.
+        """
+        known = (self.formal_map, self.posterior_map, self.relative_map)
+        return tuple(m for m in known if m is not None)[-2:]
 
     @property
     def best_map(self) -> UncertaintyMap:
         """That of the posterior where there is one."""
-        return self.maps[-1]
+        return self.formal_map if self.posterior_map is None else self.posterior_map
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +132,7 @@ class ReportInput:
     Parameters
     ----------
     name : str
-        Of the run.
+        What was calibrated: the title.
     config : mapping
         The resolved configuration.
     stars : StarSample
@@ -164,6 +172,8 @@ class ReportInput:
         Models of several periods compared, where that was asked for.
     held_out : HeldOutTruth or None
         What stars say that were set aside before the fit, where there are any.
+    selfcal : SelfcalResults or None
+        What a run without a catalogue adds.
     """
 
     name: str
@@ -187,6 +197,7 @@ class ReportInput:
     campaign: CampaignResults | None = None
     periods: TimeVariation | None = None
     held_out: HeldOutTruth | None = None
+    selfcal: SelfcalResults | None = None
 
     @property
     def unit(self) -> str:
@@ -225,7 +236,9 @@ class ReportInput:
 
     @property
     def held(self) -> frozenset[str]:
-        """Parameters that a prior holds: they are no measurements."""
+        """Parameters that a prior or the gauge holds: they are no measurements."""
+        if self.selfcal is not None:
+            return frozenset(self.selfcal.held)
         return frozenset(() if self.campaign is None else self.campaign.held)
 
     @property

@@ -39,9 +39,12 @@ def correlated_parameters(posterior: Posterior, n: int = 5) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        In the model's order; polynomial and time-dependent terms only.
+        In the model's order; polynomial and time-dependent terms only, without those that are
+        held.
     """
-    chosen = [k for k, p in enumerate(posterior.model.parameters) if p.kind != "frame"]
+    moves = np.ptp(posterior.flat, axis=0) > 0
+    kinds = [p.kind for p in posterior.model.parameters]
+    chosen = [k for k, kind in enumerate(kinds) if kind != "frame" and moves[k]]
     cov = np.asarray(posterior.cov)[np.ix_(chosen, chosen)]
     sd = np.sqrt(np.diag(cov))
     strength = np.triu(np.abs(cov / np.outer(sd, sd)), k=1)

@@ -23,6 +23,7 @@ from bayesdist.report.residuals import (
     residual_histogram,
     residuals_by_magnitude,
 )
+from bayesdist.report.selfcal import selfcal_figure
 from bayesdist.report.traces import slowest_parameters, traces
 from bayesdist.report.uncertainty import formal_uncertainty, uncertainty_radius
 from bayesdist.report.vectors import residual_vectors, vector_flow
@@ -84,6 +85,8 @@ def plan_of_figures(inputs: ReportInput) -> dict[str, Callable[[], Figure]]:
     out["formal_uncertainty"] = partial(formal_uncertainty, *maps, mosaic=mosaic)
     out["uncertainty_radius"] = partial(uncertainty_radius, *maps, mosaic=mosaic)
     out["pixel_area"] = partial(pixel_area, *(c.area for c in chips), mosaic=mosaic)
+    if inputs.selfcal is not None:
+        out["selfcal"] = partial(selfcal_figure, inputs.selfcal, inputs.unit)
     if inputs.periods is not None:
         out["period_differences"] = partial(period_differences, inputs.periods, mosaic)
     if inputs.budget is not None:

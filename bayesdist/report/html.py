@@ -19,6 +19,7 @@ from bayesdist.report.figures import plan_of_campaign
 from bayesdist.report.holdout import holdout_tables
 from bayesdist.report.page import Picture, picture_of, template
 from bayesdist.report.periods import period_tables
+from bayesdist.report.selfcal import selfcal_tables
 from bayesdist.report.status import status_checks, verdict
 
 __all__ = ["render_markdown", "render_report", "write_report"]
@@ -27,6 +28,7 @@ _TITLES = {
     "holdout": "Held-out stars",
     "data": "Data",
     "campaign": "Campaign",
+    "selfcal": "Gauge and stars",
     "fit": "Least-squares fit",
     "outliers": "Outliers",
     "coefficients": "Coefficients",
@@ -50,7 +52,7 @@ _PROVISIONAL = (
     " reasons, before anything is used."
 )
 _FOOTER = (
-    "Made by bayesdist. u and v are the reference axes; x runs to the right and y up, in FITS"
+    "u and v are the reference axes; x runs to the right and y up, in FITS"
     " pixels (centre of the first pixel = 1)."
 )
 _BUDGET_WORDS = (
@@ -109,6 +111,7 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
     """
     return template("report.html.jinja").render(
         **_contents(inputs, images),
+        trace=f"{inputs.name} · {_maker(inputs)}",
         budget_words=_BUDGET_WORDS,
         print_words=_PRINT_WORDS,
         printed=_printed(inputs),
@@ -116,6 +119,21 @@ def render_report(inputs: ReportInput, images: Mapping[str, bytes]) -> str:
         unprinted=() if inputs.campaign is None else ("data",),
         map_data=embedded(map_data(inputs)),
         budget_data=None if inputs.surface is None else embedded(budget_data(inputs)),
+    )
+
+
+def _maker(inputs: ReportInput) -> str:
+    """Version and time by which a copy on paper is traced to its run, as far as they are known."""
+    versions = inputs.provenance.get("versions", {})
+    began = str(inputs.provenance.get("created", "")).replace("T", " ").replace("+00:00", " UTC")
+    return " ".join(
+        part
+        for part in (
+            "bayesdist",
+            str(versions.get("bayesdist", "")),
+            f"in a run of {began}" if began else "",
+        )
+        if part
     )
 
 
@@ -152,12 +170,14 @@ def _contents(inputs: ReportInput, images: Mapping[str, bytes]) -> dict[str, Any
         del titles["periods"]
     if inputs.held_out is None:
         del titles["holdout"]
+    if inputs.selfcal is None:
+        del titles["selfcal"]
     return {
         "run": inputs,
         "sections": titles,
         "empty": _EMPTY,
         "provisional": _PROVISIONAL,
-        "footer": _FOOTER,
+        "footer": f"Made by {_maker(inputs)}. {_FOOTER}",
         "chips": _chips(inputs),
         "verdict": verdict(inputs),
         "status": status_checks(inputs),
@@ -169,6 +189,7 @@ def _contents(inputs: ReportInput, images: Mapping[str, bytes]) -> dict[str, Any
         "tables": {
             "holdout": holdout_tables(inputs.held_out),
             "data": tables.data_tables(inputs),
+            "selfcal": selfcal_tables(inputs),
             "fit": tables.fit_tables(inputs),
             "outliers": _present(tables.outlier_table(inputs)),
             "coefficients": tables.coefficient_tables(inputs),

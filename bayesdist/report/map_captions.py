@@ -80,6 +80,12 @@ def formal_caption(inputs: ReportInput) -> Caption:
 
 def radius_caption(inputs: ReportInput) -> Caption:
     text = "Radial uncertainty hypot(σ u, σ v), its largest place ringed."
+    if inputs.selfcal is not None:
+        text += (
+            " That of relative positions is the same whatever fixes place, rotation and scale (and"
+            " skew, where all exposures have one roll angle); the other is that of the run's gauge."
+        )
+        return Caption("Uncertainty over the detector", text, f"Contour maps. {text}")
     pairs = [(c.formal_map, c.posterior_map) for c in inputs.chips]
     ratios = [p.radius / f.radius for f, p in pairs if p is not None]
     if ratios:

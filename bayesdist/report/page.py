@@ -7,6 +7,7 @@ import struct
 from dataclasses import dataclass
 
 import jinja2
+from markupsafe import Markup
 
 from bayesdist.report.caption import Caption
 from bayesdist.report.drawing import DPI
@@ -51,6 +52,7 @@ def template(name: str) -> jinja2.Template:
         lstrip_blocks=True,
     )
     environment.filters["md"] = _markdown
+    environment.filters["css"] = _css
     environment.filters["number"] = lambda v: v if isinstance(v, str) else number(v)
     return environment.get_template(name)
 
@@ -64,3 +66,9 @@ _SPECIAL = str.maketrans(
 def _markdown(value: object) -> str:
     """Words as a line of Markdown that shows them as they are."""
     return str(value).translate(_SPECIAL)
+
+
+def _css(value: object) -> Markup:
+    """Words as a string of a style sheet: what is no plain letter by its number and a space."""
+    plain = "".join(c if c.isalnum() or c in " .,:" else f"\\{ord(c):x} " for c in str(value))
+    return Markup(f'"{plain}"')

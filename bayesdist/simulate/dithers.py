@@ -11,11 +11,22 @@ from numpy.typing import NDArray
 from bayesdist.data.detections import NO_STAR, Detections
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.simulate.patterns import flat_coefficients
 
-__all__ = ["DitheredField", "dither_pattern", "pixels_of", "simulate_dithers", "smooth_distortion"]
+__all__ = [
+    "DitheredField",
+    "dither_pattern",
+    "dithered_model",
+    "pixels_of",
+    "simulate_dithers",
+    "sky_seen",
+    "smooth_distortion",
+    "stars_on_detector",
+]
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Int = NDArray[np.int64]
 
 MOST_STEPS = 30
 CLOSE = 1e-9  # pixels
@@ -66,16 +77,9 @@ def smooth_distortion(
     rng : numpy.random.Generator
     """
     model = DistortionModel(order, tuple(chips))
-    out = np.zeros((len(chips), 2, model.n_terms))
-    above = 0.0
+    out = flat_coefficients(order, chips)
     for c, chip in enumerate(chips):
-        basis = model.basis(chip.number)
-        monomials = np.zeros((2, model.n_terms))
-        monomials[0, 1] = monomials[1, 2] = 1.0
-        out[c] = basis.from_monomials(monomials)
-        out[c, 1, 0] += above
-        above += chip.size[1] + 50.0
-        degree = np.array([i + j for i, j in basis.terms])
+        degree = np.array([i + j for i, j in model.basis(chip.number).terms])
         high = degree > 1
         out[c][:, high] += (
             size_pix * rng.standard_normal((2, high.sum())) / 4.0 ** (degree[high] - 2)
@@ -170,33 +174,13 @@ def simulate_dithers(
     InputError
         When no star falls on the detector.
     """
-    E, order = len(offsets), int((np.sqrt(8 * coefficients.shape[2] + 1) - 3) / 2)
-    centre = coefficients[:, :, 0].mean(axis=0)
-    model = DistortionModel(
-        order,
-        tuple(chips),
-        frames=frames,
-        exposures=tuple(f"e{k:03d}" for k in range(E)),
-        origin=(float(centre[0]), float(centre[1])),
-    )
-    theta = np.zeros(model.n_params)
-    theta[: model.n_polynomial] = coefficients.ravel()
-    for e in range(1, E):
-        block = model.frame_slice(e)
-        names = model.free_frame_names(e)
-        values = {"shift_u": offsets[e, 0], "shift_v": offsets[e, 1], "rotation": rolls[e]}
-        theta[block] = [values.get(name, 0.0) for name in names]
-    sky = _field(model, theta, n_stars, rng)
+    model, theta = dithered_model(chips, coefficients, offsets, rolls, frames=frames)
+    low_corner, high_corner = sky_seen(model, theta)
+    sky = low_corner + rng.uniform(size=(n_stars, 2)) * (high_corner - low_corner)
     low, high = (sigma, sigma) if isinstance(sigma, float) else sigma
     share = rng.uniform(size=n_stars)
     error = low * (high / low) ** share
-    columns: list[tuple[Float, ...]] = []
-    for e in range(E):
-        for chip in model.chips:
-            x, y, seen = pixels_of(model, theta, sky, e, chip)
-            k = np.flatnonzero(seen)
-            columns.append((x[k], y[k], np.full(len(k), e), np.full(len(k), chip.number), k))
-    x, y, exposure, number, star = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    x, y, exposure, number, star = stars_on_detector(model, theta, sky)
     n = len(x)
     if n == 0:
         raise InputError("no star falls on the detector", where="simulation", do="give more stars")
@@ -227,18 +211,77 @@ def simulate_dithers(
     )
 
 
-def _field(model: DistortionModel, theta: Float, n_stars: int, rng: np.random.Generator) -> Float:
-    """Positions over the rectangle that holds all exposures' corners."""
+def dithered_model(
+    chips: Sequence[Chip],
+    coefficients: Float,
+    offsets: Float,
+    rolls: Float,
+    *,
+    frames: str = "shift_rotation",
+) -> tuple[DistortionModel, Float]:
+    """A model of dithered exposures, and its true parameters (D,).
+
+    Parameters
+    ----------
+    chips, coefficients, offsets, rolls, frames
+        As `simulate_dithers`.
+    """
+    order = int((np.sqrt(8 * coefficients.shape[2] + 1) - 3) / 2)
+    centre = coefficients[:, :, 0].mean(axis=0)
+    model = DistortionModel(
+        order,
+        tuple(chips),
+        frames=frames,
+        exposures=tuple(f"e{k:03d}" for k in range(len(offsets))),
+        origin=(float(centre[0]), float(centre[1])),
+    )
+    theta = np.zeros(model.n_params)
+    theta[: model.n_polynomial] = coefficients.ravel()
+    for e in range(1, len(offsets)):
+        names = model.free_frame_names(e)
+        values = {"shift_u": offsets[e, 0], "shift_v": offsets[e, 1], "rotation": rolls[e]}
+        theta[model.frame_slice(e)] = [values.get(name, 0.0) for name in names]
+    return model, theta
+
+
+def sky_seen(model: DistortionModel, theta: Float) -> tuple[Float, Float]:
+    """Lowest and highest corner (2,) of the rectangle that holds all exposures' corners."""
     corners = []
     for chip in model.chips:
-        x, y = (
-            np.array(v) for v in ([0.5, chip.size[0] + 0.5] * 2, [0.5] * 2 + [chip.size[1]] * 2)
-        )
+        right, top = (n + 0.5 for n in chip.size)
+        x, y = np.array([0.5, right] * 2), np.array([0.5] * 2 + [top] * 2)
         for e in range(len(model.exposures)):
             corners.append(model.predict(theta, x, y, exposure=e, chip=chip.number))
     points = np.concatenate(corners)
-    low, high = points.min(axis=0), points.max(axis=0)
-    return low + rng.uniform(size=(n_stars, 2)) * (high - low)
+    return points.min(axis=0), points.max(axis=0)
+
+
+def stars_on_detector(
+    model: DistortionModel, theta: Float, sky: Float
+) -> tuple[Float, Float, Int, Int, Int]:
+    """Where the stars fall in all exposures.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+    sky : ndarray, shape (S, 2)
+
+    Returns
+    -------
+    x, y : ndarray, shape (N,)
+        FITS 1-based pixels.
+    exposure, chip, star : ndarray of int, shape (N,)
+        Code of the exposure, number of the chip, row of `sky`.
+    """
+    columns = []
+    for e in range(len(model.exposures)):
+        for chip in model.chips:
+            x, y, seen = pixels_of(model, theta, sky, e, chip)
+            k = np.flatnonzero(seen)
+            columns.append((x[k], y[k], np.full(len(k), e), np.full(len(k), chip.number), k))
+    x, y, exposure, number, star = (np.concatenate(part) for part in zip(*columns, strict=True))
+    return x, y, exposure, number, star
 
 
 def pixels_of(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from bayesdist.app import stages
 from bayesdist.simulate import Truth
@@ -33,8 +36,34 @@ class Finished:
     result: Result
 
 
+@pytest.fixture(scope="package", autouse=True)
+def sketched(full) -> Iterator[None]:
+    """Figures of reports are made but not drawn, unless all is run in full.
+
+    Drawing takes most of the time of a small run.  Figures as they look are the subject of
+    tests/report, and programs of their own (the demo, the examples) draw them here, too.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if not full:
+            import bayesdist.report
+
+            patch.setattr(bayesdist.report, "drawn_report", _made)
+        yield
+
+
+def _made(inputs) -> dict:
+    from bayesdist.report.drawing import Drawing
+    from bayesdist.report.figures import plan_of_figures
+
+    page = io.BytesIO()
+    Image.new("RGB", (4, 3), "white").save(page, format="png")
+    for make in plan_of_figures(inputs).values():
+        make()
+    return {name: Drawing(page.getvalue(), b"%PDF-1.7") for name in plan_of_figures(inputs)}
+
+
 @pytest.fixture(scope="package")
-def finished(tmp_path_factory) -> Finished:
+def finished(sketched, tmp_path_factory) -> Finished:
     folder = tmp_path_factory.mktemp("finished")
     matches, truth = simulated(mag=np.linspace(12.0, 18.0, 400))
     config = write_job(

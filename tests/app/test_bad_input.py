@@ -333,6 +333,9 @@ def test_stages_out_of_order(begun, tmp_path):
     (tmp_path / "req.toml").write_text('[[requirement]]\nname="r"\nstatistic="p95"\nlimit=1\n')
     for stage in ("assess", "export", "report"):
         refused(tmp_path, stage, begun, words=["needs stage 'sample'", "bayesdist sample"])
+    # neither of these is a stage itself
+    refused(tmp_path, "plan", begun, words=[": 'plan' needs stage 'sample'"])
+    refused(tmp_path, "budget", begun, "--at", 1, 1, words=[": 'budget' needs stage 'sample'"])
     refused(
         tmp_path, "validate", begun, "--requirements", tmp_path / "req.toml", words=["'sample'"]
     )
@@ -383,7 +386,8 @@ def test_a_damaged_fit(begun, tmp_path):
     ("text", "words"),
     [
         (None, ["req.toml", "cannot be read"]),
-        ("", ["req.toml", "requirement"]),
+        ("", ["req.toml: holds no settings; give it [[requirement]] blocks"]),
+        ("# later\n", ["req.toml: holds no settings"]),
         ("requirement = []", ["requirement"]),
         ("[[requirement]", ["req.toml", "TOML"]),
         ('[[requirement]]\nname = "r"\nstatistic = "p95"\n', ["requirement[1].limit"]),
@@ -397,6 +401,27 @@ def test_validate_with_a_wrong_file(finished, tmp_path, text, words):
     if text is not None:
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
     refused(finished.path, "validate", finished.path, "--requirements", path, words=words)
+
+
+@pytest.mark.parametrize("text", ["", "\n# nothing yet\n", "\ufeff"])
+def test_an_empty_configuration(tmp_path, text):
+    (tmp_path / "c.toml").write_text(text, encoding="utf-8")
+    words = ["c.toml: holds no settings", "bayesdist init"]
+    refused(tmp_path, "run", tmp_path / "c.toml", "-o", tmp_path / "run", words=words)
+
+
+def test_what_is_no_run_points_to_the_run_within(tmp_path):
+    """As of `bayesdist demo`, whose run lies beside its input."""
+    (tmp_path / "demo" / "run").mkdir(parents=True)
+    (tmp_path / "demo" / "run" / "run.json").write_text("{}")
+    (tmp_path / "file").touch()
+    at = ("--at", 1, 1)
+    within = str(tmp_path / "demo" / "run")
+    refused(tmp_path, "budget", tmp_path / "demo", *at, words=["is no run", f"give {within}"])
+    refused(tmp_path, "monitor", tmp_path / "demo", "x", words=["is no run", f"give {within}"])
+    refused(tmp_path, "plan", tmp_path / "none", words=["none: there is no such folder"])
+    refused(tmp_path, "plan", tmp_path / "file", words=["file: is a file, not the folder of a run"])
+    refused(tmp_path, "plan", tmp_path, words=["is no run", "bayesdist run"])
 
 
 def test_validate_of_what_is_no_run(tmp_path):

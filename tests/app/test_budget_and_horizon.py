@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from tests.app.support import cli, good, one_sentence
+from tests.app.support import cli, good, one_sentence, refused
 
 SIZE = (512, 256)
 N, EPOCHS = 250, np.linspace(2004.0, 2012.0, 6)
@@ -169,6 +169,37 @@ def test_a_budget_that_cannot_be_given_is_refused_in_one_sentence(run, arguments
     result = cli("budget", run, *arguments)
     assert result.code == 1
     one_sentence(result.err, *words)
+
+
+def too_large(run, folder):
+    """The same job with a catalogue that is said to be worse than the residuals scatter."""
+    text = CONFIG.replace("sigma_u = 0.004", "sigma_u = 0.04")
+    folder.mkdir()
+    stars = str(run.parent / "stars.ecsv")
+    (folder / "config.toml").write_text(text.replace('"stars.ecsv"', f'"{stars}"'))
+    return folder / "config.toml"
+
+
+def test_errors_larger_than_the_residuals_are_refused_before_anything_is_sampled(run, tmp_path):
+    config = too_large(run, tmp_path / "job")
+    words = ["budget term 'catalogue'", "errors of 0.04", "that scatter by 0.0", "in_residuals"]
+    refused(tmp_path, "run", config, "-o", tmp_path / "run", words=words)
+    refused(tmp_path, "check", config, words=words)
+
+
+def test_errors_larger_than_the_residuals_are_told_by_assess(run, tmp_path, monkeypatch):
+    """As where the posterior takes more stars for false matches than the linear fit rejects."""
+    folder = too_large(run, tmp_path / "run").parent
+    with monkeypatch.context() as patch:
+        patch.setattr("bayesdist.app.stages._check_residuals", lambda *_: None)
+        good("fit", folder, "-q")
+    for stage in ("sample", "assess"):
+        good(stage, folder, "-q")
+    [told] = [
+        w for w in json.loads((folder / "summary.json").read_text())["warnings"] if "'catal" in w
+    ]
+    assert told.startswith("Budget term 'catalogue': errors of 0.04 are said to be in residuals")
+    assert told in (folder / "bayesdist.log").read_text()
 
 
 def test_a_plan_without_the_requirement_is_refused(run):

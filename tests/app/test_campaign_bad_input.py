@@ -11,9 +11,9 @@ from astropy.table import Table, vstack
 from astropy.time import Time
 
 from bayesdist.app import stages
-from bayesdist.app.campaign.session import session_of
 from bayesdist.app.campaign.soundness import shear_doubts
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.sessions import session_of
 from bayesdist.data.tables import read_table
 from bayesdist.infer import load_fit
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting

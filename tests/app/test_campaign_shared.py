@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.app.campaign.session import session_of
 from bayesdist.app.campaign.shared import measured_shared_errors
 from bayesdist.app.campaign.stages import CAMPAIGN_STAGES
 from bayesdist.app.config import load_config
 from bayesdist.app.correlated import UNMODELLED
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import run_stage
 from tests.app.support import good, summary_of
 
@@ -51,8 +51,8 @@ def test_the_pattern_is_found_beyond_what_is_known(run):
     rows = {row["name"]: row for row in said["budget"]}
     assert rows[UNMODELLED]["kind"] == "local"
     # beside what the wider coefficients have of it already
-    rms = np.array([[row["beside_u"], row["beside_v"]] for row in found["unmodelled"]])
-    expected = np.sqrt((rms**2).sum(axis=1).mean())
+    beside = [row["beside"] for row in found["unmodelled"]]
+    expected = np.sqrt(np.mean([one["square_u"] + one["square_v"] for one in beside]))
     assert rows[UNMODELLED]["radial"] == pytest.approx(expected, rel=0.02)
 
 

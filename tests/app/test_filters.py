@@ -15,9 +15,9 @@ import bayesdist.app.session
 import bayesdist.products.release
 from bayesdist.app.campaign.filters import compare_filters
 from bayesdist.app.campaign.reference import held_tables
-from bayesdist.app.campaign.session import session_of
 from bayesdist.app.release import _require_alike
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.sessions import session_of
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior

@@ -100,3 +100,22 @@ def test_what_does_not_go_is_refused(finished, tmp_path) -> None:
     refused(tmp_path, "monitor", run, tmp_path / "none.ecsv", words=["no such file"])
     refused(tmp_path, "monitor", run, tmp_path / "unit.ecsv", words=["arcsec", "pix"])
     refused(tmp_path, "monitor", run, tmp_path / "few.ecsv", words=["few"])
+
+
+def test_the_matches_of_the_release_cannot_test_it(finished, tmp_path) -> None:
+    """Under their own name, as a copy, by a configuration, and among others."""
+    old = finished.config.parent / "stars.ecsv"
+    words = ["matches that the release was made from"]
+    refused(tmp_path, "monitor", finished.path, old, words=["stars.ecsv", *words])
+    shutil.copy(old, tmp_path / "copy.ecsv")
+    refused(tmp_path, "monitor", finished.path, tmp_path / "copy.ecsv", words=["copy.ecsv", *words])
+    as_table(new_matches()).write(tmp_path / "new.ecsv")
+    config = write_config(tmp_path / "new.toml", data={"matches": ["new.ecsv", "copy.ecsv"]})
+    refused(tmp_path, "monitor", finished.path, config, words=["copy.ecsv", *words])
+
+
+def test_a_run_is_no_table_of_matches(finished, tmp_path) -> None:
+    run, other = finished.path, tmp_path / "other"
+    shutil.copytree(run, other)
+    refused(tmp_path, "monitor", run, run, words=["is the released run itself", "new matches"])
+    refused(tmp_path, "monitor", run, other, words=["is a run, and not matches", "other"])

@@ -11,11 +11,11 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.campaign.session import session_of
 from bayesdist.app.file_positions import sip_positions
 from bayesdist.app.judging import products_of
 from bayesdist.app.product_terms import _Laid
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.sessions import session_of
 from bayesdist.app.systematics import Systematics
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta

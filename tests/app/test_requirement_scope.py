@@ -55,6 +55,10 @@ def test_scopes_are_judged_and_kept(run, capsys):
     assert inner["margin_percent"] == pytest.approx(100 * inner["margin"] / 0.5)
     printed = capsys.readouterr().out
     assert "between two stars: it would be met if coefficients fell from" in printed
+    rows = dict(zip(("inner", "pair", "corner"), printed.splitlines()[2:], strict=False))
+    assert "over the inner 80 %" in rows["inner"]
+    assert "between two positions up to 200 px apart" in rows["pair"]
+    assert "over a polygon of 3 corners" in rows["corner"]
     table = Table.read(run / "margins.ecsv")
     assert list(table["scope"]) == [
         "over the inner 80 %",
@@ -89,6 +93,6 @@ def test_scopes_that_cannot_be_judged_are_refused_in_one_sentence(run, line, mes
     path.write_text(text)
     assert main(["validate", str(run), "--requirements", str(path), "-q"]) == 1
     said = capsys.readouterr().err
-    assert message in said and "requirement 'r'" in said
+    assert message in said and f"{path}: requirement 'r'" in said
     assert said.count("\n") == 1
     assert (run / "margins.ecsv").read_bytes() == before

@@ -63,7 +63,7 @@ sys.exit(cli.main())
 
 def test_sigkill_changes_nothing(tmp_path, full, capsys):
     """Reduced, kills are seen while it starts, samples, and assesses, but not while it draws."""
-    kills, steps, stars = (10, 1500, 3000) if full else (3, 500, 2000)
+    kills, steps, stars = (10, 1500, 3000) if full else (2, 500, 2000)
     assert main(["simulate", "wise", "-o", str(tmp_path), "--stars", str(stars), "-q"]) == 0
     config = tmp_path / "config.toml"
     config.write_text(CONFIG.format(steps=steps))

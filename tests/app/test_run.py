@@ -8,6 +8,7 @@ import json
 import math
 import re
 import shutil
+import tomllib
 import warnings
 from html.parser import HTMLParser
 
@@ -21,13 +22,17 @@ from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
 from bayesdist.app import stages
+from bayesdist.app.config import parse_config
 from bayesdist.app.screen import progress_bar
+from bayesdist.app.stages.report import title_of
 from bayesdist.data import read_matches
+from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior, outlier_probability, residuals
 from tests.app.support import (
     SIZE,
     begin_stagewise,
     cli,
+    config_text,
     good,
     process,
     summary_of,
@@ -495,6 +500,47 @@ def test_max_steps_is_a_total(unconverged, finished):
     assert load_posterior(run).sampler.steps == 20
 
 
+@pytest.mark.parametrize(
+    ("sections", "title"),
+    [
+        ({"detector": {"name": "W2", "size": SIZE}}, "W2"),
+        ({"detector": {"size": SIZE}}, ""),
+        (
+            {
+                "detector": None,
+                "model": {"order": 2},
+                "chip": [
+                    {"number": k, "name": f"C{k}", "size": SIZE, "reference_pixel": (1.0, 1.0)}
+                    for k in (1, 2)
+                ],
+            },
+            "C1 and C2",
+        ),
+    ],
+)
+def test_a_report_is_titled_by_what_was_calibrated(sections, title):
+    assert title_of(parse_config(config_text(**sections), "c.toml")) == title
+
+
+def test_the_report_says_which_folder_it_is_of(finished):
+    text = (finished.path / "report.html").read_text(encoding="utf-8")
+    assert "<h1>A</h1>" in text and "<title>A: geometric distortion</title>" in text
+    assert re.search(rf"Folder</th><td>{finished.path.name}</td>", text)
+
+
+def test_figures_are_listed_once_they_are_there(copy, monkeypatch):
+    def full(drawings, folder):
+        raise InputError("No space left on device", where=str(folder), do="make room")
+
+    monkeypatch.setattr("bayesdist.report.drawn_report", lambda inputs: {"one": None})
+    monkeypatch.setattr("bayesdist.report.save_drawings", full)
+    before = summary_of(copy)["figures"]
+    assert cli("report", copy).code == 1
+    assert summary_of(copy)["figures"] == before
+    for name in before:
+        assert (copy / "figures" / name).exists()
+
+
 # -- validate, check, init, inspect, demo ---------------------------------------------------------
 
 
@@ -519,6 +565,49 @@ def test_validate_replaces_the_margins(copy, tmp_path):
     assert {k: v for k, v in after.items() if k != "margins"} == {
         k: v for k, v in before.items() if k != "margins"
     }
+
+
+def test_a_report_of_earlier_margins_is_told_and_renewed(copy, finished, tmp_path):
+    """It is not done any more, so that --resume makes it anew as well as `report`."""
+    blocks = tomllib.loads(finished.config.read_text(encoding="utf-8"))["requirement"]
+    again = _requirements(tmp_path / "same.toml", *blocks)
+    assert "renew it" not in cli("validate", copy, "--requirements", again).out
+    assert "report" in json.loads((copy / "run.json").read_text())["stages"]
+    new = {"name": "brand new", "statistic": "u_rms", "limit": 0.5, "region": "inner 80 %"}
+    path = _requirements(tmp_path / "new.toml", new)
+    for _ in range(2):
+        result = cli("validate", copy, "--requirements", path)
+        line = (
+            f"{copy / 'report.html'} shows earlier margins; renew it by 'bayesdist report {copy}'"
+        )
+        assert result.code == 0 and result.out.splitlines()[-1] == line
+        assert "over the inner 80 %" in result.out
+    good("run", finished.config, "-o", copy, "--resume")
+    assert "brand new" in (copy / "report.html").read_text(encoding="utf-8")
+    assert "renew it" not in cli("validate", copy, "--requirements", path).out
+
+
+def test_dates_that_change_nothing_are_told(tmp_path, finished):
+    """In the log of assess, by check, and by validate; where something drifts nothing is said."""
+    dated = {"name": "dated", "statistic": "rms", "limit": 1.0, "epoch": 2006.5}
+    table = Table.read(finished.config.parent / "stars.ecsv")
+    table["epoch"] = np.linspace(2004.0, 2010.0, len(table))
+    assess = {"epoch": 2005.0, "grid": (9, 7), "draws": 400}
+    config = write_job(tmp_path / "job", table, assess=assess, requirement=[dated])
+    told = "nothing in the model depends on time, so that the dates given change nothing"
+    both = f"WARNING      {told} (assess.epoch, of requirement 'dated')"
+    assert both in good("check", config).out.splitlines()
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
+    assert (run / "bayesdist.log").read_text().count(told) == 1
+    req = _requirements(tmp_path / "req.toml", dated)
+    out = good("validate", run, "--requirements", req).out
+    assert f"WARNING: {req}: {told} (of requirement 'dated')" in out.splitlines()
+    undated = {key: value for key, value in dated.items() if key != "epoch"}
+    out = good("validate", run, "--requirements", _requirements(tmp_path / "b.toml", undated)).out
+    assert told not in out
+    drift = {"epoch0": 2004.0, "terms": [["u", 1, 0]]}
+    config = write_config(config, assess=assess, requirement=[dated], **{"model.tdd": drift})
+    assert told not in good("check", config).out
 
 
 def test_validate_of_an_unconverged_run_is_not_met(unconverged, tmp_path):

@@ -1,6 +1,8 @@
 """A pattern that the model leaves out, from the table of matches to budget and margins."""
 
 import json
+import shutil
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -8,6 +10,10 @@ from astropy.table import Table
 from scipy.ndimage import map_coordinates
 
 from bayesdist.app.correlated import FILE, UNMODELLED
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.sessions import session_of
+from bayesdist.assess.holdout import held_out_truth
+from bayesdist.assess.holdout_predictive import predictive_of
 from tests.app.support import begin_stagewise, cli, good
 
 N, SIDE, SIGMA, RMS = 12_000, 1024, 0.02, 0.03
@@ -22,6 +28,8 @@ size = [1024, 1024]
 [model]
 order = 3
 reference_pixel = [512.0, 512.0]
+[outliers]
+model = "none"
 [sampler]
 target_ess = 200
 [assess]
@@ -34,7 +42,7 @@ limit = 0.1
 """
 
 
-def written(folder, rms, *stages, seed=1):
+def written(folder, rms, *stages, seed=1, more=""):
     """Stars without distortion but for a pattern on nodes 64 px apart, interpolated between.
 
     Whole runs, or these stages of one.
@@ -50,7 +58,7 @@ def written(folder, rms, *stages, seed=1):
     sigma = np.full(N, SIGMA)
     table = Table({"x": x, "y": y, "u": u, "v": v, "sigma_u": sigma, "sigma_v": sigma})
     table.write(folder / "stars.ecsv")
-    (folder / "config.toml").write_text(CONFIG)
+    (folder / "config.toml").write_text(CONFIG + more)
     if stages:
         return begin_stagewise(folder / "run", folder / "config.toml", *stages)
     good("run", folder / "config.toml", "-o", folder / "run", "-q")
@@ -60,6 +68,14 @@ def written(folder, rms, *stages, seed=1):
 @pytest.fixture(scope="module")
 def patterned(tmp_path_factory):
     return written(tmp_path_factory.mktemp("pattern"), RMS)
+
+
+@pytest.fixture(scope="module")
+def another(tmp_path_factory):
+    """Another detector without distortion, of another pattern, and held-out stars on it."""
+    folder = tmp_path_factory.mktemp("another")
+    aside = "[holdout]\nfraction = 0.25\n"
+    return written(folder, RMS, "fit", "sample", "assess", seed=2, more=aside)
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +137,46 @@ def test_stars_that_err_independently_leave_the_posterior_as_it_is(plain):
     table = Table.read(plain / "coefficients.ecsv")
     legendre = table[[str(name).startswith(("u_", "v_")) for name in table["name"]]]
     assert np.median(legendre["sd"] / legendre["sigma"]) == pytest.approx(1, abs=0.05)
+
+
+def p_value(*command, name, output):
+    good(*command, "-o", output)
+    return json.loads((output / name).read_text())
+
+
+def bare(run, folder):
+    """A run of which nothing is known but its posterior."""
+    folder.mkdir()
+    for name in ("run.json", "config.toml", "fit.nc", "posterior.nc"):
+        shutil.copy(run / name, folder)
+    return folder
+
+
+def test_comparison_rests_on_the_errors_that_were_measured(patterned, another, tmp_path):
+    """Neither has distortion: what they differ by is how their patterns have drawn the fits."""
+    name = "comparison.json"
+    signed = p_value("compare", patterned, another, name=name, output=tmp_path / "signed")
+    assert signed["chips"][0]["p_value"] > 1e-3
+    formal = (bare(run, tmp_path / key) for key, run in (("a", patterned), ("b", another)))
+    alone = p_value("compare", *formal, name=name, output=tmp_path / "alone")
+    assert alone["chips"][0]["p_value"] < 1e-12
+
+
+def test_monitoring_rests_on_the_errors_that_were_measured(patterned, another, tmp_path):
+    new, name = another.parent / "stars.ecsv", "monitor.json"
+    signed = p_value("monitor", patterned, new, name=name, output=tmp_path / "signed")
+    run = bare(patterned, tmp_path / "run")
+    alone = p_value("monitor", run, new, name=name, output=tmp_path / "alone")
+    assert alone["p_value"] < 1e-12 < signed["p_value"]
+    # the new fit has its formal errors in both
+    assert signed["size"]["noise_rms"] > 3 * alone["size"]["noise_rms"]
+
+
+def test_held_out_stars_are_predicted_with_the_errors_that_were_measured(another):
+    assert summary(another)["holdout"]["level"] == "pass"
+    with closing(session_of(RunDirectory.open(another))) as session:
+        held = session.held_matches
+        assert held_out_truth(predictive_of(session.posterior), held).level == "fail"
 
 
 def test_what_belongs_to_another_posterior_is_not_used(plain, patterned, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayesdist.assess.mean_square import MeanSquare
 from bayesdist.assess.position_errors import Judged, position_errors
 from bayesdist.assess.regions import WHOLE
 from bayesdist.assess.terms import LocalTerm
@@ -16,24 +17,44 @@ SHAPE = (16, 16)
 DRAWS = 4000
 
 
-@pytest.mark.parametrize("relative", [None, 0.05, 0.1])
-def test_a_field_scatters_as_its_size_is_known(relative):
+def drawn(squares: dict[int, MeanSquare], sigma: float = 1.0):
+    """Errors of a chip whose only term of weight is a local one."""
+    model, matches, _ = simulated(1, 400, order=1, sigma=1e-6)
+    fit = fit_linear(matches, model, **UNCLIPPED)
+    term = LocalTerm("left out", {1: np.full((*SHAPE, 2), sigma)}, squares=squares)
+    errors = position_errors(
+        fit, local=[term], grid=SHAPE, n_draws=DRAWS, rng=np.random.default_rng(1)
+    )
+    return lambda names: errors.statistics(Judged(model.chips, None, WHOLE), names)
+
+
+@pytest.mark.parametrize("error", [None, 0.1, 0.2])
+def test_a_field_scatters_as_its_size_is_known(error):
     """ln(rms) of n independent errors: variance 1 / (2 n), and that of the size in addition.
 
     Sizes of both axes are independent, so that the mean of both is known better.
     """
-    model, matches, _ = simulated(1, 400, order=1, sigma=1e-6)
-    fit = fit_linear(matches, model, **UNCLIPPED)
-    term = LocalTerm("left out", {1: np.ones((*SHAPE, 2))}, relative)
-    errors = position_errors(
-        fit, local=[term], grid=SHAPE, n_draws=DRAWS, rng=np.random.default_rng(1)
-    )
-    found = errors.statistics(Judged(model.chips, None, WHOLE), ["rms", "u_rms"])
+    squares = {} if error is None else {1: MeanSquare(np.ones(2), np.full(2, error))}
+    found = drawn(squares)(["rms", "u_rms"])
     for name, axes in (("rms", 2), ("u_rms", 1)):
         n = axes * SHAPE[0] * SHAPE[1]
-        expected = 1 / (2 * n) + (relative or 0.0) ** 2 / axes
+        # the rms of draws over places, given squares: moments of logarithms by quadrature
+        cut = stats.norm(1.0, error or 1e-9)
+        square = np.mean([cut.rvs(200_000, random_state=k) for k in range(axes)], axis=0)
+        expected = 1 / (2 * n) + np.log(square).var() / 4
         low, high = stats.chi2.ppf([1e-4, 1 - 1e-4], DRAWS - 1) / (DRAWS - 1)
         assert low < np.log(found[name]).var(ddof=1) / expected < high
         # the mean square stays what the budget says, 1 on an axis
         square = found[name] ** 2
         assert abs(square.mean() - axes) < 3.9 * np.sqrt(square.var() / DRAWS)
+
+
+def test_ignorance_of_a_term_never_makes_a_requirement_easier():
+    """What met its limit for certain is met less and less as less is known of the term's size."""
+    met = []
+    for error in (0.0, 0.3, 1.0, 3.0, 10.0):
+        square = MeanSquare(np.ones(2), np.full(2, error))
+        statistics = drawn({1: square}, float(np.sqrt(square.mean[0])))
+        met.append(np.mean(statistics(["rms"])["rms"] <= 1.6))
+    assert met[0] == 1.0
+    assert (np.diff(met) < 0).all() and met[-1] < 0.2

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from tests.benchmarks.scamp import summarised
+
 __all__ = ["to_markdown"]
 
 
@@ -295,6 +297,44 @@ def _budget(part: dict[str, Any]) -> list[str]:
     return out + _table(("what", "s"), [(r["what"], _number(r["seconds"])) for r in part["rows"]])
 
 
+def _scamp(part: dict[str, Any]) -> list[str]:
+    nx, ny = part["size"]
+    out = [
+        "## Self-calibration and SCAMP",
+        "",
+        f"{part['exposures']} exposures of {nx:g} x {ny:g} pixels at three roll angles, "
+        f"{part['stars']:,} stars, order {part['order']}, {part['distortion']:g} pix of "
+        "distortion; both begin without it, from commanded pointings. Pixels, on one axis. "
+        "*Error*: rms of relative places over the detector against the truth, linear maps taken "
+        "away; *absolute* with them, on the sky of the reference stars. *Claimed*: of the relative "
+        "places, and the share of them within one and two of it. *Scatter*: what SCAMP says, rms "
+        "of its residuals between detections and from reference stars. Seconds by the clock and "
+        "of the processors.",
+        "",
+    ]
+    if part["absent"]:
+        out += [f"{part['absent']}: bayesdist alone.", ""]
+    head = ("solution", "false", "seeds", "error", "largest", "absolute", "claimed")
+    head += ("within 1, 2", "scatter", "s", "CPU s")
+    body = []
+    for r in summarised(part["rows"]):
+        within, scatter = r.get("within"), [r.get("internal"), r.get("reference")]
+        body.append(
+            (
+                r["solution"],
+                f"{100 * r['false']:g} %",
+                str(r["seeds"]),
+                *(_number(r.get(name)) for name in ("rms", "largest", "absolute", "claimed")),
+                "–" if within is None else f"{within[0]:.3f}, {within[1]:.3f}",
+                "–" if scatter[0] is None else ", ".join(map(_number, scatter)),
+                _number(r["seconds"]),
+                _number(r["cpu_s"]),
+            )
+        )
+    out += _table(head, body)
+    return out + ([part["scamp"], ""] if part["scamp"] else [])
+
+
 _PARTS = {
     "samplers": _samplers,
     "kernel": _kernel,
@@ -302,6 +342,7 @@ _PARTS = {
     "scaling": _scaling,
     "wise": _wise,
     "budget": _budget,
+    "scamp": _scamp,
 }
 
 

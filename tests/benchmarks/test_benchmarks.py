@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.wcs import WCS
 
 from tests.benchmarks import __main__ as program
+from tests.benchmarks import scamp
 from tests.benchmarks.agreement import compare
+from tests.benchmarks.dithered import POINTING, dithered_sky, relative
 from tests.benchmarks.effective import autocorrelation, smallest_ess
+from tests.benchmarks.ldac import write_catalogues, write_references
 from tests.benchmarks.markdown import to_markdown
 from tests.benchmarks.plain import PlainDensity
 from tests.benchmarks.problem import simulated
@@ -101,6 +107,56 @@ def test_roofline_counts_the_terms_of_two_polynomials():
 
 
 @pytest.fixture(scope="module")
+def undistorted():
+    return dithered_sky(replace(scamp.QUICK, distortion=0.0, stars=60), 3, 0.0)
+
+
+def test_catalogues_hold_the_commanded_pointings(undistorted, tmp_path):
+    """Without distortion the headers alone bring detections to their stars, but for pointing."""
+    sky = undistorted
+    d = sky.field.detections
+    for e, name in enumerate(write_catalogues(sky, tmp_path)):
+        with fits.open(tmp_path / name) as hdus:
+            (text,) = hdus["LDAC_IMHEAD"].data.field(0)
+            objects = hdus["LDAC_OBJECTS"].data
+            x, y, error = (np.array(objects[k]) for k in ("X_IMAGE", "Y_IMAGE", "ERRA_IMAGE"))
+            assert (objects["FLUX_AUTO"] / objects["FLUXERR_AUTO"] > 10).all()
+        raw = (tmp_path / name).read_bytes()
+        assert raw.count(b"END" + 77 * b" ") == 4  # of three headers and the text: blanks
+        np.testing.assert_array_equal(error, d.sigma[d.exposure == e])
+        solution = WCS(fits.Header.fromstring("".join(card.ljust(80) for card in text)))
+        found = sky.plane.wcs_world2pix(solution.all_pix2world(np.stack([x, y], axis=1), 1), 1)
+        off = found - sky.field.sky[d.star[d.exposure == e]]
+        assert np.abs(off.mean(axis=0)).max() < 4 * POINTING
+        turned = 3 * np.radians(scamp.QUICK.roll_error) * 1500 + 0.1  # corners, errors of centroids
+        assert np.abs(off - off.mean(axis=0)).max() < turned
+    write_references(sky, tmp_path / "references.cat")
+    with fits.open(tmp_path / "references.cat") as hdus:
+        stars = hdus["LDAC_OBJECTS"].data
+        world = np.stack([stars["X_WORLD"], stars["Y_WORLD"]], axis=1)
+    found = sky.plane.all_world2pix(world, 1)
+    nearest = np.linalg.norm(found[:, None] - sky.field.sky, axis=2).min(axis=1)
+    assert nearest.max() < 0.06
+
+
+def test_linear_maps_of_the_sky_are_no_relative_errors(undistorted):
+    rng = np.random.default_rng(5)
+    places = undistorted.truth[2]
+    moved = places @ (np.eye(2) + 0.01 * rng.standard_normal((2, 2))) + rng.standard_normal(2)
+    assert np.abs(relative(moved - places, places)).max() < 1e-9
+    bent = (places - places.mean(axis=0)) ** 2 / 1e5
+    assert np.abs(relative(bent, places)).max() > 0.1
+
+
+def test_goes_on_where_scamp_is_missing(monkeypatch):
+    monkeypatch.setattr(scamp, "available", lambda: False)
+    monkeypatch.setattr(scamp, "own_solution", lambda *_: None)
+    monkeypatch.setattr(scamp, "SOLUTIONS", {"SCAMP": scamp.SOLUTIONS["SCAMP, one instrument"]})
+    part = scamp.run(scamp.QUICK)
+    assert part["rows"] == [] and "scamp" in part["absent"]
+
+
+@pytest.fixture(scope="module")
 def quick(tmp_path_factory):
     pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
     folder = tmp_path_factory.mktemp("bench")
@@ -141,6 +197,10 @@ def test_json_and_markdown_are_complete(quick):
     assert all(
         row["converged"] and row["peak_mb"] > row["peak_before_mb"] - 1 for row in scaling["rows"]
     )
+    selfcal = bench["parts"]["scamp"]
+    for row in selfcal["rows"]:
+        assert 0 < row["rms"] < row["largest"] < 1 and row["seconds"] > 0
+    assert len(selfcal["rows"]) == (2 if selfcal["absent"] else 5)
     budget = bench["parts"]["budget"]["rows"]
     assert len(budget) == 4 and all(row["seconds"] > 0 for row in budget)
     assert (quick / "figures" / "scaling.png").read_bytes().startswith(b"\x89PNG")

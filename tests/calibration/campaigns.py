@@ -9,10 +9,10 @@ import numpy as np
 from astropy.table import Table
 from scipy.interpolate import RegularGridInterpolator
 
-from bayesdist.app.campaign.session import session_of
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
+from bayesdist.app.sessions import session_of
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.sample import run_sample
 from bayesdist.model import Chip, DistortionModel, TimeDependence

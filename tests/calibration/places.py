@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 import numba
 import numpy as np
-from scipy.stats import t
+from scipy.stats import norm
 
 from bayesdist.app.correlated import UNMODELLED
 from bayesdist.app.judging import errors_of
@@ -104,7 +104,7 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
         if not kind.pattern:  # what a false alarm finds has no truth
             true.pop(UNMODELLED)
         for term in said.keys() & true.keys():
-            limits = _limits(errors, term)
+            limits = _limits(term, drawn[term])
             pull = true[term] / said[term]
             out[term] = {
                 "pull": pull,
@@ -114,11 +114,11 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
         return out
 
 
-def _limits(errors: PositionErrors, term: str) -> list[float]:
-    """Half the central intervals, in standard deviations: Student's where these have an error."""
-    relative = next((one.relative_error for one in errors.local if one.name == term), None)
-    dof = np.inf if not relative else 1 / (2 * relative**2)
-    return [float(t.ppf(0.5 + level / 2, dof)) for level in LEVELS]
+def _limits(term: str, drawn: np.ndarray) -> list[float]:
+    """Half the central intervals, in standard deviations; of draws where these have an error."""
+    if term == UNMODELLED:
+        return [float(np.quantile(np.abs(drawn), level)) for level in LEVELS]
+    return [float(norm.ppf(0.5 + level / 2)) for level in LEVELS]
 
 
 def _together(n: int) -> list[slice]:
@@ -154,9 +154,7 @@ def _drawn(
     out = {part: np.concatenate(found, axis=1) for part, found in parts.items()}
     shape = out[MODEL].shape
     if UNMODELLED in said:
-        (relative,) = (one.relative_error or 0.0 for one in errors.local)
-        dof = 1 / (2 * max(relative, 1e-3) ** 2)
-        size = np.sqrt(dof / rng.chisquare(dof, (shape[0], 1, 2)))
+        size = np.sqrt(errors.squares[:, 0])  # of the one local term, on one chip
         out[UNMODELLED] = rng.standard_normal(shape) * size * said[UNMODELLED]
     out[CENTROID] = rng.standard_normal(shape) * said[CENTROID]
     offset = OFFSET * rng.standard_normal((shape[0], 1, 2))

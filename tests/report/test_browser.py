@@ -316,6 +316,68 @@ def test_the_page_is_as_wide_as_the_screen(opened, width):
     assert wide <= width
 
 
+@pytest.fixture
+def wide(asked, opened, tmp_path):
+    """A page of its own whose numbers are as long as any: daggers, two chips, names of files."""
+    bad = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"), converged=False)
+    long = "0461802ej_idc.fits, 0461802ej_d2i.fits, 0461802ej_npl.fits, forward"
+    files = (ProductTerm(long, "0461802ej", "forward", plane, "the file as it was read back"),)
+    options = {"terms": TERMS, "grid": GRID, "n_draws": DRAWS, "pixel_scale": SCALE}
+    rng = np.random.default_rng(1)
+    budget = detector_budget(bad.solution, epoch=2010.3, rng=rng, products=files, **options)
+    write_report(tmp_path / "report.html", replace(bad, budget=budget), {})
+    before = opened.current_window_handle
+    opened.switch_to.new_window("tab")
+    opened.get((tmp_path / "report.html").as_uri())
+    yield opened
+    opened.close()
+    opened.switch_to.window(before)
+
+
+def edges(browser, width, cells):
+    """Right ends of what these selectors find, in pixels of a screen of that width."""
+    browser.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False},
+    )
+    return browser.execute_script(
+        "return [...document.querySelectorAll(arguments[0])]"
+        ".map(c => c.getBoundingClientRect()).filter(b => b.width).map(b => b.right)",
+        cells,
+    )
+
+
+def test_verdicts_and_totals_are_on_the_screen_of_a_phone(wide):
+    for cells, least in (
+        ("#status .mark", 10),
+        ("#margins tbody td:last-child", 3),
+        ("#budget table.grid tbody td", 100),
+        ("#products tbody td", 8),
+    ):
+        right = edges(wide, 390, cells)
+        assert len(right) >= least and max(right) <= 390, (cells, right)
+
+
+def test_no_table_is_cut_on_a_screen_of_a_desk(wide):
+    edges(wide, 1440, "table")
+    cut = wide.execute_script(
+        "return [...document.querySelectorAll('.tablebox')]"
+        ".filter(b => b.scrollWidth > b.clientWidth).map(b => b.textContent.slice(0, 60))"
+    )
+    assert cut == []
+    total = wide.find_elements("css selector", "#budget table.grid tr.total")[0]
+    assert total.find_elements("tag name", "td")[-1].is_displayed()
+
+
+def test_every_printed_page_can_be_traced(opened):
+    """The line at its foot is one that the browser knows: it takes it up as it was written."""
+    rules = opened.execute_script(
+        "return [...document.styleSheets].flatMap(s => [...s.cssRules])"
+        ".filter(r => r instanceof CSSPageRule).map(r => r.cssText).join(' ')"
+    )
+    assert "@bottom-left" in rules and "wise-w2 · bayesdist 0.1.0" in rules
+
+
 def test_no_error_is_logged_and_nothing_leaves_the_page(opened):
     """Last, after all that was done above, and from the first moment on."""
     opened.refresh()

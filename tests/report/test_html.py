@@ -89,8 +89,9 @@ def test_links_lead_to_sections_in_the_order_of_the_report(page):
 def test_pictures_are_whole_and_described(page, figures):
     images = lxml_html.fromstring(page).xpath("//figure/img")
     named = {name for names in SECTIONS.values() for name in names}
-    # periods and held-out stars were not asked for, and nothing depends on time
-    assert set(figures) == named - {*SECTIONS["periods"], *SECTIONS["holdout"], "horizon"}
+    # periods, held-out stars and no catalogue were not asked for, and nothing depends on time
+    others = {name for part in ("periods", "holdout", "selfcal") for name in SECTIONS[part]}
+    assert set(figures) == named - others - {"horizon"}
     assert len(images) == len(figures)
     for image in images:
         png = base64.b64decode(image.get("src").split(",", 1)[1], validate=True)
@@ -166,6 +167,29 @@ def test_status_has_each_criterion_with_number_limit_and_outcome(page, converged
         assert row[3].endswith(
             {"met": "pass", "missed": "FAIL", "undecided": "warn"}[margin.verdict]
         )
+
+
+def test_a_copy_on_paper_can_be_traced(converged, images):
+    """By the line below every page, which is a string of the style sheet, and by the footer."""
+    made = {"created": "2026-11-22T10:58:32+00:00", "versions": {"bayesdist": "1.2.3"}}
+    run = replace(converged, name='a "W2" </style>', provenance=made)
+    text = render_report(run, images)
+    maker = "bayesdist 1.2.3 in a run of 2026-11-22 10:58:32 UTC"
+    tree = lxml_html.fromstring(text)
+    assert tree.xpath("//footer")[0].text_content().startswith(f"Made by {maker}. ")
+    [line] = re.findall(r'@bottom-left { content: "(.*?)"; }', tree.xpath("//style")[0].text)
+    said = re.sub(r"\\([0-9a-f]+) ", lambda m: chr(int(m[1], 16)), line)
+    assert said == f"{run.name} · {maker}"
+    assert "Made by bayesdist. " in render_report(replace(converged, provenance={}), images)
+
+
+def test_negative_numbers_have_a_minus(page, converged):
+    tree = lxml_html.fromstring(page)
+    cells = [c.text_content() for c in tree.xpath("//table//td[contains(@class, 'n')]")]
+    assert not [text for text in cells if re.search(r"(^|[ (])-", text)]
+    missed = next(m for m in converged.margins if m.verdict == "missed")
+    row = tree.xpath(f"//section[@id='margins']//tr[th='{missed.requirement.name}']")[0]
+    assert f"(\N{MINUS SIGN}{abs(missed.percent):.0f}\u202f%)" in row.text_content()
 
 
 def _only(run, *verdicts):

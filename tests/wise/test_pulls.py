@@ -22,7 +22,7 @@ RARE = 1e-4  # probability of failing by chance, in each test
 
 @pytest.fixture(scope="module", params=[without_pattern, with_pattern], ids=["plain", "pattern"])
 def runs(request, full: bool):
-    return over_seeds(request.param, 4 * (40 if full else 6))
+    return over_seeds(request.param, 4 * (40 if full else 4))
 
 
 def pulls(runs, band: str | None = None) -> np.ndarray:

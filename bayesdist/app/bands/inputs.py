@@ -93,6 +93,12 @@ def _opened(path: str | Path) -> BandRun:
             where=str(path),
             do="compare its filters by 'bayesdist release'",
         )
+    if run.config.selfcal is not None:
+        raise InputError(
+            "is a run of a self-calibration",
+            where=str(path),
+            do="give runs of matched stars, one for each band",
+        )
     session = Session(run)
     require(session, "bands", ("fit", "sample"))
     chips = session.posterior.model.chips

@@ -8,22 +8,27 @@ from pydantic import Field, PositiveFloat
 
 from bayesdist.app.section import Section
 
-__all__ = ["CampaignBlock", "ReleaseBlock", "TablesBlock"]
+__all__ = ["CampaignBlock", "ReleaseBlock", "StarListsBlock", "TablesBlock"]
 
 Between = tuple[float, float]
 
 
-class CampaignBlock(Section):
+class StarListsBlock(Section):
+    """Star lists, and which of their detections are used."""
+
+    lists: str | list[str]
+    mag: Between | None = None
+    saturation: float | None = None
+    q_max: PositiveFloat | None = None
+
+
+class CampaignBlock(StarListsBlock):
     """Star lists, the catalogue that they are matched with, and what is known of the exposures."""
 
     catalog: str
     exposures: str
-    lists: str | list[str]
     start: str
     filter: str | None = None
-    mag: Between | None = None
-    saturation: float | None = None
-    q_max: PositiveFloat | None = None
     radius: PositiveFloat | None = None
     motions: Literal["reliable", "all"] = "reliable"
     aberration: Literal["log", "earth"] = "log"

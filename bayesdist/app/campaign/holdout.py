@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bayesdist.app.campaign.systematics import errors_by_star
-from bayesdist.app.holdout import whole_exposures
-from bayesdist.assess.grid import grid_pixels
+from bayesdist.app.holdout import local_errors, whole_exposures
 from bayesdist.assess.holdout_predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.data import MatchTable
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.infer.star_influence import star_influence
-from bayesdist.model import LookupTable
 
 if TYPE_CHECKING:
     from bayesdist.app.campaign.session import CampaignSession
@@ -55,7 +53,7 @@ def predictive_of_campaign(session: CampaignSession) -> Predictive:
         predictive_of(session.solution),
         deviations=ExposureDeviations(kinds, tau),
         stars=stars,
-        local=_local_errors(session),
+        local=local_errors(session),
         cell=_cell(session),
     )
 
@@ -66,18 +64,3 @@ def _cell(session: CampaignSession) -> tuple[float, float] | None:
         return None
     across, up = session.tables[0].step
     return TOGETHER * across, TOGETHER * up
-
-
-def _local_errors(session: CampaignSession) -> tuple[LookupTable, ...]:
-    """Errors of positions that belong to places on the detector, as tables of their own."""
-    terms, out = session.local_terms, []
-    for chip in session.config.chips():
-        parts = [term.sigma[chip.number] for term in terms if chip.number in term.sigma]
-        if not parts:
-            continue
-        x, y = grid_pixels(chip.size, session.config.assess.grid)
-        sigma = np.sqrt(sum(part**2 for part in parts))
-        step = (float(x[1] - x[0]), float(y[1] - y[0]))
-        values = np.moveaxis(np.asarray(sigma), 2, 0)
-        out.append(LookupTable(chip.number, values, first=(float(x[0]), float(y[0])), step=step))
-    return tuple(out)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.config import CampaignBlock
+from bayesdist.app.campaign.config import CampaignBlock, StarListsBlock
 from bayesdist.data import (
     ExposureLog,
     ReferenceCatalog,
@@ -24,7 +24,7 @@ from bayesdist.errors import InputError
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.parity import parity_of
 
-__all__ = ["Inputs", "cuts_of", "read_inputs", "start_of"]
+__all__ = ["Inputs", "cuts_of", "lists_of", "read_inputs", "start_of"]
 
 Float = NDArray[np.float64]
 
@@ -89,8 +89,7 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
         bare = tuple(replace(one, vafactor=None) for one in log)
         log = ExposureLog(bare, log.source).with_aberration()
     log.require("vafactor")
-    names = block.lists if isinstance(block.lists, list) else [block.lists]
-    lists = tuple(one for name in names for one in read_star_lists(base / name))
+    lists = lists_of(block, base)
     wanted = tuple(one for one in lists if one.exposure in log)
     missing = sorted(set(log.names) - {one.exposure for one in wanted})
     if missing:
@@ -107,7 +106,15 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
     return Inputs(catalog, n, log, wanted, tuple(strangers))
 
 
-def cuts_of(block: CampaignBlock) -> StarCuts:
+def lists_of(
+    block: StarListsBlock, base: Path, columns: Mapping[str, str] | None = None
+) -> tuple[StarList, ...]:
+    """All star lists that the configuration names."""
+    names = block.lists if isinstance(block.lists, list) else [block.lists]
+    return read_star_lists([base / name for name in names], columns)
+
+
+def cuts_of(block: StarListsBlock) -> StarCuts:
     """Which detections are used."""
     return StarCuts(mag=block.mag, saturation=block.saturation, q_max=block.q_max)
 

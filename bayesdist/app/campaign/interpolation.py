@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.between_nodes import BetweenNodes, between_nodes
 from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.assess.mean_square import MeanSquare
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms import MEASURED, LocalTerm
 from bayesdist.data import MatchTable
@@ -154,13 +155,15 @@ def interpolation_term(
     chips = solution.model.chips
     if not between or any(chip.number not in between for chip in chips):
         return ()
-    sigma = {}
+    sigma, squares = {}, {}
     for chip in chips:
         place = place_of(solution.model, epoch=epoch, chip=chip.number)
         P = place.polynomial(solution.mean)
         by_x, by_y = place.gradient(*mesh(*grid_pixels(chip.size, grid)))
         J = np.stack([by_x @ P.T, by_y @ P.T], axis=-1)
-        variance = np.einsum("nab,b->na", J**2, between[chip.number].variance)
+        found, into = between[chip.number], np.mean(J**2, axis=0)
+        variance = J**2 @ found.left.mean
         sigma[chip.number] = np.sqrt(variance).reshape(grid[1], grid[0], 2)
-    relative = max(one.relative_error for one in between.values())
-    return (LocalTerm(INTERPOLATION, sigma, relative, SOURCE),)
+        error = np.sqrt(into**2 @ found.error**2)
+        squares[chip.number] = MeanSquare(into @ found.square, error)
+    return (LocalTerm(INTERPOLATION, sigma, SOURCE, squares),)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.campaign.systematics import as_assessed
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
@@ -33,7 +32,7 @@ class NewExposures:
     Parameters
     ----------
     released : Posterior
-        With the errors of the catalogue.
+        With the errors of the catalogue, and those that its stars share.
     matches : MatchTable
         At the pixels that the release's tables have corrected, with errors.
     errors : StarErrors or None
@@ -72,7 +71,7 @@ def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
         For star lists, which have to be matched first; pairs in another unit or filter, without
         epochs, or without a way to errors; when all exposures are those of the release.
     """
-    released = as_assessed(session)
+    released = session.signed
     run = RunDirectory(new) if (new / "run.json").exists() else None
     pairs = _pairs(run, new, released.model.unit)
     where = ", ".join(pairs.sources)

@@ -13,6 +13,7 @@ from bayesdist.app.campaign.inputs import cuts_of
 from bayesdist.app.campaign.overlap import overlap_test
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import as_json
+from bayesdist.assess.grid import outline_pixels
 from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
 from bayesdist.data import MatchTable, read_catalog, with_centroid_errors
 from bayesdist.data.motions import motion_error_line
@@ -167,7 +168,7 @@ def _footprints(session: CampaignSession) -> Footprints:
     for name in model.exposures:
         exposure = session.inputs.log[name]
         for chip in model.chips:
-            x, y = _outline(chip.size)
+            x, y = outline_pixels(chip.size)
             place = {"exposure": name, "chip": chip.number}
             when = exposure.epoch if model.time is not None else None
             outlines.append(model.predict(theta, x, y, epoch=when, **place))
@@ -176,15 +177,6 @@ def _footprints(session: CampaignSession) -> Footprints:
     return Footprints(
         catalog.u[rows], catalog.v[rows], tuple(outlines), np.array(epochs), catalog.unit
     )
-
-
-def _outline(size: tuple[float, float]) -> tuple[Float, Float]:
-    """Pixels once around a chip: its edges are not straight on the sky."""
-    nx, ny = size
-    t = np.linspace(0, 1, 9)
-    x = 0.5 + nx * np.concatenate([t, 1 + 0 * t, 1 - t, 0 * t])
-    y = 0.5 + ny * np.concatenate([0 * t, t, 1 + 0 * t, 1 - t])
-    return x, y
 
 
 # matrices here are small: more BLAS threads only get in each other's way

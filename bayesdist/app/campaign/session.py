@@ -16,10 +16,9 @@ from bayesdist.app.campaign.inputs import Inputs, read_inputs
 from bayesdist.app.campaign.interpolation import interpolation_term
 from bayesdist.app.campaign.reference import FREE, rate_priors
 from bayesdist.app.campaign.shared import measured_shared_errors
-from bayesdist.app.campaign.systematics import systematics_of
+from bayesdist.app.campaign.systematics import systematics_of, with_kept_stars
 from bayesdist.app.campaign.table_file import KeptTables, read_tables, write_tables
 from bayesdist.app.correlated import keep_shared_errors
-from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
@@ -36,7 +35,7 @@ from bayesdist.infer.series import Series
 from bayesdist.infer.settling import Settling
 from bayesdist.model import DistortionModel, LookupTable, corrected
 
-__all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession", "session_of"]
+__all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession"]
 
 Float = NDArray[np.float64]
 
@@ -122,7 +121,7 @@ class CampaignSession(Session):
         if block.detector is not None:
             given = f"{GIVEN}: errors of the detector's tables in {block.detector}"
             source = given if block.method == "none" else f"{MEASURED}, and {given}"
-        return (LocalTerm("look-up tables", sigma, source=source), *between)
+        return (LocalTerm("look-up tables", sigma, source), *between)
 
     @property
     def between_nodes(self) -> Mapping[int, BetweenNodes]:
@@ -152,6 +151,12 @@ class CampaignSession(Session):
             return None
         held = self._corrected(held)
         return held if errors is None else with_centroid_errors(held, errors)
+
+    @property
+    def signed(self) -> Posterior:
+        """The solution with the errors of the catalogue as `assess` has kept them."""
+        posterior = with_kept_stars(self)
+        return posterior if self.shared_errors is None else self.shared_errors.widened(posterior)
 
     @property
     def predictive(self) -> Predictive:
@@ -313,8 +318,3 @@ class CampaignSession(Session):
         self.fit_changed()
         for name in ("_all_matches", "_split", "_kept_tables", "raw_matches", "plain_model"):
             self.__dict__.pop(name, None)
-
-
-def session_of(run: RunDirectory) -> Session:
-    """The session of a run, be it of matched stars or of a campaign."""
-    return CampaignSession(run) if run.config.campaign is not None else Session(run)

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CATALOGUE_ERRORS",
-    "as_assessed",
     "catalogue_covariance",
     "catalogue_terms",
     "covariance_of",
     "errors_by_star",
     "shared_stars_of",
     "systematics_of",
+    "with_kept_stars",
     "with_shared_stars",
 ]
 
@@ -156,7 +156,7 @@ def catalogue_covariance(
     return found
 
 
-def as_assessed(session: CampaignSession) -> Posterior:
+def with_kept_stars(session: CampaignSession) -> Posterior:
     """The posterior with the errors of the catalogue as `assess` has kept them.
 
     Neither catalogue nor pairs are needed; where nothing is kept it is the posterior alone.

@@ -178,8 +178,8 @@ def _between(one: BetweenNodes) -> Mapping[str, object]:
     """Pixels along x and y, as the budget has them, and mean squares as measured."""
     return {
         "chip": one.chip,
-        "rms_x": float(one.variance[0] ** 0.5),
-        "rms_y": float(one.variance[1] ** 0.5),
+        "rms_x": float(one.left.mean[0] ** 0.5),
+        "rms_y": float(one.left.mean[1] ** 0.5),
         "square": one.square.tolist(),
         "square_error": one.error.tolist(),
         "n_pairs": one.n_pairs,

@@ -14,9 +14,13 @@ from bayesdist.app.stages.export import run_export
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.report import run_report
 from bayesdist.app.stages.sample import run_sample
+from bayesdist.assess import SAMPLE, star_sample
+from bayesdist.assess.centroid import centroid_scatter
+from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
+from bayesdist.infer import LinearFit
 
-__all__ = ["NEEDS", "rehearse", "require", "run_stage"]
+__all__ = ["NEEDS", "rehearse", "rehearse_solution", "require", "run_stage"]
 
 log = logging.getLogger("bayesdist")
 
@@ -58,9 +62,20 @@ def rehearse(session: Session) -> None:
     ------
     BayesdistError
     """
-    config = session.config
     check_pairs(session)
-    fit, _ = session.linear
+    fit, errors = session.linear
+    _check_residuals(session, fit, errors)
+    rehearse_solution(session, fit)
+
+
+def rehearse_solution(session: Session, fit: LinearFit) -> None:
+    """Budget, margins and files of a fit, with few draws; nothing is written.
+
+    Raises
+    ------
+    BayesdistError
+    """
+    config = session.config
     budget_of(session, fit, REHEARSAL_DRAWS)
     margins_of(session, config.requirements(), fit, REHEARSAL_DRAWS)
     if config.products.sip is not None:
@@ -72,8 +87,23 @@ def rehearse(session: Session) -> None:
         wise_sip_of(session, fit)
 
 
+def _check_residuals(session: Session, fit: LinearFit, errors: MagnitudeErrors | None) -> None:
+    """Refuse a budget with errors that are said to be in the residuals and are larger than these.
+
+    Raises
+    ------
+    InputError
+    """
+    held = session.config.held_in_residuals(fit.model.unit)
+    if held:
+        raw = session.raw_matches
+        matches = raw if errors is None else raw.with_errors_by_magnitude(errors)
+        stars = star_sample(matches.sample(SAMPLE), len(matches), fit)
+        centroid_scatter(stars, held, n_params=fit.model.n_params)
+
+
 def require(session: Session, stage: str, needs: tuple[str, ...]) -> None:
-    """Refuse a stage whose predecessors have not been run.
+    """Refuse a stage, or another command, whose predecessors have not been run.
 
     Raises
     ------
@@ -82,7 +112,7 @@ def require(session: Session, stage: str, needs: tuple[str, ...]) -> None:
     for earlier in needs:
         if not session.run.done(earlier):
             raise InputError(
-                f"stage '{stage}' needs stage '{earlier}', which has not been run",
+                f"'{stage}' needs stage '{earlier}', which has not been run",
                 where=str(session.run.path),
                 do=f"run 'bayesdist {earlier} {session.run.path}' first",
             )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.dates import idle_dates
 from bayesdist.app.holdout import held_out_of, holdout_summary, holdout_table
 from bayesdist.app.horizon import write_horizons
 from bayesdist.app.judging import assessed_horizons, budget_of, margins_of
@@ -23,9 +25,10 @@ from bayesdist.assess import (
     uncertainty_map,
 )
 from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.maps import RELATIVE
 from bayesdist.products.maps_file import write_maps
 
-__all__ = ["run_assess"]
+__all__ = ["relative_maps", "run_assess"]
 
 log = logging.getLogger("bayesdist")
 
@@ -40,8 +43,10 @@ def run_assess(session: Session) -> None:
     formal = [uncertainty_map(session.fit, **place) for place in places]
     maps = [uncertainty_map(solution, **place) for place in places]
     areas = [area_map(solution, **place) for place in places]
+    relative = relative_maps(session, places)
     state = trust(session)
-    write_maps(run / "maps.fits", [*formal, *maps], areas, note=solution.approximation, **state)
+    notes = (solution.approximation, session.gauge_words)
+    write_maps(run / "maps.fits", [*formal, *maps, *relative], areas, notes=notes, **state)
     coefficients = coefficient_table(session.fit, solution)
     coefficients.meta |= state | labelled(session)
     write_table(coefficients, run / "coefficients.ecsv")
@@ -57,12 +62,15 @@ def run_assess(session: Session) -> None:
     table.meta = {"epoch": epoch, "grid": list(grid), "statistic": "rms over the grid"}
     table.meta |= state | labelled(session)
     write_table(table, run / "budget.ecsv")
-    margins = margins_of(session, config.requirements())
+    requirements = config.requirements()
+    if idle := idle_dates(config, requirements):
+        log.warning("assess: WARNING: %s", idle)
+    margins = margins_of(session, requirements)
     write_margins(session, margins)
-    write_horizons(session, assessed_horizons(session, config.requirements()))
+    write_horizons(session, assessed_horizons(session, requirements))
     _assess_periods(session)
     run.summarise(
-        map=_map_summary(maps, formal),
+        map=_map_summary(maps, formal, relative),
         budget=budget.rows(),
         misfit=_misfit_summary(session),
         warnings=warnings,
@@ -90,8 +98,18 @@ def _assess_periods(session: Session) -> None:
         log.info("assess: %s", text)
 
 
+def relative_maps(session: Session, places: Sequence[dict[str, Any]]) -> list[UncertaintyMap]:
+    """Maps of relative positions, where the gauge is a question; else none."""
+    relative = session.relative
+    if relative is None:
+        return []
+    return [replace(uncertainty_map(relative, **place), kind=RELATIVE) for place in places]
+
+
 def _map_summary(
-    maps: Sequence[UncertaintyMap], formal: Sequence[UncertaintyMap]
+    maps: Sequence[UncertaintyMap],
+    formal: Sequence[UncertaintyMap],
+    relative: Sequence[UncertaintyMap] = (),
 ) -> dict[str, Any]:
     """The worst of all chips, and each chip."""
     chips = [
@@ -105,13 +123,15 @@ def _map_summary(
         }
         for m, least_squares in zip(maps, formal, strict=True)
     ]
+    for chip, one in zip(chips, relative, strict=bool(relative)):
+        chip["radius_max_relative"] = one.radius_max
     worst = max(chips, key=lambda c: c["radius_max"])
-    largest = ("sigma_u_max", "sigma_v_max", "radius_max_least_squares")
+    largest = ("sigma_u_max", "sigma_v_max", "radius_max_least_squares", "radius_max_relative")
     return {
         "unit": maps[0].unit,
         "epoch": maps[0].epoch,
         **worst,
-        **{key: max(c[key] for c in chips) for key in largest},
+        **{key: max(c[key] for c in chips) for key in largest if key in worst},
         "chips": chips,
     }
 

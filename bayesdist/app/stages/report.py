@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 from bayesdist.app.campaign.report import campaign_results
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.config import Config
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.horizon import kept_horizons
 from bayesdist.app.judging import budget_of, errors_of, margins_of, products_of
 from bayesdist.app.margins import judged_requirements
 from bayesdist.app.periods import periods_of
 from bayesdist.app.rundir import as_json
+from bayesdist.app.selfcal.report import selfcal_results
+from bayesdist.app.selfcal.session import SelfcalSession
 from bayesdist.app.session import Session
+from bayesdist.app.stages.assess import relative_maps
 from bayesdist.app.trust import posterior_warnings
 from bayesdist.assess import (
     area_map,
@@ -31,7 +35,7 @@ from bayesdist.errors import InputError
 if TYPE_CHECKING:
     from bayesdist.report.context import ChipResults
 
-__all__ = ["run_report"]
+__all__ = ["run_report", "title_of"]
 
 log = logging.getLogger("bayesdist")
 
@@ -53,7 +57,7 @@ def run_report(session: Session) -> None:
     run, config = session.run, session.config
     fit, posterior = session.fit, session.posterior
     several = len(fit.model.exposures) > 1
-    record = run.record
+    record, folder = run.record, run.path.resolve().name
     products = tuple(
         Product(
             path=p["path"],
@@ -64,7 +68,7 @@ def run_report(session: Session) -> None:
     )
     judged = judged_requirements(run)
     inputs = ReportInput(
-        name=run.path.resolve().name,
+        name=title_of(config) or folder,
         config=as_json(config.model_dump(exclude_none=True)),
         stars=session.stars,
         exposures=session.sums.exposures,
@@ -84,21 +88,29 @@ def run_report(session: Session) -> None:
         held_out=held_out_of(session),
         magnitude_errors=session.magnitude_errors,
         flagged=flagged_by_exposure(session.shards, posterior) if several else None,
-        provenance={
-            k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")
-        },
+        provenance={"folder": folder}
+        | {k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")},
     )
     if isinstance(session, CampaignSession):
         inputs = replace(inputs, campaign=campaign_results(session))
+    if isinstance(session, SelfcalSession):
+        inputs = replace(inputs, selfcal=selfcal_results(session))
     drawings = drawn_report(inputs)
     names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
+    save_drawings(drawings, run / "figures")
     for stale in set(run.summary.get("figures", [])) - set(names):
         (run / "figures" / stale).unlink(missing_ok=True)
-    run.summarise(figures=names)
-    save_drawings(drawings, run / "figures")
+    run.summarise(figures=names)  # what is there, should the disk be full
     images = {name: one.png for name, one in drawings.items()}
     write_report(run / "report.html", inputs, images)
     log.info("report: %s", run / "report.html")
+
+
+def title_of(config: Config) -> str:
+    """What was calibrated: detector, or chips, and the filter of a campaign; may be empty."""
+    detector = config.detector.name or " and ".join(chip.name for chip in config.chip)
+    band = None if config.campaign is None else config.campaign.filter
+    return ", ".join(part for part in (detector, band) if part)
 
 
 def _surface(session: Session) -> BudgetSurface | None:
@@ -127,13 +139,20 @@ def _chip_results(session: Session) -> tuple[ChipResults, ...]:
 
     fit, posterior, epoch = session.fit, session.solution, session.epoch
     out = []
-    for chip, place, sums in zip(
-        posterior.model.chips,
-        chip_places(posterior, epoch=epoch),
-        session.shown_sums,
-        strict=True,
+    places = [
+        {"grid": session.config.assess.grid, "epoch": epoch, "chip": chip.number}
+        for chip in posterior.model.chips
+    ]
+    relative = dict(enumerate(relative_maps(session, places)))
+    for k, (chip, place, sums) in enumerate(
+        zip(
+            posterior.model.chips,
+            chip_places(posterior, epoch=epoch),
+            session.shown_sums,
+            strict=True,
+        )
     ):
-        on_chip = {"grid": session.config.assess.grid, "epoch": epoch, "chip": chip.number}
+        on_chip = places[k]
         vectors = on_chip | {"grid": _vector_grid(chip.size)}
         out.append(
             ChipResults(
@@ -145,6 +164,7 @@ def _chip_results(session: Session) -> tuple[ChipResults, ...]:
                 area=area_map(posterior, **on_chip),
                 binned=sums.residuals(),
                 place=place,
+                relative_map=relative.get(k),
             )
         )
     return tuple(out)

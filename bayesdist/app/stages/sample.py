@@ -14,7 +14,7 @@ from bayesdist.infer import (
     save_posterior,
 )
 
-__all__ = ["run_sample"]
+__all__ = ["keep_posterior", "run_sample"]
 
 log = logging.getLogger("bayesdist")
 
@@ -39,15 +39,21 @@ def run_sample(session: Session) -> None:
         method=s.method,
         second_stage=s.second_stage,
     )
-    posterior = session.settled(posterior)
-    record = run.record
-    provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
-    matches = session.matches
-    table = matches if isinstance(matches, MatchTable) else None
-    save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
+    keep_posterior(session, session.settled(posterior))
+
+
+def keep_posterior(session: Session, posterior: Posterior) -> None:
+    """Write a posterior, what it says of each star, and its part of summary.json."""
+    run = session.run
     for name in ("stars", "systematics"):
         session.__dict__.pop(name, None)
     session.__dict__["posterior"] = posterior
+    record = run.record
+    provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
+    provenance |= {"gauge": session.gauge_words} if session.gauge_words else {}
+    matches = session.matches
+    table = matches if isinstance(matches, MatchTable) else None
+    save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
     write_star_files(matches, session.fit, posterior, run / FOLDER)
     c, i = posterior.convergence, posterior.sampler
     run.summarise(

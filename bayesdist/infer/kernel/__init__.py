@@ -18,12 +18,11 @@ with kept_by_content():
         least_squares_moments,
         mixture_moments,
     )
+    from bayesdist.infer.kernel.sky_places import linearised, positions
     from bayesdist.infer.kernel.stars import memberships, residuals
     from bayesdist.infer.kernel.stars_unknown import (
         eliminate_stars,
-        linearised,
         log_marginals,
-        positions,
         weighted_stars,
     )
 

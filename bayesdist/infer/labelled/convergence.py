@@ -8,7 +8,8 @@ ensemble averages, which sees a drift that all walkers share (Goodman and Weare 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ __all__ = ["Convergence", "Limits", "diagnose", "importance_efficiency", "pareto
 Float = NDArray[np.float64]
 
 LEAST_PER_WALKER = 5.0  # effective draws that each walker must have made
+
+_COLUMNS = ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ class Convergence:
     names : tuple of str
         theta, then the hyperparameters as sampled.
     rhat, ess_bulk, ess_tail, mcse_mean, mcse_sd : ndarray, shape (D,)
+        NaN for parameters that are held: they do not move and are not judged.
     pareto_k : float
         Of the importance weights of the independence proposal (Vehtari et al. 2024).
     importance_efficiency : float
@@ -70,17 +74,29 @@ class Convergence:
     @property
     def rhat_max(self) -> float:
         """Largest R-hat."""
-        return float(self.rhat.max())
+        return float(np.nanmax(self.rhat))
 
     @property
     def ess_bulk_min(self) -> float:
         """Smallest bulk effective sample size."""
-        return float(self.ess_bulk.min())
+        return float(np.nanmin(self.ess_bulk))
 
     @property
     def ess_tail_min(self) -> float:
         """Smallest tail effective sample size."""
-        return float(self.ess_tail.min())
+        return float(np.nanmin(self.ess_tail))
+
+    def among(self, names: tuple[str, ...]) -> Convergence:
+        """The same verdict with further names, of parameters that are held and not judged."""
+        at = [names.index(name) for name in self.names]
+
+        def spread(values: Float) -> Float:
+            out = np.full(len(names), np.nan)
+            out[at] = values
+            return out
+
+        columns: dict[str, Any] = {name: spread(getattr(self, name)) for name in _COLUMNS}
+        return replace(self, names=names, **columns)
 
 
 def diagnose(

@@ -8,9 +8,12 @@ is left are the parameters of a `DistortionModel`.
     solve       the mode of everything together
     gauge       what detections leave free, by name, and what fixes it
     information what is known beside them: commanded offsets, ties, priors
+    references  stars whose places are known
+    start       where the search begins
     calibrate   grouping and solving in turn
     errors      of detections, by magnitude
     target, proposal, sampling      the posterior
+    relative    what is known whatever the gauge
     catalogue   the stars
 """
 
@@ -18,6 +21,8 @@ from bayesdist.infer.selfcal.calibrate import SelfCalibration, self_calibrate
 from bayesdist.infer.selfcal.catalogue import StarCatalogue, star_catalogue
 from bayesdist.infer.selfcal.gauge import Gauge, NamedDirection
 from bayesdist.infer.selfcal.information import Information, pointing_information, tie
+from bayesdist.infer.selfcal.references import ReferenceStars
+from bayesdist.infer.selfcal.relative import gauge_free
 from bayesdist.infer.selfcal.sampling import sample_selfcal
 from bayesdist.infer.selfcal.solve import Solution
 
@@ -25,9 +30,11 @@ __all__ = [
     "Gauge",
     "Information",
     "NamedDirection",
+    "ReferenceStars",
     "SelfCalibration",
     "Solution",
     "StarCatalogue",
+    "gauge_free",
     "pointing_information",
     "sample_selfcal",
     "self_calibrate",

@@ -14,12 +14,12 @@ from bayesdist.errors import NotSettledError
 from bayesdist.infer.selfcal.errors import scatter_by_magnitude
 from bayesdist.infer.selfcal.gauge import Gauge, find_gauge
 from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.normal import expand
+from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepared
 from bayesdist.infer.selfcal.solve import Solution, solve, wide_mixture
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfCalibration", "places_of", "self_calibrate"]
+__all__ = ["SelfCalibration", "curvatures", "gauge_of", "places_of", "self_calibrate"]
 
 Float = NDArray[np.float64]
 
@@ -27,9 +27,11 @@ MOST_ROUNDS = 12
 SHRINK = 0.5  # of the linking length from round to round, at most
 REACH = 12.0  # errors that a linking length has to span
 SETTLED = 1e-3  # share of the detections that may change their star
+ALIKE = 0.02  # change of the number of detections that leaves the errors as they were
 GUESS = 0.02  # pixels: error where none is quoted, until it is measured
 
-References = Callable[[Problem], StarPriors]
+Knowledge = Callable[[Float], Information]
+References = Callable[[Problem, Float], StarPriors]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +64,16 @@ def self_calibrate(
     detections: Detections,
     theta: Float,
     *,
-    information: Information | None = None,
+    knowledge: Knowledge | None = None,
     match_radius: float,
     start_radius: float | None = None,
     least: int = 2,
     motion: str = "none",
+    parallax_factors: Float | None = None,
     dilation: Float | None = None,
     jitter: float | None = None,
     references: References | None = None,
+    rounds: int = MOST_ROUNDS,
     log: Callable[[str], None] = lambda text: None,
 ) -> SelfCalibration:
     """Calibrate a detector from detections alone.
@@ -81,22 +85,24 @@ def self_calibrate(
         Without errors these are measured, by magnitude where magnitudes are given.
     theta : ndarray, shape (D,)
         A start by which detections of a star lie closer than `start_radius`.
-    information : Information, optional
-        What is known beside the detections.
+    knowledge : callable, optional
+        What is known beside the detections, linearised at parameters (D,).
     match_radius : float
         Linking length of the last round, pixels: how far false detections reach.
     start_radius : float, optional
         Of the first one.
     least : int
         Fewest detections of a star.
-    motion : str
+    motion, parallax_factors
         As `prepared`.
     dilation : ndarray, shape (E,), optional
         VAFACTOR of each exposure.
     jitter : float, optional
         Held at this, pixels.
     references : callable, optional
-        What is known of the stars of a problem beforehand.
+        What is known of the stars of a problem at parameters (D,) beforehand.
+    rounds : int
+        At most so many.
     log : callable, optional
         Called with a sentence for each round.
 
@@ -112,27 +118,31 @@ def self_calibrate(
         When the groups go on changing.
     """
     theta = np.array(theta, float)
-    information = information or Information.none(theta)
+    knowledge = knowledge or Information.none
     measured = detections.sigma is None
     if measured:
         detections = replace(detections, sigma=np.full(len(detections), GUESS))
     radius = max(start_radius or match_radius, match_radius)
     pixel = model.pixel_size(theta)
     errors: tuple[Float, Float] | None = None
-    before = None
-    for turn in range(MOST_ROUNDS):
+    before: Friends | None = None
+    solution: Solution | None = None
+    for turn in range(rounds):
         friends = friends_of_friends(
             places_of(model, detections, theta, dilation), detections.exposure, radius * pixel
         )
         found = replace(detections, star=friends.star)
         problem = prepared(
-            model, found, theta, match_radius=radius, least=least, motion=motion, dilation=dilation
-        )
+            model, found, theta, match_radius=radius, least=least, motion=motion,
+            parallax_factors=parallax_factors, dilation=dilation,
+        )  # fmt: skip
         if references is not None:
-            problem = replace(problem, priors=references(problem))
-        gauge = _gauge(problem, theta, information)
+            problem = replace(problem, priors=references(problem, theta))
+        information = knowledge(theta)
+        gauge = gauge_of(problem, theta, information)
         free = np.setdiff1d(np.arange(model.n_params), gauge.held)
-        solution = solve(problem, theta, free, information, jitter=jitter)
+        known = None if solution is None else _still(problem, solution)
+        solution = solve(problem, theta, free, information, jitter=jitter, mixture=known)
         theta = solution.theta
         log(
             f"round {turn + 1}: linking length {radius:.3g} pix, {friends.n_stars} stars, "
@@ -151,7 +161,7 @@ def self_calibrate(
                     problem, theta, free, information, stars=solution.stars, jitter=jitter,
                     mixture=solution.mixture,
                 )  # fmt: skip
-            gauge = _gauge(solution.problem, solution.theta, information, solution)
+            gauge = gauge_of(solution.problem, solution.theta, information, solution)
             return SelfCalibration(
                 solution, gauge, friends, replace(detections, star=friends.star), errors, turn + 1
             )
@@ -159,7 +169,7 @@ def self_calibrate(
         scatter = float(np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2))
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
     raise NotSettledError(
-        f"stars and solution still change after {MOST_ROUNDS} rounds",
+        f"stars and solution still change after {rounds} rounds",
         where="self-calibration",
         do="give a better start, another match radius, or a lower order",
     )
@@ -186,17 +196,48 @@ def places_of(
     return np.asarray(o + (out - o) * dilation[detections.exposure, None])
 
 
-def _gauge(
+def gauge_of(
     problem: Problem, theta: Float, information: Information, solution: Solution | None = None
 ) -> Gauge:
+    """What the detections of a problem leave free, and what fixes it.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : ndarray, shape (D,)
+    information : Information
+    solution : Solution, optional
+        Of the problem; before there is one, stars lie at the means of their detections.
+    """
     if solution is None:
         stars = problem.mean_places(theta)
         problem = problem.at(theta, stars)
         mixture = wide_mixture(problem, theta, stars)
     else:
         stars, mixture = solution.stars, solution.mixture
-    found = expand(problem, theta, mixture, stars, observed=False)
-    return find_gauge(problem, theta, found.curvature, information)
+    alone, known = curvatures(problem, theta, mixture, stars)
+    return find_gauge(problem, theta, alone, information, known=known)
+
+
+def curvatures(
+    problem: Problem, theta: Float, mixture: Mixture, stars: Float
+) -> tuple[Float, Float]:
+    """Curvature (D, D) of the detections alone, and with what is known of the stars beforehand."""
+    known = expand(problem, theta, mixture, stars, observed=False).curvature
+    if not problem.priors.informed.any():
+        return known, known
+    bare = replace(problem, priors=StarPriors.none(problem.n_stars, problem.n_star))
+    return expand(bare, theta, mixture, stars, observed=False).curvature, known
+
+
+def _still(problem: Problem, solution: Solution) -> Mixture | None:
+    """The mixture of the last round, where this one has nearly the same detections to begin with.
+
+    New ones may lie far from where the solution has them, and so do stars that move, which begin at
+    rest: then errors have to begin large.
+    """
+    same = abs(len(problem) / len(solution.problem) - 1.0) < ALIKE
+    return solution.mixture if same and problem.n_star == 2 else None
 
 
 def _with_errors(

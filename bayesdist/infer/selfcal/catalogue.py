@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.selfcal.errors import memberships
-from bayesdist.infer.selfcal.normal import eliminated_rows
+from bayesdist.infer.selfcal.normal import eliminated_rows, memberships
 from bayesdist.infer.selfcal.solve import Solution
 
 __all__ = ["StarCatalogue", "star_catalogue"]

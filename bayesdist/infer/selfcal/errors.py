@@ -5,38 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer import kernel
-from bayesdist.infer.selfcal.normal import Mixture
+from bayesdist.infer.selfcal.normal import Mixture, memberships
 from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = ["memberships", "scatter_by_magnitude"]
+__all__ = ["scatter_by_magnitude"]
 
 Float = NDArray[np.float64]
 
 LEAST = 200  # detections of a bin
 MOST_BINS = 20
-
-
-def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:
-    """Probability (N,) that a detection is its star's."""
-    p = problem
-    j2, log_core, log_out = mixture.constants(p.log_outlier)
-    return np.asarray(
-        kernel.weighted_stars(
-            p.starts,
-            p.places(theta),
-            p.W,
-            p.var,
-            j2,
-            log_core,
-            log_out,
-            p.time,
-            p.factor,
-            p.priors.centre,
-            p.priors.precision,
-            stars.copy(),
-        )
-    )
 
 
 def scatter_by_magnitude(

@@ -21,6 +21,7 @@ from bayesdist.model import DistortionModel
 
 __all__ = [
     "GENERATORS",
+    "SAME_ROLL",
     "Gauge",
     "NamedDirection",
     "find_gauge",
@@ -40,8 +41,11 @@ GENERATORS = {
     "skew_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
     "skew_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
 }
+RATES = ("drift_u", "drift_v", "spin", "expansion")  # of the sky, where stars move
+PARALLAX = "parallax"  # of the whole sky, where stars have one
 POINTS = ("zero_point_u", "zero_point_v")
 NULL = 1e-10  # of the largest eigenvalue: no information but rounding
+FREE_PIX = 10.0  # error at the detector's edge above which a direction counts as free
 WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as nearly free
 EXPLAINED = 1e-2  # share of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
@@ -103,6 +107,9 @@ class Gauge:
         parameter that stands out in it.
     spread : float
         Largest difference of two roll angles, radians, a half turn counted as none.
+    rates : tuple of str
+        Where stars move: moves of the whole sky with time that are free, of `RATES`, and
+        `PARALLAX`.
     """
 
     null: Float
@@ -112,6 +119,7 @@ class Gauge:
     unnamed: tuple[str, ...]
     weakest: Float
     spread: float
+    rates: tuple[str, ...] = ()
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -122,7 +130,7 @@ class Gauge:
     def sentences(self) -> tuple[str, ...]:
         """What cannot be known, why, and what fixes it."""
         out, free = [], set(self.free_names)
-        if {"skew_plus", "skew_cross"} <= free:
+        if {"skew_plus", "skew_cross"} <= free and self.spread < SAME_ROLL:
             out.append(
                 f"one roll angle (they differ by {np.degrees(self.spread):.2g} deg at most, half "
                 "turns apart): a linear skew of the distortion cannot be told from one of the sky"
@@ -142,7 +150,18 @@ class Gauge:
                     f" ({one.sigma * one.edge_pix:.2g} pix at the edge); {_fixed(one)}"
                 )
         if set(POINTS) <= free:
-            out.append("the zero point on the sky is free: only relative positions are known")
+            points = [one for one in self.directions if one.name in POINTS]
+            worst = max(points, key=lambda one: one.sigma_fixed)
+            out.append(
+                f"zero point on the sky: free; {_fixed(worst)}"
+                if np.isfinite(worst.sigma_fixed)
+                else "the zero point on the sky is free: only relative positions are known"
+            )
+        if self.rates:
+            out.append(
+                f"motions are relative: {', '.join(self.rates)} of the whole sky cannot be told "
+                "from what the exposures did"
+            )
         if self.unnamed:
             out.append(
                 "also free: combinations in which " + ", ".join(self.unnamed) + " stand out; "
@@ -202,6 +221,38 @@ def moves(model: DistortionModel, theta: Float) -> dict[str, Float]:
         for axis, name in enumerate(POINTS):
             linear[name][shift] = np.eye(2)[axis] - M[:, axis]
     return linear
+
+
+def rates(model: DistortionModel, theta: Float, years: Float) -> dict[str, Float]:
+    """Moves of the whole sky that grow with time, as changes (D,) of the exposures' frames.
+
+    Stars follow them where they have motions.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+    years : ndarray, shape (E,)
+        Since the first exposure.
+    """
+    out = {name: np.zeros(model.n_params) for name in RATES}
+    for e in range(1, len(model.exposures)):
+        names, block = model.free_frame_names(e), model.frame_slice(e)
+        if len(names) < 2:
+            continue
+        M, d = model.frame(theta, e)
+        shift = slice(block.start, block.start + 2)
+        for axis, name in enumerate(("drift_u", "drift_v")):
+            out[name][shift] = years[e] * np.eye(2)[axis]
+        if "rotation" in names:
+            out["spin"][shift] = years[e] * GENERATORS["rotation"] @ d
+            out["spin"][block.start + names.index("rotation")] = years[e]
+        if "scale" in names:
+            out["expansion"][shift] = years[e] * d
+            out["expansion"][block.start + names.index("scale")] = years[e] * np.sqrt(
+                np.linalg.det(M)
+            )
+    return {name: row for name, row in out.items() if row.any()}
 
 
 def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
@@ -264,7 +315,14 @@ def roll_spread(model: DistortionModel, theta: Float) -> float:
     return float(worst)
 
 
-def find_gauge(problem: Problem, theta: Float, curvature: Float, information: Information) -> Gauge:
+def find_gauge(
+    problem: Problem,
+    theta: Float,
+    curvature: Float,
+    information: Information,
+    *,
+    known: Float | None = None,
+) -> Gauge:
     """Free directions of a problem at a solution.
 
     Parameters
@@ -274,19 +332,25 @@ def find_gauge(problem: Problem, theta: Float, curvature: Float, information: In
     curvature : ndarray, shape (D, D)
         Of the detections, with EM weights: never indefinite but by rounding.
     information : Information
+    known : ndarray, shape (D, D), optional
+        Curvature with what is known of the stars beforehand; the same by default.
     """
     model = problem.model
     years = float(np.ptp(problem.groups.epoch)) or 1.0
     scale = parameter_scale(model, theta, years)
     null, values, vectors = _null(curvature * np.outer(scale, scale))
-    both = curvature + information.precision
+    both = (curvature if known is None else known) + information.precision
     open_, *_ = _null(both * np.outer(scale, scale))
     held = _pivots(model, open_)
     directions = _directions(model, theta, scale, null, curvature, open_, both)
-    known = np.stack(
-        [row / scale for row in moves(model, theta).values()], axis=1
-    )  # in pixels at the edge
-    weak = (values > NULL * values[-1]) & (values < WEAK_PIX**-2)
+    named = moves(model, theta)
+    moving = _rates_of(problem, theta)
+    known_moves = np.stack(  # in pixels at the edge
+        [row / scale for row in (named | moving).values()], axis=1
+    )
+    # a spin bends the paths of stars that move, by next to nothing
+    loose = vectors[:, values < WEAK_PIX**-2]
+    weak = (values > _least(values)) & (values < WEAK_PIX**-2)
     weakest = np.array(
         [[values[k] ** -0.5, np.argmax(np.abs(vectors[:, k]))] for k in np.flatnonzero(weak)]
     ).reshape(-1, 2)
@@ -295,15 +359,45 @@ def find_gauge(problem: Problem, theta: Float, curvature: Float, information: In
         open=open_ * scale[:, None],
         held=held,
         directions=directions,
-        unnamed=_unnamed(model, null, known),
+        unnamed=_unnamed(model, null, known_moves),
         weakest=weakest,
         spread=roll_spread(model, theta),
+        rates=tuple(name for name, row in moving.items() if _within(row / scale, loose)),
     )
+
+
+def _rates_of(problem: Problem, theta: Float) -> dict[str, Float]:
+    """Moves with time of the stars' sky; none where stars do not move."""
+    if problem.n_star < 4:
+        return {}
+    exposure, E = problem.groups.exposure[problem.groups.index], len(problem.model.exposures)
+    seen = np.maximum(np.bincount(exposure, minlength=E), 1)
+    when = np.bincount(exposure, problem.time, E) / seen
+    out = rates(problem.model, theta, when - when[0])
+    if problem.n_star == 5:  # exposures are shifted as all stars are
+        out[PARALLAX] = np.zeros(len(theta))
+        of_each = [np.bincount(exposure, f, E) / seen for f in problem.factor.T]
+        for e in range(1, E):
+            block = problem.model.frame_slice(e)
+            if block.stop - block.start >= 2:
+                out[PARALLAX][block.start : block.start + 2] = [f[e] - f[0] for f in of_each]
+    return out
+
+
+def _within(row: Float, null: Float) -> bool:
+    """Whether a move is one of the free directions."""
+    left = row - null @ (null.T @ row)
+    return bool(np.linalg.norm(left) < EXPLAINED * np.linalg.norm(row))
 
 
 def _null(scaled: Float) -> tuple[Float, Float, Float]:
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    return vectors[:, values < NULL * values[-1]], values, vectors
+    return vectors[:, values < _least(values)], values, vectors
+
+
+def _least(values: Float) -> float:
+    """Eigenvalue, in pixels^-2 at the edge, below which a direction is free."""
+    return max(NULL * float(values[-1]), FREE_PIX**-2)
 
 
 def _pivots(model: DistortionModel, null: Float) -> Int:
@@ -371,7 +465,7 @@ def _directions(
 def _inverse(H: Float, scale: Float) -> Float:
     """Pseudo-inverse (D, D), without the free directions."""
     values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    good = values >= NULL * values[-1]
+    good = values >= _least(values)
     root = (vectors[:, good] / np.sqrt(values[good])) * scale[:, None]
     return np.asarray(root @ root.T)
 
@@ -380,7 +474,7 @@ def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ..
     """Parameters that stand out in what of the free directions no move of the sky describes."""
     if not null.shape[1]:
         return ()
-    Q, _ = np.linalg.qr(known)
+    Q, _ = np.linalg.qr(np.concatenate([known, _chip_moves(model)], axis=1))
     left = null - Q @ (Q.T @ null)
     U, s, _ = np.linalg.svd(left, full_matrices=False)
     out = []
@@ -388,3 +482,11 @@ def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ..
         for at in np.argsort(-np.abs(U[:, k]))[:2]:
             out.append(model.names[at])
     return tuple(dict.fromkeys(out))
+
+
+def _chip_moves(model: DistortionModel) -> Float:
+    """Shifts and linear maps (D, n) of each further chip, which no star may tie to the first."""
+    starts = [
+        model.coefficient_slice(c.number, axis).start for c in model.chips[1:] for axis in (0, 1)
+    ]
+    return np.eye(model.n_params)[:, [at + k for at in starts for k in range(3)]]

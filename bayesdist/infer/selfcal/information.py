@@ -5,6 +5,7 @@ Every piece is Gaussian in the parameters, linearised at a solution.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from bayesdist.model import DistortionModel
 
-__all__ = ["Information", "linear_part", "pointing_information", "tie"]
+__all__ = ["Information", "frame_information", "linear_part", "pointing_information", "tie"]
 
 Float = NDArray[np.float64]
 
@@ -82,6 +83,7 @@ def pointing_information(
     sigma: Float,
     *,
     group: NDArray[np.int64] | None = None,
+    pixels: Sequence[tuple[int, float, float]] | None = None,
 ) -> Information:
     """Commanded offsets: where the reference pixel of the first chip is on the sky.
 
@@ -98,15 +100,19 @@ def pointing_information(
         Error of each on one axis.
     group : ndarray of int, shape (E,), optional
         Exposures with the same guide stars; all of them by default.
+    pixels : sequence of (int, float, float), optional
+        Chip number, x and y of some pixels: their mean place is what is pointed, in place of the
+        reference pixel.
     """
-    E, chip = len(model.exposures), model.chips[0]
-    x, y = (np.full(E, c) for c in chip.reference_pixel)
-    codes = np.arange(E)
-    where: dict[str, Any] = {"exposure": codes, "chip": chip.number}
-    if model.time is not None:
-        where["epoch"] = np.full(E, model.time.epoch0[0])
-    rows = model.jacobian(theta, x, y, **where)
-    places = model.predict(theta, x, y, **where)
+    E, first = len(model.exposures), model.chips[0]
+    pixels = pixels or [(first.number, *first.reference_pixel)]
+    rows, places = np.zeros((E, 2, model.n_params)), np.zeros((E, 2))
+    for chip, x, y in pixels:
+        at: dict[str, Any] = {"exposure": np.arange(E), "chip": chip}
+        if model.time is not None:
+            at["epoch"] = np.full(E, model.time.epoch0[0])
+        rows += model.jacobian(theta, np.full(E, x), np.full(E, y), **at) / len(pixels)
+        places += model.predict(theta, np.full(E, x), np.full(E, y), **at) / len(pixels)
     precision, right = np.zeros((model.n_params,) * 2), np.zeros(model.n_params)
     known = np.isfinite(offsets).all(axis=1)
     group = np.zeros(E, np.int64) if group is None else group
@@ -120,6 +126,37 @@ def pointing_information(
             precision += J.T @ weight @ J
             right += J.T @ weight @ (offsets[here, axis] - places[here, axis])
     return Information(np.array(theta, float), precision, right)
+
+
+def frame_information(
+    model: DistortionModel, theta: Float, name: str, values: Float, sigma: float
+) -> Information:
+    """One property of the exposures' frames, known but for a zero point that all share.
+
+    Commanded rolls, each with its error, or scales that scatter about one.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+        At which it is linearised.
+    name : str
+        A parameter of the frames: 'rotation', 'scale'.
+    values : ndarray, shape (E,)
+        NaN where there is none; the first exposure's is that of the polynomials.
+    sigma : float
+        Error of each.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    rows, now = np.zeros((len(known), model.n_params)), np.zeros(len(known))
+    for r, e in enumerate(known):
+        names = model.free_frame_names(int(e))
+        if name in names:
+            at = model.frame_slice(int(e)).start + names.index(name)
+            rows[r, at], now[r] = 1.0, theta[at]
+    weight = (np.eye(len(known)) - 1.0 / len(known)) / sigma**2
+    right = rows.T @ weight @ (values[known] - now)
+    return Information(np.array(theta, float), rows.T @ weight @ rows, right)
 
 
 def linear_part(model: DistortionModel, chip: int | None = None) -> Float:

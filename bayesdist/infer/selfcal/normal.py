@@ -20,13 +20,22 @@ from numpy.typing import NDArray
 from bayesdist.infer import kernel
 from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = ["Expansion", "Mixture", "Structure", "eliminated_rows", "expand", "log_marginal"]
+__all__ = [
+    "Anchor",
+    "Expansion",
+    "Mixture",
+    "Structure",
+    "eliminated_rows",
+    "expand",
+    "log_marginal",
+    "memberships",
+]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STARS = 4096  # eliminated at a time
-SCRATCH = 16_000_000  # bytes of coefficients of draws held at a time
+SCRATCH = 1_000_000  # bytes of coefficients of draws at a time: what a core has near it
 
 
 @dataclass(frozen=True)
@@ -63,7 +72,7 @@ class Structure:
         Effective coefficients.
     linear : ndarray, shape (G, 2, 2)
         M.
-    extra : ndarray, shape (G, 2, K, m)
+    extra : ndarray, shape (G, m, 2, K)
         Derivatives by drift and frames; zero where a group has fewer than m of them.
     columns : ndarray of int, shape (G, m)
         Which parameters these are; -1 for none.
@@ -80,13 +89,13 @@ class Structure:
         groups, K = problem.groups, problem.model.n_terms
         found = problem.effective_jacobian(theta)
         m = max(len(columns) for columns, _ in found) - 2 * K
-        extra, columns = np.zeros((len(groups), 2, K, m)), np.full((len(groups), m), -1)
+        extra, columns = np.zeros((len(groups), m, 2, K)), np.full((len(groups), m), -1)
         linear = np.empty((len(groups), 2, 2))
         for g, (which, derivative) in enumerate(found):
             linear[g] = derivative[:, 0, [0, K]]
             n = len(which) - 2 * K
             columns[g, :n] = which[2 * K :]
-            extra[g, ..., :n] = derivative[..., 2 * K :]
+            extra[g, :n] = np.moveaxis(derivative[..., 2 * K :], 2, 0)
         return cls(problem.effective(theta), linear, extra, columns)
 
 
@@ -215,15 +224,66 @@ def _assemble(
     for g, columns in enumerate(structure.columns):
         used = columns >= 0
         which, at = columns[used], 2 * K * chips[g]
-        block = edges[g].reshape(2 * K, -1)[:, used]
+        block = edges[g].reshape(-1, 2 * K)[used].T
         N[at : at + 2 * K, which] += block
         N[which, at : at + 2 * K] += block.T
         N[np.ix_(which, which)] += owns[g][np.ix_(used, used)]
 
 
-def log_marginal(
-    problem: Problem, theta: Float, mixtures: Float, stars: Float, middles: Float
-) -> Float:
+def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:
+    """Probability (N,) that a detection is its star's."""
+    p = problem
+    j2, log_core, log_out = mixture.constants(p.log_outlier)
+    return np.asarray(
+        kernel.weighted_stars(
+            p.starts,
+            p.places(theta),
+            p.W,
+            p.var,
+            j2,
+            log_core,
+            log_out,
+            p.time,
+            p.factor,
+            p.priors.centre,
+            p.priors.precision,
+            p.least_root,
+            stars.copy(),
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """Modes of the stars at a solution, and how they follow their detections from there.
+
+    Parameters
+    ----------
+    stars : ndarray, shape (S, q)
+    share : ndarray, shape (N,)
+        Weight of each detection in the place of its star; they add to 1.
+    middles : ndarray, shape (S, 2)
+        Mean places of the detections at the solution, so weighted.
+    """
+
+    stars: Float
+    share: Float
+    middles: Float
+
+    @classmethod
+    def at(cls, problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Anchor:
+        """That of a problem at theta (D,), where `stars` are the modes."""
+        p, z = problem, problem.places(theta)
+        member = memberships(problem, theta, mixture, stars)
+        weight = member / (p.var + mixture.jitter**2) * (p.W[:, 0] + p.W[:, 2])
+        total = np.bincount(p.star, weight)
+        lost = total[p.star] <= 0  # a star without members stays in the middle
+        share = np.where(lost, 1.0 / p.counts[p.star], weight / np.where(lost, 1.0, total[p.star]))
+        middles = [np.bincount(p.star, share * z[:, axis]) for axis in (0, 1)]
+        return cls(stars, share, np.stack(middles, axis=1))
+
+
+def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: Anchor) -> Float:
     """Log density of parameter vectors, the stars integrated out (Laplace), up to a constant.
 
     Parameters
@@ -232,10 +292,8 @@ def log_marginal(
     theta : ndarray, shape (n, D)
     mixtures : ndarray, shape (n, 2)
         Jitter in pixels, share of false detections.
-    stars : ndarray, shape (S, q)
-        Modes at some theta.
-    middles : ndarray, shape (S, 2)
-        Mean places of the stars' detections at the same.
+    anchor : Anchor
+        Of a solution near by: where the search for the stars' modes begins.
 
     Returns
     -------
@@ -251,8 +309,9 @@ def log_marginal(
             0,
             p.n_stars,
             *p.columns,
-            stars,
-            middles,
+            anchor.stars,
+            anchor.middles,
+            anchor.share,
             p.powers(theta[some]),
             p.model.order,
             rows[some],

@@ -45,6 +45,11 @@ class StarPriors:
         """Nothing is known of any star."""
         return cls(np.zeros((n, q)), np.tile(VAGUE * np.eye(q), (n, 1, 1)))
 
+    @property
+    def informed(self) -> NDArray[np.bool_]:
+        """Of which stars (S,) something is known."""
+        return np.asarray(np.trace(self.precision, axis1=1, axis2=2) > 10 * VAGUE)
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -206,6 +211,30 @@ class Problem:
         """Stars (S, q) at the means of their detections: where a search may begin."""
         out = np.zeros((self.n_stars, self.n_star))
         out[:, :2] = self.middles(theta)
+        return out
+
+    def median_places(self, theta: Float) -> Float:
+        """Stars (S, q) at the medians of their detections, which a few false ones do not move."""
+        out, z = np.zeros((self.n_stars, self.n_star)), self.places(theta)
+        low, high = (self.counts - 1) // 2, self.counts // 2
+        for axis in (0, 1):
+            ordered = z[np.lexsort((z[:, axis], self.star)), axis]
+            first = self.starts[:-1]
+            out[:, axis] = (ordered[first + low] + ordered[first + high]) / 2
+        return out
+
+    def found_again(self, theta: Float, stars: Float) -> Float:
+        """Stars (S, q), those that have left all their detections back at the mean of these."""
+        middles, places = self.middles(theta), self.star_places(stars)
+        sums = [np.bincount(self.star, places[:, axis]) / self.counts for axis in (0, 1)]
+        # what a star may lie off is what its least curvature stands for: the match circle
+        reach = np.sqrt(2.0) / self.least_root
+        lost = np.hypot(*(np.stack(sums, axis=1) - middles).T) > reach
+        if not lost.any():
+            return stars
+        out = stars.copy()
+        out[lost] = 0.0
+        out[lost, :2] = middles[lost]
         return out
 
     def at(self, theta: Float, stars: Float) -> Problem:

@@ -23,12 +23,16 @@ __all__ = ["sample_selfcal"]
 
 Float = NDArray[np.float64]
 
+# what a detection costs in a pass, in matched stars: its star's mode is found anew each time
+DEARER = 60
+
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def sample_selfcal(
     solution: Solution,
     *,
     jitter: float | None = None,
+    fraction_prior: tuple[float, float] = (1.0, 9.0),
     seed: int = 1,
     ensembles: int = 4,
     target_ess: float = 400.0,
@@ -45,13 +49,16 @@ def sample_selfcal(
     solution : Solution
     jitter : float, optional
         Held at this, in pixels; sampled by default.
+    fraction_prior : tuple of float
+        As `OutlierMixture`.
     seed, ensembles, target_ess, target_rhat, max_steps, checkpoint_every, folder, progress
         As `sample`.
 
     Returns
     -------
     Posterior
-        Parameters that the gauge holds have the same value in all draws.  The jitter is in pixels.
+        Parameters that the gauge holds have the same value in all draws and are not judged.  The
+        jitter is in pixels.
 
     Raises
     ------
@@ -63,17 +70,19 @@ def sample_selfcal(
             f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
         )
     started = time.monotonic()
-    target = SelfTarget(solution, jitter)
+    target = SelfTarget(solution, jitter, fraction_prior)
     proposal = propose(target)
     seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
     settings = Settings(
         seeds=tuple(int(s) for s in seeds[:-1]),
-        n_stars=len(solution.problem),
+        n_stars=DEARER * len(solution.problem),
         limits=Limits(target_ess, target_rhat),
         max_steps=max_steps,
         checkpoint_every=checkpoint_every,
         folder=None if folder is None else Path(folder),
-        fingerprint=_fingerprint(solution, seed, ensembles, checkpoint_every),
+        fingerprint=_fingerprint(
+            solution, jitter, fraction_prior, seed, ensembles, checkpoint_every
+        ),
         progress=progress,
     )
     chains = run_chains(target, proposal, settings)  # type: ignore[arg-type]
@@ -90,7 +99,7 @@ def sample_selfcal(
         n_flagged=round(len(solution.problem) - expansion.n_members),
         n_false=len(solution.problem) - expansion.n_members,
         reference_sigma=target.hyper.scale,
-        convergence=chains.verdict,
+        convergence=chains.verdict.among((*solution.problem.model.names, *target.hyper.names)),
         sampler=SamplerInfo(
             method=f"emcee {chains.plan.method}",
             ensembles=ensembles,

@@ -101,13 +101,13 @@ def solve(
     NotSettledError
         When it does not converge.
     """
-    stars = problem.mean_places(theta) if stars is None else stars
+    stars = problem.median_places(theta) if stars is None else stars
     problem = problem.at(theta, stars)
     mixture = mixture or wide_mixture(problem, theta, stars)
     near = False
     for _ in range(MOST_PASSES):
         found = expand(problem, theta, mixture, stars, observed=near)
-        stars = found.stars
+        stars = problem.found_again(theta, found.stars)
         gradient = found.gradient + information.pull(theta)
         step = newton_step(found.curvature + information.precision, gradient, free)
         if step is None and near:
@@ -131,7 +131,8 @@ def solve(
         )
         if near and decrement < CLOSE and change < SETTLED:
             found = expand(problem, theta, mixture, stars)
-            return Solution(problem, theta, found.stars, mixture, free, found, information)
+            stars = problem.found_again(theta, found.stars)
+            return Solution(problem, theta, stars, mixture, free, found, information)
         near = decrement < NEAR and change < 0.1
         mixture = after
     raise NotSettledError(
@@ -144,7 +145,9 @@ def solve(
 def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
     """Step (D,) of the free parameters; None where the curvature is not positive."""
     H = curvature[np.ix_(free, free)]
-    scale = np.sqrt(np.maximum(np.diag(H), 1e-300))
+    if not (np.diag(H) > 0).all():
+        return None
+    scale = np.sqrt(np.diag(H))
     try:
         L = np.linalg.cholesky(H / np.outer(scale, scale))
     except np.linalg.LinAlgError:

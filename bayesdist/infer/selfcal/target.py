@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.mixture import Hyper, OutlierMixture
 from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.normal import log_marginal
+from bayesdist.infer.selfcal.normal import Anchor, log_marginal
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.solve import Solution
 
@@ -30,10 +30,13 @@ class SelfTarget:
         The mode; parameters that it holds stay there.
     jitter : float, optional
         Held at this; sampled by default.
+    fraction_prior : tuple of float
+        Parameters (a, b) of the Beta prior of the share of false detections.
     """
 
     solution: Solution
     jitter: float | None = None
+    fraction_prior: tuple[float, float] = (1.0, 9.0)
 
     @property
     def problem(self) -> Problem:
@@ -48,7 +51,8 @@ class SelfTarget:
     @cached_property
     def mixture(self) -> OutlierMixture:
         """Uniform false detections, in pixels."""
-        return OutlierMixture("uniform", self.problem.match_radius, self.jitter)
+        radius = self.problem.match_radius
+        return OutlierMixture("uniform", radius, self.jitter, self.fraction_prior)
 
     @cached_property
     def hyper(self) -> Hyper:
@@ -67,8 +71,9 @@ class SelfTarget:
         return (*(all_names[k] for k in self.solution.free), *self.hyper.names)
 
     @cached_property
-    def _middles(self) -> Float:
-        return self.problem.middles(self.solution.theta)
+    def _anchor(self) -> Anchor:
+        s = self.solution
+        return Anchor.at(s.problem, s.theta, s.mixture, s.stars)
 
     def theta(self, free: Float) -> Float:
         """Parameters (..., D) from free ones (..., F)."""
@@ -90,8 +95,6 @@ class SelfTarget:
             return out
         theta, h = self.theta(psi[ok, : self.n_theta]), psi[ok, self.n_theta :]
         value = self.information.log_density(theta) + self.hyper.log_prior(h)
-        value += log_marginal(
-            self.problem, theta, self.mixtures(h), self.solution.stars, self._middles
-        )
+        value += log_marginal(self.problem, theta, self.mixtures(h), self._anchor)
         out[ok] = np.where(np.isnan(value), -np.inf, value)
         return out

@@ -30,7 +30,7 @@ def map_table(inputs: ReportInput) -> TextTable:
                 for v in (m.sigma_u_max, m.sigma_v_max, m.radius_max, float(np.median(m.radius)))
             ]
             cells.append("({:.0f}, {:.0f})".format(*m.position_of_max))
-            if m is c.posterior_map:
+            if m is not c.formal_map:
                 cells = [marked(inputs, text) for text in cells]
             name = f"{c.chip.name}, {m.kind}" if inputs.several else m.kind
             rows.append((name, *cells))
@@ -80,6 +80,7 @@ def budget_table(inputs: ReportInput) -> TextTable | None:
         tuple(out),
         words=tuple(range(len(heads) - 4)),
         leading=len(inputs.budget.rows()),  # those of all chips together
+        stacked=(heads.index("Radial"),),
         note="The parts of the model are correlated and enter the total jointly, by draws;"
         " independent terms are added in quadrature. The total therefore need not be the root of"
         f" the sum of squares.{_of_products(rows)} {gauge_of_new_exposure(inputs)}".rstrip(),
@@ -114,7 +115,7 @@ def margin_table(inputs: ReportInput) -> TextTable | None:
         cells = (
             rounded(m.value, spread),
             interval(*m.interval, spread),
-            f"{rounded(m.margin, spread)} ({m.percent:.0f} %)",
+            f"{rounded(m.margin, spread)} ({percent(m.percent / 100, 2)})",
             f"{number(m.probability_met)} ± {number(m.mc_error, 2)}",
         )
         epoch = "" if m.epoch is None else f" at {m.epoch:.2f}"
@@ -138,6 +139,7 @@ def margin_table(inputs: ReportInput) -> TextTable | None:
         ("Name", "Requirement", "Value", "95 % interval", "Margin", "P(met)", "Unit", "Verdict"),
         tuple(out),
         words=(0, 1, 6, 7),
+        stacked=(7,),
         note="Margin: the limit minus the value that the statistic stays under with the probability"
         f" asked for. {gauge_of_new_exposure(inputs)}".rstrip(),
     )

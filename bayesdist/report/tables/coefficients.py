@@ -35,7 +35,7 @@ def coefficient_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
         polynomial,
         with_unit=False,
     )
-    out = [replace(legendre, note=_notes(gauge_note(inputs), _held_note(fixed)))]
+    out = [replace(legendre, note=_notes(gauge_note(inputs), _held_note(inputs, fixed)))]
     if others:
         table = _parameter_table(
             inputs,
@@ -43,7 +43,7 @@ def coefficient_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
             others[:MOST_ROWS],
             with_unit=True,
         )
-        note = _notes(_held_note(fixed_others), further(len(others)))
+        note = _notes(_held_note(inputs, fixed_others), further(len(others)))
         out.append(replace(table, note=note, detail=True))
     out += [_monomial_table(inputs, chip.number) for chip in inputs.fit.model.chips]
     return tuple(out)
@@ -53,7 +53,7 @@ def _notes(*sentences: str) -> str:
     return " ".join(s for s in sentences if s)
 
 
-def _held_note(names: list[str]) -> str:
+def _held_note(inputs: ReportInput, names: list[str]) -> str:
     """Parameters that are no measurements, those of one term together."""
     if not names:
         return ""
@@ -62,6 +62,11 @@ def _held_note(names: list[str]) -> str:
         term, _, kind = name.rpartition(".")
         terms.setdefault(term, []).append(kind)
     texts = [f"{term} ({', '.join(kinds)})" if term else kinds[0] for term, kinds in terms.items()]
+    if inputs.selfcal is not None:
+        return (
+            "Held by the gauge, and therefore not shown: the detections say nothing of what these"
+            f" parameters stand for: {'; '.join(texts)}."
+        )
     return (
         "Held, and therefore not shown: a prior alone says what these parameters are, and the data"
         f" add nothing to it: {'; '.join(texts)}."

@@ -35,6 +35,9 @@ class TextTable:
         Columns that are printed; all of them where it is empty.
     leading : int
         Rows that are printed, the first so many; 0 for all of them.
+    stacked : tuple of int
+        Columns that stand first where a narrow screen shows each row as a block; where it is empty
+        the table stays one.
     """
 
     caption: str
@@ -45,6 +48,7 @@ class TextTable:
     detail: bool = False
     on_paper: tuple[int, ...] = ()
     leading: int = 0
+    stacked: tuple[int, ...] = ()
 
     @property
     def is_small(self) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.infer.selfcal.normal import Mixture, expand, log_marginal
+from bayesdist.infer.selfcal.normal import Anchor, Mixture, expand, log_marginal
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
 from bayesdist.simulate.dithers import pixels_of
@@ -77,11 +77,11 @@ def test_gradient_is_that_of_the_density():
     theta = simulated.theta
     found = expand(problem, theta, NO_FALSE, stars)
     rng, scale = np.random.default_rng(0), 1 / np.sqrt(np.diag(found.curvature))
-    middles = problem.middles(theta)
+    anchor = Anchor.at(problem, theta, NO_FALSE, found.stars)
     for _ in range(4):
         step = scale * rng.normal(size=len(theta))
         near = theta + np.outer([0.03, -0.03], step)
-        value = log_marginal(problem, near, np.tile([0.0, 1e-300], (2, 1)), found.stars, middles)
+        value = log_marginal(problem, near, np.tile([0.0, 1e-300], (2, 1)), anchor)
         slope = (value[0] - value[1]) / 0.06
         assert slope == pytest.approx(found.gradient @ step, rel=1e-4, abs=1e-3)
         bend = (2 * found.value - value.sum()) / 0.03**2
@@ -91,15 +91,12 @@ def test_gradient_is_that_of_the_density():
 def test_expansion_and_density_agree():
     simulated = field(3, 8, 150, disturbed=0.03)
     problem, stars = problem_of(simulated)
-    found = expand(problem, simulated.theta, Mixture(0.01, 0.03), stars)
-    value = log_marginal(
-        problem,
-        simulated.theta[None],
-        np.array([[0.01, 0.03]]),
-        found.stars,
-        problem.middles(simulated.theta),
-    )
-    assert value[0] == pytest.approx(found.value, abs=1e-8)
+    theta, mixture = simulated.theta, Mixture(0.01, 0.03)
+    found = expand(problem, theta, mixture, stars)
+    anchor = Anchor.at(problem, theta, mixture, found.stars)
+    value = log_marginal(problem, theta[None], np.array([[0.01, 0.03]]), anchor)
+    # the curvature of a star is that of its last step but one
+    assert value[0] == pytest.approx(found.value, abs=1e-7)
 
 
 def test_star_integral():
@@ -168,8 +165,7 @@ def test_a_larger_sky_is_no_better_than_a_smaller_one():
         problem,
         np.stack([theta, grown]),
         np.tile([0.0, 0.01], (2, 1)),
-        found.stars,
-        problem.middles(theta),
+        Anchor.at(problem, theta, Mixture(0.0, 0.01), found.stars),
     )
     # of 2 n squared residuals a thousandth would be 2; what is left is of second order
     assert len(problem) > 500
@@ -198,3 +194,29 @@ def test_aberration_is_undone():
     assert np.sqrt(with_factor.squares(moved, found.stars).mean()) < 1e-6
     other = expand(without, moved, Mixture(1.0, 1e-300), without.mean_places(moved))
     assert np.sqrt(without.squares(moved, other.stars).mean()) > 0.01
+
+
+def test_stars_that_left_their_detections_are_found_again():
+    simulated = field(6, 8, 150)
+    problem, stars = problem_of(simulated)
+    far = stars.copy()
+    some = np.arange(0, problem.n_stars, 7)
+    far[some, 0] += 5.0
+    again = problem.found_again(simulated.theta, far)
+    np.testing.assert_allclose(again[some], problem.middles(simulated.theta)[some])
+    others = np.setdiff1d(np.arange(problem.n_stars), some)
+    assert np.array_equal(again[others], stars[others])
+
+
+@pytest.mark.parametrize("distance", [0.1, 0.2, 0.3, 0.5, 1.0, 3.0])
+def test_information_is_never_negative(distance):
+    """Wherever the search for a star begins: with EM weights the curvature is a sum of squares."""
+    simulated = field(6, 8, 150)
+    problem, stars = problem_of(simulated)
+    mixture = Mixture(0.0, 0.01)
+    angle = np.random.default_rng(0).uniform(0, 2 * np.pi, problem.n_stars)
+    far = stars + distance * np.column_stack([np.cos(angle), np.sin(angle)])
+    H = expand(problem, simulated.theta, mixture, far, observed=False).curvature
+    best = expand(problem, simulated.theta, mixture, stars, observed=False).curvature
+    scale = np.sqrt(np.diag(best))
+    assert np.linalg.eigvalsh(H / np.outer(scale, scale))[0] > -1e-9

@@ -1,0 +1,1 @@
+"""Comparison of dither patterns: `bayesdist plan PATTERNS.toml`."""

@@ -1,0 +1,173 @@
+"""`bayesdist plan PATTERNS.toml`: which dither pattern makes a self-calibration well determined?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.folder import whole_folder
+from bayesdist.app.patterns.config import PlanConfig, load_plan
+from bayesdist.app.rundir import versions, write_json
+from bayesdist.app.screen import table_text
+from bayesdist.app.session import write_table
+from bayesdist.assess.pattern_words import lacking, nearly_free
+from bayesdist.assess.patterns import KINDS, PlannedPattern, compare_patterns
+
+__all__ = ["plan_patterns"]
+
+SCHEMA = 1
+LEGEND = (
+    "reach: largest distance of two pointings, pix; free: directions that detections leave free; "
+    "the rest is errors of positions over the detector, radial, 1 sigma, pix; gauge-free: without "
+    "what is free; shape: without shift, rotation and scale, by which patterns are sorted; "
+    "absolute: without the zero point alone; -: nothing bounds it"
+)
+
+
+def plan_patterns(path: str | Path, output: str | Path | None = None, command: str = "") -> str:
+    """Compare the dither patterns of a file by the covariance to be expected.
+
+    Parameters
+    ----------
+    path : path
+        TOML with ``[[pattern]]`` blocks.
+    output : path, optional
+        New or empty folder for table, record and figure.
+    command : str
+        For the record.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    ConfigError
+        For a file that is not sound.
+    InputError
+        For a pattern whose exposures do not overlap, and a folder that is in use.
+    """
+    config = load_plan(path)
+    camera = config.camera()
+    found = compare_patterns(config.patterns(), camera, config.stars_planned(), config.known())
+    if output is not None:
+        _write(Path(output), found, config, command)
+    return _text(found, config)
+
+
+def _row(one: PlannedPattern) -> dict[str, Any]:
+    """A pattern in one row of the table."""
+    problem = one.solution.problem
+    rolls = np.unique(np.round(np.degrees(one.pattern.rolls), 3))
+    row: dict[str, Any] = {
+        "pattern": one.pattern.name,
+        "exposures": len(one.pattern),
+        "rolls": len(rolls),
+        "reach": one.pattern.reach,
+        "stars": problem.n_stars,
+        "detections": len(problem),
+        "free": one.n_free,
+    }
+    for kind in KINDS:
+        row[f"{kind} rms"], row[f"{kind} max"] = one.rms(kind), one.largest(kind)
+    return row
+
+
+def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
+    s = config.stars
+    lines = [
+        f"Order {config.model.order}, {s.per_detector:g} stars per exposure of {s.sigma:g} pix "
+        f"each, {100 * s.false:g} % of them false",
+        "",
+        table_text([_row(one) for one in found], 3),
+        "",
+        LEGEND,
+    ]
+    for one in found:
+        lines += ["", f"{one.pattern.name}:"]
+        lines += [f"  {sentence}" for sentence in _sentences(one)]
+    best, mas = found[0], config.detector.scale_mas
+    rms, largest = best.rms("shape"), best.largest("shape")
+    if np.isfinite(rms):
+        angle = "" if mas is None else f" ({mas * rms:.2g} and {mas * largest:.2g} mas)"
+        verdict = f"shape known to {rms:.2g} pix rms, {largest:.2g} at worst{angle}"
+    else:
+        verdict = "and yet nothing bounds the shape, for want of rolls and of commanded offsets"
+    lines += ["", f"Best: {best.pattern.name}, {verdict}"]
+    return "\n".join(lines)
+
+
+def _sentences(one: PlannedPattern) -> list[str]:
+    said = [*lacking(one), *one.solution.gauge.sentences]
+    combinations = nearly_free(one)
+    return said + ([combinations] if combinations else [])
+
+
+def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:
+    from bayesdist.report import drawn, save_images  # figures take seconds to import
+    from bayesdist.report.patterns import pattern_maps
+
+    with whole_folder(output) as folder:
+        write_table(_table(found), folder / "patterns.ecsv")
+        save_images(drawn({"patterns": pattern_maps(found)}), folder / "figures")
+        record = {
+            "schema": SCHEMA,
+            "command": command,
+            "versions": versions(),
+            "config": config.model_dump(),
+            "unit": "pix",
+            "patterns": [_record(one) for one in found],
+        }
+        write_json(folder / "plan.json", record)
+
+
+def _table(found: Sequence[PlannedPattern]) -> Table:
+    rows = [
+        {key.replace(" ", "_").replace("-", "_"): value for key, value in _row(one).items()}
+        | {f"degree_{k}": value for k, value in one.by_degree.items()}
+        | {"lacks": "; ".join(lacking(one))}
+        for one in found
+    ]
+    table = Table(rows)
+    for name in table.colnames:
+        if name == "reach" or name.startswith("degree_") or name.endswith(("_rms", "_max")):
+            table[name].unit = "pix"
+    table.meta = {"columns": LEGEND}
+    return table
+
+
+def _record(one: PlannedPattern) -> dict[str, Any]:
+    """What scripts read of a pattern; what is unbounded is null there."""
+    gauge, problem = one.solution.gauge, one.solution.problem
+    return {
+        "name": one.pattern.name,
+        "offsets": one.pattern.offsets,
+        "rolls_deg": np.degrees(one.pattern.rolls),
+        "reach": one.pattern.reach,
+        "n_stars": problem.n_stars,
+        "n_detections": len(problem),
+        "n_free": one.n_free,
+        "held": [one.solution.model.names[k] for k in gauge.held],
+        "directions": [
+            {
+                "name": d.name,
+                "sigma_detections": d.sigma,
+                "sigma_fixed": d.sigma_fixed,
+                "unit": d.unit,
+            }
+            for d in gauge.directions
+        ],
+        **{
+            kind.replace("-", "_"): {"rms": one.rms(kind), "max": one.largest(kind)}
+            for kind in KINDS
+        },
+        "by_degree": one.by_degree,
+        "lacks": list(lacking(one)),
+        "sentences": list(gauge.sentences),
+        "nearly_free": nearly_free(one),
+    }

@@ -1,0 +1,256 @@
+"""The file of a comparison of dither patterns: every key, its type and its default."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+
+from bayesdist.app.config import (
+    ChipBlock,
+    Detector,
+    chips_of,
+    load_text,
+    reference_first,
+    require_detector,
+    require_own_names,
+    validated,
+)
+from bayesdist.app.section import Section
+from bayesdist.assess.patterns import Beforehand, Camera, PlannedStars
+from bayesdist.model import Chip
+from bayesdist.simulate.dithers import dither_pattern
+from bayesdist.simulate.patterns import (
+    DitherPattern,
+    flat_coefficients,
+    grid_offsets,
+    rolls_in_turn,
+)
+
+__all__ = ["PlanConfig", "load_plan"]
+
+Pair = tuple[PositiveFloat, PositiveFloat]
+Count = Annotated[int, Field(ge=1)]
+Pointing = tuple[float, float] | tuple[float, float, float]
+
+
+class PlannedChip(ChipBlock):
+    """One of several chips."""
+
+    place: tuple[float, float] | None = None
+
+
+class PlannedModel(Section):
+    """The polynomials."""
+
+    order: Annotated[int, Field(ge=1, le=9)]
+    reference_pixel: Pair | None = None
+
+
+class PlannedSelfcal(Section):
+    """What of a self-calibration matters before there are detections."""
+
+    frames: Literal["shift", "shift_rotation", "shift_rotation_scale"] = "shift_rotation"
+    least_detections: Annotated[int, Field(ge=2)] = 2
+
+
+class PlannedScale(Section):
+    """How well the size of a pixel will be known."""
+
+    sigma: PositiveFloat
+
+
+class PlannedGauge(Section):
+    """What will be known beside the detections: each piece by its error."""
+
+    offset_sigma: PositiveFloat | None = None
+    roll_sigma_deg: PositiveFloat | None = None
+    exposure_scale_sigma: PositiveFloat | None = None
+    scale: PlannedScale | None = None
+
+
+class StarsBlock(Section):
+    """The field of stars."""
+
+    per_detector: PositiveFloat
+    sigma: PositiveFloat
+    false: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    seed: Annotated[int, Field(ge=0)] = 1
+
+
+class GridBlock(Section):
+    """Offsets on a regular grid."""
+
+    n: tuple[Count, Count]
+    step: PositiveFloat | Pair
+
+
+class ScalesBlock(Section):
+    """Offsets of all lengths, in all directions."""
+
+    least: PositiveFloat = 5.0
+    largest: PositiveFloat = 0.75
+
+
+class PatternBlock(Section):
+    """One pattern."""
+
+    name: str
+    offsets: list[Pointing] | None = None
+    grid: GridBlock | None = None
+    scales: ScalesBlock | None = None
+    unit: Literal["pix", "detector"] = "pix"
+    rolls: list[float] | None = None
+    exposures: PositiveInt | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> PatternBlock:
+        where = f"pattern {self.name!r}"
+        if sum(one is not None for one in (self.offsets, self.grid, self.scales)) != 1:
+            raise ValueError(f"{where} has offsets, a grid, or scales; give one of the three")
+        if self.offsets == [] or self.rolls == []:
+            key = "offsets" if self.offsets == [] else "rolls"
+            raise ValueError(f"{where} has an empty list of {key}; fill it or leave it out")
+        if self.rolls is not None and any(len(one) == 3 for one in self.offsets or []):
+            raise ValueError(
+                f"{where} has rolls in its offsets and a list of rolls; give one of the two"
+            )
+        if self.scales is not None:
+            if self.exposures is None:
+                raise ValueError(f"{where} has scales without a number of exposures; give it")
+            if self.unit != "pix":
+                raise ValueError(
+                    f"{where} has a unit, and scales go from least, in pixels, to largest, a part "
+                    "of the detector; leave the unit out"
+                )
+        return self
+
+
+class PlanConfig(Section):
+    """The whole file."""
+
+    detector: Detector = Detector()
+    chip: list[PlannedChip] = Field(default_factory=list)
+    model: PlannedModel
+    selfcal: PlannedSelfcal = PlannedSelfcal()
+    gauge: PlannedGauge = PlannedGauge()
+    stars: StarsBlock
+    pattern: list[PatternBlock] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _sound(self) -> PlanConfig:
+        require_detector(self.chip, self.detector, self.model.reference_pixel)
+        given = sum(c.place is not None for c in self.chip)
+        if 0 < given < len(self.chip):
+            raise ValueError(
+                "some [[chip]] blocks have a place and some have none; give all or none"
+            )
+        if self.gauge.exposure_scale_sigma is not None and "scale" not in self.selfcal.frames:
+            raise ValueError(
+                "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
+                "selfcal.frames to 'shift_rotation_scale'"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _patterns(self) -> PlanConfig:
+        if not self.pattern:
+            raise ValueError("there is no pattern; give [[pattern]] blocks, each with a name")
+        require_own_names("pattern", [p.name for p in self.pattern])
+        for pattern in self.patterns():
+            if len(pattern) < 2:
+                raise ValueError(
+                    f"pattern {pattern.name!r} has one exposure, which says nothing of the "
+                    "distortion; give at least two"
+                )
+            if self.selfcal.frames == "shift" and np.ptp(pattern.rolls) > 0:
+                raise ValueError(
+                    f"pattern {pattern.name!r} has rolls, and selfcal.frames is 'shift'; set it to "
+                    "'shift_rotation'"
+                )
+        return self
+
+    def chips(self) -> tuple[Chip, ...]:
+        """Chips of the model, also for a detector of one."""
+        if self.chip:
+            return chips_of(self.chip)
+        nx, ny = size = self.detector.size  # type: ignore[misc]
+        middle = self.model.reference_pixel or ((nx + 1) / 2, (ny + 1) / 2)
+        return (Chip(1, self.detector.name or "detector", size, middle),)  # type: ignore[arg-type]
+
+    def camera(self) -> Camera:
+        """The detector that is planned for."""
+        chips = self.chips()
+        places = [c.place for c in reference_first(self.chip) if isinstance(c, PlannedChip)]
+        given = [p for p in places if p is not None]
+        flat = flat_coefficients(self.model.order, chips, given or None)
+        return Camera(chips, flat, self.selfcal.frames)
+
+    def stars_planned(self) -> PlannedStars:
+        """The field of stars."""
+        s, least = self.stars, self.selfcal.least_detections
+        return PlannedStars(s.per_detector, s.sigma, s.false, least, s.seed)
+
+    def known(self) -> Beforehand:
+        """What will be known beside the detections."""
+        g = self.gauge
+        return Beforehand(
+            g.offset_sigma,
+            None if g.roll_sigma_deg is None else float(np.radians(g.roll_sigma_deg)),
+            g.exposure_scale_sigma,
+            None if g.scale is None else g.scale.sigma,
+        )
+
+    def patterns(self) -> tuple[DitherPattern, ...]:
+        """The patterns, each against its first exposure."""
+        side = self.camera().side
+        return tuple(_pattern(block, side, self.stars.seed) for block in self.pattern)
+
+
+def _pattern(block: PatternBlock, side: float, seed: int) -> DitherPattern:
+    unit = side if block.unit == "detector" else 1.0
+    own = block.rolls or [0.0]
+    if block.offsets is not None:
+        round_ = unit * np.array([one[:2] for one in block.offsets])
+        if any(len(one) == 3 for one in block.offsets):
+            listed = np.array([one[2] if len(one) == 3 else 0.0 for one in block.offsets])
+            n = block.exposures or len(round_)
+            return _against_first(block.name, round_, listed[np.arange(n) % len(listed)])
+    elif block.grid is not None:
+        step = block.grid.step
+        pair = step if isinstance(step, tuple) else (step, step)
+        round_ = unit * grid_offsets(block.grid.n, pair)
+    else:
+        assert block.scales is not None and block.exposures is not None
+        # the same offsets for patterns that differ in their rolls alone
+        rng = np.random.default_rng([seed, 2])
+        low, high = block.scales.least, block.scales.largest
+        round_, _ = dither_pattern(
+            block.exposures, (side, side), [0.0], rng, least=low, largest=high
+        )
+    n = block.exposures or len(round_) * len(own)
+    return _against_first(block.name, round_, rolls_in_turn(n, len(round_), own))
+
+
+def _against_first(
+    name: str, round_: NDArray[np.float64], rolls_deg: NDArray[np.float64]
+) -> DitherPattern:
+    offsets = round_[np.arange(len(rolls_deg)) % len(round_)]
+    return DitherPattern(name, offsets - offsets[0], np.radians(rolls_deg - rolls_deg[0]))
+
+
+def load_plan(path: str | Path) -> PlanConfig:
+    """Read a file of patterns.
+
+    Raises
+    ------
+    ConfigError
+        With file, key and reason; an unknown key names the nearest known one.
+    """
+    config: PlanConfig = validated(
+        PlanConfig, load_text(path), str(path), begin="give it [[pattern]] blocks"
+    )
+    return config

@@ -1,0 +1,1 @@
+"""Runs without a catalogue: the distortion from dithered exposures alone."""

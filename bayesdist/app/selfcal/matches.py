@@ -1,0 +1,127 @@
+"""The detections of a self-calibration as pairs: each beside the place where its star was found.
+
+So the usual statistics of residuals, maps of bins and diagrams serve self-calibrations too.  Stars
+follow their detections: residuals are smaller than the errors by what that takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.selfcal.inputs import Inputs
+from bayesdist.data import MagnitudeErrors, MatchTable
+from bayesdist.data.detections import Detections
+from bayesdist.infer.linear import Clip, LinearFit
+from bayesdist.infer.selfcal import Solution
+from bayesdist.infer.selfcal.errors import scatter_by_magnitude
+from bayesdist.infer.selfcal.normal import memberships
+
+__all__ = ["fit_of", "magnitude_errors_of", "matches_of"]
+
+Float = NDArray[np.float64]
+
+CHI2 = 25.0  # of both axes, beyond which a detection counts as rejected in the statistics
+
+
+def matches_of(
+    solution: Solution, detections: Detections, inputs: Inputs, unused: Mapping[str, int]
+) -> MatchTable:
+    """Detections of the stars beside these, in the frame of each exposure's own VAFACTOR.
+
+    Parameters
+    ----------
+    solution : Solution
+    detections : Detections
+        Of which the solution has some.
+    inputs : Inputs
+    unused : mapping of str to int
+        Detections that are of no star, by reason.
+    """
+    p, d = solution.problem, detections
+    rows, model = p.rows, p.model
+    places = p.star_places(solution.stars)
+    if p.dilation is not None:
+        o = np.asarray(model.origin)
+        places = o + (places - o) / p.dilation[d.exposure[rows], None]
+    sigma = np.sqrt(p.var)[:, None] * _axes(p.W)
+    numbers = np.array([chip.number for chip in model.chips])
+    chip = np.zeros(len(rows), np.int64)
+    for code, number in enumerate(numbers[1:], start=1):
+        chip[d.chip[rows] == number] = code
+    return MatchTable.of_distinct_rows(
+        x=d.x[rows],
+        y=d.y[rows],
+        u=places[:, 0],
+        v=places[:, 1],
+        sigma_u=sigma[:, 0],
+        sigma_v=sigma[:, 1],
+        unit=model.unit,
+        epoch=None if d.epoch is None else d.epoch[d.exposure[rows]],
+        mag=None if d.mag is None else d.mag[rows],
+        exposure=d.exposure[rows],
+        exposure_names=d.exposure_names,
+        chip=chip,
+        chip_numbers=tuple(int(n) for n in numbers),
+        row=rows,
+        sources=(d.source,),
+        n_rows=inputs.n_read,
+        rejected={**inputs.rejected, **unused},
+    )
+
+
+def _axes(W: Float) -> Float:
+    """What a pixel of error is along u and along v, (N, 2): of W^-1."""
+    det = W[:, 0] * W[:, 2] - W[:, 1] ** 2
+    return np.sqrt(np.stack([W[:, 2], W[:, 0]], axis=1) / det[:, None])
+
+
+def fit_of(solution: Solution) -> LinearFit:
+    """The solution as a fit, with the statistics of its residuals.
+
+    The covariance is that of the curvature at the mode, with the stars eliminated; zero for what
+    the gauge holds.
+    """
+    p, theta = solution.problem, solution.theta
+    pixel = p.model.pixel_size(theta)
+    wider = 1.0 + solution.mixture.jitter**2 / p.sigma**2
+    clip = Clip(theta, CHI2 * wider, p.match_radius * pixel)
+    square = p.squares(theta, solution.stars) / p.var
+    residual = p.places(theta) - p.star_places(solution.stars)
+    far = np.hypot(*residual.T) > clip.abs_limit
+    used = (square <= clip.chi2_limit) & ~far
+    n, n_used = len(p), int(used.sum())
+    precision = solution.precision
+    scale = np.sqrt(np.diag(precision))
+    uu, vv = (residual[used] ** 2).mean(axis=0)
+    lost = p.n_star * p.n_stars + len(solution.free)
+    return LinearFit(
+        model=p.model,
+        mean=theta,
+        cov=solution.cov,
+        clip=clip,
+        n_rows=n,
+        n_used=n_used,
+        rms_u=float(np.sqrt(uu)),
+        rms_v=float(np.sqrt(vv)),
+        rms_rejected=float(np.sqrt((residual[~used] ** 2).mean())) if n > n_used else 0.0,
+        rejected={"chi-square": int((~used & ~far).sum()), "absolute residual": int(far.sum())},
+        chi2=float(square[used].sum()),
+        dof=max(2 * n_used - lost, 1),
+        condition=float(np.linalg.cond(precision / np.outer(scale, scale))),
+    )
+
+
+def magnitude_errors_of(solution: Solution, matches: MatchTable) -> MagnitudeErrors | None:
+    """Errors of centroids by magnitude, in the unit of u, v; None without magnitudes."""
+    if matches.mag is None:
+        return None
+    p = solution.problem
+    given = p, solution.theta, solution.mixture, solution.stars
+    middles, sigma = scatter_by_magnitude(*given, matches.mag)
+    sigma = sigma * p.model.pixel_size(solution.theta)
+    edges = np.concatenate([[-np.inf], (middles[1:] + middles[:-1]) / 2, [np.inf]])
+    n = np.histogram(matches.mag, edges, weights=memberships(*given))[0]
+    return MagnitudeErrors(middles, sigma, sigma, n.astype(np.int64), sigma, sigma)

@@ -1,0 +1,205 @@
+"""How the detections of a self-calibration became stars, exposure by exposure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from bayesdist.app.selfcal.inputs import Inputs
+from bayesdist.data.detections import NO_STAR
+from bayesdist.errors import InputError
+from bayesdist.infer.selfcal import SelfCalibration
+from bayesdist.infer.selfcal.calibrate import places_of
+from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.model import DistortionModel
+
+__all__ = ["TURN_BACK", "Matching", "half_turned", "matching_of"]
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+STRANGE = 0.5  # of the usual share of common detections: an exposure that does not fit
+HALF_TURN = np.radians(10.0)  # from half a turn
+TURN_BACK = "turn its pixels back by 180 degrees if they were turned, or leave it out"
+AMBIGUOUS = 0.05  # share of groups of which it is not clear what they are, that is worth a warning
+
+
+@dataclass(frozen=True, eq=False)
+class Matching:
+    """What was found.
+
+    Parameters
+    ----------
+    table : astropy.table.Table
+        One row for each exposure: detections, those that lie where other exposures look, those that
+        are of a common star, that share, rms in pixels, shift and rotation.
+    summary : dict
+        For summary.json.
+    """
+
+    table: Table
+    summary: dict[str, Any]
+
+    @property
+    def sentence(self) -> str:
+        """What was found, in a line."""
+        n = self.summary
+        return (
+            f"{n['n_stars']} stars of {n['detections']['used']} of {n['detections']['read']} "
+            f"detections in {n['n_exposures']} exposures, {n['n_ambiguous']} ambiguous groups"
+        )
+
+    def refuse_strangers(self) -> None:
+        """Refuse an exposure that hardly shares stars with the others where they overlap.
+
+        Raises
+        ------
+        InputError
+            Naming it, and whether it lies half a turn from the others.
+        """
+        share = np.asarray(self.table["share_common"], float)
+        if len(share) < 3:  # of two nobody knows which one is wrong
+            return
+        usual = np.array([np.nanmedian(np.delete(share, k)) for k in range(len(share))])
+        strange = share < STRANGE * usual
+        if not strange.any():
+            return
+        k = int(np.nanargmin(np.where(strange, share / usual, np.nan)))
+        name = str(self.table["exposure"][k])
+        half = k in half_turned(np.radians(np.asarray(self.table["rotation"], float)))
+        told = ", and it lies half a turn from all the others" if half else ""
+        raise InputError(
+            f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in "
+            f"common with them, and the usual share is {100 * usual[k]:.0f} %{told}",
+            where="selfcal.lists",
+            do=TURN_BACK if half else "check its pixels, or leave it out",
+        )
+
+
+def half_turned(rolls: Float) -> list[int]:
+    """Exposures that lie half a turn from all the others, of at least three."""
+    if len(rolls) < 3:
+        return []
+    off = np.abs(np.angle(np.exp(1j * (rolls[:, None] - rolls)))) - np.pi
+    np.fill_diagonal(off, 0.0)
+    return np.flatnonzero((np.abs(off) < HALF_TURN).all(axis=1)).tolist()
+
+
+def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
+    """Count what a self-calibration made of its detections.
+
+    Parameters
+    ----------
+    found : SelfCalibration
+    inputs : Inputs
+    least : int
+        Fewest detections of a star.
+    """
+    s, d, friends = found.solution, found.detections, found.friends
+    p, model = s.problem, s.problem.model
+    E = len(d.exposure_names)
+    used = np.zeros(len(d), bool)
+    used[p.rows] = True
+    seen = _seen_by_others(
+        model, s.theta, places_of(model, d, s.theta, inputs.dilation), d.exposure
+    )
+    total, overlap, common = (
+        np.bincount(d.exposure[which], minlength=E)
+        for which in (np.ones(len(d), bool), seen, used & seen)
+    )
+    w = memberships(p, s.theta, s.mixture, s.stars)
+    square = p.squares(s.theta, s.stars)
+    exposure = d.exposure[p.rows]
+    weight = np.bincount(exposure, w, minlength=E)
+    rms = np.sqrt(np.bincount(exposure, w * square, minlength=E) / np.maximum(2 * weight, 1e-9))
+    frames = [model.frame(s.theta, e) for e in range(E)]
+    table = Table(
+        {
+            "exposure": list(d.exposure_names),
+            "detections": total,
+            "overlapping": overlap,
+            "common": common,
+            "share_common": common / np.maximum(overlap, 1),
+            "rms": rms,
+            "shift_u": [shift[0] for _, shift in frames],
+            "shift_v": [shift[1] for _, shift in frames],
+            "rotation": [np.degrees(np.arctan2(M[1, 0], M[0, 0])) for M, _ in frames],
+        }
+    )
+    table["rms"].unit, table["rotation"].unit = "pix", "deg"
+    for name in ("shift_u", "shift_v"):
+        table[name].unit = model.unit
+    counts = np.bincount(d.star[d.star != NO_STAR], minlength=friends.n_stars)
+    few = (counts > 1) & (counts < least)
+    alone = int((counts == 1).sum())
+    unused = {
+        "of a star that one exposure alone has": alone,
+        "of a star with too few detections": int(counts[few].sum()),
+        "second detection of a star in an exposure": friends.n_dropped,
+        "in a chain of several stars": int((d.star == NO_STAR).sum()) - friends.n_dropped,
+    }
+    warnings = []
+    if friends.n_ambiguous > AMBIGUOUS * max(p.n_stars, 1):
+        warnings.append(
+            f"{friends.n_ambiguous} groups of detections are ambiguous beside {p.n_stars} stars: "
+            "the field is crowded for this match radius"
+        )
+    summary = {
+        "n_exposures": E,
+        "n_stars": p.n_stars,
+        "n_ambiguous": friends.n_ambiguous,
+        "n_doubled": friends.n_doubled,
+        "n_chains": friends.n_chains,
+        "rounds": found.rounds,
+        "match_radius": p.match_radius,
+        "detections": {
+            "read": inputs.n_read,
+            "cut": dict(inputs.rejected),
+            "used": len(p),
+            "unused": {reason: count for reason, count in unused.items() if count},
+        },
+        "per_star": {"median": float(np.median(p.counts)), "most": int(p.counts.max())},
+        "warnings": warnings,
+    }
+    return Matching(table, summary)
+
+
+def _seen_by_others(
+    model: DistortionModel, theta: Float, places: Float, exposure: NDArray[np.int64]
+) -> Bool:
+    """Which detections lie on the sky where another exposure has a chip."""
+    E = len(model.exposures)
+    outlines = [
+        [_corners(model, theta, e, chip.number, chip.size) for chip in model.chips]
+        for e in range(E)
+    ]
+    out = np.zeros(len(places), bool)
+    for e in range(E):
+        rows = np.flatnonzero(exposure == e)
+        inside = np.zeros(len(rows), bool)
+        for other in range(E):
+            if other != e:
+                for corners in outlines[other]:
+                    inside |= _inside(places[rows], corners)
+        out[rows] = inside
+    return out
+
+
+def _corners(
+    model: DistortionModel, theta: Float, exposure: int, chip: int, size: tuple[float, float]
+) -> Float:
+    x, y = (0.5 + n * np.array(c) for n, c in zip(size, ([0, 1, 1, 0], [0, 0, 1, 1]), strict=True))
+    when = None if model.time is None else np.full(4, model.time.epoch0[0])
+    return model.predict(theta, x, y, exposure=np.full(4, exposure), chip=chip, epoch=when)
+
+
+def _inside(points: Float, corners: Float) -> Bool:
+    """Whether points lie in a convex polygon."""
+    side = np.roll(corners, -1, axis=0) - corners
+    off = points[:, None] - corners
+    cross = side[:, 0] * off[..., 1] - side[:, 1] * off[..., 0]
+    return np.asarray((cross > 0).all(axis=1) | (cross < 0).all(axis=1))

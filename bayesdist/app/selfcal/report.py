@@ -1,0 +1,46 @@
+"""What the report shows of a self-calibration, put together from its session."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.selfcal.session import SelfcalSession
+from bayesdist.assess.grid import outline_pixels
+
+if TYPE_CHECKING:
+    from bayesdist.report.selfcal import SelfcalResults
+
+__all__ = ["selfcal_results"]
+
+
+def selfcal_results(session: SelfcalSession) -> SelfcalResults:
+    """What a self-calibration adds to the report of its run.
+
+    Parameters
+    ----------
+    session : SelfcalSession
+        Of a run that has been assessed.
+    """
+    from bayesdist.report.selfcal import SelfcalResults  # figures take seconds to import
+
+    run, model, theta = session.run, session.model, session.posterior.mean
+    outlines = []
+    for e in range(len(model.exposures)):
+        for chip in model.chips:
+            x, y = outline_pixels(chip.size)
+            when = None if model.time is None else np.full(len(x), session.epoch)
+            place = {"exposure": np.full(len(x), e), "chip": chip.number, "epoch": when}
+            outlines.append(model.predict(theta, x, y, **place))
+    names = model.names
+    return SelfcalResults(
+        words=session.gauge_words,
+        gauge=Table.read(run / "gauge.ecsv"),
+        matching=Table.read(run / "matching.ecsv"),
+        stars=Table.read(run / "stars.ecsv"),
+        outlines=tuple(outlines),
+        held=tuple(names[k] for k in session.gauge.held),
+        summary=run.summary["selfcal"],
+    )

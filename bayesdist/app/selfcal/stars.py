@@ -1,0 +1,111 @@
+"""The stars that a self-calibration found, as a catalogue that others can use."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from bayesdist.app.selfcal.session import SelfcalSession
+from bayesdist.app.session import write_table
+from bayesdist.app.trust import labelled, trust
+from bayesdist.data.parquet_write import write_columns
+from bayesdist.infer.selfcal import StarCatalogue, star_catalogue
+
+__all__ = ["FLAGS", "star_table", "write_stars"]
+
+NAMES = ("u", "v", "pm_u", "pm_v", "parallax")
+FEW, DOUBTFUL, REFERENCE = 1, 2, 4
+FLAGS = {
+    FEW: "two detections: one false one would not show",
+    DOUBTFUL: "more than a third of the detections are expected to be false",
+    REFERENCE: "a reference star: its catalogue position is in its place",
+}
+MEMBERS = 2 / 3  # of the detections, below which a star is doubtful
+MANY = 100_000  # stars, above which there is a Parquet file beside the table
+
+
+def write_stars(session: SelfcalSession) -> dict[str, Any]:
+    """Write stars.ecsv, and of many stars stars.parquet.
+
+    Returns
+    -------
+    dict
+        For summary.json.
+    """
+    solution = session.solved
+    found = star_catalogue(solution)
+    table = star_table(session, found)
+    table.meta |= trust(session) | labelled(session)
+    write_table(table, session.run / "stars.ecsv")
+    path = session.run / "stars.parquet"
+    path.unlink(missing_ok=True)
+    if len(table) > MANY:
+        columns = {name: np.asarray(table[name]) for name in table.colnames}
+        units = {name: str(table[name].unit) for name in columns if table[name].unit is not None}
+        write_columns(path, columns, units)
+    flags = np.asarray(table["flags"])
+    sigma = np.hypot(table["sigma_u"], table["sigma_v"])
+    own = np.hypot(table["sigma_own_u"], table["sigma_own_v"])
+    return {
+        "n": len(table),
+        "unit": found.unit,
+        "epoch": found.epoch or None,
+        "n_two_detections": int((flags & FEW > 0).sum()),
+        "n_doubtful": int((flags & DOUBTFUL > 0).sum()),
+        "n_reference": int((flags & REFERENCE > 0).sum()),
+        "radius_median": float(np.median(sigma)),
+        "radius_own_median": float(np.median(own)),
+    }
+
+
+def star_table(session: SelfcalSession, found: StarCatalogue) -> Table:
+    """Stars with their covariance: one row for each.
+
+    Columns u, v (and pm_u, pm_v), sigma_u and so on with the errors of distortion and frames in
+    the gauge of the run, cov_u_v and so on, sigma_own_u, sigma_own_v of the star's detections
+    alone, n, n_members, mag (the median), flags.
+    """
+    solution = session.solved
+    q = found.values.shape[1]
+    names = NAMES[:q]
+    table = Table({"star": np.arange(len(found))})
+    units = [f"{found.unit} / yr" if name.startswith("pm") else found.unit for name in names]
+    for k, name in enumerate(names):
+        table[name] = found.values[:, k]
+        table[name].unit = units[k]
+    for k, name in enumerate(names):
+        table[f"sigma_{name}"] = np.sqrt(found.cov[:, k, k])
+        table[f"sigma_{name}"].unit = units[k]
+    for a, b in combinations_with_replacement(range(q), 2):
+        if a != b:
+            table[f"cov_{names[a]}_{names[b]}"] = found.cov[:, a, b]
+    for k, name in enumerate(names[:2]):
+        table[f"sigma_own_{name}"] = np.sqrt(found.own[:, k, k])
+        table[f"sigma_own_{name}"].unit = found.unit
+    table["n"] = found.n
+    table["n_members"] = found.n_members
+    mag = session.raw_matches.mag
+    if mag is not None:
+        table["mag"] = _medians(mag, solution.problem.starts)
+    flags = np.where(found.n == 2, FEW, 0)
+    flags |= np.where(found.n_members < MEMBERS * found.n, DOUBTFUL, 0)
+    flags |= np.where(solution.problem.priors.informed, REFERENCE, 0)
+    table["flags"] = flags
+    table.meta = {"flags": {str(bit): text for bit, text in FLAGS.items()}}
+    if found.epoch:
+        table.meta["epoch"] = found.epoch
+    if session.reference_catalog is not None and session.reference_catalog.tangent_point:
+        table.meta["tangent_point"] = list(session.reference_catalog.tangent_point)
+    return table
+
+
+def _medians(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Median of each run of values."""
+    star = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    ordered = values[np.lexsort((values, star))]
+    low, high = starts[:-1] + (np.diff(starts) - 1) // 2, starts[:-1] + np.diff(starts) // 2
+    return np.asarray((ordered[low] + ordered[high]) / 2)

@@ -1,0 +1,205 @@
+"""Model and first parameters of a self-calibration, from its lists alone or from what is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.campaign.inputs import start_of
+from bayesdist.app.config import Config
+from bayesdist.app.selfcal.inputs import Commanded, Inputs
+from bayesdist.data import ReferenceCatalog
+from bayesdist.data.linear_map import LinearMap
+from bayesdist.data.mutual import mutual_frames
+from bayesdist.data.patterns import Similarity, find_similarity, pattern_index
+from bayesdist.errors import InputError
+from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer.selfcal.start import (
+    Start,
+    chips_side_by_side,
+    fitted_polynomials,
+    start_parameters,
+    undistorted,
+)
+from bayesdist.model import Chip, DistortionModel
+
+__all__ = ["chips_of", "started"]
+
+Float = NDArray[np.float64]
+
+
+def chips_of(config: Config, number: int) -> tuple[Chip, ...]:
+    """The chips of the configuration; a detector of one chip has the number of the data."""
+    size, reference = config.detector.size, config.model.reference_pixel
+    if size is None:
+        return config.chips()
+    centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
+    name = config.detector.name or f"chip {number}"
+    return (Chip(number, name, size, reference or centre),)
+
+
+def started(
+    config: Config,
+    base: Path,
+    inputs: Inputs,
+    unit_arcsec: float | None,
+    references: ReferenceCatalog | None,
+    commanded: Commanded | None,
+) -> tuple[DistortionModel, Float]:
+    """Model, and parameters (D,) by which the detections of a star lie near each other.
+
+    The sky lies as the reference stars do, or else as the commanded offsets, or else as the first
+    exposure.
+
+    Parameters
+    ----------
+    config : Config
+    base : Path
+    inputs : Inputs
+    unit_arcsec : float or None
+        Size of the unit of u, v, where it is known.
+    references : ReferenceCatalog or None
+    commanded : Commanded or None
+
+    Raises
+    ------
+    InputError
+        Naming exposures that have no stars in common; for a start that cannot be read, and
+        reference stars that are not found again.
+    """
+    block, d = config.selfcal, inputs.detections
+    assert block is not None
+    chips = chips_of(config, int(d.chip[0]))
+    start = _first(config, base, chips, unit_arcsec)
+    # each chip of each exposure by itself: without a start nobody knows how the chips lie
+    several = len(chips) > 1 and block.start is None
+    exposure, number, rows = _lists(inputs, apart=several)
+    names = [d.exposure_names[e] for e in exposure]
+    mags = None if d.mag is None else [d.mag[r] for r in rows]
+
+    def planes(of: Start) -> list[Float]:
+        return [_placed(of, d.x[r], d.y[r], d.chip[r]) for r in rows]
+
+    if several:
+        labels = [f"{name} chip {n}" for name, n in zip(names, number, strict=True)]
+        apart = mutual_frames(planes(start), mags, labels, source="selfcal.lists")
+        start = chips_side_by_side(start, chips, apart, exposure, number)
+        exposure, number, rows = _lists(inputs, apart=False)
+        names, mags = list(d.exposure_names), None if d.mag is None else [d.mag[r] for r in rows]
+    on = planes(start)
+    onto = _onto_references(on[0], None if mags is None else mags[0], references, block.frames)
+    if onto is not None:
+        on = [onto(plane) for plane in on]
+    frames = mutual_frames(on, mags, names, source="selfcal.lists")
+    if onto is None and commanded is not None and commanded.offsets is not None:
+        middles = np.stack([plane.mean(axis=0) for plane in on])
+        turned = _onto_offsets(frames.matrices, frames.shifts, middles[0], commanded.offsets)
+        if turned is not None:
+            onto, on = turned, [turned(plane) for plane in on]
+            frames = mutual_frames(on, mags, names, source="selfcal.lists")
+    middles = np.stack([plane.mean(axis=0) for plane in on])
+    model = DistortionModel(
+        config.model.order,
+        chips,
+        unit=block.unit,
+        time=config.time(),
+        frames=block.frames,
+        exposures=d.exposure_names,
+        origin=(float(middles[0, 0]), float(middles[0, 1])),
+    )
+    coefficients = fitted_polynomials(start, chips, model.order, onto)
+    return model, start_parameters(model, coefficients, frames, middles)
+
+
+def _lists(inputs: Inputs, *, apart: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], list]:
+    """Exposure and chip of each list, and the rows of its detections."""
+    d = inputs.detections
+    found = []
+    for e in range(len(d.exposure_names)):
+        here = np.flatnonzero(d.exposure == e)
+        if not apart:
+            found.append((e, 0, here))
+            continue
+        found += [(e, int(n), here[d.chip[here] == n]) for n in np.unique(d.chip[here])]
+    exposure, number, rows = zip(*found, strict=True)
+    return np.array(exposure), np.array(number), list(rows)
+
+
+def _placed(start: Start, x: Float, y: Float, chip: NDArray[np.int64]) -> Float:
+    out = np.empty((len(x), 2))
+    for number in np.unique(chip):
+        rows = chip == number
+        out[rows] = start(x[rows], y[rows], int(number))
+    return out
+
+
+def _first(config: Config, base: Path, chips: tuple[Chip, ...], unit_arcsec: float | None) -> Start:
+    """The known distortion: of an earlier run, an IDCTAB, or none."""
+    block = config.selfcal
+    assert block is not None
+    pixel = 1.0
+    if block.unit != "pix":
+        assert unit_arcsec is not None and config.detector.scale_mas is not None
+        pixel = config.detector.scale_mas / 1000 / unit_arcsec
+    if block.start is None:
+        return undistorted(chips, pixel)
+    path = base / block.start
+    if path.is_dir() or path.suffix == ".nc":
+        known = load_fit(path) if path.name == "fit.nc" else load_posterior(path)
+        if known.model.unit != block.unit:
+            raise InputError(
+                f"is in {known.model.unit}, and selfcal.unit is {block.unit!r}",
+                where=str(path),
+                do="calibrate in the same unit",
+            )
+
+        def earlier(x: Float, y: Float, chip: int) -> Float:
+            when = None if known.model.time is None else known.model.time.epoch0[0]
+            return np.asarray(known.model.predict(known.mean, x, y, chip=chip, epoch=when))
+
+        return earlier
+    if unit_arcsec is None:
+        raise InputError(
+            "an IDCTAB is in seconds of arc, and nobody says what a pixel is",
+            where=str(path),
+            do="give detector.scale_mas",
+        )
+    tab = start_of(path, unit_arcsec, None)
+    return lambda x, y, chip: np.asarray(tab(x, y, np.full(np.shape(x), chip), 0.0))
+
+
+def _onto_references(
+    plane: Float, mag: Float | None, references: ReferenceCatalog | None, frames: str
+) -> LinearMap | None:
+    """Similarity from the first exposure onto the reference stars; a mirrored one is allowed."""
+    if references is None:
+        return None
+    index = pattern_index(np.column_stack([references.u, references.v]), references.mag)
+    given = {"source": "the first exposure", "reference_name": references.source}
+    use = mag if references.mag is not None else None
+
+    def found(mirrored: bool) -> Similarity:
+        return find_similarity(plane, index, mag=use, mirrored=mirrored, **given)
+
+    try:
+        return found(False).map
+    except InputError:
+        return found(True).map
+
+
+def _onto_offsets(
+    matrices: Float, shifts: Float, middle: Float, offsets: Float
+) -> LinearMap | None:
+    """Rotation and scale by which the exposures lie as they were commanded; None for one place."""
+    known = np.isfinite(offsets).all(axis=1)
+    if known.sum() < 2:
+        return None
+    places, asked = (matrices @ middle + shifts)[known], offsets[known]
+    p, q = ((a - a.mean(axis=0)) @ [1, 1j] for a in (places, asked))
+    if not np.abs(p).max() > 0:
+        return None
+    turn = np.vdot(p, q) / np.vdot(p, p).real
+    matrix = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
+    return LinearMap(matrix, np.zeros(2), middle)

@@ -1,0 +1,93 @@
+"""`bayesdist validate`: the margins of a run against requirements of their own file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from bayesdist.app.config import load_requirements
+from bayesdist.app.dates import idle_dates
+from bayesdist.app.demo import margins_text
+from bayesdist.app.horizon import write_horizons
+from bayesdist.app.judging import assessed_horizons, margins_of
+from bayesdist.app.margins import margin_rows, write_margins
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.session import Session
+from bayesdist.app.sessions import session_of
+from bayesdist.app.stages import require
+from bayesdist.assess import Margin, Requirement
+from bayesdist.errors import InputError
+
+__all__ = ["validate"]
+
+
+def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
+    """Judge a run by requirements, and replace its margins and horizons by theirs.
+
+    Parameters
+    ----------
+    run : path
+        A run that has been sampled.
+    requirements : path
+        TOML file of ``[[requirement]]`` blocks.
+
+    Returns
+    -------
+    text : str
+        What to print.
+    met : bool
+        Whether all are met.
+
+    Raises
+    ------
+    InputError
+        For a run that has not been sampled, and for a file that cannot be read or asks for what the
+        run cannot be judged by; its name is in the message.
+    """
+    asked = load_requirements(requirements)
+    with closing(session_of(RunDirectory.open(run))) as session:
+        require(session, "validate", ("fit", "sample"))
+        with _named_after(requirements, asked):
+            margins = margins_of(session, asked)
+            horizons = assessed_horizons(session, asked)
+        before = _judgement(session)
+        write_margins(session, margins)
+        write_horizons(session, horizons)
+        if _judgement(session) != before:
+            session.run.outdate("report")
+        report = session.run / "report.html"
+        outdated = report.exists() and not session.run.done("report")
+        label = session.posterior.approximation
+    warnings = label, idle_dates(session.config, asked, str(requirements))
+    lines = [*_lines(margins), *(one.sentence for one in horizons)]
+    lines += [f"WARNING: {text}" for text in warnings if text]
+    if outdated:
+        lines.append(f"{report} shows earlier margins; renew it by 'bayesdist report {run}'")
+    return "\n".join(lines), all(m.verdict == "met" for m in margins)
+
+
+@contextmanager
+def _named_after(path: str | Path, asked: Sequence[Requirement]) -> Iterator[None]:
+    """Put the name of their file before errors of its requirements."""
+    try:
+        yield
+    except InputError as error:
+        if not error.where.startswith(tuple(r.where for r in asked)):
+            raise
+        raise type(error)(error.cause, where=f"{path}: {error.where}", do=error.do) from error
+
+
+def _judgement(session: Session) -> list[Any]:
+    """What the run says of its requirements."""
+    return [session.run.summary.get(key) for key in ("margins", "horizons")]
+
+
+def _lines(margins: Sequence[Margin]) -> Iterator[str]:
+    yield margins_text(margin_rows(tuple(margins)))
+    for m in margins:
+        if m.verdict != "met":
+            yield f"{m.requirement.name}: {m.verdict}: {m.reason}"
+        if m.remedy is not None:
+            yield f"{m.requirement.name}: {m.remedy.sentence}"

@@ -1,0 +1,103 @@
+"""Where on the sky a model has detections, and where on the detector it has stars.
+
+Polynomials are sums of powers of scaled pixels, by Horner's rule, or of Legendre products; terms
+are sorted by total order, then by falling power of x.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from bayesdist.infer.kernel.polynomial import FAST
+
+__all__ = ["legendre", "linearised", "positions", "powers"]
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def legendre(x, y, order, px, py, phi):
+    """All basis functions of one position, by total order, then by falling power of x."""
+    px[0] = py[0] = 1.0
+    if order > 0:
+        px[1], py[1] = x, y
+    for k in range(1, order):
+        a, b = (2.0 * k + 1.0) / (k + 1.0), k / (k + 1.0)
+        px[k + 1] = a * x * px[k] - b * px[k - 1]
+        py[k + 1] = a * y * py[k] - b * py[k - 1]
+    n = 0
+    for total in range(order + 1):
+        for j in range(total + 1):
+            phi[n] = px[total - j] * py[j]
+            n += 1
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def powers(coef, order, x, y):
+    """Sum of c_ij x^i y^j by Horner's rule, terms sorted as the basis functions."""
+    out = 0.0
+    for i in range(order, -1, -1):
+        inner = coef[order * (order + 1) // 2 + (order - i)]
+        for j in range(order - i - 1, -1, -1):
+            total = i + j
+            inner = inner * y + coef[total * (total + 1) // 2 + j]
+        out = out * x + inner
+    return out
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+def positions(group, X, Y, coef, order):
+    """Places (N, 2) of detections from coefficients (G, 2, K) of the scaled powers."""
+    out = np.empty((len(X), 2))
+    for i in nb.prange(len(X)):
+        out[i, 0] = powers(coef[group[i], 0], order, X[i], Y[i])
+        out[i, 1] = powers(coef[group[i], 1], order, X[i], Y[i])
+    return out
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+def linearised(group, seen_X, seen_Y, X, Y, places, coef, by_X, by_Y, half, order):
+    """Where stars lie on the detector by a solution, and the plane about it.
+
+    Parameters
+    ----------
+    group : ndarray of int, shape (N,)
+    seen_X, seen_Y, X, Y : ndarray, shape (N,)
+        Scaled positions of the detections, and where their stars lie as far as is known.
+    places : ndarray, shape (N, 2)
+        Of the stars on the sky.
+    coef, by_X, by_Y : ndarray, shape (G, 2, K)
+        Coefficients of the scaled powers, of the model and of its derivatives by X and by Y.
+    half : ndarray, shape (G, 2)
+        What X = 1 and Y = 1 are in pixels.
+    order : int
+
+    Returns
+    -------
+    X, Y : ndarray, shape (N,)
+        One step of Newton's further.
+    offset : ndarray, shape (N, 2)
+        J times the pixels from there to the detection.
+    W : ndarray, shape (N, 3)
+        uu, uv, vv of the inverse of J J^T.
+    """
+    n = len(X)
+    new_X, new_Y, offset, W = np.empty(n), np.empty(n), np.empty((n, 2)), np.empty((n, 3))
+    for i in nb.prange(n):
+        g, x, y = group[i], X[i], Y[i]
+        ru = powers(coef[g, 0], order, x, y) - places[i, 0]
+        rv = powers(coef[g, 1], order, x, y) - places[i, 1]
+        for last in range(2):
+            ux, uy = powers(by_X[g, 0], order, x, y), powers(by_Y[g, 0], order, x, y)
+            vx, vy = powers(by_X[g, 1], order, x, y), powers(by_Y[g, 1], order, x, y)
+            if last == 0:
+                det = ux * vy - uy * vx
+                x -= (vy * ru - uy * rv) / det
+                y -= (ux * rv - vx * ru) / det
+        dx, dy = seen_X[i] - x, seen_Y[i] - y
+        offset[i, 0], offset[i, 1] = ux * dx + uy * dy, vx * dx + vy * dy
+        ux, uy, vx, vy = ux / half[g, 0], uy / half[g, 1], vx / half[g, 0], vy / half[g, 1]
+        uu, uv, vv = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
+        det = uu * vv - uv * uv
+        W[i, 0], W[i, 1], W[i, 2] = vv / det, -uv / det, uu / det
+        new_X[i], new_Y[i] = x, y
+    return new_X, new_Y, offset, W

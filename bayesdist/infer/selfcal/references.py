@@ -1,0 +1,105 @@
+"""Reference stars: some of the stars have places that are known, with errors and motions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.linear_map import LEAST, LinearMap, iterated_map
+from bayesdist.errors import InputError
+from bayesdist.infer.selfcal.problem import Problem, StarPriors
+
+__all__ = ["ReferenceStars"]
+
+Float = NDArray[np.float64]
+
+FEWEST = 2  # reference stars that fix place, rotation and scale
+FAR = 5.0  # times the median distance from the map: no reference star, but a neighbour
+CLOSE = 0.01  # pixels: what no distance is too small for
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceStars:
+    """What a catalogue says of the stars of a problem.
+
+    Parameters
+    ----------
+    catalog : ReferenceCatalog
+        With errors, on the plane and in the unit of the solution.
+    radius : float
+        Within which a star is taken for a reference star, pixels.
+    """
+
+    catalog: ReferenceCatalog
+    radius: float
+
+    def __call__(self, problem: Problem, theta: Float) -> StarPriors:
+        """Priors of the stars of a problem at a solution theta (D,).
+
+        The stars are laid onto the catalogue by a linear map first: what detections leave open
+        must not decide who is who.  A star that lies far from its reference star, as the others
+        lie, has none.
+
+        Raises
+        ------
+        InputError
+            When hardly a star is found again.
+        """
+        catalog = self.catalog.at(problem.epoch0) if problem.epoch0 else self.catalog
+        places = problem.middles(theta)
+        rows, which = self._pairs(problem, catalog, places)
+        if len(rows) < FEWEST:
+            raise InputError(
+                f"{len(rows)} of its {len(catalog)} stars are among the {problem.n_stars} detected "
+                f"ones, and {FEWEST} are needed",
+                where=catalog.source,
+                do="check epoch, tangent point and unit, or give a larger gauge.reference.radius",
+            )
+        none = StarPriors.none(problem.n_stars, problem.n_star)
+        centre, precision = none.centre.copy(), none.precision.copy()
+        assert catalog.sigma_u is not None and catalog.sigma_v is not None
+        for axis, (value, sigma) in enumerate(
+            ((catalog.u, catalog.sigma_u), (catalog.v, catalog.sigma_v))
+        ):
+            centre[rows, axis] = value[which]
+            precision[rows, axis, axis] += sigma[which] ** -2.0
+        if problem.n_star >= 4 and catalog.pm_u is not None and catalog.sigma_pm_u is not None:
+            assert catalog.pm_v is not None and catalog.sigma_pm_v is not None
+            for axis, (value, sigma) in enumerate(
+                ((catalog.pm_u, catalog.sigma_pm_u), (catalog.pm_v, catalog.sigma_pm_v))
+            ):
+                centre[rows, 2 + axis] = value[which]
+                precision[rows, 2 + axis, 2 + axis] += sigma[which] ** -2.0
+        return replace(none, centre=centre, precision=precision)
+
+    def _pairs(
+        self, problem: Problem, catalog: ReferenceCatalog, places: Float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Stars and their reference stars."""
+        radius = self.radius * float(np.median(_pixels(problem)))
+        known = np.column_stack([catalog.u, catalog.v])
+        middle = places.mean(axis=0)
+        start = LinearMap(np.eye(2), np.zeros(2), middle)
+        tree = cKDTree(known)
+        laid = iterated_map(places, known, tree, start, radius, radius) or start
+        moved = laid(places)
+        distance, nearest = tree.query(moved, distance_upper_bound=radius)
+        near = np.isfinite(distance)
+        limit = FAR * max(float(np.median(distance[near])), CLOSE * radius) if near.any() else 0.0
+        if near.sum() > LEAST:
+            near &= distance <= limit
+        # of two stars the nearer one
+        order = np.flatnonzero(near)[np.argsort(distance[near], kind="stable")]
+        _, first = np.unique(nearest[order], return_index=True)
+        rows = np.sort(order[first])
+        return rows, nearest[rows]
+
+
+def _pixels(problem: Problem) -> Float:
+    """Size of a pixel at each detection, in the unit of u, v."""
+    W = problem.W
+    return np.asarray((W[:, 0] * W[:, 2] - W[:, 1] ** 2) ** -0.25)

@@ -1,0 +1,81 @@
+"""What is known whatever the gauge: a solution without its errors along free directions.
+
+Two solutions of the same detections in different gauges differ by a move along directions that
+detections leave free.  Of every error the part that such a move over the detector describes best is
+taken away (an S-transformation: Baarda 1973; Teunissen 1985); what is left has every gauge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import NDArray
+
+from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.posterior import Posterior
+from bayesdist.model import DistortionModel
+
+__all__ = ["gauge_free", "gauge_free_matrix"]
+
+Float = NDArray[np.float64]
+
+
+def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Float:
+    """Matrix (D, D) that takes from a change of the parameters what the free directions make of it.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+        The solution.
+    null : ndarray, shape (D, d)
+        Free directions: `Gauge.null`.
+
+    Returns
+    -------
+    ndarray, shape (D, D)
+        S with S null = 0: the positions of all chips in the first exposure that S d makes are those
+        of d without the combination of free directions that is nearest to them, by least squares
+        over the area of the chips.
+    """
+    D = model.n_params
+    if not null.shape[1]:
+        return np.eye(D)
+    nodes, weights = leggauss(model.order + 1)  # exact for squares of the polynomials
+    rows = []
+    for chip in model.chips:
+        nx, ny = chip.size
+        x, y = (
+            a.ravel() for a in np.meshgrid((nx + 1 + nx * nodes) / 2, (ny + 1 + ny * nodes) / 2)
+        )
+        where = {"exposure": np.zeros(len(x), np.int64), "chip": np.full(len(x), chip.number)}
+        if model.time is not None:
+            where["epoch"] = np.full(len(x), model.time.epoch0[0])
+        J = model.jacobian(theta, x, y, **where)
+        area = nx * ny * np.outer(weights, weights).ravel()
+        rows.append((np.sqrt(area)[:, None, None] * J).reshape(-1, D))
+    J = np.concatenate(rows)
+    return np.asarray(np.eye(D) - null @ np.linalg.pinv(J @ null) @ J)
+
+
+def gauge_free(solution: LinearFit | Posterior, null: Float) -> LinearFit | Posterior:
+    """A solution whose errors are those of relative positions on the detector.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    null : ndarray, shape (D, d)
+        Free directions at it.
+
+    Returns
+    -------
+    LinearFit or Posterior
+        With the same mean.
+    """
+    S = gauge_free_matrix(solution.model, solution.mean, null)
+    if isinstance(solution, LinearFit):
+        return replace(solution, cov=S @ solution.cov @ S.T)
+    mean = solution.mean
+    return replace(solution, theta=mean + (solution.theta - mean) @ S.T)

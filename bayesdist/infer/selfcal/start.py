@@ -1,0 +1,150 @@
+"""Where a self-calibration begins: a known distortion, or none, and exposures that lie on the sky.
+
+A start is good enough when detections of a star come to lie within the first linking length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import NDArray
+
+from bayesdist.data.linear_map import LinearMap
+from bayesdist.data.mutual import MutualFrames
+from bayesdist.model import Chip, DistortionModel, PolynomialBasis
+
+__all__ = ["chips_side_by_side", "fitted_polynomials", "start_parameters", "undistorted"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Start = Callable[[Float, Float, int], Float]
+
+
+def undistorted(chips: Sequence[Chip], pixel: float) -> Start:
+    """Pixels of every chip about its own reference pixel, and nothing else.
+
+    Parameters
+    ----------
+    chips : sequence of Chip
+    pixel : float
+        Size of a pixel in the unit of u, v.
+
+    Returns
+    -------
+    callable
+        From x, y and the number of a chip to positions (N, 2).
+    """
+    reference = {chip.number: chip.reference_pixel for chip in chips}
+
+    def start(x: Float, y: Float, chip: int) -> Float:
+        return pixel * (np.stack([x, y], axis=-1) - reference[chip])
+
+    return start
+
+
+def chips_side_by_side(
+    start: Start, chips: Sequence[Chip], frames: MutualFrames, exposure: Int, number: Int
+) -> Start:
+    """A start in which the chips lie to each other as their stars say.
+
+    Parameters
+    ----------
+    start : callable
+        Of each chip by itself.
+    chips : sequence of Chip
+    frames : MutualFrames
+        Of lists, each of one chip of one exposure.
+    exposure, number : ndarray of int, shape (lists,)
+        Exposure and chip of each list.
+
+    Returns
+    -------
+    callable
+        On the plane of the first chip; a chip that no exposure has beside the first one stays.
+    """
+    maps = {}
+    for chip in chips[1:]:
+        found = []
+        for one in np.unique(exposure):
+            rows = [
+                np.flatnonzero((exposure == one) & (number == n))
+                for n in (chips[0].number, chip.number)
+            ]
+            if all(len(r) for r in rows):
+                (a,), (b,) = rows
+                back = np.linalg.inv(frames.matrices[a])
+                matrix = back @ frames.matrices[b]
+                found.append(
+                    np.column_stack([matrix, back @ (frames.shifts[b] - frames.shifts[a])])
+                )
+        if found:
+            maps[chip.number] = np.median(found, axis=0)
+
+    def moved(x: Float, y: Float, chip: int) -> Float:
+        plane = start(x, y, chip)
+        if chip not in maps:
+            return plane
+        return plane @ maps[chip][:, :2].T + maps[chip][:, 2]
+
+    return moved
+
+
+def fitted_polynomials(
+    start: Start, chips: Sequence[Chip], order: int, onto: LinearMap | None = None
+) -> Float:
+    """Legendre coefficients (chips, 2, K) of a start, by quadrature over each chip.
+
+    Parameters
+    ----------
+    start : callable
+        From x, y and the number of a chip to positions (N, 2).
+    chips : sequence of Chip
+    order : int
+    onto : LinearMap, optional
+        Applied to the positions.
+    """
+    nodes, weights = leggauss(4 * (order + 1))
+    out = []
+    for chip in chips:
+        nx, ny = chip.size
+        x, y = (
+            a.ravel() for a in np.meshgrid((nx + 1 + nx * nodes) / 2, (ny + 1 + ny * nodes) / 2)
+        )
+        root = np.sqrt(np.outer(weights, weights).ravel())[:, None]
+        basis = PolynomialBasis(order, chip.size, chip.reference_pixel).evaluate(x, y)
+        plane = start(x, y, chip.number)
+        plane = plane if onto is None else onto(plane)
+        out.append(np.linalg.lstsq(root * basis, root * plane, rcond=None)[0].T)
+    return np.stack(out)
+
+
+def start_parameters(
+    model: DistortionModel, coefficients: Float, frames: MutualFrames, middles: Float
+) -> Float:
+    """Parameters (D,) at which exposures lie as they were found to.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    coefficients : ndarray, shape (chips, 2, K)
+    frames : MutualFrames
+        Onto the plane of the first exposure.
+    middles : ndarray, shape (E, 2)
+        Of each exposure's detections on its own plane: there the frame is exact.
+    """
+    theta = np.zeros(model.n_params)
+    for chip, of_chip in zip(model.chips, coefficients, strict=True):
+        for axis in (0, 1):
+            theta[model.coefficient_slice(chip.number, axis)] = of_chip[axis]
+    o = np.asarray(model.origin)
+    for e in range(1, len(model.exposures)):
+        names = model.free_frame_names(e)
+        angle = frames.rotations[e] if "rotation" in names else 0.0
+        c, s = np.cos(angle), np.sin(angle)
+        place = frames.matrices[e] @ middles[e] + frames.shifts[e]
+        shift = place - o - np.array([[c, -s], [s, c]]) @ (middles[e] - o)
+        values = {"shift_u": shift[0], "shift_v": shift[1], "rotation": angle}
+        theta[model.frame_slice(e)] = [values.get(name, 0.0) for name in names]
+    return theta

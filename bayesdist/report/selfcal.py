@@ -1,0 +1,241 @@
+"""A self-calibration in the report: its gauge, how exposures and stars came about, the stars."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bayesdist.report.caption import Caption
+from bayesdist.report.numerals import MISSING, count, number, percent
+from bayesdist.report.scales import display_scale, with_mas
+from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
+from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, listing
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from bayesdist.report.context import ReportInput
+
+__all__ = ["SelfcalResults", "selfcal_caption", "selfcal_figure", "selfcal_tables"]
+
+Float = NDArray[np.float64]
+
+DRAWN = 20_000  # stars in a figure: more only hide each other
+PALE = "#9AA7B4"
+
+
+@dataclass(frozen=True, eq=False)
+class SelfcalResults:
+    """What a run without a catalogue adds.
+
+    Parameters
+    ----------
+    words : str
+        In which gauge everything stands.
+    gauge : astropy.table.Table
+        As gauge.ecsv.
+    matching : astropy.table.Table
+        One row for each exposure.
+    stars : astropy.table.Table
+        As stars.ecsv.
+    outlines : tuple of ndarray, each (M, 2)
+        Closed outline of each chip in each exposure, on the sky.
+    held : tuple of str
+        Parameters that the gauge holds.
+    summary : mapping
+        As in summary.json.
+    """
+
+    words: str
+    gauge: Table
+    matching: Table
+    stars: Table
+    outlines: tuple[Float, ...]
+    held: tuple[str, ...]
+    summary: Mapping[str, Any]
+
+
+def selfcal_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
+    """Gauge, detections, exposures and stars; none for other runs."""
+    found = inputs.selfcal
+    if found is None:
+        return ()
+    return (_gauge(found), _detections(found), _exposures(found, inputs), _stars(found, inputs))
+
+
+def _gauge(found: SelfcalResults) -> TextTable:
+    rows = [
+        (
+            str(row["name"]).replace("_", " "),
+            str(row["state"]),
+            _sigma(row["sigma_detections"], row["unit"]),
+            _sigma(row["sigma_fixed"], row["unit"]),
+            _edge(row["sigma_fixed"], row["edge_pix"]),
+            str(row["fixed_by"]) or MISSING,
+        )
+        for row in found.gauge
+    ]
+    heads = (
+        "Property",
+        "From detections",
+        "σ from these",
+        "σ as fixed",
+        "at the edge [pix]",
+        "Fixed by",
+    )
+    return TextTable(
+        "What detections alone cannot tell, and what fixes it",
+        heads,
+        tuple(rows),
+        words=(0, 1, 5),
+        note=f"{found.words} Relative positions do not depend on any of it: their errors are in"
+        " the maps of that name.",
+    )
+
+
+def _sigma(value: Any, unit: Any) -> str:
+    value = float(value)
+    return f"{number(value, 2)} {unit}".strip() if np.isfinite(value) else MISSING
+
+
+def _edge(sigma: Any, edge: Any) -> str:
+    value = float(sigma) * float(edge)
+    return number(value, 2) if np.isfinite(value) else MISSING
+
+
+def _detections(found: SelfcalResults) -> TextTable:
+    s = found.summary
+    d = s["detections"]
+    return listing(
+        "Detections and stars",
+        {
+            "Detections read": count(d["read"]),
+            **{f"Cut: {reason}": count(n) for reason, n in d["cut"].items()},
+            **{reason[0].upper() + reason[1:]: count(n) for reason, n in d["unused"].items()},
+            "Detections used": count(d["used"]),
+            "Stars": count(s["n_stars"]),
+            "Detections of a star, median and most": f"{number(s['per_star']['median'])}, "
+            f"{count(s['per_star']['most'])}",
+            "Ambiguous groups": count(s["n_ambiguous"]),
+            "Rounds of grouping and solving": count(s["rounds"]),
+        },
+    )
+
+
+def _exposures(found: SelfcalResults, inputs: ReportInput) -> TextTable:
+    rows = [
+        (
+            str(row["exposure"]),
+            count(row["detections"]),
+            percent(float(row["share_common"])),
+            number(float(row["rms"])),
+            number(float(row["shift_u"]), 6),
+            number(float(row["shift_v"]), 6),
+            number(float(row["rotation"]), 6),
+        )
+        for row in found.matching[:MOST_ROWS]
+    ]
+    heads = (
+        *("Exposure", "Detections", "In common", "rms on an axis [pix]"),
+        *(f"Shift u [{inputs.unit}]", f"Shift v [{inputs.unit}]", "Rotation [deg]"),
+    )
+    return TextTable(
+        "Exposures",
+        heads,
+        tuple(rows),
+        note="In common: of the detections that lie where another exposure looks. "
+        + further(len(found.matching)),
+        detail=True,
+    )
+
+
+def _stars(found: SelfcalResults, inputs: ReportInput) -> TextTable:
+    s = found.summary["stars"]
+    mas = inputs.scale_mas
+    return listing(
+        "The catalogue of the stars",
+        {
+            "Stars": count(s["n"]),
+            "Radius of the error, median": with_mas(s["radius_median"], s["unit"], mas),
+            "The same for a known distortion": with_mas(s["radius_own_median"], s["unit"], mas),
+            "With two detections alone": count(s["n_two_detections"]),
+            "Doubtful": count(s["n_doubtful"]),
+            "Reference stars": count(s["n_reference"]),
+        },
+        note="All stars with their covariances: stars.ecsv. Their errors hold those of distortion"
+        " and exposures, which stars have in common, in the gauge of the run.",
+    )
+
+
+def selfcal_figure(found: SelfcalResults, unit: str) -> Figure:
+    """The field with its exposures, and the errors of the stars.
+
+    Parameters
+    ----------
+    found : SelfcalResults
+    unit : str
+        Of u and v.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    stars = found.stars[:: max(1, -(-len(found.stars) // DRAWN))]
+    with figure_style():
+        fig = new_figure(WIDTH, 0.5 * WIDTH)
+        field, errors = fig.subplots(1, 2)
+        field.plot(stars["u"], stars["v"], ".", ms=1.5, color=PALE, mec="none", zorder=1)
+        strong = (0.4, 0.5) if len(found.outlines) > 30 else (0.9, 0.9)
+        field.add_collection(
+            LineCollection(found.outlines, colors=CYCLE[0], linewidths=strong[0], alpha=strong[1])
+        )
+        field.set_aspect("equal")
+        field.autoscale_view()
+        field.set_xlabel(f"u [{unit}]")
+        field.set_ylabel(f"v [{unit}]")
+        field.set_title(f"{count(len(found.matching))} exposures")
+        _errors(errors, stars, unit)
+        for ax in (field, errors):
+            ax.tick_params(colors=INK)
+    return fig
+
+
+def _errors(ax: Axes, stars: Table, unit: str) -> None:
+    radius = np.hypot(stars["sigma_u"], stars["sigma_v"])
+    own = np.hypot(stars["sigma_own_u"], stars["sigma_own_v"])
+    scale = display_scale(unit, float(np.median(radius)))
+    by_mag = "mag" in stars.colnames
+    x = np.asarray(stars["mag"] if by_mag else stars["n"], float)
+    for values, color, label in (
+        (radius, CYCLE[0], "with distortion and frames"),
+        (own, CYCLE[1], "of a known distortion"),
+    ):
+        ax.plot(
+            x, np.asarray(values) * scale.factor, ".", ms=2, mec="none", color=color, label=label
+        )
+    ax.set_yscale("log")
+    ax.set_xlabel("magnitude" if by_mag else "detections")
+    ax.set_ylabel(f"radius of the error (1 σ) [{scale.unit}]")
+    ax.set_title("Errors of the stars")
+    ax.legend(markerscale=4)
+
+
+def selfcal_caption(inputs: ReportInput) -> Caption:
+    """Words of the figure."""
+    found = inputs.selfcal
+    assert found is not None
+    s = found.summary["stars"]
+    size = with_mas(s["radius_median"], s["unit"], inputs.scale_mas)
+    return Caption(
+        "Exposures and stars",
+        f"Outlines of the exposures over the {count(s['n'])} stars that were found, and the errors"
+        f" of these, {size} at the median, in the gauge of the run.",
+        f"Outlines of exposures over stars, and errors of the stars, median {size}.",
+    )

@@ -1,0 +1,108 @@
+"""Dither patterns: where exposures are pointed, and how they are rolled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import lcm
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
+
+from bayesdist.model import Chip, DistortionModel
+
+__all__ = ["DitherPattern", "flat_coefficients", "grid_offsets", "rolls_in_turn"]
+
+Float = NDArray[np.float64]
+
+GAP = 50.0  # pixels between chips whose places nobody gave
+ONE_LINE = 0.02  # of the spread along the offsets, below which that across them counts as none
+
+
+@dataclass(frozen=True, eq=False)
+class DitherPattern:
+    """Pointings and rolls of some exposures.
+
+    Parameters
+    ----------
+    name : str
+    offsets : ndarray, shape (E, 2)
+        Of the detector's middle against the first exposure, pixels along the first one's axes.
+    rolls : ndarray, shape (E,)
+        Against the first exposure, radians.
+    """
+
+    name: str
+    offsets: Float
+    rolls: Float
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    @cached_property
+    def reach(self) -> float:
+        """Largest distance of two pointings, pixels."""
+        return float(pdist(self.offsets).max(initial=0.0))
+
+    @property
+    def along_one_line(self) -> bool:
+        """Whether the pointings differ, and along one line only."""
+        spread = np.linalg.svd(self.offsets - self.offsets.mean(axis=0), compute_uv=False)
+        return bool(spread[0] > 0 and spread[1:].max(initial=0.0) < ONE_LINE * spread[0])
+
+
+def grid_offsets(n: tuple[int, int], step: tuple[float, float]) -> Float:
+    """Offsets (n_x n_y, 2) of a regular grid, row by row from zero.
+
+    Parameters
+    ----------
+    n : tuple of int
+        Points along x and y.
+    step : tuple of float
+        Pixels.
+    """
+    x, y = np.meshgrid(np.arange(n[0]) * step[0], np.arange(n[1]) * step[1])
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def rolls_in_turn(n: int, n_offsets: int, rolls: Sequence[float]) -> Float:
+    """Rolls (n,) of exposures that go round some offsets: every offset meets every roll.
+
+    Parameters
+    ----------
+    n : int
+        Exposures.
+    n_offsets : int
+        After which offsets are the same again.
+    rolls : sequence of float
+        Taken in turn.
+    """
+    k = np.arange(n)
+    # where both would come round together, the rolls go one further
+    return np.asarray(rolls, float)[(k + k // lcm(n_offsets, len(rolls))) % len(rolls)]
+
+
+def flat_coefficients(
+    order: int, chips: Sequence[Chip], places: Sequence[tuple[float, float]] | None = None
+) -> Float:
+    """Legendre coefficients (chips, 2, K) of chips without distortion.
+
+    Parameters
+    ----------
+    order : int
+    chips : sequence of Chip
+    places : sequence of (float, float), optional
+        Where the chips' reference pixels lie, in pixels; one above the other by default, the first
+        one below, fifty pixels between them.
+    """
+    model = DistortionModel(order, tuple(chips))
+    out, above = np.zeros((len(chips), 2, model.n_terms)), 0.0
+    for c, chip in enumerate(chips):
+        monomials = np.zeros((2, model.n_terms))
+        monomials[0, 1] = monomials[1, 2] = 1.0
+        monomials[:, 0] = (0.0, above) if places is None else places[c]
+        out[c] = model.basis(chip.number).from_monomials(monomials)
+        above += chip.size[1] + GAP
+    return out

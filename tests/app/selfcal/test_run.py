@@ -1,0 +1,193 @@
+"""A self-calibration from star lists to the report: the truth is covered, the gauge is told."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from scipy import stats
+
+from bayesdist.app import sessions
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.sessions import session_of
+from bayesdist.infer import load_posterior
+from tests.app.selfcal.support import affine_left
+from tests.app.support import cli, good, one_sentence, snapshot, summary_of
+
+
+def _grid(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    at = (np.arange(n) + 0.5) * 1024 / n + 0.5
+    x, y = np.meshgrid(at, at)
+    return x.ravel(), y.ravel()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "n_free"), [("three_rolls", "similarity", 4), ("one_roll", "linear", 6)]
+)
+def test_the_distortion_is_within_its_errors(name, kind, n_free, request):
+    """Chi-square of the coefficients, but for the sky's free maps, which theta's null space has."""
+    finished = request.getfixturevalue(name)
+    with_session = session_of(RunDirectory.open(finished.path))
+    posterior, gauge = with_session.posterior, with_session.gauge
+    assert gauge.null.shape[1] == gauge.open.shape[1] == n_free
+    relative = with_session.relative
+    model, truth = posterior.model, finished.truth
+    x, y = _grid()
+    first = np.zeros(len(x), np.int64)
+    ours = model.predict(posterior.mean, x, y, exposure=first)
+    true = truth.model.predict(truth.theta, x, y, exposure=first)
+    off = true - ours - affine_left(ours, true, ours, kind)
+    K = model.n_polynomial
+    J = model.jacobian(posterior.mean, x, y, exposure=first)[..., :K].reshape(-1, K)
+    cov = J @ np.asarray(relative.cov)[:K, :K] @ J.T
+    values, vectors = np.linalg.eigh(cov)
+    known = values > 1e-8 * values[-1]
+    assert known.sum() == K - n_free
+    # both projections are over the detector's area: of a fine grid here, exact there
+    chi2 = (((vectors[:, known].T @ off.ravel()) ** 2) / values[known]).sum()
+    low, high = stats.chi2.ppf([0.001, 0.999], K - n_free)
+    assert low < chi2 < high
+
+
+def test_stars_are_where_they_were(three_rolls):
+    """But for a similarity of the sky, and by the errors of their own detections."""
+    stars, truth = Table.read(three_rolls.path / "stars.ecsv"), three_rolls.truth
+    found = np.column_stack([stars["u"], stars["v"]])
+    problem = session_of(RunDirectory.open(three_rolls.path)).solved.problem
+    every = np.split(truth.detections.star[problem.rows], problem.starts[1:-1])
+    whose = np.array([np.median(one) for one in every]).astype(int)
+    assert len(np.unique(whose)) == len(whose) == len(stars)
+    sky = truth.sky[whose]
+    off = found + affine_left(found, sky, found, "similarity") - sky
+    sigma = np.column_stack([stars["sigma_own_u"], stars["sigma_own_v"]])
+    inside = np.mean(np.abs(off) < 2 * sigma)
+    n = off.size
+    # the errors of the distortion come on top of the stars' own: 12 % at the median
+    assert inside > 0.93 - 3 * np.sqrt(0.95 * 0.05 / n)
+    counts = summary_of(three_rolls.path)["selfcal"]
+    assert len(stars) == counts["n_stars"] == counts["stars"]["n"]
+    assert stars["n"].sum() == counts["detections"]["used"]
+    assert (counts["stars"]["n_two_detections"]) == (stars["n"] == 2).sum()
+    for row in stars[:5]:
+        cov = row["cov_u_v"]
+        assert abs(cov) < row["sigma_u"] * row["sigma_v"]
+
+
+def test_every_detection_is_accounted_for(three_rolls):
+    counts = summary_of(three_rolls.path)["selfcal"]["detections"]
+    lost = sum(counts["unused"].values()) + sum(counts["cut"].values())
+    assert counts["read"] == len(three_rolls.truth.detections) == counts["used"] + lost
+    matching = Table.read(three_rolls.path / "matching.ecsv")
+    assert matching["detections"].sum() == counts["read"]
+
+
+def test_one_roll_is_told_by_name(one_roll):
+    summary = summary_of(one_roll.path)
+    gauge = summary["selfcal"]["gauge"]
+    free = {d["name"] for d in gauge["directions"] if d["state"] == "free"}
+    assert free == {
+        *("zero_point_u", "zero_point_v", "scale", "rotation"),
+        *("skew_plus", "skew_cross"),
+    }
+    assert all(d["fixed_by"] == "convention" for d in gauge["directions"] if d["name"] in free)
+    assert len(gauge["held"]) == gauge["n_free"] == 6
+    assert any("one roll angle" in text.lower() for text in summary["warnings"])
+    table = Table.read(one_roll.path / "gauge.ecsv")
+    assert set(table["name"][table["state"] == "free"]) == free
+
+
+def test_check_names_the_free_directions_and_writes_nothing(one_roll):
+    before = snapshot(one_roll.config.parent)
+    out = good("check", one_roll.config).out
+    assert "skew_plus: held by convention" in out
+    assert "6 directions are free, 6 of them held by convention" in out
+    assert "One roll angle" in out
+    assert snapshot(one_roll.config.parent) == before
+
+
+def test_every_product_names_the_gauge(three_rolls):
+    run = three_rolls.path
+    held = summary_of(run)["selfcal"]["gauge"]["held"]
+    for name in ("coefficients", "budget", "margins", "stars"):
+        words = Table.read(run / f"{name}.ecsv").meta["gauge"]
+        assert all(one in words for one in held), name
+    with fits.open(run / "maps.fits") as file:
+        words = "".join(file[0].header["COMMENT"])
+        assert "scale, rotation by convention" in words
+        assert {"MIX_SIGMA_U", "REL_SIGMA_U", "REL_SIGMA_V", "REL_CORR"} <= {h.name for h in file}
+    assert "Gauge of a self-calibration" in (run / "sip.hdr").read_text(encoding="ascii")
+    with fits.open(run / "acs_sbc_idc.fits") as file:
+        assert "Gauge of a self-calibration" in " ".join(file[0].header["HISTORY"])
+
+
+def test_parameters_that_are_held_are_not_judged(three_rolls):
+    posterior = load_posterior(three_rolls.path)
+    held = summary_of(three_rolls.path)["selfcal"]["gauge"]["held"]
+    c = posterior.convergence
+    assert c.converged and np.isfinite(c.rhat_max) and np.isfinite(c.ess_bulk_min)
+    unjudged = {name for name, rhat in zip(c.names, c.rhat, strict=True) if not np.isfinite(rhat)}
+    assert unjudged == set(held)
+    still = np.ptp(posterior.flat, axis=0) == 0
+    assert {posterior.model.names[k] for k in np.flatnonzero(still)} == set(held)
+
+
+def test_the_report_shows_gauge_and_stars(three_rolls):
+    text = (three_rolls.path / "report.md").read_text(encoding="utf-8")
+    assert "## Gauge and stars" in text
+    assert "What detections alone cannot tell, and what fixes it" in text
+    assert "relative positions" in text
+    assert (three_rolls.path / "figures" / "selfcal.png").is_file()
+
+
+class Killed(BaseException):
+    """What no stage catches."""
+
+
+def test_a_run_that_was_killed_goes_on(three_rolls, tmp_path, monkeypatch, no_report):
+    """Killed before each of its stages in turn, it ends bit for bit as if nothing had happened."""
+    shutil.copytree(three_rolls.config.parent, tmp_path / "input")
+    config, run = tmp_path / "input" / "config.toml", tmp_path / "run"
+
+    def killed(session):
+        raise Killed
+
+    for stage, flag in (("fit", ()), ("sample", ("--resume",)), ("assess", ("--resume",))):
+        with monkeypatch.context() as patch:
+            patch.setitem(sessions.SELFCAL_STAGES, stage, killed)
+            with pytest.raises(Killed):
+                cli("run", config, "-o", run, *flag)
+    good("run", config, "-o", run, "--resume")
+    one, other = load_posterior(run), load_posterior(three_rolls.path)
+    assert np.array_equal(one.theta, other.theta)
+    assert np.array_equal(one.hyper["j"], other.hyper["j"])
+    a, b = (Table.read(p / "stars.ecsv") for p in (run, three_rolls.path))
+    assert np.array_equal(a["u"], b["u"]) and np.array_equal(a["sigma_u"], b["sigma_u"])
+
+
+def test_other_commands(three_rolls, tmp_path):
+    """What needs matched stars says so; budget and requirements are there."""
+    run = three_rolls.path
+    assert "total" in good("budget", run, "--at", 512, 512).out
+    for arguments, word in (
+        (("order", three_rolls.config), "[selfcal]"),
+        (("monitor", run, run), "self-calibration"),
+        (("bands", run, "-o", tmp_path / "bands"), "self-calibration"),
+        (("plan", run), "self-calibration"),
+        (("release", run, "-o", tmp_path / "release"), "campaign"),
+    ):
+        result = cli(*arguments)
+        assert result.code == 1, arguments
+        one_sentence(result.err, word)
+    assert "posterior of a distortion" in good("inspect", run).out
+
+
+def test_requirements_are_judged(three_rolls, tmp_path):
+    shutil.copytree(three_rolls.path, tmp_path / "run")
+    text = '[[requirement]]\nname = "a"\nstatistic = "p95"\nlimit = 0.05\nprobability = 0.9\n'
+    (tmp_path / "req.toml").write_text(text)
+    good("validate", tmp_path / "run", "--requirements", tmp_path / "req.toml")
+    [margin] = summary_of(tmp_path / "run")["margins"]
+    assert margin["verdict"] == "met"
