@@ -302,7 +302,8 @@ def test_linear_terms_are_the_derivatives_at_the_reference_pixel(epoch):
         found.append(np.stack([p[0], (p[1] - p[2]) / (2 * h), (p[3] - p[4]) / (2 * h)]).T.ravel())
     np.testing.assert_allclose(terms.values, np.concatenate(found), atol=1e-7)
     assert linear_terms(source, 2, epoch=epoch).labels[0] == "A_1"
-    np.testing.assert_array_equal(linear_terms(source, 2, epoch=epoch).cov, terms.cov[6:, 6:])
+    alone = linear_terms(source, 2, epoch=epoch).cov
+    np.testing.assert_allclose(alone, terms.cov[6:, 6:], rtol=1e-12)
 
 
 def test_covariance_of_linear_terms_is_that_of_the_parameters():

@@ -109,9 +109,12 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
 def lists_of(
     block: StarListsBlock, base: Path, columns: Mapping[str, str] | None = None
 ) -> tuple[StarList, ...]:
-    """All star lists that the configuration names."""
+    """All star lists that the configuration names.
+
+    Each place is read alone: a list whose name stands in two is an exposure given twice, not two.
+    """
     names = block.lists if isinstance(block.lists, list) else [block.lists]
-    return read_star_lists([base / name for name in names], columns)
+    return tuple(one for name in names for one in read_star_lists(base / name, columns))
 
 
 def cuts_of(block: StarListsBlock) -> StarCuts:

@@ -126,7 +126,7 @@ def diagnose(
     -------
     Convergence
     """
-    import arviz as az  # takes seconds to import
+    az = _arviz()
 
     E, T, W, D = chains.shape
     in_time = chains.reshape(E, T * W, D)
@@ -194,9 +194,17 @@ def diagnose(
     )
 
 
+def _arviz() -> Any:
+    """ArviZ, without its daily notice, of which a user of ours can make nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz  # takes seconds: only where it is needed
+    return arviz
+
+
 def _coupled_ess(chains: Float, each) -> Float:
     """Effective sample size of the mean over ensembles that may move as one."""
-    import arviz as az
+    az = _arviz()
 
     D = chains.shape[-1]
     averages = chains.mean(axis=2)
@@ -221,7 +229,7 @@ def pareto_k(log_weights: Float) -> float:
     0 where no weight is more than twice the mean: there is no tail then, and the shape of weights
     that are all but equal says nothing.
     """
-    import arviz as az
+    az = _arviz()
 
     finite = log_weights[np.isfinite(log_weights)]
     if len(finite) < 25 or np.ptp(finite) < 1e-9:

@@ -26,7 +26,8 @@ Float = NDArray[np.float64]
 MOST_ROUNDS = 12
 SHRINK = 0.5  # of the linking length from round to round, at most
 REACH = 12.0  # errors that a linking length has to span
-SETTLED = 1e-3  # share of the detections that may change their star
+SETTLED = 1e-3  # share of the detections that may change their star,
+FEWEST = 4  # or so many: two at the edge of the linking length, each with its successor
 ALIKE = 0.02  # change of the number of detections that leaves the errors as they were
 GUESS = 0.02  # pixels: error where none is quoted, until it is measured
 
@@ -152,7 +153,8 @@ def self_calibrate(
         last = radius <= match_radius
         if measured:
             detections, errors = _with_errors(detections, solution)
-        if last and before is not None and _changed(before, friends) < SETTLED:
+        few = max(SETTLED * len(detections), FEWEST)
+        if last and before is not None and _changed(before, friends) <= few:
             if measured:  # with the errors of this round
                 sigma = detections.sigma
                 assert sigma is not None
@@ -168,8 +170,14 @@ def self_calibrate(
         before = friends
         scatter = float(np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2))
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
+    cause = (
+        f"stars and solution still change after {rounds} rounds"
+        if last
+        else f"after {rounds} rounds the detections still ask for a linking length of "
+        f"{radius:.3g} pix, since they scatter by {scatter:.3g} pix"
+    )
     raise NotSettledError(
-        f"stars and solution still change after {rounds} rounds",
+        cause,
         where="self-calibration",
         do="give a better start, another match radius, or a lower order",
     )
@@ -253,11 +261,18 @@ def _with_errors(
     return replace(detections, sigma=of_each), (middles, sigma)
 
 
-def _changed(before: Friends, after: Friends) -> float:
-    """Share of the detections whose neighbours in the list of their star are others."""
-    if before.n_stars != after.n_stars:
-        # codes follow the first detections: they shift where a star has come or gone
-        return abs(before.n_stars - after.n_stars) / max(after.n_stars, 1) + float(
-            np.mean((before.star < 0) != (after.star < 0))
-        )
-    return float(np.mean(before.star != after.star))
+def _changed(before: Friends, after: Friends) -> int:
+    """How many detections follow another one in their star than before.
+
+    Codes of stars would not do: they shift where a star comes or goes.
+    """
+    return int(np.sum(_previous(before.star) != _previous(after.star)))
+
+
+def _previous(star: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each detection, the one before it in its star, or -1."""
+    order = np.argsort(star, kind="stable")
+    same = (star[order[1:]] == star[order[:-1]]) & (star[order[1:]] >= 0)
+    out = np.full(len(star), -1)
+    out[order[1:]] = np.where(same, order[:-1], -1)
+    return out
