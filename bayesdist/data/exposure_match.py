@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.linear_map import LEAST, LinearMap, iterated_map
+from bayesdist.data.linear_map import LEAST, LinearMap, best_similarity, iterated_map
 from bayesdist.data.matching import match_to_catalog
 from bayesdist.data.pairs import (
     beats_chance,
@@ -154,7 +154,9 @@ def match_exposure(
             where=source,
             do="give a better known distortion, or a search radius",
         )
-    turn, centre = _similarity(points[index] - middle, reference[partner])
+    onto = best_similarity(points[index] - middle, reference[partner])
+    turn = complex(*onto.matrix[:, 0])
+    centre = onto(np.zeros((1, 2)))[0]
     expected = np.zeros(len(catalog), bool)
     expected[nearby[_footprint(moved, chip, reference)]] = True
     partner = nearby[partner]
@@ -177,7 +179,7 @@ def match_exposure(
         false_share=false_share,
         rotation=float(np.degrees(np.angle(turn)) % 360.0),
         scale=float(abs(turn)),
-        offset=(centre.real, centre.imag),
+        offset=(float(centre[0]), float(centre[1])),
         radius=(float(allowed.radius.min()), float(allowed.radius.max())),
         zero_point=zero_point,
         coincidences=coincidences,
@@ -334,14 +336,6 @@ def _around(points: Float, catalog: ReferenceCatalog) -> Int:
     inside = (catalog.u >= low[0] - margin) & (catalog.u <= high[0] + margin)
     inside &= (catalog.v >= low[1] - margin) & (catalog.v <= high[1] + margin)
     return np.flatnonzero(inside)
-
-
-def _similarity(points: Float, reference: Float) -> tuple[complex, complex]:
-    """Rotation and scale as a complex number, and where the origin comes to lie."""
-    z, w = (p[:, 0] + 1j * p[:, 1] for p in (points, reference))
-    dz, dw = z - z.mean(), w - w.mean()
-    turn = complex((np.conj(dz) * dw).sum() / (np.abs(dz) ** 2).sum())
-    return turn, complex(w.mean() - turn * z.mean())
 
 
 def _range(

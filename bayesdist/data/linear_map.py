@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = ["LEAST", "SAMPLE", "LinearMap", "iterated_map"]
+__all__ = ["LEAST", "SAMPLE", "LinearMap", "best_similarity", "iterated_map"]
 
 Float = NDArray[np.float64]
 
@@ -36,6 +36,21 @@ class LinearMap:
     def __call__(self, points: Float) -> Float:
         """Transformed points, shape (N, 2)."""
         return (points - self.origin) @ self.matrix.T + self.origin + self.shift
+
+
+def best_similarity(points: Float, reference: Float) -> LinearMap:
+    """Rotation, scale and shift by least squares, about the mean of the points.
+
+    Parameters
+    ----------
+    points, reference : ndarray, shape (N, 2)
+        Pairs; the points not all in one place.
+    """
+    origin, there = points.mean(axis=0), reference.mean(axis=0)
+    p, q = (points - origin) @ [1, 1j], (reference - there) @ [1, 1j]
+    turn = np.vdot(p, q) / np.vdot(p, p).real
+    matrix = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
+    return LinearMap(matrix, there - origin, origin)
 
 
 def iterated_map(

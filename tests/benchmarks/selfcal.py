@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.linear_map import LinearMap, iterated_map
+from bayesdist.data.linear_map import LinearMap, best_similarity, iterated_map
 from bayesdist.infer.selfcal import Solution, self_calibrate
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.model import DistortionModel
@@ -113,11 +113,7 @@ def _onto_references(solution: Solution, references: Float, *, rigid: bool) -> L
         return found
     distance, which = tree.query(found(stars), distance_upper_bound=MATCH)
     near = np.isfinite(distance)
-    z, w = ((a - a.mean(axis=0)) @ [1, 1j] for a in (stars[near], references[which[near]]))
-    turn = np.vdot(z, w) / np.vdot(z, z).real
-    matrix = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
-    origin = stars[near].mean(axis=0)
-    return LinearMap(matrix, references[which[near]].mean(axis=0) - origin, origin)
+    return best_similarity(stars[near], references[which[near]])
 
 
 def _priors(problem: Problem, theta: Float, onto: LinearMap, references: Float) -> StarPriors:

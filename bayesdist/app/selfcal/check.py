@@ -10,7 +10,6 @@ from bayesdist.app.screen import number
 from bayesdist.app.selfcal.gauge import CONVENTION, fixed_by
 from bayesdist.app.selfcal.matching import matching_of
 from bayesdist.app.selfcal.session import SelfcalSession
-from bayesdist.infer.selfcal.calibrate import curvatures
 
 __all__ = ["selfcal_lines"]
 
@@ -22,9 +21,7 @@ def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
     matching = matching_of(found, session.inputs, session.block.least_detections)
     matching.refuse_strangers()
     summary = matching.summary
-    alone, known = curvatures(s.problem, s.theta, s.mixture, s.stars)
-    pieces = session.known_for(model)
-    fixed = fixed_by(gauge, s.problem, s.theta, alone, known, pieces)
+    fixed = fixed_by(gauge, s, session.known_for(model))
     d = summary["detections"]
     cut = "".join(f", {count} {reason}" for reason, count in d["cut"].items())
     yield f"exposures    {summary['n_exposures']}"

@@ -13,6 +13,7 @@ from bayesdist.app.config import Config
 from bayesdist.app.selfcal.inputs import Commanded
 from bayesdist.errors import InputError
 from bayesdist.infer.prior import GaussianPriors
+from bayesdist.infer.selfcal.calibrate import curvatures
 from bayesdist.infer.selfcal.gauge import Gauge, NamedDirection, find_gauge, functionals
 from bayesdist.infer.selfcal.information import (
     Information,
@@ -20,7 +21,7 @@ from bayesdist.infer.selfcal.information import (
     pointing_information,
     tie,
 )
-from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.selfcal.solve import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["CONVENTION", "Known", "fixed_by", "gauge_summary", "gauge_table", "gauge_words"]
@@ -138,20 +139,17 @@ def _pixel(model: DistortionModel, theta: Float) -> float:
 # -- told -----------------------------------------------------------------------------------------
 
 
-def fixed_by(
-    gauge: Gauge, problem: Problem, theta: Float, alone: Float, known: Float, pieces: Known
-) -> dict[str, str]:
+def fixed_by(gauge: Gauge, solution: Solution, pieces: Known) -> dict[str, str]:
     """What fixes each property of the solution, by its name.
 
     Parameters
     ----------
     gauge : Gauge
-    problem : Problem
-    theta : ndarray, shape (D,)
-    alone, known : ndarray, shape (D, D)
-        Curvature of the detections, without and with what is known of the stars beforehand.
+    solution : Solution
     pieces : Known
     """
+    problem, theta = solution.problem, solution.theta
+    alone, known = curvatures(problem, theta, solution.mixture, solution.stars)
     found = {name: piece(theta) for name, piece in pieces.pieces.items()}
     sigmas: dict[str, dict[str, float]] = {}
     none = Information.none(theta)

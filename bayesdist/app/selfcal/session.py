@@ -33,7 +33,7 @@ from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer import GaussianPriors, Matches
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, ReferenceStars, SelfCalibration, Solution, gauge_free
-from bayesdist.infer.selfcal.calibrate import curvatures, gauge_of, self_calibrate
+from bayesdist.infer.selfcal.calibrate import gauge_of, self_calibrate
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem, prepared
 from bayesdist.model import DistortionModel
@@ -279,10 +279,7 @@ class SelfcalSession(Session):
     @cached_property
     def fixed(self) -> dict[str, str]:
         """What fixes each property of the solution."""
-        s = self.solved
-        alone, known = curvatures(s.problem, s.theta, s.mixture, s.stars)
-        pieces = self.known_for(s.problem.model)
-        return fixed_by(self.gauge, s.problem, s.theta, alone, known, pieces)
+        return fixed_by(self.gauge, self.solved, self.known_for(self.model))
 
     # -- what the usual stages ask for ------------------------------------------------------------
 

@@ -11,7 +11,7 @@ from bayesdist.app.campaign.inputs import start_of
 from bayesdist.app.config import Config
 from bayesdist.app.selfcal.inputs import Commanded, Inputs
 from bayesdist.data import ReferenceCatalog
-from bayesdist.data.linear_map import LinearMap
+from bayesdist.data.linear_map import LinearMap, best_similarity
 from bayesdist.data.mutual import mutual_frames
 from bayesdist.data.patterns import Similarity, find_similarity, pattern_index
 from bayesdist.errors import InputError
@@ -197,9 +197,6 @@ def _onto_offsets(
     if known.sum() < 2:
         return None
     places, asked = (matrices @ middle + shifts)[known], offsets[known]
-    p, q = ((a - a.mean(axis=0)) @ [1, 1j] for a in (places, asked))
-    if not np.abs(p).max() > 0:
+    if not np.ptp(places, axis=0).max() > 0:
         return None
-    turn = np.vdot(p, q) / np.vdot(p, p).real
-    matrix = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
-    return LinearMap(matrix, np.zeros(2), middle)
+    return LinearMap(best_similarity(places, asked).matrix, np.zeros(2), middle)
