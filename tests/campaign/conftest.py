@@ -10,7 +10,7 @@ from tests.seeds import over
 
 # how many seeds; what takes longest begins
 FULL = {PUBLISHED_SIZE: 1, ISR: 4, MATERN: 20, LOOSE: 12}
-REDUCED = {MATERN: 2, LOOSE: 1}
+REDUCED = {MATERN: 1, LOOSE: 1}
 
 
 @pytest.fixture(scope="package")

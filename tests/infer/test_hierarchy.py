@@ -247,7 +247,7 @@ def test_jointly_is_alone_and_then_the_line():
 @pytest.mark.parametrize("own", [None, OWN], ids=["together", "apart"])
 def test_scatter_and_lines_over_many_truths(full, own):
     """Pulls of alpha and beta, and where the true tau lies in its posterior."""
-    n = 100 if full else 12
+    n = 100 if full else 6
     truth = TAU if own is None else np.concatenate([TAU, own])
     pulls, ranks = [], []
     for seed in range(n):
@@ -291,7 +291,7 @@ def test_a_gap_that_goes_with_the_shear_is_no_second_measurement_of_it(full):
     In the gauge of WFC2 its B_2 deviates by twice the shear, and no error of its rate can be below
     what that scatter leaves of a line through the exposures.
     """
-    n = 60 if full else 8
+    n = 60 if full else 4
     pulls, ratio = [], []
     for seed in range(n):
         whole, matches, theta = campaign(2000 + seed, 40, 150, tau=(5e-6, 5e-6, 5e-6))

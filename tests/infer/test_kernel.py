@@ -299,8 +299,11 @@ print(hashlib.sha256(b"".join(np.ascontiguousarray(f).tobytes() for f in found))
 """
 
 
-def test_code_from_the_cache_gives_the_bits_of_code_just_compiled(tmp_path):
+@pytest.mark.slow
+def test_code_from_the_cache_gives_the_bits_of_code_just_compiled(full, tmp_path):
     """A run killed while it compiled, and resumed, must not differ."""
+    if not full:
+        pytest.skip("compiles everything anew: set BAYESDIST_FULL=1")
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     cold, warm = (
         subprocess.run(

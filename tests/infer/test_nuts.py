@@ -18,7 +18,10 @@ numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not i
 
 
 def _nuts(matches, fit, draws: int, seed: int):
-    """Means and standard deviations of theta, log j, logit f, log s_out from NUTS."""
+    """Draws of theta, j, logit f and log s_out from NUTS.
+
+    Of j, not of its logarithm: where j may be zero that has a tail which nobody's draws settle.
+    """
     import jax
     import jax.numpy as jnp
     import numpyro.distributions as dist
@@ -75,13 +78,13 @@ def _nuts(matches, fit, draws: int, seed: int):
         )
         mcmc.run(jax.random.PRNGKey(seed))
     got = mcmc.get_samples()
-    return np.column_stack([got["theta"], got["log_j"], got["logit_f"], got["log_s"]])
+    return np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"], got["log_s"]])
 
 
 def _ours(posterior):
     h = {k: v.ravel() for k, v in posterior.hyper.items()}
     logit = np.log(h["f"]) - np.log1p(-h["f"])
-    return np.column_stack([posterior.flat, np.log(h["j"]), logit, np.log(h["s_out"])])
+    return np.column_stack([posterior.flat, h["j"], logit, np.log(h["s_out"])])
 
 
 def _simulated(jitter: float, n: int):
@@ -106,15 +109,18 @@ def _hst1pass(data_dir):
 
 @pytest.mark.parametrize("case", ["simulated", "errors exact (j = 0)", "real hst1pass exposure"])
 def test_agrees_with_nuts(case, full, request, capsys):
+    if case == "simulated" and not full:
+        pytest.skip("the other two are run: set BAYESDIST_FULL=1")
     if case.startswith("real"):
         matches, fit = _hst1pass(request.getfixturevalue("data_dir"))
     else:
         matches, fit = _simulated(0.02 if case == "simulated" else 0.0, 2000 if full else 600)
     # Standard deviations within 3 % ask for some 10^4 effective draws on either side.
-    posterior = sample(fit, matches, outliers=OutlierMixture(), target_ess=30_000, seed=5)
+    draws, limit = (30_000, 0.03) if full else (10_000, 0.05)
+    posterior = sample(fit, matches, outliers=OutlierMixture(), target_ess=draws, seed=5)
     assert posterior.convergence.converged
     ours = _ours(posterior)
-    nuts = _nuts(matches, fit, 12000 if full else 10000, seed=3)
+    nuts = _nuts(matches, fit, 12000 if full else 4000, seed=3)
     sd = nuts.std(axis=0)
     shift = np.abs(ours.mean(axis=0) - nuts.mean(axis=0)) / sd
     ratio = ours.std(axis=0) / sd
@@ -124,4 +130,4 @@ def test_agrees_with_nuts(case, full, request, capsys):
             f"{shift.max():.3f} sd, sd ratio {ratio.min():.4f} to {ratio.max():.4f}"
         )
     assert shift.max() < 0.1
-    assert np.abs(ratio - 1).max() < 0.03
+    assert np.abs(ratio - 1).max() < limit

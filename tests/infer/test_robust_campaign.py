@@ -96,7 +96,7 @@ def test_polynomials_alone_are_those_of_all_parameters():
 @pytest.mark.slow
 def test_clean_campaigns_raise_no_alarm(full, capsys):
     """The ratio is 1 on the mean, whichever clusters; p-values are not too small."""
-    n, stars = 100 if full else 12, 2 * PER
+    n, stars = 100 if full else 6, 2 * PER
     kinds = {
         "cells": {"exposures": False},
         "cells and exposures": {},
@@ -126,7 +126,7 @@ def test_clean_campaigns_raise_no_alarm(full, capsys):
 @pytest.mark.slow
 def test_positions_are_covered_with_a_pattern_without_tables(full, capsys):
     """64-pixel blocks, new ones for each campaign: measured intervals cover, formal ones do not."""
-    n = 100 if full else 16
+    n = 100 if full else 8
     share = {"measured": [], "formal": []}
     for seed in range(n):
         model, matches, theta, joint = fitted(500 + seed, pattern=0.06)

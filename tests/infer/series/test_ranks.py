@@ -105,7 +105,9 @@ def spline_ranks(seed: int) -> dict[str, float]:
 
 @pytest.mark.parametrize("function", [line_ranks, step_ranks, spline_ranks])
 def test_ranks_are_uniform(function, full, capsys):
-    n = 300 if full else 24
+    if function is not line_ranks and not full:
+        pytest.skip("lines are run: set BAYESDIST_FULL=1")
+    n = 300 if full else 16
     ranks = over_seeds(function, n)
     assert np.mean([r["converged"] for r in ranks]) > 0.9
     for key in ranks[0]:
