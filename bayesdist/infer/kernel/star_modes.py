@@ -7,9 +7,12 @@ pixel, r^T W r is in square pixels.
 
     log p = sum_i log[ (1 - f) / (2 pi s_i^2) exp(-r^T W r / (2 s_i^2)) + f / (pi R^2) ]
 
-with s_i^2 the detection's variance, jitter included, in square pixels.  With u_i the density of
-false detections over that of true ones, the membership is 1 / (1 + u_i), and the logarithms are
-those of products: a detection takes one exponential.
+with s_i^2 the detection's variance, jitter included, in square pixels.  With e_i the exponential
+and o_i what false detections are beside it, the membership is e_i / (e_i + o_i), and the logarithms
+are those of products: a detection takes one exponential.
+
+The detections of a star are one array (ROWS, n), a row for each quantity: sums over them are then
+vector instructions.
 """
 
 from __future__ import annotations
@@ -17,9 +20,15 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
+
+from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.infer.kernel.polynomial import FAST
 
 __all__ = [
     "MOST_STAR",
+    "PLACE_U",
+    "PLACE_V",
     "add_curvature",
     "cholesky",
     "design",
@@ -27,6 +36,7 @@ __all__ = [
     "hessian",
     "log_root",
     "membership",
+    "own_rows",
     "residual",
     "to_mode",
 ]
@@ -36,8 +46,21 @@ MOST_STEPS = 60
 CLOSE = 1e-8  # decrement at which one more step of Newton's is the last
 STILL = 1e-6  # square of the step, in errors, by which it may be so
 NEAR = 1.0  # decrement below which the curvature of the mixture is used
-FAR = 300.0  # half the squared residual beyond which a detection is false
 RANGE = 1e150  # of products whose logarithm is taken
+
+# of the detections of a star: place on the sky, W (uu, uv, vv), variance, e + o
+PLACE_U, PLACE_V, UU, UV, VV, VAR, TERM = range(7)
+ROWS = 7
+
+
+@nb.njit(cache=True, forceinline=True)
+def own_rows(W, var, a, e):
+    """Detections a..e of a star, (ROWS, e - a), but for their places."""
+    own = np.empty((ROWS, e - a))
+    for i in range(a, e):
+        own[UU, i - a], own[UV, i - a], own[VV, i - a] = W[i, 0], W[i, 1], W[i, 2]
+        own[VAR, i - a] = var[i]
+    return own
 
 
 @nb.njit(cache=True, forceinline=True)
@@ -86,27 +109,27 @@ def design(S, q, i, time, factor):
 
 
 @nb.njit(cache=True, forceinline=True)
-def residual(i, z, S, p, q, W):
+def residual(i, own, S, p, q):
     """W times the residual, and its square in pixels."""
-    ru, rv = z[i, 0], z[i, 1]
+    ru, rv = own[PLACE_U, i], own[PLACE_V, i]
     for k in range(q):
         ru -= S[0, k] * p[k]
         rv -= S[1, k] * p[k]
-    wu, wv = W[i, 0] * ru + W[i, 1] * rv, W[i, 1] * ru + W[i, 2] * rv
+    wu, wv = own[UU, i] * ru + own[UV, i] * rv, own[UV, i] * ru + own[VV, i] * rv
     return wu, wv, ru * wu + rv * wv
 
 
 @nb.njit(cache=True, forceinline=True)
 def far_odds(log_core, log_out):
-    """Density of false detections over that of true ones, but for s^2 exp(r^T W r / (2 s^2))."""
+    """Density of false detections over that of true ones, but for s^2 / e."""
     return 2.0 * math.pi * math.exp(log_out - log_core)
 
 
 @nb.njit(cache=True, forceinline=True)
 def membership(odds, square, s2):
     """Probability that a detection is its star's; `odds` as of `far_odds`."""
-    half = 0.5 * square / s2
-    return 1.0 / (1.0 + odds * s2 * math.exp(half)) if half < FAR else 0.0
+    near = exp_negative(-0.5 * square / s2)
+    return near / (near + odds * s2)
 
 
 @nb.njit(cache=True, forceinline=True)
@@ -120,16 +143,14 @@ def add_curvature(A, S, q, h0, h1, h2):
 
 
 @nb.njit(cache=True, forceinline=True)
-def hessian(i, W, wu, wv, s2, w, observed):
+def hessian(i, own, wu, wv, s2, w, observed):
     """Curvature (3 numbers) of a detection by its place: of the mixture, or with its EM weight."""
     core = w / s2
-    if not observed:
-        return core * W[i, 0], core * W[i, 1], core * W[i, 2]
-    tie = w * (1.0 - w) / (s2 * s2)
+    tie = w * (1.0 - w) / (s2 * s2) if observed else 0.0
     return (
-        core * W[i, 0] - tie * wu * wu,
-        core * W[i, 1] - tie * wu * wv,
-        core * W[i, 2] - tie * wv * wv,
+        core * own[UU, i] - tie * wu * wu,
+        core * own[UV, i] - tie * wu * wv,
+        core * own[VV, i] - tie * wv * wv,
     )
 
 
@@ -146,65 +167,74 @@ def _start(centre, precision, p, A, b):
     return value
 
 
-@nb.njit(cache=True)
-def _expanded(
-    z, W, var, j2, log_core, log_out, time, factor, centre, precision, p, S, A, b, observed
-):  # fmt: skip
-    """Log density of one star, its gradient b and the lower half of its curvature A."""
-    q, odds = len(p), far_odds(log_core, log_out)
-    value, product, n_near = _start(centre, precision, p, A, b), 1.0, 0
-    scale = 1.0 / (var[0] + j2)  # keeps products near one
+@nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
+def _sums(own, j2, odds, pu, pv, share):
+    """Curvature and gradient of a star that stands still at (pu, pv); `share` as of `_expanded`."""
+    u, v, uu, uv, vv = own[PLACE_U], own[PLACE_V], own[UU], own[UV], own[VV]
+    var, term = own[VAR], own[TERM]
     a00 = a10 = a11 = b0 = b1 = 0.0
-    for i in range(len(z)):
-        s2 = var[i] + j2
-        if q == 2:  # the loops below, unrolled: most stars stand still
-            ru, rv = z[i, 0] - p[0], z[i, 1] - p[1]
-            wu, wv = W[i, 0] * ru + W[i, 1] * rv, W[i, 1] * ru + W[i, 2] * rv
-            square = ru * wu + rv * wv
-        else:
-            design(S, q, i, time, factor)
-            wu, wv, square = residual(i, z, S, p, q, W)
-        half = 0.5 * square / s2
-        if half > FAR:
-            value += log_out
-            continue
-        n_near += 1
-        more = 1.0 + odds * s2 * math.exp(half)
-        w = 1.0 / more
-        value -= half
-        product *= more / (scale * s2)
-        if not 1.0 / RANGE < product < RANGE:
-            value += math.log(product)
-            product = 1.0
-        h0, h1, h2 = hessian(i, W, wu, wv, s2, w, observed)
-        core = w / s2
-        if q == 2:
-            a00 += h0
-            a10 += h1
-            a11 += h2
-            b0 += core * wu
-            b1 += core * wv
-        else:
-            add_curvature(A, S, q, h0, h1, h2)
-            for k in range(q):
-                b[k] += core * (S[0, k] * wu + S[1, k] * wv)
-    if q == 2:
+    for i in range(len(u)):
+        inverse = 1.0 / (var[i] + j2)
+        ru, rv = u[i] - pu, v[i] - pv
+        wu, wv = uu[i] * ru + uv[i] * rv, uv[i] * ru + vv[i] * rv
+        near = exp_negative(-0.5 * (ru * wu + rv * wv) * inverse)
+        term[i] = near + odds * (var[i] + j2)
+        w = near / term[i]
+        core = w * inverse
+        tie = share * (1.0 - w) * core * inverse
+        a00 += core * uu[i] - tie * wu * wu
+        a10 += core * uv[i] - tie * wu * wv
+        a11 += core * vv[i] - tie * wv * wv
+        b0 += core * wu
+        b1 += core * wv
+    return a00, a10, a11, b0, b1
+
+
+@nb.njit(cache=True)
+def _expanded(own, j2, odds, time, factor, centre, precision, p, S, A, b, observed):
+    """Log density of what is known of one star, gradient b and lower half of the curvature A."""
+    q, value = len(p), _start(centre, precision, p, A, b)
+    if q == 2:  # most stars stand still
+        a00, a10, a11, b0, b1 = _sums(own, j2, odds, p[0], p[1], 1.0 if observed else 0.0)
         A[0, 0] += a00
         A[1, 0] += a10
         A[1, 1] += a11
         b[0] += b0
         b[1] += b1
-    return (
-        value + math.log(product) + n_near * (log_core - math.log(2.0 * math.pi) + math.log(scale))
-    )
+        return value
+    for i in range(own.shape[1]):
+        s2 = own[VAR, i] + j2
+        design(S, q, i, time, factor)
+        wu, wv, square = residual(i, own, S, p, q)
+        near = exp_negative(-0.5 * square / s2)
+        own[TERM, i] = near + odds * s2
+        w = near / own[TERM, i]
+        h0, h1, h2 = hessian(i, own, wu, wv, s2, w, observed)
+        add_curvature(A, S, q, h0, h1, h2)
+        core = w / s2
+        for k in range(q):
+            b[k] += core * (S[0, k] * wu + S[1, k] * wv)
+    return value
 
 
 @nb.njit(cache=True)
-def to_mode(
-    z, W, var, j2, log_core, log_out, time, factor, centre, precision, p, S, A, b, seen, least
-):  # fmt: skip
+def _log_density(own, j2, log_core):
+    """Of the detections of a star, from the terms of its last expansion."""
+    value, product, n = 0.0, 1.0, own.shape[1]
+    scale = own[VAR, 0] + j2  # keeps products near one
+    for i in range(n):
+        product *= own[TERM, i] * scale / (own[VAR, i] + j2)
+        if not 1.0 / RANGE < product < RANGE:
+            value += math.log(product)
+            product = 1.0
+    return value + math.log(product) + n * (log_core - math.log(2.0 * math.pi * scale))
+
+
+@nb.njit(cache=True)
+def to_mode(own, j2, log_core, log_out, time, factor, centre, precision, p, S, A, b, seen, least):
     """Move p to the mode of one star; leaves the factor of the curvature there in A.
 
+    own: as of `own_rows`, with places.
     `least` is the root of the least curvature that its place may have: a star without members has
     less, and stays where it is.
 
@@ -212,10 +242,9 @@ def to_mode(
     asked by `seen`, or in need.
     """
     q, observed, failed, value, left = len(p), True, False, 0.0, 1.0
+    odds = far_odds(log_core, log_out)
     for _ in range(MOST_STEPS):
-        value = _expanded(
-            z, W, var, j2, log_core, log_out, time, factor, centre, precision, p, S, A, b, observed
-        )  # fmt: skip
+        value = _expanded(own, j2, odds, time, factor, centre, precision, p, S, A, b, observed)
         if not cholesky(A, q):
             if not observed:
                 break  # nothing known: a star without members
@@ -226,24 +255,22 @@ def to_mode(
             observed = False
             continue
         if A[0, 0] < least:
-            return value, observed
+            return value + _log_density(own, j2, log_core), observed
         for k in range(q):
             p[k] += b[k]
         # a step may be long and gain little; the curvature is another one where it ends
-        moved = W[0, 0] * b[0] * b[0] + 2.0 * W[0, 1] * b[0] * b[1] + W[0, 2] * b[1] * b[1]
-        if left < CLOSE and moved < STILL * (var[0] + j2):
+        moved = own[UU, 0] * b[0] ** 2 + 2.0 * own[UV, 0] * b[0] * b[1] + own[VV, 0] * b[1] ** 2
+        if left < CLOSE and moved < STILL * (own[VAR, 0] + j2):
             if observed == seen:  # the last step changes the curvature by next to nothing
-                return value + 0.5 * left, observed
+                return value + _log_density(own, j2, log_core) + 0.5 * left, observed
             break
         observed = left < NEAR and not failed
     for attempt in range(2):
         observed = seen and attempt == 0
-        value = _expanded(
-            z, W, var, j2, log_core, log_out, time, factor, centre, precision, p, S, A, b, observed
-        )  # fmt: skip
+        value = _expanded(own, j2, odds, time, factor, centre, precision, p, S, A, b, observed)
         if cholesky(A, q):
-            return value, observed
-    return value, False
+            break
+    return value + _log_density(own, j2, log_core), observed
 
 
 @nb.njit(cache=True, forceinline=True)

@@ -12,9 +12,11 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.polynomial import FAST
-from bayesdist.infer.kernel.sky_places import legendre, powers
+from bayesdist.infer.kernel.sky_places import legendre
 from bayesdist.infer.kernel.star_modes import (
     MOST_STAR,
+    PLACE_U,
+    PLACE_V,
     add_curvature,
     cholesky,
     design,
@@ -22,6 +24,7 @@ from bayesdist.infer.kernel.star_modes import (
     hessian,
     log_root,
     membership,
+    own_rows,
     residual,
     to_mode,
 )
@@ -41,15 +44,18 @@ def weighted_stars(
     for s in nb.prange(n):
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
         a, e = starts[s], starts[s + 1]
+        own = own_rows(W, var, a, e)
+        for i in range(a, e):
+            own[PLACE_U, i - a], own[PLACE_V, i - a] = z[i, 0], z[i, 1]
         when = time[a:e] if q >= 4 else time
         where = factor[a:e] if q == 5 else factor
         to_mode(
-            z[a:e], W[a:e], var[a:e], j2, log_core, log_out, when, where, centre[s], precision[s],
-            stars[s], S, A, b, False, least,
+            own, j2, log_core, log_out, when, where, centre[s], precision[s], stars[s], S, A, b,
+            False, least,
         )  # fmt: skip
         for i in range(a, e):
             design(S, q, i - a, when, where)
-            _, _, square = residual(i - a, z[a:e], S, stars[s], q, W[a:e])
+            _, _, square = residual(i - a, own, S, stars[s], q)
             member[i] = membership(odds, square, var[i] + j2)
     return member
 
@@ -63,42 +69,56 @@ def log_marginals(
 
     middles (S, 2), share (N,): a star goes where its detections go on the mean, these weighted, and
     lies at `stars` where the mean is `middles`.
+    coef (G, 2, K, D): of the Legendre products, draws last: one detection takes them together.
     rows (D, 3): squared jitter, log of the core's share, log density of outliers.
     least: root of the least curvature that a star's place may have.
     """
-    q, n_draws = stars.shape[1], len(rows)
+    q, K, n_draws = stars.shape[1], coef.shape[2], len(rows)
     sums = np.zeros((PIECES, n_draws))
     step = -(-(last - first) // PIECES)
     for piece in nb.prange(PIECES):
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
-        p = np.empty(q)
-        z = np.empty((16, 2))
+        px, py, phi = np.empty(order + 1), np.empty(order + 1), np.empty(K)
+        p, mean = np.empty(q), np.empty((2, n_draws))
         for s in range(first + piece * step, min(first + (piece + 1) * step, last)):
             a, e = starts[s], starts[s + 1]
-            if e - a > len(z):
-                z = np.empty((2 * (e - a), 2))
-            at, own, wide = z[: e - a], W[a:e], var[a:e]
+            own = own_rows(W, var, a, e)
             when = time[a:e] if q >= 4 else time
             where = factor[a:e] if q == 5 else factor
+            at = np.empty((2, e - a, n_draws))
+            mean[:] = 0.0
+            for i in range(a, e):
+                legendre(X[i], Y[i], order, px, py, phi)
+                for axis in range(2):
+                    _add_products(coef[group[i], axis], phi, offset[i, axis], at[axis, i - a])
+                    for d in range(n_draws):
+                        mean[axis, d] += share[i] * at[axis, i - a, d]
             for d in range(n_draws):
-                mean_u = mean_v = 0.0
-                for i in range(a, e):
-                    of = coef[d, group[i]]
-                    u = powers(of[0], order, X[i], Y[i]) + offset[i, 0]
-                    v = powers(of[1], order, X[i], Y[i]) + offset[i, 1]
-                    at[i - a, 0], at[i - a, 1] = u, v
-                    mean_u += share[i] * u
-                    mean_v += share[i] * v
+                for i in range(e - a):
+                    own[PLACE_U, i], own[PLACE_V, i] = at[0, i, d], at[1, i, d]
                 for k in range(q):
                     p[k] = stars[s, k]
-                p[0] += mean_u - middles[s, 0]
-                p[1] += mean_v - middles[s, 1]
+                p[0] += mean[0, d] - middles[s, 0]
+                p[1] += mean[1, d] - middles[s, 1]
                 value, _ = to_mode(
-                    at, own, wide, rows[d, 0], rows[d, 1], rows[d, 2], when, where, centre[s],
-                    precision[s], p, S, A, b, True, least,
+                    own, rows[d, 0], rows[d, 1], rows[d, 2], when, where, centre[s], precision[s],
+                    p, S, A, b, True, least,
                 )  # fmt: skip
                 sums[piece, d] += value - log_root(A, q, least)
     return sums
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _add_products(coef, phi, start, out):
+    """start + sum of phi_k coef_k, for all draws (D,) at a time."""
+    for d in range(len(out)):
+        out[d] = start + phi[0] * coef[0, d]
+    for k in range(1, len(phi) - 1, 2):  # two at a time: half as often to memory and back
+        for d in range(len(out)):
+            out[d] += phi[k] * coef[k, d] + phi[k + 1] * coef[k + 1, d]
+    if len(phi) % 2 == 0:
+        for d in range(len(out)):
+            out[d] += phi[-1] * coef[-1, d]
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
@@ -133,12 +153,12 @@ def eliminate_stars(
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
         px, py = np.empty(order + 1), np.empty(order + 1)
         by = np.empty((2, max(m, 1)))
-        z, basis = np.empty((16, 2)), np.empty((16, K))
+        basis = np.empty((16, K))
         for s in range(first + piece * step, min(first + (piece + 1) * step, last)):
             a, e = starts[s], starts[s + 1]
-            if e - a > len(z):
-                z, basis = np.empty((2 * (e - a), 2)), np.empty((2 * (e - a), K))
-            at, mine, wide = z[: e - a], W[a:e], var[a:e]
+            if e - a > len(basis):
+                basis = np.empty((2 * (e - a), K))
+            mine = own_rows(W, var, a, e)
             when = time[a:e] if q >= 4 else time
             where = factor[a:e] if q == 5 else factor
             for i in range(a, e):
@@ -148,11 +168,11 @@ def eliminate_stars(
                     total = offset[i, axis]
                     for k in range(K):
                         total += coef[group[i], axis, k] * phi[k]
-                    at[i - a, axis] = total
+                    mine[PLACE_U if axis == 0 else PLACE_V, i - a] = total
             p = stars[s]
             value, observed = to_mode(
-                at, mine, wide, j2, log_core, log_out, when, where, centre[s], precision[s], p, S,
-                A, b, seen, least,
+                mine, j2, log_core, log_out, when, where, centre[s], precision[s], p, S, A, b,
+                seen, least,
             )  # fmt: skip
             scalars[piece, 0] += value - log_root(A, q, least)
             row = (s - first) * q
@@ -164,8 +184,8 @@ def eliminate_stars(
                 g, c = group[i], chip[group[i]]
                 phi = basis[i - a]
                 design(S, q, i - a, when, where)
-                wu, wv, square = residual(i - a, at, S, p, q, mine)
-                s2 = wide[i - a] + j2
+                wu, wv, square = residual(i - a, mine, S, p, q)
+                s2 = var[i] + j2
                 w = membership(odds, square, s2)
                 h0, h1, h2 = hessian(i - a, mine, wu, wv, s2, w, observed)
                 add_curvature(A, S, q, h0, h1, h2)

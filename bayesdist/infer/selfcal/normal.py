@@ -35,7 +35,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STARS = 4096  # eliminated at a time
-SCRATCH = 1_000_000  # bytes of coefficients of draws at a time: what a core has near it
+SCRATCH = 2_000_000  # bytes of coefficients of draws at a time: what a core has near it
 
 
 @dataclass(frozen=True)
@@ -302,7 +302,8 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: Anchor
     p = problem
     rows = np.array([Mixture(j, f).constants(p.log_outlier) for j, f in mixtures])
     out = np.empty(len(theta))
-    step = max(1, SCRATCH // (16 * p.model.n_terms * len(p.groups)))
+    # a multiple of eight: what a vector instruction takes
+    step = max(8, SCRATCH // (16 * p.model.n_terms * len(p.groups)) // 8 * 8)
     for a in range(0, len(theta), step):
         some = slice(a, a + step)
         sums = kernel.log_marginals(
@@ -312,7 +313,7 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: Anchor
             anchor.stars,
             anchor.middles,
             anchor.share,
-            p.powers(theta[some]),
+            np.ascontiguousarray(np.moveaxis(p.effective(theta[some]), 0, -1)),
             p.model.order,
             rows[some],
             p.least_root,
