@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.data.files import atomic_path
-from tests.benchmarks import budget, likelihood, linear, samplers, scaling, scamp, wise
+from tests.benchmarks import budget, dithers, likelihood, linear, samplers, scaling, scamp, wise
 from tests.benchmarks.figure import draw_scaling
 from tests.benchmarks.machine import describe
 from tests.benchmarks.markdown import to_markdown
@@ -27,6 +27,7 @@ PARTS = {
     "wise": wise,
     "budget": budget,
     "scamp": scamp,
+    "dithers": dithers,
 }
 
 

@@ -335,6 +335,45 @@ def _scamp(part: dict[str, Any]) -> list[str]:
     return out + ([part["scamp"], ""] if part["scamp"] else [])
 
 
+def _dithers(part: dict[str, Any]) -> list[str]:
+    out = [
+        "## Self-calibration by size",
+        "",
+        f"Two chips of 4096 x 2048 pixels, order {part['order']}, three roll angles, 5 % false "
+        "detections, without a catalogue, each in a process of its own. *Solve*: detections "
+        "grouped into stars, solved, grouped again until nothing changes; *sample*: to ESS 400, "
+        "with the catalogue of the stars. Memory is the peak of the process, libraries and "
+        "simulation included.",
+        "",
+    ]
+    head = ("exposures", "stars", "detections", "solve [s]", "sample [s]", "together [s]")
+    head += ("us per detection", "passes", "converged", "peak [MB]")
+    out += _table(
+        head,
+        [
+            (
+                str(r["exposures"]),
+                f"{r['stars']:,}",
+                f"{r['n_stars']:,}",
+                _number(r["solve_s"]),
+                _number(r["sample_s"]),
+                _number(r["seconds"]),
+                _number(1e6 * r["seconds"] / r["n_stars"]),
+                f"{r['passes']:,}",
+                "yes" if r["converged"] else "no",
+                f"{r['peak_mb']:,.0f}",
+            )
+            for r in part["rows"]
+        ],
+    )
+    for n in part["stopped"]:
+        out += [f"{n} exposures were stopped after {part['limit_s']:g} s.", ""]
+    fitted = part["exponent"]
+    if fitted is not None:
+        out += [f"Exponent: {fitted['value']:.3f} ± {fitted['error']:.3f}.", ""]
+    return out
+
+
 _PARTS = {
     "samplers": _samplers,
     "kernel": _kernel,
@@ -343,6 +382,7 @@ _PARTS = {
     "wise": _wise,
     "budget": _budget,
     "scamp": _scamp,
+    "dithers": _dithers,
 }
 
 

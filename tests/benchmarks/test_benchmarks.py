@@ -201,6 +201,8 @@ def test_json_and_markdown_are_complete(quick):
     for row in selfcal["rows"]:
         assert 0 < row["rms"] < row["largest"] < 1 and row["seconds"] > 0
     assert len(selfcal["rows"]) == (2 if selfcal["absent"] else 5)
+    (dithers,) = bench["parts"]["dithers"]["rows"]
+    assert dithers["converged"] and dithers["n_stars"] > dithers["stars"] > 0
     budget = bench["parts"]["budget"]["rows"]
     assert len(budget) == 4 and all(row["seconds"] > 0 for row in budget)
     assert (quick / "figures" / "scaling.png").read_bytes().startswith(b"\x89PNG")
