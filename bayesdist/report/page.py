@@ -50,6 +50,7 @@ def template(name: str) -> jinja2.Template:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=_typeset,
     )
     environment.filters["md"] = _markdown
     environment.filters["css"] = _css
@@ -61,6 +62,11 @@ def template(name: str) -> jinja2.Template:
 _SPECIAL = str.maketrans(
     {"|": "\\|", "*": "\\*", "`": "\\`", "[": "\\[", "<": "&lt;", "&": "&amp;", "\n": " "}
 )
+
+
+def _typeset(value: object) -> object:
+    """Sentences are written for terminals too, where +- stands for the sign."""
+    return value.replace(" +- ", " ± ") if isinstance(value, str) else value
 
 
 def _markdown(value: object) -> str:
