@@ -189,6 +189,11 @@ def read_commanded(
 
     codes, labels = column("exposure").labels()
     row_of = {labels[code]: k for k, code in enumerate(codes)}
+    if len(row_of) < len(codes):
+        twice = labels[int(np.argmax(np.bincount(codes)))]
+        raise InputError(
+            f"exposure {twice} stands there twice", where=str(path), do="keep one row of each"
+        )
     rows = np.array([row_of.get(name, -1) for name in names])
     if (rows < 0).all():
         raise InputError(
@@ -203,7 +208,7 @@ def read_commanded(
     offsets, error = None, np.full(len(names), np.nan if sigma is None else sigma)
     if "du" in found:
         offsets = np.stack([of_each(length("du")), of_each(length("dv"))], axis=1)
-        if "sigma" in found:
+        if "sigma" in found and sigma is None:
             error = of_each(length("sigma"), 1.0)
         if not (error > 0).all():
             raise InputError(

@@ -19,8 +19,10 @@ with kept_by_content():
         mixture_moments,
     )
     from bayesdist.infer.kernel.sky_places import linearised, positions
+    from bayesdist.infer.kernel.star_modes import DOUBTFUL, FALSE, MEMBER
     from bayesdist.infer.kernel.stars import memberships, residuals
     from bayesdist.infer.kernel.stars_unknown import (
+        MOST_DOUBTFUL,
         eliminate_stars,
         log_marginals,
         weighted_stars,
@@ -28,7 +30,11 @@ with kept_by_content():
 
 __all__ = [
     "BLOCK",
+    "DOUBTFUL",
+    "FALSE",
     "GAUSSIAN",
+    "MEMBER",
+    "MOST_DOUBTFUL",
     "NO_OUTLIERS",
     "PIECE",
     "UNIFORM",

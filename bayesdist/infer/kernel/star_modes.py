@@ -13,6 +13,10 @@ are those of products: a detection takes one exponential.
 
 The detections of a star are one array (ROWS, n), a row for each quantity: sums over them are then
 vector instructions.
+
+Where it is doubtful which detections are of the star, p has several modes, which come and go as z
+changes, and an expansion about one of them jumps.  The product over the detections is then written
+out: each choice of members is one Gaussian in p, whose integral is known, and these are added.
 """
 
 from __future__ import annotations
@@ -26,6 +30,9 @@ from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import FAST
 
 __all__ = [
+    "DOUBTFUL",
+    "FALSE",
+    "MEMBER",
     "MOST_STAR",
     "PLACE_U",
     "PLACE_V",
@@ -38,6 +45,7 @@ __all__ = [
     "membership",
     "own_rows",
     "residual",
+    "summed_over_members",
     "to_mode",
 ]
 
@@ -51,6 +59,9 @@ RANGE = 1e150  # of products whose logarithm is taken
 # of the detections of a star: place on the sky, W (uu, uv, vv), variance, e + o
 PLACE_U, PLACE_V, UU, UV, VV, VAR, TERM = range(7)
 ROWS = 7
+
+# what a detection is, where the members of its star are chosen
+MEMBER, DOUBTFUL, FALSE = range(3)
 
 
 @nb.njit(cache=True, forceinline=True)
@@ -283,3 +294,66 @@ def log_root(A, q, least):
     for k in range(q):
         total += math.log(max(A[k, k], least) if k < 2 else A[k, k])
     return total
+
+
+@nb.njit(cache=True)
+def summed_over_members(own, state, j2, log_core, log_out, centre, precision, p, which, least):
+    """Log density of a star that stands still, its place integrated out, of all choices of members.
+
+    own: as of `own_rows`, with places.
+    state (n,): MEMBER, DOUBTFUL or FALSE; 2^k choices of k doubtful ones are added.
+    p (2,): a place near by, from which places are counted.
+    which (k or more,): scratch.
+    least: as of `to_mode`; without members and knowledge the star is somewhere in the match circle.
+
+    The same up to a factor of 2 pi as the expansion about a mode has it: density less `log_root`.
+    """
+    log_norm = log_core - math.log(2.0 * math.pi)
+    du, dv = centre[0] - p[0], centre[1] - p[1]
+    a00, a10, a11 = precision[0, 0], precision[1, 0], precision[1, 1]
+    b0, b1 = a00 * du + a10 * dv, a10 * du + a11 * dv
+    square, sure, n_doubtful = b0 * du + b1 * dv, 0.0, 0
+    for i in range(own.shape[1]):
+        if state[i] == FALSE:
+            sure += log_out
+        elif state[i] == DOUBTFUL:
+            which[n_doubtful] = i
+            n_doubtful += 1
+        else:
+            c00, c10, c11, g0, g1, more, log_one = _one_member(own, i, j2, log_norm, p)
+            a00, a10, a11, b0, b1 = a00 + c00, a10 + c10, a11 + c11, b0 + g0, b1 + g1
+            square += more
+            sure += log_one
+    top, total, floor = -math.inf, 0.0, 2.0 * math.log(least)
+    for choice in range(1 << n_doubtful):
+        t00, t10, t11, s0, s1, t, value = a00, a10, a11, b0, b1, square, sure
+        for k in range(n_doubtful):
+            if not choice >> k & 1:
+                value += log_out
+                continue
+            c00, c10, c11, g0, g1, more, log_one = _one_member(own, which[k], j2, log_norm, p)
+            t00, t10, t11, s0, s1 = t00 + c00, t10 + c10, t11 + c11, s0 + g0, s1 + g1
+            t += more
+            value += log_one
+        det = t00 * t11 - t10 * t10
+        if det > 0.0:
+            t -= (t11 * s0 * s0 - 2.0 * t10 * s0 * s1 + t00 * s1 * s1) / det
+            value -= 0.5 * t + max(0.5 * math.log(det), floor)
+        else:
+            value -= floor
+        if value > top:
+            total = total * math.exp(top - value) + 1.0
+            top = value
+        else:
+            total += math.exp(value - top)
+    return top + math.log(total)
+
+
+@nb.njit(cache=True, forceinline=True)
+def _one_member(own, i, j2, log_norm, p):
+    """Curvature, gradient at p, square there and log of the norm of one member."""
+    s2 = own[VAR, i] + j2
+    u, v = own[PLACE_U, i] - p[0], own[PLACE_V, i] - p[1]
+    c00, c10, c11 = own[UU, i] / s2, own[UV, i] / s2, own[VV, i] / s2
+    g0, g1 = c00 * u + c10 * v, c10 * u + c11 * v
+    return c00, c10, c11, g0, g1, g0 * u + g1 * v, log_norm - math.log(s2)

@@ -14,6 +14,7 @@ import numpy as np
 from bayesdist.infer.kernel.polynomial import FAST
 from bayesdist.infer.kernel.sky_places import legendre
 from bayesdist.infer.kernel.star_modes import (
+    DOUBTFUL,
     MOST_STAR,
     PLACE_U,
     PLACE_V,
@@ -26,11 +27,13 @@ from bayesdist.infer.kernel.star_modes import (
     membership,
     own_rows,
     residual,
+    summed_over_members,
     to_mode,
 )
 
-__all__ = ["eliminate_stars", "log_marginals", "weighted_stars"]
+__all__ = ["MOST_DOUBTFUL", "eliminate_stars", "log_marginals", "weighted_stars"]
 
+MOST_DOUBTFUL = 6  # detections of a star whose membership is added up
 PIECES = 8  # whose sums are kept apart, whatever the number of threads
 
 
@@ -63,9 +66,11 @@ def weighted_stars(
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def log_marginals(
     first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars,
-    middles, share, coef, order, rows, least,
+    middles, share, state, coef, order, rows, least,
 ):  # fmt: skip
     """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
+
+    Over all choices of members where some are doubtful: state (N,), as of `summed_over_members`.
 
     middles (S, 2), share (N,): a star goes where its detections go on the mean, these weighted, and
     lies at `stars` where the mean is `middles`.
@@ -79,13 +84,16 @@ def log_marginals(
     for piece in nb.prange(PIECES):
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
         px, py, phi = np.empty(order + 1), np.empty(order + 1), np.empty(K)
-        p, mean = np.empty(q), np.empty((2, n_draws))
+        p, mean, which = np.empty(q), np.empty((2, n_draws)), np.empty(MOST_DOUBTFUL, np.int64)
         for s in range(first + piece * step, min(first + (piece + 1) * step, last)):
             a, e = starts[s], starts[s + 1]
             own = own_rows(W, var, a, e)
             when = time[a:e] if q >= 4 else time
             where = factor[a:e] if q == 5 else factor
             at = np.empty((2, e - a, n_draws))
+            doubtful = False
+            for i in range(a, e):
+                doubtful |= state[i] == DOUBTFUL
             mean[:] = 0.0
             for i in range(a, e):
                 legendre(X[i], Y[i], order, px, py, phi)
@@ -100,6 +108,12 @@ def log_marginals(
                     p[k] = stars[s, k]
                 p[0] += mean[0, d] - middles[s, 0]
                 p[1] += mean[1, d] - middles[s, 1]
+                if doubtful:
+                    sums[piece, d] += summed_over_members(
+                        own, state[a:e], rows[d, 0], rows[d, 1], rows[d, 2], centre[s],
+                        precision[s], p, which, least,
+                    )  # fmt: skip
+                    continue
                 value, _ = to_mode(
                     own, rows[d, 0], rows[d, 1], rows[d, 2], when, where, centre[s], precision[s],
                     p, S, A, b, True, least,

@@ -163,6 +163,8 @@ def self_calibrate(
                     problem, theta, free, information, stars=solution.stars, jitter=jitter,
                     mixture=solution.mixture,
                 )  # fmt: skip
+            # what is known, linearised where the detections are: it must leave the same free
+            information = knowledge(solution.theta)
             gauge = gauge_of(solution.problem, solution.theta, information, solution)
             return SelfCalibration(
                 solution, gauge, friends, replace(detections, star=friends.star), errors, turn + 1

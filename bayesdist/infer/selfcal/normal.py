@@ -35,6 +35,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STARS = 4096  # eliminated at a time
+SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is thought of
 SCRATCH = 2_000_000  # bytes of coefficients of draws at a time: what a core has near it
 
 
@@ -264,11 +265,14 @@ class Anchor:
         Weight of each detection in the place of its star; they add to 1.
     middles : ndarray, shape (S, 2)
         Mean places of the detections at the solution, so weighted.
+    state : ndarray of int, shape (N,)
+        Whether a detection is a member, is not, or doubtful: `kernel.MEMBER` and so on.
     """
 
     stars: Float
     share: Float
     middles: Float
+    state: NDArray[np.int8]
 
     @classmethod
     def at(cls, problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Anchor:
@@ -280,7 +284,28 @@ class Anchor:
         lost = total[p.star] <= 0  # a star without members stays in the middle
         share = np.where(lost, 1.0 / p.counts[p.star], weight / np.where(lost, 1.0, total[p.star]))
         middles = [np.bincount(p.star, share * z[:, axis]) for axis in (0, 1)]
-        return cls(stars, share, np.stack(middles, axis=1))
+        return cls(stars, share, np.stack(middles, axis=1), _states(p, member))
+
+
+def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
+    """Which memberships are to be added up: those of stars that stand still.
+
+    All of a star of few detections if one is doubtful: another one may have the members right.
+    """
+    out = np.where(member > 0.5, kernel.MEMBER, kernel.FALSE).astype(np.int8)
+    if problem.n_star > 2:
+        return out
+    doubtful = member < SURE
+    few = problem.counts <= kernel.MOST_DOUBTFUL
+    open_stars = np.bincount(problem.star, doubtful) > 0
+    out[(few & open_stars)[problem.star]] = kernel.DOUBTFUL
+    # of many detections the most doubtful ones
+    rest = np.flatnonzero(doubtful & (member > NEVER) & ~few[problem.star])
+    rest = rest[np.lexsort((np.abs(member[rest] - 0.5), problem.star[rest]))]
+    star = problem.star[rest]
+    rank = np.arange(len(rest)) - np.searchsorted(star, star)
+    out[rest[rank < kernel.MOST_DOUBTFUL]] = kernel.DOUBTFUL
+    return out
 
 
 def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: Anchor) -> Float:
@@ -313,6 +338,7 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: Anchor
             anchor.stars,
             anchor.middles,
             anchor.share,
+            anchor.state,
             np.ascontiguousarray(np.moveaxis(p.effective(theta[some]), 0, -1)),
             p.model.order,
             rows[some],

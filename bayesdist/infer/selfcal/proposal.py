@@ -25,6 +25,7 @@ DROP = 18.0  # how far below the top (in log density) the nodes reach
 MOST_NODES, FEWEST_NODES = 25, 9
 CLOSE = 1e-4  # decrement at which a node is found
 MOST_STEPS = 12
+MOST_TURNS = 10  # in each of which the mesh of log j is narrowed by seven: to 1e-8
 FLAT = 0.02  # change of the log density beyond which the jitter is felt
 LEAST = 1e-3  # of the median error: no jitter
 
@@ -89,12 +90,12 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
     sigma = target.problem.sigma
     low, high = np.log(LEAST * sigma), np.log(30 * max(sigma, solution.mixture.jitter))
     mesh = np.linspace(low, high, 16)
-    for _ in range(4):
+    for turn in range(MOST_TURNS):
         value = along(mesh)
         top = int(np.argmax(value))
         inside = np.flatnonzero(value > value[top] - DROP)
         begin, end = max(inside[0] - 1, 0), min(inside[-1] + 1, len(mesh) - 1)
-        if inside[-1] - inside[0] > 6:
+        if inside[-1] - inside[0] > 6 or turn == MOST_TURNS - 1:
             break
         mesh = np.linspace(mesh[begin], mesh[end], 16)
     fine = np.linspace(mesh[begin], mesh[end], 400)
@@ -139,8 +140,7 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
         stars[:, :2] += after - middles
         middles = after
     y = np.append(theta[free], z)
-    hyper = split.to_psi(y, at)[len(free) :]
-    value = found.value + float(target.information.log_density(theta))
-    value += float(target.hyper.log_prior(hyper))
+    # of the density itself: that of the expansion has one choice of members
+    value = float(target.log_density(split.to_psi(y, at)[None])[0])
     log_marginal = value + float(split.log_jacobian(y)) - 0.5 * factor.logdet
     return Node(at, y, factor, log_marginal)

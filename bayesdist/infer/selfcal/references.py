@@ -61,19 +61,23 @@ class ReferenceStars:
             )
         none = StarPriors.none(problem.n_stars, problem.n_star)
         centre, precision = none.centre.copy(), none.precision.copy()
-        assert catalog.sigma_u is not None and catalog.sigma_v is not None
-        for axis, (value, sigma) in enumerate(
-            ((catalog.u, catalog.sigma_u), (catalog.v, catalog.sigma_v))
-        ):
-            centre[rows, axis] = value[which]
-            precision[rows, axis, axis] += sigma[which] ** -2.0
-        if problem.n_star >= 4 and catalog.pm_u is not None and catalog.sigma_pm_u is not None:
-            assert catalog.pm_v is not None and catalog.sigma_pm_v is not None
-            for axis, (value, sigma) in enumerate(
-                ((catalog.pm_u, catalog.sigma_pm_u), (catalog.pm_v, catalog.sigma_pm_v))
-            ):
-                centre[rows, 2 + axis] = value[which]
-                precision[rows, 2 + axis, 2 + axis] += sigma[which] ** -2.0
+        moving = problem.n_star >= 4 and catalog.pm_u is not None and catalog.sigma_pm_u is not None
+        for axis, name in enumerate("uv"):
+            sigma = getattr(catalog, f"sigma_{name}")[which]
+            centre[rows, axis] = getattr(catalog, name)[which]
+            if not moving:
+                precision[rows, axis, axis] += sigma**-2.0
+                continue
+            # at its own epoch a catalogue's positions and motions are independent; here, years
+            # later, a place is the one plus so many times the other
+            sigma = getattr(self.catalog, f"sigma_{name}")[which]
+            motion = getattr(self.catalog, f"sigma_pm_{name}")[which]
+            years = problem.epoch0 - np.broadcast_to(self.catalog.epoch, len(self.catalog))[which]
+            centre[rows, 2 + axis] = getattr(catalog, f"pm_{name}")[which]
+            precision[rows, axis, axis] += sigma**-2.0
+            precision[rows, axis, 2 + axis] -= years * sigma**-2.0
+            precision[rows, 2 + axis, axis] -= years * sigma**-2.0
+            precision[rows, 2 + axis, 2 + axis] += motion**-2.0 + (years / sigma) ** 2
         return replace(none, centre=centre, precision=precision)
 
     def _pairs(

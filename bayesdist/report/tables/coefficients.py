@@ -61,7 +61,10 @@ def _held_note(inputs: ReportInput, names: list[str]) -> str:
     for name in names:
         term, _, kind = name.rpartition(".")
         terms.setdefault(term, []).append(kind)
-    texts = [f"{term} ({', '.join(kinds)})" if term else kinds[0] for term, kinds in terms.items()]
+    texts = [
+        f"{term} ({', '.join(kinds)})" if term else ", ".join(kinds)
+        for term, kinds in terms.items()
+    ]
     if inputs.selfcal is not None:
         return (
             "Held by the gauge, and therefore not shown: the detections say nothing of what these"
