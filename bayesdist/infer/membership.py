@@ -108,8 +108,14 @@ def memberships_of(posterior: Posterior, stars: Stars) -> Memberships:
 
 
 def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
-    """The draws over which memberships are averaged: theta (n, D), and the mixture at each."""
-    theta, h = some_draws(*sampled_points(posterior), posterior.n_stars)
+    """The draws over which memberships are averaged: theta (n, D), and the mixture at each.
+
+    The mean alone where places of stars go with it: beside other draws they would not be theirs.
+    """
+    if posterior.own_places:
+        theta, h = (one.mean(axis=0, keepdims=True) for one in sampled_points(posterior))
+    else:
+        theta, h = some_draws(*sampled_points(posterior), posterior.n_stars)
     return theta, posterior.mixture.bind(posterior.reference_sigma).constants(h)
 
 

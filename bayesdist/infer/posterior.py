@@ -77,6 +77,9 @@ class Posterior:
     sampler : SamplerInfo
     certificate : Certificate, optional
         Of the surrogate, where one was made.
+    own_places : bool
+        Whether the places of the stars are unknowns of the same solution, as in a self-calibration:
+        the matches then have those that go with the mean, and with no other draw.
     """
 
     model: DistortionModel
@@ -91,6 +94,7 @@ class Posterior:
     convergence: Convergence
     sampler: SamplerInfo
     certificate: Certificate | None = None
+    own_places: bool = False
 
     @property
     def approximation(self) -> str:

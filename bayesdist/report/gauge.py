@@ -36,6 +36,11 @@ def gauge_of_maps(inputs: ReportInput) -> str:
     """Whether shift and rotation count in the maps of the uncertainty; empty without frames."""
     if not inputs.fit.model.n_frame:
         return ""
+    if inputs.selfcal is not None:
+        return (
+            "What the gauge holds by convention, shift and rotation of the detector as a whole"
+            " among them unless something fixes them, has no error here."
+        )
     first = inputs.fit.model.exposures[0]
     return (
         "Shift and rotation of the detector as a whole count as errors here, relative to exposure"

@@ -241,7 +241,7 @@ def _accuracy_sentence(inputs: ReportInput) -> str:
         f" {with_mas(median, inputs.unit, inputs.scale_mas)} at the median"
         f" place and at most {with_mas(best.radius_max, inputs.unit, inputs.scale_mas)},"
         f" at pixel ({x:.0f}, {y:.0f}){inputs.on_chip(worst.chip)}"
-        f"{', shift and rotation included' if inputs.fit.model.n_frame else ''}"
+        f"{_with_shift(inputs)}"
     )
     if inputs.budget is None:
         return f"{text}."
@@ -253,3 +253,10 @@ def _accuracy_sentence(inputs: ReportInput) -> str:
         else " for a new exposure whose shift and rotation are fitted by whoever uses it"
     )
     return f"{text}; with all terms of the budget the rms over the detector is {with_budget}{whom}."
+
+
+def _with_shift(inputs: ReportInput) -> str:
+    """What a shift and a rotation of the whole count for in the errors of positions."""
+    if inputs.selfcal is not None:
+        return ", in the gauge of the solution"
+    return ", shift and rotation included" if inputs.fit.model.n_frame else ""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from bayesdist.app.config import Config
 from bayesdist.app.selfcal.inputs import Commanded
@@ -30,6 +31,7 @@ Float = NDArray[np.float64]
 Piece = Callable[[Float], Information]
 
 CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"
+CONTRADICTS = 1e-4  # probability of a chi-square at which a piece and the detections do not agree
 FAR = 3.0  # times the final error: a piece by which a direction is known no better fixes it not
 
 
@@ -51,6 +53,20 @@ class Known:
         for piece in self.pieces.values():
             out = out + piece(theta)
         return out
+
+    def contradictions(self, theta: Float) -> Iterator[str]:
+        """Pieces that a solution (D,), which has them in it, is too far from, as sentences."""
+        for name, piece in self.pieces.items():
+            known = piece(theta)
+            values, vectors = np.linalg.eigh(known.precision)
+            measured = values > 1e-10 * values[-1]
+            right = vectors[:, measured].T @ known.right
+            square, n = float(np.sum(right**2 / values[measured])), int(measured.sum())
+            if chi2.sf(square, n) < CONTRADICTS:
+                yield (
+                    f"the {name} contradict the detections: chi-square {square:.4g} of {n}; an "
+                    "error is too small, or a value is wrong"
+                )
 
     @classmethod
     def of(

@@ -337,7 +337,8 @@ class SelfcalSession(Session):
     def doubts(self) -> list[str]:
         """What cannot be known, and what the match found odd."""
         warnings = self.run.summary.get("selfcal", {}).get("warnings", [])
-        return [*self.gauge.sentences, *warnings]
+        known = self.known_for(self.model).contradictions(self.solved.theta)
+        return [*self.gauge.sentences, *known, *warnings]
 
     def fit_changed(self) -> None:
         """Forget what rests on the solution."""

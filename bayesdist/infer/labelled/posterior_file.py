@@ -88,7 +88,9 @@ def save_posterior(
     if matches is not None and len(matches) <= MOST_STARS:
         groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
         groups["constant_data"] = _constants(posterior, matches, xr)
-        if posterior.log_prob.size * len(matches) * 8 <= LARGEST:
+        # of one draw alone where the places of stars go with it
+        few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
+        if few and not posterior.own_places:
             values = star_log_likelihood(posterior, matches)
             groups["log_likelihood"] = xr.Dataset({"uv": (("chain", "draw", "star"), values)})
     tree = xr.DataTree.from_dict({f"/{name}": data for name, data in groups.items()})
@@ -100,6 +102,7 @@ def save_posterior(
         "provenance": json.dumps(dict(provenance or {}), default=str),
         "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
         "n_parameters": n_theta,
+        "own_places": int(posterior.own_places),
         **{name: getattr(posterior, name) for name in NUMBERS},
     }
     netcdf.write(tree, path)
@@ -184,6 +187,7 @@ def load_posterior(path: str | Path) -> Posterior:
             ),
             sampler=SamplerInfo(**info),
             certificate=_certificate(json.loads(attrs["certificate"])),
+            own_places=bool(attrs.get("own_places", False)),
         )
 
 

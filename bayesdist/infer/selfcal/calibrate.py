@@ -172,16 +172,17 @@ def self_calibrate(
         before = friends
         scatter = float(np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2))
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
-    cause = (
-        f"stars and solution still change after {rounds} rounds"
-        if last
-        else f"after {rounds} rounds the detections still ask for a linking length of "
-        f"{radius:.3g} pix, since they scatter by {scatter:.3g} pix"
-    )
+    if last:
+        raise NotSettledError(
+            f"stars and solution still change after {rounds} rounds",
+            where="self-calibration",
+            do="give a better start, another match radius, or a lower order",
+        )
     raise NotSettledError(
-        cause,
+        f"after {rounds} rounds the detections still ask for a linking length of {radius:.3g} pix, "
+        f"since they scatter by {scatter:.3g} pix",
         where="self-calibration",
-        do="give a better start, another match radius, or a lower order",
+        do="give a higher order, a better start, or a larger match radius",
     )
 
 

@@ -72,7 +72,10 @@ class ReferenceStars:
             # later, a place is the one plus so many times the other
             sigma = getattr(self.catalog, f"sigma_{name}")[which]
             motion = getattr(self.catalog, f"sigma_pm_{name}")[which]
-            years = problem.epoch0 - np.broadcast_to(self.catalog.epoch, len(self.catalog))[which]
+            years = (
+                problem.epoch0
+                - np.broadcast_to(np.asarray(self.catalog.epoch, float), len(self.catalog))[which]
+            )
             centre[rows, 2 + axis] = getattr(catalog, f"pm_{name}")[which]
             precision[rows, axis, axis] += sigma**-2.0
             precision[rows, axis, 2 + axis] -= years * sigma**-2.0

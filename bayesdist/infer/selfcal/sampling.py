@@ -15,6 +15,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.chains import Settings, run_chains
 from bayesdist.infer.labelled.convergence import Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.selfcal.normal import memberships
 from bayesdist.infer.selfcal.proposal import propose
 from bayesdist.infer.selfcal.solve import Solution
 from bayesdist.infer.selfcal.target import SelfTarget
@@ -89,6 +90,7 @@ def sample_selfcal(
     E, T, W, D = chains.psi.shape
     draws = np.swapaxes(chains.psi, 1, 2).reshape(E, W * T, D)
     n, expansion = target.n_theta, solution.expansion
+    member = memberships(solution.problem, solution.theta, solution.mixture, solution.stars)
     return Posterior(
         model=solution.problem.model,
         mixture=target.mixture,
@@ -96,7 +98,7 @@ def sample_selfcal(
         hyper=target.hyper.values(draws[..., n:]),
         log_prob=np.swapaxes(chains.log_prob, 1, 2).reshape(E, W * T),
         n_stars=len(solution.problem),
-        n_flagged=round(len(solution.problem) - expansion.n_members),
+        n_flagged=int((member < 0.5).sum()),
         n_false=len(solution.problem) - expansion.n_members,
         reference_sigma=target.hyper.scale,
         convergence=chains.verdict.among((*solution.problem.model.names, *target.hyper.names)),
@@ -111,6 +113,7 @@ def sample_selfcal(
             wall_s=time.monotonic() - started,
             seed=seed,
         ),
+        own_places=True,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy.table import Table, vstack
 
 from bayesdist.assess import uncertainty_map
 from bayesdist.infer.selfcal import gauge_free, star_catalogue
@@ -57,6 +57,36 @@ def test_scale_and_rotation_from_offsets(truth, offsets):
         assert found[name]["sigma_fixed"] == pytest.approx(SIGMA / lever, rel=5e-3)
     assert found["zero_point_u"]["fixed_by"] == "convention"
     assert session.run.summary["selfcal"]["gauge"]["held"] == ["u_0_0", "v_0_0"]
+
+
+def test_offsets_that_contradict_the_detections_are_told(truth, offsets, tmp_path):
+    session, table = offsets
+    assert not any("contradict" in text for text in session.doubts)
+    wrong = table.copy()
+    wrong["du"][3] += 8 * SIGMA
+    config = write_selfcal(tmp_path, list_table(truth), gauge={"offsets": "offsets.ecsv"})
+    wrong.write(config.parent / "offsets.ecsv")
+    doubts = fitted(tmp_path / "run", config).doubts
+    assert any("commanded offsets contradict" in text for text in doubts)
+
+
+def test_an_exposure_whose_offset_stands_twice(truth, offsets, tmp_path):
+    _, table = offsets
+    config = write_selfcal(tmp_path, list_table(truth), gauge={"offsets": "offsets.ecsv"})
+    vstack([table, table[2:3]]).write(config.parent / "offsets.ecsv")
+    result = cli("check", config)
+    assert result.code == 1
+    one_sentence(result.err.splitlines()[-1], "offsets.ecsv", str(table["exposure"][2]), "twice")
+
+
+def test_the_error_of_the_configuration_goes_before_that_of_the_table(truth, offsets, tmp_path):
+    session, table = offsets
+    gauge = {"offsets": "offsets.ecsv", "offset_sigma": 3 * SIGMA}
+    config = write_selfcal(tmp_path, list_table(truth), gauge=gauge)
+    table.write(config.parent / "offsets.ecsv")
+    found, before = directions(fitted(tmp_path / "run", config)), directions(session)
+    ratio = found["scale"]["sigma_fixed"] / before["scale"]["sigma_fixed"]
+    assert ratio == pytest.approx(3, rel=0.01)
 
 
 def test_the_scale_is_that_of_the_offsets(truth, offsets):

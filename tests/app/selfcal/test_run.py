@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 from astropy.io import fits
 from astropy.table import Table
@@ -50,6 +51,24 @@ def test_the_distortion_is_within_its_errors(name, kind, n_free, request):
     chi2 = (((vectors[:, known].T @ off.ravel()) ** 2) / values[known]).sum()
     low, high = stats.chi2.ppf([0.001, 0.999], K - n_free)
     assert low < chi2 < high
+
+
+@pytest.mark.parametrize("name", ["three_rolls", "one_roll"])
+def test_false_detections_are_told_as_in_the_posterior(name, request):
+    """Places of stars go with the solution: beside other draws all detections would look false."""
+    path = request.getfixturevalue(name).path
+    posterior = load_posterior(path)
+    assert posterior.own_places
+    said = np.concatenate(
+        [
+            parquet.read_table(part, columns=["outlier_probability"]).column(0).to_numpy()
+            for part in path.glob("stars/*")
+        ]
+    )
+    assert len(said) == posterior.n_stars
+    # expected numbers of the mode, and at the mean of the draws
+    assert said.sum() == pytest.approx(posterior.n_false, rel=0.15, abs=2)
+    assert abs(int((said > 0.5).sum()) - posterior.n_flagged) <= 2 + 0.1 * posterior.n_flagged
 
 
 def test_stars_are_where_they_were(three_rolls):
