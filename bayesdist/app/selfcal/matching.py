@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.data.detections import NO_STAR
+from bayesdist.data.pairs import hull_of, inside_hull
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.calibrate import places_of
@@ -174,7 +175,7 @@ def _seen_by_others(
     """Which detections lie on the sky where another exposure has a chip."""
     E = len(model.exposures)
     outlines = [
-        [_corners(model, theta, e, chip.number, chip.size) for chip in model.chips]
+        [hull_of(_corners(model, theta, e, chip.number, chip.size))[0] for chip in model.chips]
         for e in range(E)
     ]
     out = np.zeros(len(places), bool)
@@ -183,8 +184,8 @@ def _seen_by_others(
         inside = np.zeros(len(rows), bool)
         for other in range(E):
             if other != e:
-                for corners in outlines[other]:
-                    inside |= _inside(places[rows], corners)
+                for outline in outlines[other]:
+                    inside |= inside_hull(places[rows], outline)
         out[rows] = inside
     return out
 
@@ -195,11 +196,3 @@ def _corners(
     x, y = (0.5 + n * np.array(c) for n, c in zip(size, ([0, 1, 1, 0], [0, 0, 1, 1]), strict=True))
     when = None if model.time is None else np.full(4, model.time.epoch0[0])
     return model.predict(theta, x, y, exposure=np.full(4, exposure), chip=chip, epoch=when)
-
-
-def _inside(points: Float, corners: Float) -> Bool:
-    """Whether points lie in a convex polygon."""
-    side = np.roll(corners, -1, axis=0) - corners
-    off = points[:, None] - corners
-    cross = side[:, 0] * off[..., 1] - side[:, 1] * off[..., 0]
-    return np.asarray((cross > 0).all(axis=1) | (cross < 0).all(axis=1))

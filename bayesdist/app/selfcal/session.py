@@ -274,7 +274,7 @@ class SelfcalSession(Session):
     def gauge(self) -> Gauge:
         """What the detections leave free, and what fixes it."""
         s = self.solved
-        return gauge_of(s.problem, s.theta, s.information, s)
+        return gauge_of(s.problem, s.theta, self.known_for(self.model)(s.theta), s)
 
     @cached_property
     def fixed(self) -> dict[str, str]:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
-from numpy.typing import NDArray
 
 from bayesdist.app.selfcal.session import SelfcalSession
 from bayesdist.app.session import write_table
@@ -90,7 +89,7 @@ def star_table(session: SelfcalSession, found: StarCatalogue) -> Table:
     table["n_members"] = found.n_members
     mag = session.raw_matches.mag
     if mag is not None:
-        table["mag"] = _medians(mag, solution.problem.starts)
+        table["mag"] = solution.problem.medians(mag)
     flags = np.where(found.n == 2, FEW, 0)
     flags |= np.where(found.n_members < MEMBERS * found.n, DOUBTFUL, 0)
     flags |= np.where(solution.problem.priors.informed, REFERENCE, 0)
@@ -101,11 +100,3 @@ def star_table(session: SelfcalSession, found: StarCatalogue) -> Table:
     if session.reference_catalog is not None and session.reference_catalog.tangent_point:
         table.meta["tangent_point"] = list(session.reference_catalog.tangent_point)
     return table
-
-
-def _medians(values: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Median of each run of values."""
-    star = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    ordered = values[np.lexsort((values, star))]
-    low, high = starts[:-1] + (np.diff(starts) - 1) // 2, starts[:-1] + np.diff(starts) // 2
-    return np.asarray((ordered[low] + ordered[high]) / 2)

@@ -297,13 +297,13 @@ def log_root(A, q, least):
 
 
 @nb.njit(cache=True)
-def summed_over_members(own, state, j2, log_core, log_out, centre, precision, p, which, least):
+def summed_over_members(own, state, j2, log_core, log_out, centre, precision, p, doubtful, least):
     """Log density of a star that stands still, its place integrated out, of all choices of members.
 
     own: as of `own_rows`, with places.
     state (n,): MEMBER, DOUBTFUL or FALSE; 2^k choices of k doubtful ones are added.
     p (2,): a place near by, from which places are counted.
-    which (k or more,): scratch.
+    doubtful (k or more, 7): scratch, for what each would add.
     least: as of `to_mode`; without members and knowledge the star is somewhere in the match circle.
 
     The same up to a factor of 2 pi as the expansion about a mode has it: density less `log_root`.
@@ -316,11 +316,14 @@ def summed_over_members(own, state, j2, log_core, log_out, centre, precision, p,
     for i in range(own.shape[1]):
         if state[i] == FALSE:
             sure += log_out
-        elif state[i] == DOUBTFUL:
-            which[n_doubtful] = i
+            continue
+        c00, c10, c11, g0, g1, more, log_one = _one_member(own, i, j2, log_norm, p)
+        if state[i] == DOUBTFUL:
+            one = doubtful[n_doubtful]
+            one[0], one[1], one[2], one[3], one[4] = c00, c10, c11, g0, g1
+            one[5], one[6] = more, log_one
             n_doubtful += 1
         else:
-            c00, c10, c11, g0, g1, more, log_one = _one_member(own, i, j2, log_norm, p)
             a00, a10, a11, b0, b1 = a00 + c00, a10 + c10, a11 + c11, b0 + g0, b1 + g1
             square += more
             sure += log_one
@@ -331,10 +334,9 @@ def summed_over_members(own, state, j2, log_core, log_out, centre, precision, p,
             if not choice >> k & 1:
                 value += log_out
                 continue
-            c00, c10, c11, g0, g1, more, log_one = _one_member(own, which[k], j2, log_norm, p)
-            t00, t10, t11, s0, s1 = t00 + c00, t10 + c10, t11 + c11, s0 + g0, s1 + g1
-            t += more
-            value += log_one
+            one = doubtful[k]
+            t00, t10, t11 = t00 + one[0], t10 + one[1], t11 + one[2]
+            s0, s1, t, value = s0 + one[3], s1 + one[4], t + one[5], value + one[6]
         det = t00 * t11 - t10 * t10
         if det > 0.0:
             t -= (t11 * s0 * s0 - 2.0 * t10 * s0 * s1 + t00 * s1 * s1) / det

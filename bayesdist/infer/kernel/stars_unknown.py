@@ -84,16 +84,16 @@ def log_marginals(
     for piece in nb.prange(PIECES):
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
         px, py, phi = np.empty(order + 1), np.empty(order + 1), np.empty(K)
-        p, mean, which = np.empty(q), np.empty((2, n_draws)), np.empty(MOST_DOUBTFUL, np.int64)
+        p, mean, doubtful = np.empty(q), np.empty((2, n_draws)), np.empty((MOST_DOUBTFUL, 7))
         for s in range(first + piece * step, min(first + (piece + 1) * step, last)):
             a, e = starts[s], starts[s + 1]
             own = own_rows(W, var, a, e)
             when = time[a:e] if q >= 4 else time
             where = factor[a:e] if q == 5 else factor
             at = np.empty((2, e - a, n_draws))
-            doubtful = False
+            several = False
             for i in range(a, e):
-                doubtful |= state[i] == DOUBTFUL
+                several |= state[i] == DOUBTFUL
             mean[:] = 0.0
             for i in range(a, e):
                 legendre(X[i], Y[i], order, px, py, phi)
@@ -108,10 +108,10 @@ def log_marginals(
                     p[k] = stars[s, k]
                 p[0] += mean[0, d] - middles[s, 0]
                 p[1] += mean[1, d] - middles[s, 1]
-                if doubtful:
+                if several:
                     sums[piece, d] += summed_over_members(
                         own, state[a:e], rows[d, 0], rows[d, 1], rows[d, 2], centre[s],
-                        precision[s], p, which, least,
+                        precision[s], p, doubtful, least,
                     )  # fmt: skip
                     continue
                 value, _ = to_mode(

@@ -23,6 +23,7 @@ __all__ = ["ExpectedSolution", "expected_solution"]
 
 Float = NDArray[np.float64]
 
+BOUNDED = 1e-3  # of a free direction that others may leave of it and still describe it
 NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)
 
 
@@ -72,9 +73,6 @@ class ExpectedSolution:
         ):
             return None
         return np.asarray(S @ self.cov @ S.T)
-
-
-BOUNDED = 1e-3  # of a free direction that others may leave of it and still describe it
 
 
 def _largest(change: Float, model: DistortionModel) -> float:

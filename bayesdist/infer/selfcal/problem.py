@@ -141,10 +141,14 @@ class Problem:
         return -float(np.log(np.pi * self.match_radius**2))
 
     @cached_property
+    def pixel(self) -> float:
+        """Median size of a pixel on the sky, in the unit of u, v."""
+        return float(np.median(np.linalg.det(_square(self.W))) ** -0.25)
+
+    @cached_property
     def least_root(self) -> float:
         """Root of the curvature at which a star may be anywhere in its match circle."""
-        pixel = float(np.median(np.linalg.det(_square(self.W))) ** -0.25)
-        return float(np.sqrt(2.0) / (self.match_radius * pixel))
+        return float(np.sqrt(2.0) / (self.match_radius * self.pixel))
 
     @cached_property
     def sigma(self) -> float:
@@ -216,12 +220,15 @@ class Problem:
     def median_places(self, theta: Float) -> Float:
         """Stars (S, q) at the medians of their detections, which a few false ones do not move."""
         out, z = np.zeros((self.n_stars, self.n_star)), self.places(theta)
-        low, high = (self.counts - 1) // 2, self.counts // 2
         for axis in (0, 1):
-            ordered = z[np.lexsort((z[:, axis], self.star)), axis]
-            first = self.starts[:-1]
-            out[:, axis] = (ordered[first + low] + ordered[first + high]) / 2
+            out[:, axis] = self.medians(z[:, axis])
         return out
+
+    def medians(self, values: Float) -> Float:
+        """Medians (S,) of numbers (N,) over the detections of each star."""
+        ordered, first = values[np.lexsort((values, self.star))], self.starts[:-1]
+        low, high = first + (self.counts - 1) // 2, first + self.counts // 2
+        return np.asarray((ordered[low] + ordered[high]) / 2)
 
     def found_again(self, theta: Float, stars: Float) -> Float:
         """Stars (S, q), those that have left all their detections back at the mean of these."""

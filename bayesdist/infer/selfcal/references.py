@@ -87,7 +87,7 @@ class ReferenceStars:
         self, problem: Problem, catalog: ReferenceCatalog, places: Float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Stars and their reference stars."""
-        radius = self.radius * float(np.median(_pixels(problem)))
+        radius = self.radius * problem.pixel
         known = np.column_stack([catalog.u, catalog.v])
         middle = places.mean(axis=0)
         start = LinearMap(np.eye(2), np.zeros(2), middle)
@@ -104,9 +104,3 @@ class ReferenceStars:
         _, first = np.unique(nearest[order], return_index=True)
         rows = np.sort(order[first])
         return rows, nearest[rows]
-
-
-def _pixels(problem: Problem) -> Float:
-    """Size of a pixel at each detection, in the unit of u, v."""
-    W = problem.W
-    return np.asarray((W[:, 0] * W[:, 2] - W[:, 1] ** 2) ** -0.25)
