@@ -91,6 +91,7 @@ class Session:
         """Matches as read, without those that are held out."""
         return self._all_matches if self._split is None else self._split.kept
 
+    things = "stars"  # what a row of the data is, in words
     needed_exposures = 0  # the first ones, which cannot be held out
 
     @property

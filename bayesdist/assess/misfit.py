@@ -44,6 +44,9 @@ class Misfit:
     unit : str
     chip : Chip or None
         The chip, where the detector has several.
+    told : float
+        Share of the patterns over the partition that would have been seen: below 1 where fitted
+        stars hide some.
     """
 
     p_value: float
@@ -51,6 +54,7 @@ class Misfit:
     structure: float
     unit: str
     chip: Chip | None = None
+    told: float = 1.0
 
     @property
     def significant(self) -> bool:

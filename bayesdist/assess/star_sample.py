@@ -36,6 +36,9 @@ class StarSample:
     posterior_residual : ndarray, shape (N, 2), or None
         Data minus the model at the posterior mean; None where nothing was sampled.
     outlier_probability : ndarray, shape (N,), or None
+    taken : ndarray, shape (N,), or None
+        Share of the variance that fitted places of the stars take out of the residuals; None where
+        places are known.
     """
 
     table: MatchTable
@@ -44,6 +47,7 @@ class StarSample:
     n_total: int
     posterior_residual: Float | None = None
     outlier_probability: Float | None = None
+    taken: Float | None = None
 
     def __len__(self) -> int:
         return len(self.table)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.report.numerals import count
 from bayesdist.report.scales import with_mas
+from bayesdist.report.words import DETECTED, MATCHED, Words
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -205,11 +206,17 @@ class ReportInput:
         return self.fit.model.unit
 
     @property
+    def words(self) -> Words:
+        """What things are called."""
+        return MATCHED if self.selfcal is None else DETECTED
+
+    @property
     def sample(self) -> str:
         """'a sample of 200 000 of 11 213 542 stars'; empty where all stars are shown."""
         if not self.stars.partial:
             return ""
-        return f"a sample of {count(len(self.stars))} of {count(self.stars.n_total)} stars"
+        some, every = count(len(self.stars)), count(self.stars.n_total)
+        return f"a sample of {some} of {every} {self.words.things}"
 
     @property
     def provisional(self) -> bool:

@@ -51,7 +51,7 @@ def plan_of_figures(inputs: ReportInput) -> dict[str, Callable[[], Figure]]:
     """The same figures, not yet made."""
     out: dict[str, Callable[[], Figure]] = {}
     stars = inputs.stars
-    drawn = {"unit": inputs.unit, "sampled": stars.partial}
+    drawn = {"unit": inputs.unit, "sampled": stars.partial, "things": inputs.words.things}
     if stars.table.mag is not None and np.isfinite(stars.table.mag).any():
         out["residuals_by_magnitude"] = partial(
             residuals_by_magnitude,
@@ -130,10 +130,11 @@ def mixture_curves(inputs: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
         return MixtureCurve(sigmas[0]), MixtureCurve(sigmas[1])
     mixture = inputs.posterior.mixture
     jitter = mixture.jitter if mixture.jitter is not None else inputs.sampled_mean("j")
+    taken = 0.0 if inputs.stars.taken is None else inputs.stars.taken
     uniform = mixture.model == "uniform"
     scale = float(mixture.match_radius) if uniform else inputs.sampled_mean("s_out")
     u, v = (
-        MixtureCurve(s, inputs.sampled_mean("f"), float(jitter), scale, mixture.model)
+        MixtureCurve(s, inputs.sampled_mean("f"), float(jitter), scale, mixture.model, taken)
         for s in sigmas
     )
     return u, v

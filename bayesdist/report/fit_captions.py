@@ -24,12 +24,12 @@ def _sampled(inputs: ReportInput) -> str:
 
 
 def by_magnitude_caption(inputs: ReportInput) -> Caption:
-    text = "Residuals grow towards faint stars; colour counts stars."
+    words = inputs.words
+    text = f"Residuals grow towards faint stars; colour counts {words.things}."
     if inputs.magnitude_errors is not None:
-        text += (
-            " The lines are ±1 σ as assigned to each magnitude:"
-            " about two thirds of the stars lie between them."
-        )
+        text += " The lines are ±1 σ as assigned to each magnitude: about two thirds of the"
+        text += f" {words.things} lie between them"
+        text += ", and some more as stars follow them." if words.taken else "."
     text += _sampled(inputs)
     return Caption(
         "Residuals against magnitude",
@@ -39,18 +39,20 @@ def by_magnitude_caption(inputs: ReportInput) -> Caption:
 
 
 def histogram_caption(inputs: ReportInput) -> Caption:
+    words = inputs.words
     if inputs.posterior is None:
         text = (
             "The line is what the quoted errors alone predict;"
-            " stars above it in the wings are outliers."
+            f" {words.things} above it in the wings are outliers."
         )
     else:
         text = (
-            "The line is the fitted mixture summed over the stars' own errors, not a fit to the"
-            " bars: it should follow them in the core (top) and in the wings (bottom, logarithmic)."
+            f"The line is the fitted mixture summed over the {words.things}' own errors"
+            f"{words.taken}, not a fit to the bars: it should follow them in the core (top) and in"
+            " the wings (bottom, logarithmic)."
         )
         if inputs.posterior.mixture.model != "none":
-            text += " The dashed part is false matches."
+            text += f" The dashed part is {words.false}."
     text += _sampled(inputs)
     return Caption(
         "Residual histograms",
@@ -78,6 +80,11 @@ def binned_caption(inputs: ReportInput) -> Caption:
             cannot = "neither tables nor polynomial follow"
             if significant < chance / 2:
                 which += " They are fewer than by chance, as the tables follow these very stars."
+    if inputs.words.taken:
+        which = (
+            " Stars were fitted to these very detections, so that fewer may do so than by chance:"
+            " the status has the test that allows for it."
+        )
     return Caption(
         "Binned residuals",
         f"Mean residual of each cell{axes}; dark arrows differ from zero by more than 2 σ."
@@ -91,7 +98,7 @@ def binned_caption(inputs: ReportInput) -> Caption:
 def outliers_caption(inputs: ReportInput) -> Caption:
     text = "Joint posterior of the mixture's parameters; dashed lines hold 68 %."
     if inputs.posterior is not None and "f" in inputs.posterior.hyper:
-        text += f" The fraction of false matches is {percent(inputs.sampled_mean('f'))}."
+        text += f" The fraction of {inputs.words.false} is {percent(inputs.sampled_mean('f'))}."
     return Caption(
         "Outlier fraction, jitter and outlier scale",
         text,

@@ -48,6 +48,8 @@ class MixtureCurve:
         s_out of a Gaussian outlier component, or the match radius of a uniform one.
     outliers : str
         'gaussian', 'uniform' or 'none'.
+    taken : ndarray, shape (N,), or float
+        Share of the variance of each residual that fitted places of the stars take out of it.
     """
 
     sigma: Float
@@ -55,6 +57,7 @@ class MixtureCurve:
     jitter: float = 0.0
     scale: float = 0.0
     outliers: str = "none"
+    taken: Float | float = 0.0
 
     def expected(self, edges: ArrayLike) -> tuple[Float, Float]:
         """Stars expected in each bin: of the good component, and of the outliers.
@@ -78,7 +81,7 @@ class MixtureCurve:
 
     def _widths(self) -> tuple[Float, Float]:
         """Total widths that occur, and how many stars have each (binned where there are many)."""
-        total = np.hypot(self.sigma, self.jitter)
+        total = np.hypot(self.sigma, self.jitter) * np.sqrt(1.0 - self.taken)
         values, counts = np.unique(total, return_counts=True)
         if values.size > _SIGMA_BINS:
             # in equal steps of log width; the mean square in a bin keeps the variance exact
@@ -105,6 +108,7 @@ def residual_histogram(
     *,
     unit: str,
     sampled: bool = False,
+    things: str = "stars",
 ) -> Figure:
     """Histograms of the two axes: the core, and everything on a logarithmic scale of counts.
 
@@ -117,6 +121,8 @@ def residual_histogram(
     unit : str
     sampled : bool
         Whether these are some stars of more, which the labels then say.
+    things : str
+        What the residuals are of: 'stars' or 'detections'.
 
     Returns
     -------
@@ -126,7 +132,7 @@ def residual_histogram(
     widest = max(float(np.sqrt(np.max(c.sigma**2 + c.jitter**2))) for c in curves)
     core = min(6.0 * width, 4.0 * widest)
     tail = max(float(np.abs(residual).max()), 1.2 * core) * 1.02
-    everything = "whole sample" if sampled else "all stars"
+    everything = "whole sample" if sampled else f"all {things}"
     with figure_style():
         fig = new_figure(WIDTH, 4.9)
         axes = fig.subplots(2, 2, sharey="row")
@@ -134,27 +140,33 @@ def residual_histogram(
             for row, (reach, bins) in enumerate(((core, 81), (tail, 121))):
                 ax = axes[row, column]
                 scale = display_scale(unit, reach)
-                _histogram(ax, residual[:, column], curve, reach, bins, scale.factor)
+                _histogram(ax, residual[:, column], curve, reach, bins, scale.factor, things)
                 ax.set_xlabel(f"residual in {axis} [{scale.unit}]")
             axes[0, column].set_title(f"{axis}: core")
             axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
             axes[1, column].set_yscale("log")
         axes[1, 0].set_ylim(bottom=0.5)
         for ax in axes[:, 0]:
-            ax.set_ylabel("stars of the sample per bin" if sampled else "stars per bin")
+            ax.set_ylabel(f"{things} of the sample per bin" if sampled else f"{things} per bin")
         handles, labels = axes[0, 0].get_legend_handles_labels()
         fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
     return fig
 
 
 def _histogram(
-    ax: Axes, values: Float, curve: MixtureCurve, reach: float, bins: int, factor: float
+    ax: Axes,
+    values: Float,
+    curve: MixtureCurve,
+    reach: float,
+    bins: int,
+    factor: float,
+    things: str,
 ) -> None:
     edges = np.linspace(-reach, reach, bins + 1)
     counts, _ = np.histogram(values, edges)
     good, outlying = curve.expected(edges)
     middle = (edges[1:] + edges[:-1]) / 2 * factor
-    ax.stairs(counts, edges * factor, fill=True, color="#C5CED8", label="stars", zorder=1)
+    ax.stairs(counts, edges * factor, fill=True, color="#C5CED8", label=things, zorder=1)
     ax.plot(middle, good + outlying, color=PALETTE["blue"], label="expected", zorder=3)
     if curve.outliers != "none":
         ax.plot(
@@ -175,6 +187,7 @@ def residuals_by_magnitude(
     unit: str,
     errors: MagnitudeErrors | None = None,
     sampled: bool = False,
+    things: str = "stars",
 ) -> Figure:
     """Density of the residuals against magnitude, with the errors assigned to each magnitude.
 
@@ -188,12 +201,14 @@ def residuals_by_magnitude(
     errors : MagnitudeErrors, optional
     sampled : bool
         Whether these are some stars of more, which the labels then say.
+    things : str
+        What the residuals are of: 'stars' or 'detections'.
 
     Returns
     -------
     matplotlib.figure.Figure
     """
-    stars = "sampled stars" if sampled else "stars"
+    shown = f"sampled {things}" if sampled else things
     known = np.isfinite(mag)
     mag, residual = mag[known], residual[known]
     reach = _magnitude_reach(residual, errors)
@@ -226,10 +241,10 @@ def residuals_by_magnitude(
             ax.axhline(0.0, color=INK, lw=0.5)
             ax.set_xlim(low - pad, high + pad)
             ax.set_ylim(-reach * scale.factor, reach * scale.factor)
-            ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {stars} lie outside")
+            ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {shown} lie outside")
             ax.set_xlabel("magnitude [mag]")
         axes[0].set_ylabel(f"residual [{scale.unit}]")
-        fig.colorbar(hexagons, ax=axes, label=f"{stars} per hexagon", fraction=0.04, pad=0.01)
+        fig.colorbar(hexagons, ax=axes, label=f"{shown} per hexagon", fraction=0.04, pad=0.01)
     return fig
 
 

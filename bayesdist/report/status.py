@@ -138,7 +138,7 @@ def _fit_checks(inputs: ReportInput) -> tuple[Check, ...]:
             _level(low <= ratio <= high, "warn"),
         ),
         Check(
-            "Stars left out by the least-squares fit",
+            f"{inputs.words.things.capitalize()} left out by the {inputs.words.chooser}",
             percent(left_out),
             f"at most {percent(_LEFT_OUT, 2)}",
             _level(left_out <= _LEFT_OUT, "warn"),

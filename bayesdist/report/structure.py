@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from bayesdist.assess.misfit import SIGNIFICANT, Misfit, worst_misfit
 from bayesdist.report.context import Check
-from bayesdist.report.numerals import number, probability
+from bayesdist.report.numerals import number, percent, probability
 from bayesdist.report.scales import display_scale
 
 __all__ = ["structure_check"]
@@ -30,6 +30,8 @@ def structure_check(misfits: Sequence[Misfit], *, fit: str) -> Check:
     chip = "" if worst.chip is None else f" of {worst.chip.name}"
     size = display_scale(worst.unit, worst.structure).text(worst.structure, 2)
     found = f"{size} rms in {worst.partition}{chip}" if worst.structure > 0 else "none"
+    if worst.told < 1:
+        found += f" ({percent(worst.told)} of all patterns can be told from places of stars)"
     return Check(
         f"Structure in the residuals of {fit}, beyond noise",
         f"{found}, {probability(worst.p_value)}",

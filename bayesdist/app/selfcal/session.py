@@ -25,6 +25,9 @@ from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.app.selfcal.matching import TURN_BACK, half_turned
 from bayesdist.app.selfcal.start import started
 from bayesdist.app.session import Session
+from bayesdist.assess import SAMPLE, StarSample, star_sample
+from bayesdist.assess.dithered_misfit import dithered_misfit
+from bayesdist.assess.misfit import Misfit
 from bayesdist.assess.solution import Solution as Assessed
 from bayesdist.data import MagnitudeErrors, MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
@@ -34,6 +37,7 @@ from bayesdist.infer import GaussianPriors, Matches
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, ReferenceStars, SelfCalibration, Solution, gauge_free
 from bayesdist.infer.selfcal.calibrate import gauge_of, self_calibrate
+from bayesdist.infer.selfcal.following import taken_by_stars
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem, prepared
 from bayesdist.model import DistortionModel
@@ -51,6 +55,8 @@ _MATCH_AGAIN, _FIT_AGAIN = "run the stage 'match' again", "run the stage 'fit' a
 @dataclass
 class SelfcalSession(Session):
     """What the stages share: detections, stars, the solution with its stars, its gauge."""
+
+    things = "detections"
 
     @property
     def block(self) -> SelfcalBlock:
@@ -317,6 +323,20 @@ class SelfcalSession(Session):
     def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
         """The same."""
         return self.magnitude_errors
+
+    @cached_property
+    def stars(self) -> StarSample:  # type: ignore[override]
+        """Some detections, or all of them, and what fit and posterior say of each."""
+        matches, solution = self.raw_matches, self.solved
+        taken = np.zeros(len(self.detections))
+        taken[solution.problem.rows] = taken_by_stars(solution)
+        sample = star_sample(matches.sample(SAMPLE), len(matches), self.fit, self.posterior)
+        return replace(sample, taken=taken[sample.table.row])
+
+    @cached_property
+    def misfits(self) -> tuple[Misfit, ...]:  # type: ignore[override]
+        """Structure that the solution leaves, of all chips together: they share stars."""
+        return (dithered_misfit(self.solved),)
 
     def measure(self) -> None:
         """Nothing beside the posterior: stars that are free take up what detections share."""

@@ -61,8 +61,9 @@ def summarise_fit(session: Session, fit: LinearFit) -> None:
         },
     )
     log.info(
-        "fit: %d stars, %d rejected, rms %.4g and %.4g %s, chi2/dof %.3f",
+        "fit: %d %s, %d rejected, rms %.4g and %.4g %s, chi2/dof %.3f",
         fit.n_rows,
+        session.things,
         fit.n_rejected,
         fit.rms_u,
         fit.rms_v,

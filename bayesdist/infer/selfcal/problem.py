@@ -189,6 +189,31 @@ class Problem:
         )
         return np.asarray(found + self.offset)
 
+    @cached_property
+    def _half(self) -> Float:
+        """Half the detector's sides in pixels, of each group (G, 2)."""
+        chips = [self.model.chips[c].number for c in self.groups.chip]
+        return np.array([self.model.basis(chip).half_size for chip in chips])
+
+    def _slopes(self, theta: Float) -> tuple[Float, Float]:
+        """Coefficients (G, 2, K) of the scaled powers of the derivatives by X and by Y."""
+        bases = [self.model.basis(self.model.chips[c].number) for c in self.groups.chip]
+        E, half, scaled = self.effective(theta), self._half, bases[0].to_scaled_powers
+        by_X, by_Y = (
+            scaled(np.stack([E[g] @ b.derivatives[k].T * half[g, k] for g, b in enumerate(bases)]))
+            for k in (0, 1)
+        )
+        return by_X, by_Y
+
+    def jacobians(self, theta: Float, rows: slice) -> Float:
+        """Places of some detections by their pixels, (n, 2, 2)."""
+        g, order = self.groups.index[rows], self.model.order
+        columns = [
+            kernel.positions(g, self.X[rows], self.Y[rows], by, order) / self._half[g, k, None]
+            for k, by in enumerate(self._slopes(theta))
+        ]
+        return np.stack(columns, axis=2)
+
     def star_places(self, stars: Float) -> Float:
         """Where on the sky the star of each detection is at its date, (N, 2)."""
         out = stars[self.star, :2]
@@ -246,26 +271,19 @@ class Problem:
 
     def at(self, theta: Float, stars: Float) -> Problem:
         """The same, linearised about a solution: theta (D,) and stars (S, q)."""
-        model, groups = self.model, self.groups
-        E = self.effective(theta)
-        bases = [model.basis(model.chips[c].number) for c in groups.chip]
-        half = np.array([basis.half_size for basis in bases])
-        scaled = bases[0].to_scaled_powers
-        by_X, by_Y = (
-            np.stack([E[g] @ basis.derivatives[k].T * half[g, k] for g, basis in enumerate(bases)])
-            for k in (0, 1)
-        )
+        groups, half = self.groups, self._half
+        by_X, by_Y = self._slopes(theta)
         X, Y, offset, W = kernel.linearised(
             groups.index,
             *self.seen,
             self.X,
             self.Y,
             self.star_places(stars),
-            scaled(E),
-            scaled(by_X),
-            scaled(by_Y),
+            self.powers(theta),
+            by_X,
+            by_Y,
             half,
-            model.order,
+            self.model.order,
         )
         return replace(self, X=X, Y=Y, offset=offset, W=W)
 

@@ -14,13 +14,13 @@ __all__ = ["data_tables"]
 
 def data_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
     """What was read, what was rejected, errors by magnitude, exposures."""
-    m, fit = inputs.stars.table, inputs.fit
+    m, fit, words = inputs.stars.table, inputs.fit, inputs.words
     partial = ", of the sample" if inputs.stars.partial else ""
     pairs = {
         "Sources": ", ".join(short_paths(m.sources)),
         "Rows read": count(m.n_rows),
-        "Matched stars": count(inputs.stars.n_total),
-        "Used by the least-squares fit": count(fit.n_used),
+        words.all_things.capitalize(): count(inputs.stars.n_total),
+        f"Used by the {words.chooser}": count(fit.n_used),
         "Unit of u, v": m.unit,
         "Exposures": count(np.count_nonzero(inputs.exposures.n)),
         "Filters": ", ".join(f for f in m.filter_names if f) or MISSING,
@@ -29,22 +29,22 @@ def data_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
         pairs[f"Epochs [yr]{partial}"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
     if m.mag is not None and np.isfinite(m.mag).any():
         pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
-    pairs["Errors of the stars"] = (
+    pairs[f"Errors of the {words.things}"] = (
         "by magnitude, see below"
         if inputs.magnitude_errors is not None
         else str(inputs.setting("data", "sigma", "as given"))
     )
     reasons = [(f"{k} (reading)", count(v)) for k, v in m.rejected.items()]
-    reasons += [(f"{k} (least-squares fit)", count(v)) for k, v in fit.rejected.items()]
+    reasons += [(f"{k} ({words.chooser})", count(v)) for k, v in fit.rejected.items()]
     rejected = TextTable(
         "Rows left out, by reason",
         ("Reason", "Rows"),
         tuple(reasons) or (("none", "0"),),
-        note="The posterior uses every matched star: the mixture takes the place of rejection."
+        note=f"The posterior uses all {words.all_things}: the mixture takes the place of rejection."
         if inputs.posterior is not None
         else "",
     )
-    note = f"Figures and tables of single stars show {inputs.sample}." if partial else ""
+    note = f"Figures and tables of single {words.things} show {inputs.sample}." if partial else ""
     out = [listing("Input", pairs, note), rejected]
     if inputs.magnitude_errors is not None:
         out.append(_magnitude_table(inputs))
@@ -63,7 +63,12 @@ def _magnitude_table(inputs: ReportInput) -> TextTable:
     )
     return TextTable(
         "Errors by magnitude, estimated from the residuals",
-        ("Magnitude", "Stars", f"σ u [{scale.unit}]", f"σ v [{scale.unit}]"),
+        (
+            "Magnitude",
+            inputs.words.things.capitalize(),
+            f"σ u [{scale.unit}]",
+            f"σ v [{scale.unit}]",
+        ),
         rows,
         words=(),
         detail=True,
@@ -88,7 +93,7 @@ def _exposure_table(inputs: ReportInput) -> TextTable:
         "Exposures",
         (
             "Exposure",
-            "Stars",
+            inputs.words.things.capitalize(),
             "Used",
             f"rms u [{scale.unit}]",
             f"rms v [{scale.unit}]",

@@ -18,7 +18,7 @@ __all__ = ["fit_tables", "outlier_table"]
 def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
     """The linear fit in figures, and statistics of its residuals."""
     fit, model, stars = inputs.fit, inputs.fit.model, inputs.stars
-    mas = inputs.scale_mas
+    mas, words = inputs.scale_mas, inputs.words
     pairs = {
         "Polynomial order": str(model.order),
         "Parameters": f"{count(model.n_params)} ({count(model.n_polynomial)} polynomial)",
@@ -29,7 +29,8 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
         f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",
         "rms of u": with_mas(fit.rms_u, inputs.unit, mas),
         "rms of v": with_mas(fit.rms_v, inputs.unit, mas),
-        "Stars used, left out": f"{count(fit.n_used)}, {count(fit.n_rejected)}",
+        f"{words.things} used, left out".capitalize(): f"{count(fit.n_used)}, "
+        f"{count(fit.n_rejected)}",
         "Condition of the scaled normal matrix": number(fit.condition, 2),
     }
     scale = display_scale(inputs.unit, [fit.rms_u, fit.rms_v])
@@ -42,17 +43,24 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
                 s = residual_statistics(values * scale.factor)
                 rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
     if inputs.held:
-        pairs["Parameters"] += f", {count(len(inputs.held))} of them held by a prior"
+        pairs["Parameters"] += f", {count(len(inputs.held))} of them held by {words.holder}"
     return (
-        listing("Linear fit", pairs),
+        listing(words.fit.capitalize(), pairs),
         *((_skew_table(inputs),) if inputs.setting("fit", "skew", False) else ()),
         TextTable(
-            f"Residuals of the stars used [{scale.unit}]",
+            f"Residuals of the {words.things} used [{scale.unit}]",
             ("Chip, axis" if inputs.several else "Axis", *heads),
             tuple(rows),
-            note=f"From {inputs.sample}." if inputs.sample else "",
+            note=_residual_note(inputs),
         ),
     )
+
+
+def _residual_note(inputs: ReportInput) -> str:
+    notes = [f"From {inputs.sample}."] if inputs.sample else []
+    if inputs.words.taken:
+        notes.append("Stars were fitted with them: residuals are smaller than errors by that.")
+    return " ".join(notes)
 
 
 def _skew_table(inputs: ReportInput) -> TextTable:
@@ -123,14 +131,14 @@ def _chips_of_stars(inputs: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
 
 
 def outlier_table(inputs: ReportInput) -> TextTable | None:
-    """The mixture's own parameters, and how many stars it flags."""
-    post = inputs.posterior
+    """The mixture's own parameters, and how many stars or detections it flags."""
+    post, told = inputs.posterior, inputs.words
     if post is None:
         return None
     words = {
-        "f": ("Fraction of false matches, f", ""),
+        "f": (f"Fraction of {told.false}, f", ""),
         "j": ("Jitter, j: error beyond the quoted one", inputs.unit),
-        "s_out": ("Scale of the false matches, s_out", inputs.unit),
+        "s_out": (f"Scale of the {told.false}, s_out", inputs.unit),
     }
     rows = []
     for key, (name, unit) in words.items():
@@ -143,10 +151,20 @@ def outlier_table(inputs: ReportInput) -> TextTable | None:
         sd = float(v.std())
         cells = (rounded(v.mean(), sd), number(sd, 2), interval(low, high, sd))
         rows.append((name, *(marked(inputs, c) for c in cells), scale.unit))
+    things, missing = told.things, (MISSING, MISSING)
     flagged = marked(inputs, count(post.n_flagged))
-    rows.append(("Stars flagged (probability above 0.5)", flagged, MISSING, MISSING, "stars"))
+    rows.append(
+        (f"{things.capitalize()} flagged (probability above 0.5)", flagged, *missing, things)
+    )
     expected = marked(inputs, number(post.n_false, 4))
-    rows.append(("False matches expected (sum of the probabilities)", expected, "–", "–", "stars"))
+    rows.append(
+        (
+            f"{told.false.capitalize()} expected (sum of the probabilities)",
+            expected,
+            *missing,
+            things,
+        )
+    )
     mixture = post.mixture
     note = f"Outlier component: {mixture.model}"
     if mixture.match_radius is not None:

@@ -1,0 +1,80 @@
+"""How far stars follow their detections: what that takes of residuals, and of patterns in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.selfcal.normal import STARS, memberships
+from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.selfcal.solve import Solution
+
+__all__ = ["Following", "following", "taken_by_stars"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Following:
+    """Some stars with their n detections, in pixels of the detector.
+
+    Parameters
+    ----------
+    rows : slice
+        Their detections, in the order of the problem.
+    star : ndarray of int, shape (n,)
+        Which of these stars each detection is of.
+    weight : ndarray, shape (n,)
+        Inverse variance of each axis, times the probability to be the star's.
+    residual : ndarray, shape (n, 2)
+        Detection minus star.
+    ties : ndarray, shape (n, q, 2)
+        L^-1 B: B is the curvature of the log density by the star's parameters and the detection's
+        pixels, L L^T that by the star's parameters alone.
+    """
+
+    rows: slice
+    star: Int
+    weight: Float
+    residual: Float
+    ties: Float
+
+
+def following(solution: Solution) -> Iterator[Following]:
+    """Go over the stars of a solution, some at a time."""
+    p, theta, mixture = solution.problem, solution.theta, solution.mixture
+    weights = memberships(p, theta, mixture, solution.stars) / (p.var + mixture.jitter**2)
+    residuals = p.places(theta) - p.star_places(solution.stars)
+    for first in range(0, p.n_stars, STARS):
+        last = min(first + STARS, p.n_stars)
+        rows = slice(int(p.starts[first]), int(p.starts[last]))
+        to_pixels = np.linalg.inv(p.jacobians(theta, rows))
+        w, star = weights[rows], p.star[rows] - first
+        by_star = np.swapaxes(to_pixels @ _by_star(p, rows), 1, 2)
+        own = np.array(p.priors.precision[first:last])
+        np.add.at(own, star, w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2))
+        roots = np.linalg.inv(np.linalg.cholesky(own))
+        residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
+        yield Following(rows, star, w, residual, w[:, None, None] * (roots[star] @ by_star))
+
+
+def taken_by_stars(solution: Solution) -> Float:
+    """Share (N,) of the variance of each detection that its star takes out of the residual."""
+    out = np.empty(len(solution.problem))
+    for some in following(solution):
+        square = np.sum(some.ties**2, axis=(1, 2))
+        out[some.rows] = square / (2 * np.maximum(some.weight, np.finfo(float).tiny))
+    return out
+
+
+def _by_star(problem: Problem, rows: slice) -> Float:
+    """Places of detections by the parameters of their stars, (n, 2, q)."""
+    n, q, unit = rows.stop - rows.start, problem.n_star, np.eye(2)
+    out = np.broadcast_to(unit, (n, 2, 2))
+    if q >= 4:
+        out = np.concatenate([out, problem.time[rows, None, None] * unit], axis=2)
+    return out if q < 5 else np.concatenate([out, problem.factor[rows, :, None]], axis=2)
