@@ -409,25 +409,33 @@ class Config(Section):
             ),
             "sampler.method": (self.sampler.method, "exact", "leave it out"),
             "sampler.walkers": (self.sampler.walkers, None, "leave it out"),
+            "sampler.second_stage": (self.sampler.second_stage, "auto", "leave it out"),
         }
         for key, (value, default, do) in others.items():
             if value != default:
                 raise ValueError(f"{key} has no meaning in a [selfcal]; {do}")
-        if self.outliers.model == "none":
+        said = "model" in self.outliers.model_fields_set
+        if said and self.outliers.model != "uniform":
             raise ValueError(
-                "outliers.model is 'none', and in a [selfcal] false detections are uniform within "
-                "the match radius; leave it out"
+                f"outliers.model is '{self.outliers.model}', and in a [selfcal] false detections "
+                "are uniform within the match radius; leave it out"
             )
         if self.gauge.exposure_scale_sigma is not None and "scale" not in self.selfcal.frames:
             raise ValueError(
                 "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
                 "selfcal.frames to 'shift_rotation_scale'"
             )
+        if self.gauge.roll_sigma_deg is not None and "rotation" not in self.selfcal.frames:
+            raise ValueError(
+                "gauge.roll_sigma_deg is given, and the exposures have no rotations; set "
+                "selfcal.frames to 'shift_rotation'"
+            )
         if self._needs_scale and self.detector.scale_mas is None:
             raise ValueError(
                 "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
             )
-        return self
+        uniform = self.outliers.model_copy(update={"model": "uniform"})
+        return self.model_copy(update={"outliers": uniform})
 
     @property
     def _needs_scale(self) -> bool:
@@ -513,7 +521,7 @@ class Config(Section):
         o = self.outliers
         return OutlierMixture(
             model=o.model,
-            match_radius=o.match_radius,
+            match_radius=o.match_radius if self.selfcal is None else self.selfcal.match_radius,
             jitter=None if o.jitter == "fit" else o.jitter,
             fraction_prior=o.fraction_prior,
         )

@@ -172,6 +172,8 @@ def _contents(inputs: ReportInput, images: Mapping[str, bytes]) -> dict[str, Any
         del titles["holdout"]
     if inputs.selfcal is None:
         del titles["selfcal"]
+    else:
+        titles["fit"] = inputs.words.fit.capitalize()
     return {
         "run": inputs,
         "sections": titles,

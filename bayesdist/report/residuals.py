@@ -145,7 +145,9 @@ def residual_histogram(
             axes[0, column].set_title(f"{axis}: core")
             axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
             axes[1, column].set_yscale("log")
-        axes[1, 0].set_ylim(bottom=0.5)
+        # curves fall far below one star: they are not what the axis is for
+        most = [np.histogram(r, np.linspace(-tail, tail, 122))[0].max() for r in residual.T]
+        axes[1, 0].set_ylim(0.5, 2.0 * max(*most, 1))
         for ax in axes[:, 0]:
             ax.set_ylabel(f"{things} of the sample per bin" if sampled else f"{things} per bin")
         handles, labels = axes[0, 0].get_legend_handles_labels()

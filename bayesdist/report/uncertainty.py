@@ -147,7 +147,7 @@ def uncertainty_radius(*maps: UncertaintyMap, mosaic: Mosaic | None = None) -> F
                 ring = {"ms": 5, "mfc": "none", "clip_on": False}
                 ax.plot(x, y, "o", mec="white", mew=2.2, zorder=5, **ring)
                 ax.plot(x, y, "o", mec=INK, mew=1.0, zorder=6, **ring)
-                text = f"{one.kind}: {radius.min():.3g} to {radius.max():.3g} {scale.unit}"
+                text = f"{one.kind}: {radius.min():.3g} to {radius.max():.3g}"
                 ax.set_title(mosaic.title(k, text, ", "))
         every = [ax for axes in panels for ax in axes]
         fig.colorbar(

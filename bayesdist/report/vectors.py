@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.stats import f as f_distribution
 
 from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.scales import display_scale
@@ -38,7 +39,6 @@ __all__ = [
 Float = NDArray[np.float64]
 
 CHANCE = 0.0455  # how often noise alone puts one axis beyond 2 sigma
-_SIGNIFICANT = -2.0 * np.log(CHANCE)  # chi-square of two axes that it passes as rarely
 
 
 def grid_size(x: Float, y: Float) -> tuple[float, float]:
@@ -240,7 +240,7 @@ def residual_vectors(
 
 
 def significant_cells(binned: BinnedResiduals) -> NDArray[np.bool_]:
-    """Cells whose mean lies beyond 2 sigma from zero, both axes taken together.
+    """Cells whose mean lies so far from zero as noise puts it with probability `CHANCE`.
 
     Parameters
     ----------
@@ -251,6 +251,8 @@ def significant_cells(binned: BinnedResiduals) -> NDArray[np.bool_]:
     ndarray of bool
         False where a standard error is unknown or zero.
     """
+    # the errors are those of as few stars as the cell has: the tails are Fisher's
+    beyond = 2.0 * f_distribution.isf(CHANCE, 2, np.maximum(binned.count - 1, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         z2 = (binned.mean_u / binned.sem_u) ** 2 + (binned.mean_v / binned.sem_v) ** 2
-    return np.isfinite(z2) & (z2 > _SIGNIFICANT)
+    return np.isfinite(z2) & (z2 > beyond)

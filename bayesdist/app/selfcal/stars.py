@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
+from astropy.units import Unit
 
 from bayesdist.app.selfcal.session import SelfcalSession
 from bayesdist.app.session import write_table
@@ -82,6 +83,7 @@ def star_table(session: SelfcalSession, found: StarCatalogue) -> Table:
     for a, b in combinations_with_replacement(range(q), 2):
         if a != b:
             table[f"cov_{names[a]}_{names[b]}"] = found.cov[:, a, b]
+            table[f"cov_{names[a]}_{names[b]}"].unit = Unit(units[a]) * Unit(units[b])
     for k, name in enumerate(names[:2]):
         table[f"sigma_own_{name}"] = np.sqrt(found.own[:, k, k])
         table[f"sigma_own_{name}"].unit = found.unit

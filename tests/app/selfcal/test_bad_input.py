@@ -128,6 +128,8 @@ def test_a_single_exposure(truth, tmp_path):
         ({"model": {"order": 3, "frames": "affine"}}, ["model.frames", "selfcal.frames"]),
         ({"fit": {"clip_chi2": 9.0}}, ["fit", "[selfcal]"]),
         ({"outliers": {"match_radius": 1.0}}, ["selfcal.match_radius"]),
+        ({"outliers": {"model": "gaussian"}}, ["outliers.model", "uniform"]),
+        ({"sampler": {"second_stage": "never"}}, ["sampler.second_stage", "[selfcal]"]),
         ({"data": {"matches": "stars.ecsv"}}, ["[data]", "[selfcal]", "give one"]),
         ({"prior": [{"parameter": "u_9_9", "mean": 0.0, "sigma": 1.0}]}, ["'u_9_9'"]),
         ({"products": {"idctab": SBC}, "detector": {"size": SIZE}}, ["scale"]),

@@ -159,6 +159,13 @@ def test_the_report_shows_gauge_and_stars(three_rolls):
     assert "What detections alone cannot tell, and what fixes it" in text
     assert "relative positions" in text
     assert (three_rolls.path / "figures" / "selfcal.png").is_file()
+    # what is fitted are detections; the test for structure allows for their stars
+    said = ("Detections of stars", "false detections", "Structure in the residuals")
+    for words in (*said, "| outliers.model | uniform |"):
+        assert words in text
+    for words in ("Matched stars", "false matches", "least-squares fit"):
+        assert words not in text
+    assert not summary_of(three_rolls.path)["misfit"]["significant"]
 
 
 class Killed(BaseException):
