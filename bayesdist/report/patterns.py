@@ -53,7 +53,7 @@ def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
             last = k == len(found) - 1
             _footprint(row[0], one, of_one, limits, last)
             row[0].set_title(
-                f"first exposure in red\n{one.pattern.name}" if not k else one.pattern.name
+                f"first exposure in orange\n{one.pattern.name}" if not k else one.pattern.name
             )
             for ax, kind in zip(row[1:], SHOWN, strict=True):
                 filled += _map(ax, one, kind, norm, last)
@@ -117,7 +117,7 @@ def _map(ax: Axes, one: PlannedPattern, kind: str, norm: LogNorm, last: bool) ->
         ax.set_title("not bounded")
         ax.set_facecolor(UNBOUNDED)
     else:
-        ax.set_title(f"{one.rms(kind):.2g}, max {one.largest(kind):.2g}")
+        ax.set_title(f"{one.rms(kind):.2g}, max {one.largest(kind):.2g} pix")
     ax.tick_params(labelleft=False)
     _sky_axis(ax, last)
     return filled

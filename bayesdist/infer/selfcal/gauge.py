@@ -107,6 +107,8 @@ class Gauge:
         parameter that stands out in it.
     spread : float
         Largest difference of two roll angles, radians, a half turn counted as none.
+    whole : tuple of str
+        Moves of the whole sky that are free, of `GENERATORS`.
     rates : tuple of str
         Where stars move: moves of the whole sky with time that are free, of `RATES`, and
         `PARALLAX`.
@@ -119,6 +121,7 @@ class Gauge:
     unnamed: tuple[str, ...]
     weakest: Float
     spread: float
+    whole: tuple[str, ...] = ()
     rates: tuple[str, ...] = ()
 
     @property
@@ -129,20 +132,23 @@ class Gauge:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What cannot be known, why, and what fixes it."""
-        out, free = [], set(self.free_names)
-        if {"skew_plus", "skew_cross"} <= free and self.spread < SAME_ROLL:
+        out, free = list[str](), set(self.free_names)
+        # what cannot be told from a skew of the sky is said at once
+        skew = {"skew_plus", "skew_cross"}
+        told = set(POINTS) | (skew if skew & set(self.whole) else set())
+        if skew <= told and skew <= free and self.spread < SAME_ROLL:
             out.append(
                 f"one roll angle (they differ by {np.degrees(self.spread):.2g} deg at most, half "
                 "turns apart): a linear skew of the distortion cannot be told from one of the sky"
             )
-        elif free & {"skew_plus", "skew_cross"}:
+        elif skew <= told:
             out.append("a linear skew of the distortion cannot be told from one of the sky")
         for one in self.directions:
             if one.free and one.name == "scale":
                 out.append(f"scale: the detections say nothing of it; {_fixed(one)}")
             elif one.free and one.name == "rotation":
                 out.append(f"rotation on the sky: free; {_fixed(one)}")
-            elif one.free and one.name not in (*POINTS, "skew_plus", "skew_cross"):
+            elif one.free and one.name not in told:
                 out.append(f"{one.name}: the detections say nothing of it; {_fixed(one)}")
             elif one.weak and not one.free:
                 out.append(
@@ -362,6 +368,7 @@ def find_gauge(
         unnamed=_unnamed(model, null, known_moves),
         weakest=weakest,
         spread=roll_spread(model, theta),
+        whole=tuple(name for name in GENERATORS if _within(named[name] / scale, null)),
         rates=tuple(name for name, row in moving.items() if _within(row / scale, loose)),
     )
 
