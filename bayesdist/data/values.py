@@ -191,9 +191,12 @@ class SourceColumn:
             own, unique = replace(self, values=self.values.labels).labels()
             return own[self.values.codes], unique
         values = self._plain()
-        if values.dtype.kind == "O":
-            values = np.array([_text(v) for v in values])
-        codes, found = encoded(values)
+        if values.dtype.kind == "O":  # each object once: most are the same few
+            known: dict[Any, int] = {}
+            codes = np.array([known.setdefault(v, len(known)) for v in values], np.int64)
+            found: Iterable[Any] = known
+        else:
+            codes, found = encoded(values)
         names = [_text(v) for v in found]
         again, unique = encoded(np.array(names))  # 'a' and 'a ' are one name
         return again[codes], unique

@@ -69,7 +69,10 @@ def frame_names(kind: str) -> tuple[str, ...]:
 
 def _rotation(angle: Float) -> Float:
     c, s = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    out = np.empty((*np.shape(angle), 2, 2))
+    out[..., 0, 0] = out[..., 1, 1] = c
+    out[..., 0, 1], out[..., 1, 0] = -s, s
+    return out
 
 
 def _parts(kind: str, p: Float) -> tuple[Float, Float]:

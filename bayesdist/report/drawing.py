@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
@@ -21,12 +22,11 @@ from bayesdist.report.ticks import plain_ticks
 __all__ = [
     "DPI",
     "Drawing",
+    "drawing_of",
     "drawn",
-    "pdf_of",
     "png_of",
     "save_drawings",
     "save_images",
-    "save_pdfs",
 ]
 
 DPI = 150
@@ -54,50 +54,56 @@ def drawn(figures: Mapping[str, Figure]) -> dict[str, bytes]:
     return {name: png_of(figure) for name, figure in figures.items()}
 
 
+def drawing_of(figure: Figure) -> Drawing:
+    """A figure as PNG and as PDF, whose letters are letters; the same figure gives the same."""
+    canvas, box = _laid_out(figure)
+    return Drawing(_png(figure, canvas, box), _pdf(figure, box))
+
+
 def png_of(figure: Figure) -> bytes:
     """A figure as PNG file of 256 colours: a third of the size, and no eye sees the difference."""
+    return _png(figure, *_laid_out(figure))
+
+
+def _laid_out(figure: Figure) -> tuple[FigureCanvasAgg, Bbox]:
+    """Draw a figure, once for all, and say what is drawn on: in inches, with room around it."""
     with figure_style():  # mathematical text and ticks read the settings only when drawn
         plain_ticks(figure)
         figure.set_dpi(DPI)
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
-        figure.set_layout_engine("none")
-        box = _extent(figure)
-        page = Bbox.from_bounds(0, 0, *figure.get_size_inches())
-        if not (page.contains(*box.min) and page.contains(*box.max)):  # what is outside as well
-            buffer = io.BytesIO()
+        _settle(figure)
+        return canvas, figure.get_tightbbox().padded(PAD)
+
+
+def _png(figure: Figure, canvas: FigureCanvasAgg, box: Bbox) -> bytes:
+    page = Bbox.from_bounds(0, 0, *figure.get_size_inches())
+    if not (page.contains(*box.min) and page.contains(*box.max)):  # what is outside as well
+        buffer = io.BytesIO()
+        with figure_style():
             figure.savefig(buffer, format="png", dpi=DPI, bbox_inches=box)
-            image = Image.open(buffer).convert("RGB")
-        else:
-            image = Image.fromarray(_cut(np.asarray(canvas.buffer_rgba()), box))
+        image = Image.open(buffer).convert("RGB")
+    else:
+        image = Image.fromarray(_cut(np.asarray(canvas.buffer_rgba()), box))
     few = image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     few.save(buffer, format="png", dpi=(DPI, DPI))
     return buffer.getvalue()
 
 
-def pdf_of(figure: Figure) -> bytes:
-    """A figure as PDF file whose letters are letters; the same figure gives the same bytes."""
+def _pdf(figure: Figure, box: Bbox) -> bytes:
     buffer = io.BytesIO()
     with figure_style():
-        plain_ticks(figure)
-        figure.set_dpi(DPI)
-        if figure.get_layout_engine() is not None:
-            figure.draw_without_rendering()
-            figure.set_layout_engine("none")
         figure.savefig(
-            buffer,
-            format="pdf",
-            dpi=DPI,
-            bbox_inches=_extent(figure),
-            metadata={"CreationDate": None},
+            buffer, format="pdf", dpi=DPI, bbox_inches=box, metadata={"CreationDate": None}
         )
     return buffer.getvalue()
 
 
-def _extent(figure: Figure) -> Bbox:
-    """What is drawn, in inches, with some room around it."""
-    return figure.get_tightbbox().padded(PAD)
+def _settle(figure: Figure) -> None:
+    """Leave all where it lies; an engine, even 'none', would have each file drawn twice."""
+    with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        figure.set_layout_engine(None)
 
 
 def _cut(pixels: np.ndarray, box: Bbox) -> np.ndarray:
@@ -128,27 +134,6 @@ def save_images(images: Mapping[str, bytes], folder: str | os.PathLike[str]) -> 
         When the folder cannot be made or a file cannot be written.
     """
     return _saved(images, "png", made_folder(folder))
-
-
-def save_pdfs(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write figures as PDF files whose letters are letters.
-
-    Parameters
-    ----------
-    figures : mapping of str to matplotlib.figure.Figure
-    folder : path-like
-        One that is there.
-
-    Returns
-    -------
-    tuple of pathlib.Path
-
-    Raises
-    ------
-    InputError
-        When a file cannot be written.
-    """
-    return _saved({name: pdf_of(figure) for name, figure in figures.items()}, "pdf", Path(folder))
 
 
 def save_drawings(

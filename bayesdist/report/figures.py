@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from bayesdist.report.area import pixel_area
 from bayesdist.report.budget import budget_terms, dominating_term
-from bayesdist.report.campaign.figures import CampaignFigure, campaign_figures
+from bayesdist.report.campaign.figures import CampaignFigure, campaign_draws, campaign_figures
 from bayesdist.report.context import ReportInput
 from bayesdist.report.corners import corner_coefficients, corner_outliers
 from bayesdist.report.holdout import holdout_figure
@@ -64,7 +64,8 @@ def plan_of_figures(inputs: ReportInput) -> dict[str, Callable[[], Figure]]:
         stars.residual, mixture_curves(inputs), **drawn
     )
     chips, mosaic = inputs.chips, mosaic_of(inputs)
-    out |= {name: one.draw for name, one in plan_of_campaign(inputs).items()}
+    if inputs.campaign is not None:
+        out |= campaign_draws(inputs.campaign, mosaic)
     out["residual_vectors"] = partial(
         residual_vectors, *(c.binned for c in chips), unit=inputs.unit, mosaic=mosaic
     )
@@ -109,11 +110,7 @@ def plan_of_campaign(inputs: ReportInput) -> dict[str, CampaignFigure]:
 def mosaic_of(inputs: ReportInput) -> Mosaic:
     """How the chips of a run are drawn."""
     chips = inputs.chips
-    return Mosaic(
-        sizes=tuple(c.chip.size for c in chips),
-        names=tuple(c.chip.name if inputs.several else "" for c in chips),
-        places=tuple(c.place for c in chips),
-    )
+    return Mosaic.of_chips([c.chip for c in chips], [c.place for c in chips])
 
 
 def mixture_curves(inputs: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:

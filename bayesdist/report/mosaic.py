@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from bayesdist.model import Chip
 from bayesdist.report.style import (
     WIDTH,
     detector_axes,
@@ -40,6 +42,12 @@ class Mosaic:
     sizes: tuple[Size, ...]
     names: tuple[str, ...] = ("",)
     places: tuple[tuple[int, int], ...] = ((0, 0),)
+
+    @classmethod
+    def of_chips(cls, chips: Sequence[Chip], places: Sequence[tuple[int, int]]) -> Mosaic:
+        """Chips of a model, which go by their names where there are several."""
+        names = tuple(chip.name if len(chips) > 1 else "" for chip in chips)
+        return cls(tuple(chip.size for chip in chips), names, tuple(places))
 
     @classmethod
     def column(cls, *sizes: Size) -> Mosaic:

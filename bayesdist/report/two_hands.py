@@ -1,7 +1,9 @@
 """The figures of a report drawn by two processes, where there are many and two processors.
 
 The other process is a program of its own, not a fork: threads of numerical libraries run here.  It
-makes and draws every second figure; should it fail, they are drawn here.
+starts while results are still being read and draws what it is given, from the last figure on, as
+this process does from the first; a figure is whose process claims it first.  Should the other one
+fail, its figures are drawn here.
 """
 
 from __future__ import annotations
@@ -12,77 +14,150 @@ import pickle
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
 
 from bayesdist.report.context import ReportInput
-from bayesdist.report.drawing import Drawing, pdf_of, png_of
+from bayesdist.report.drawing import Drawing, drawing_of
 from bayesdist.report.figures import plan_of_figures
+from bayesdist.report.style import figure_style, new_figure
 
-__all__ = ["drawn_report"]
+__all__ = ["Hand", "drawn_report", "second_hand"]
 
 log = logging.getLogger("bayesdist")
 
-MANY = 24  # figures: fewer are drawn sooner than another process has started
+Plan = Mapping[str, Callable[[], Figure]]
 
 
-def drawn_report(inputs: ReportInput) -> dict[str, Drawing]:
+class Hand:
+    """Another process that draws.
+
+    Parameters
+    ----------
+    process : subprocess.Popen
+    folder : path
+        Where it finds what it is given, and both claim figures.
+    """
+
+    FAILURES = (OSError, EOFError, pickle.PickleError, AttributeError, TypeError, ValueError)
+
+    def __init__(self, process: subprocess.Popen[bytes], folder: Path) -> None:
+        self.process, self.folder, self._given = process, folder, 0
+
+    def give(self, plan: Callable[..., Plan], *arguments: Any) -> None:
+        """Have it draw the figures of a plan: those that are nobody's yet."""
+        path, pipe = self.folder / f"{self._given}.plan", self.process.stdin
+        self._given += 1
+        assert pipe is not None
+        try:  # by a file: it may be drawing, and a full pipe would have this process wait
+            path.write_bytes(pickle.dumps((plan, arguments)))
+            pipe.write(f"{path}\n".encode())
+            pipe.flush()
+        except self.FAILURES:
+            self.process.kill()  # the answer says so
+
+    def answer(self) -> dict[str, Drawing]:
+        """What it has drawn; it ends with that."""
+        pipe = self.process.stdout
+        assert self.process.stdin is not None and pipe is not None
+        try:
+            self.process.stdin.close()
+            found: dict[str, Drawing] = pickle.loads(pipe.read())
+        except self.FAILURES as error:
+            log.warning("report: figures are drawn by one process, the other failed: %s", error)
+            return {}
+        return found
+
+
+@contextmanager
+def second_hand(wanted: bool) -> Iterator[Hand | None]:
+    """Another process that will draw; it ends with the block.
+
+    Parameters
+    ----------
+    wanted : bool
+        Whether there are many figures: few are drawn sooner than a process has started.
+
+    Yields
+    ------
+    Hand or None
+        None where it is not wanted, or there is one processor.
+    """
+    if not wanted or (os.cpu_count() or 1) < 2 or not sys.executable:
+        yield None
+        return
+    code = "from bayesdist.report.two_hands import _draw; _draw()"
+    with tempfile.TemporaryDirectory() as folder:  # of this user alone
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-c", code, folder],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )
+        try:
+            yield Hand(process, Path(folder))
+        finally:
+            process.kill()
+            with suppress(OSError), process:  # of a pipe that it has left
+                pass
+
+
+def drawn_report(inputs: ReportInput, hand: Hand | None = None) -> dict[str, Drawing]:
     """All figures of a report as files, in its order; the same whoever draws them.
 
     Parameters
     ----------
     inputs : ReportInput
+    hand : Hand, optional
+        That may have begun with some of them.
 
     Returns
     -------
     dict of str to Drawing
     """
-    names = list(plan_of_figures(inputs))
-    if len(names) < MANY or (os.cpu_count() or 1) < 2 or not sys.executable:
-        return _drawings(inputs, names)
-    found: dict[str, Drawing] = {}
+    plan, found = plan_of_figures(inputs), dict[str, Drawing]()
+    if hand is not None:
+        hand.give(plan_of_figures, inputs)
+        found = _drawings(plan, plan, hand.folder)
+        found |= hand.answer()
+    found |= _drawings(plan, [name for name in plan if name not in found])
+    return {name: found[name] for name in plan}
+
+
+def _drawings(plan: Plan, names: Iterable[str], claims: Path | None = None) -> dict[str, Drawing]:
+    return {
+        name: drawing_of(plan[name]()) for name in names if claims is None or _claimed(claims, name)
+    }
+
+
+def _claimed(claims: Path, name: str) -> bool:
+    """Whether a figure was nobody's; now it is of this process."""
     try:
-        with _helper(inputs, names[1::2]) as helper:
-            found = _drawings(inputs, names[::2])
-            answer, _ = helper.communicate()
-        if helper.returncode:
-            raise OSError(f"it ended with exit code {helper.returncode}")
-        found |= pickle.loads(answer)
-    except (OSError, EOFError, pickle.PickleError, AttributeError, TypeError) as error:
-        log.warning("report: figures are drawn by one process, the other failed: %s", error)
-    found |= _drawings(inputs, [name for name in names if name not in found])
-    return {name: found[name] for name in names}
+        (claims / name).touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
 
 
-def _drawings(inputs: ReportInput, names: Iterable[str]) -> dict[str, Drawing]:
-    plan, out = plan_of_figures(inputs), {}
-    for name in names:
-        figure = plan[name]()
-        out[name] = Drawing(png_of(figure), pdf_of(figure))
-    return out
+def _draw() -> None:
+    """Draw what is given: the other process."""
+    claims, found = Path(sys.argv[1]), dict[str, Drawing]()
+    _warm_up()
+    for line in sys.stdin:
+        plan_of, arguments = pickle.loads(Path(line.rstrip("\n")).read_bytes())
+        plan = plan_of(*arguments)
+        found |= _drawings(plan, reversed(list(plan)), claims)
+    sys.stdout.buffer.write(pickle.dumps(found))
 
 
-@contextmanager
-def _helper(inputs: ReportInput, names: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    """Another process that draws; it answers on its standard output."""
-    code = "from bayesdist.report.two_hands import _answer; _answer()"
-    with tempfile.TemporaryDirectory() as folder:  # of this user alone
-        question = Path(folder) / "inputs"
-        question.write_bytes(pickle.dumps((inputs, names)))
-        helper = subprocess.Popen(
-            [sys.executable, "-P", "-c", code, str(question)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        )
-        with helper:
-            try:
-                yield helper
-            finally:
-                helper.kill()
-
-
-def _answer() -> None:
-    inputs, names = pickle.loads(Path(sys.argv[1]).read_bytes())
-    sys.stdout.buffer.write(pickle.dumps(_drawings(inputs, names)))
+def _warm_up() -> None:
+    """Draw something: that reads fonts and imports what draws."""
+    with figure_style():
+        figure = new_figure(1.0, 1.0)
+        figure.subplots().set_title("$x$")
+    drawing_of(figure)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,10 +49,11 @@ def sketched(full) -> Iterator[None]:
             import bayesdist.report
 
             patch.setattr(bayesdist.report, "drawn_report", _made)
+            patch.setattr(bayesdist.report, "second_hand", lambda wanted: nullcontext())
         yield
 
 
-def _made(inputs) -> dict:
+def _made(inputs, hand=None) -> dict:
     from bayesdist.report.drawing import Drawing
     from bayesdist.report.figures import plan_of_figures
 

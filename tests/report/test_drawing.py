@@ -3,6 +3,7 @@
 import io
 import re
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bayesdist.report import drawing, two_hands
-from bayesdist.report.drawing import DPI, PAD, pdf_of, png_of
+from bayesdist.report.drawing import DPI, PAD, drawing_of, png_of
+from bayesdist.report.figures import plan_of_figures
 from bayesdist.report.style import figure_style, new_figure
 from bayesdist.report.ticks import plain_ticks
 
@@ -45,10 +47,8 @@ def test_a_picture_is_cut_to_what_is_drawn_and_no_more(at):
 
 def test_the_same_figure_gives_the_same_files():
     first, second = (square(0.1, 0.1, 0.5) for _ in range(2))
-    assert png_of(first) == png_of(second)
-    assert pdf_of(first) == pdf_of(second)
-    alone = square(0.1, 0.1, 0.5)
-    assert pdf_of(alone) == pdf_of(first)  # with or without a picture before it
+    assert drawing_of(first) == drawing_of(second)
+    assert drawing_of(first).png == png_of(second)
 
 
 # -- numbers at ticks ------------------------------------------------------------------------------
@@ -98,33 +98,45 @@ def test_numbers_are_those_of_matplotlib(limits, scale):
 
 @pytest.fixture(scope="module")
 def alone(converged):
-    return two_hands.drawn_report(converged)  # fewer figures than are worth another process
+    return two_hands.drawn_report(converged)
 
 
 def test_two_processes_draw_what_one_draws(converged, alone, monkeypatch):
-    monkeypatch.setattr(two_hands, "MANY", 2)
     monkeypatch.setattr(two_hands.os, "cpu_count", lambda: 2)
     made = []
-    real = two_hands.png_of
-    monkeypatch.setattr(two_hands, "png_of", lambda f: made.append(f) or real(f))
-    both = two_hands.drawn_report(converged)
+    real = two_hands.drawing_of
+    monkeypatch.setattr(two_hands, "drawing_of", lambda f: made.append(f) or real(f))
+    with two_hands.second_hand(True) as hand:
+        hand.give(plan_of_figures, converged)
+        end = time.monotonic() + 60
+        while not (hand.folder / list(alone)[-1]).exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        both = two_hands.drawn_report(converged, hand)
+    assert hand.process.poll() is not None and not hand.folder.exists()
     assert list(both) == list(alone) and both == alone
-    assert len(made) == (len(alone) + 1) // 2  # the other half was not drawn here
+    assert 0 < len(made) < len(alone)  # the others were not drawn here
+
+
+def test_a_process_that_is_not_wanted_is_none(monkeypatch):
+    for wanted, processors in ((False, 2), (True, 1)):
+        monkeypatch.setattr(two_hands.os, "cpu_count", lambda n=processors: n)
+        with two_hands.second_hand(wanted) as hand:
+            assert hand is None
 
 
 def test_a_process_that_fails_is_made_up_for(converged, alone, monkeypatch, tmp_path):
-    monkeypatch.setattr(two_hands, "MANY", 2)
     monkeypatch.setattr(two_hands.os, "cpu_count", lambda: 2)
     broken = tmp_path / "python"
     broken.write_text(f"#!{sys.executable}\nraise SystemExit(3)\n")
     broken.chmod(0o755)
     monkeypatch.setattr(two_hands.sys, "executable", str(broken))
-    assert two_hands.drawn_report(converged) == alone
+    with two_hands.second_hand(True) as hand:
+        assert two_hands.drawn_report(converged, hand) == alone
 
 
 def test_both_kinds_are_saved(tmp_path):
     fig = square(0.1, 0.1, 0.5)
-    one = drawing.Drawing(png_of(fig), pdf_of(fig))
+    one = drawing_of(fig)
     paths = drawing.save_drawings({"a": one}, tmp_path / "figures")
     assert [p.name for p in paths] == ["a.png", "a.pdf"]
     assert paths[0].read_bytes() == one.png and paths[1].read_bytes().startswith(b"%PDF")

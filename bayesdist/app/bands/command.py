@@ -16,7 +16,7 @@ from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.errors import InputError
 from bayesdist.products import sip_from_solution, write_wise_meta
-from bayesdist.report import drawn, save_images, save_pdfs
+from bayesdist.report import drawing_of, save_drawings
 from bayesdist.report.bands import BandsInput, band_figures, write_bands
 from bayesdist.report.bands.findings import overview_table
 from bayesdist.simulate.wise import WISE_BANDS
@@ -89,9 +89,9 @@ def bands_of_runs(
         )
         files = [*write_tables(inputs, folder), *_meta(bands, folder)]
         figures = band_figures(inputs)
-        images = drawn(figures)
-        save_images(images, folder / "figures")
-        save_pdfs(figures, folder / "figures")
+        drawings = {name: drawing_of(figure) for name, figure in figures.items()}
+        save_drawings(drawings, folder / "figures")
+        images = {name: one.png for name, one in drawings.items()}
         write_bands(folder / "bands.html", inputs, images)
         files += ["bands.html", *(f"figures/{name}.png" for name in figures)]
         files += [f"figures/{name}.pdf" for name in figures]

@@ -33,7 +33,9 @@ from bayesdist.assess.mosaic import chip_places
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
-    from bayesdist.report.context import ChipResults
+    from bayesdist.report.campaign import CampaignResults
+    from bayesdist.report.context import ChipResults, ReportInput
+    from bayesdist.report.two_hands import Hand
 
 __all__ = ["run_report", "title_of"]
 
@@ -45,14 +47,25 @@ VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide 
 
 def run_report(session: Session) -> None:
     # figures take seconds to import
-    from bayesdist.report import (
-        Check,
-        Product,
-        ReportInput,
-        drawn_report,
-        save_drawings,
-        write_report,
-    )
+    from bayesdist.report import drawn_report, save_drawings, second_hand, write_report
+
+    run = session.run
+    with second_hand(isinstance(session, CampaignSession)) as hand:  # they have most figures
+        inputs = _inputs(session, hand)
+        drawings = drawn_report(inputs, hand)
+    names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
+    save_drawings(drawings, run / "figures")
+    for stale in set(run.summary.get("figures", [])) - set(names):
+        (run / "figures" / stale).unlink(missing_ok=True)
+    run.summarise(figures=names)  # what is there, should the disk be full
+    images = {name: one.png for name, one in drawings.items()}
+    write_report(run / "report.html", inputs, images)
+    log.info("report: %s", run / "report.html")
+
+
+def _inputs(session: Session, hand: Hand | None) -> ReportInput:
+    """All that the report shows; another process may begin to draw what is found first."""
+    from bayesdist.report import Check, Product, ReportInput
 
     run, config = session.run, session.config
     fit, posterior = session.fit, session.posterior
@@ -67,6 +80,7 @@ def run_report(session: Session) -> None:
         for p in run.summary.get("products", [])
     )
     judged = judged_requirements(run)
+    campaign = _campaign(session, hand) if isinstance(session, CampaignSession) else None
     inputs = ReportInput(
         name=title_of(config) or folder,
         config=as_json(config.model_dump(exclude_none=True)),
@@ -88,22 +102,25 @@ def run_report(session: Session) -> None:
         held_out=held_out_of(session),
         magnitude_errors=session.magnitude_errors,
         flagged=flagged_by_exposure(session.shards, posterior) if several else None,
+        campaign=campaign,
         provenance={"folder": folder}
         | {k: record[k] for k in ("command", "created", "seed", "inputs", "versions", "stages")},
     )
-    if isinstance(session, CampaignSession):
-        inputs = replace(inputs, campaign=campaign_results(session))
     if isinstance(session, SelfcalSession):
         inputs = replace(inputs, selfcal=selfcal_results(session))
-    drawings = drawn_report(inputs)
-    names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
-    save_drawings(drawings, run / "figures")
-    for stale in set(run.summary.get("figures", [])) - set(names):
-        (run / "figures" / stale).unlink(missing_ok=True)
-    run.summarise(figures=names)  # what is there, should the disk be full
-    images = {name: one.png for name, one in drawings.items()}
-    write_report(run / "report.html", inputs, images)
-    log.info("report: %s", run / "report.html")
+    return inputs
+
+
+def _campaign(session: CampaignSession, hand: Hand | None) -> CampaignResults:
+    from bayesdist.report.campaign import campaign_draws
+    from bayesdist.report.mosaic import Mosaic
+
+    results = campaign_results(session)
+    if hand is not None:  # half of all figures
+        posterior = session.posterior
+        places = chip_places(posterior, epoch=session.epoch)
+        hand.give(campaign_draws, results, Mosaic.of_chips(posterior.model.chips, places))
+    return results
 
 
 def title_of(config: Config) -> str:

@@ -9,7 +9,12 @@ from bayesdist.report.campaign.context import (
     LinearSeries,
     OverlapTest,
 )
-from bayesdist.report.campaign.figures import PARTS, CampaignFigure, campaign_figures
+from bayesdist.report.campaign.figures import (
+    PARTS,
+    CampaignFigure,
+    campaign_draws,
+    campaign_figures,
+)
 from bayesdist.report.campaign.status import campaign_checks
 from bayesdist.report.campaign.texttables import campaign_tables
 
@@ -24,6 +29,7 @@ __all__ = [
     "LinearSeries",
     "OverlapTest",
     "campaign_checks",
+    "campaign_draws",
     "campaign_figures",
     "campaign_tables",
 ]

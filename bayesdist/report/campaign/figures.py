@@ -29,7 +29,7 @@ from bayesdist.report.campaign.timecaptions import caption_of_overlap, caption_o
 from bayesdist.report.caption import Caption
 from bayesdist.report.mosaic import Mosaic
 
-__all__ = ["PARTS", "CampaignFigure", "campaign_figures"]
+__all__ = ["PARTS", "CampaignFigure", "campaign_draws", "campaign_figures"]
 
 # parts of the section, in their order: name and heading
 PARTS = {
@@ -81,6 +81,11 @@ def campaign_figures(results: CampaignResults, mosaic: Mosaic) -> dict[str, Camp
         *_release(results),
     )
     return {one.name: one for one in made}
+
+
+def campaign_draws(results: CampaignResults, mosaic: Mosaic) -> dict[str, Callable[[], Figure]]:
+    """What draws each of them."""
+    return {name: one.draw for name, one in campaign_figures(results, mosaic).items()}
 
 
 def _matching(r: CampaignResults) -> Iterator[CampaignFigure]:
