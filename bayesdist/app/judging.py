@@ -120,12 +120,16 @@ def margins_of(
     n_draws: int | None = None,
 ) -> tuple[Margin, ...]:
     """Margins of a solution, as in `budget_of`; as many draws as configured by default."""
-    doubt = ""
+    doubt, enlarging = "", False
     if n_draws is None:
-        doubt = session.majority or _unaccounted(session)
+        doubt = session.majority
+        if not doubt:
+            doubt = _unaccounted(session)
+            # a measurement of shared errors that has doubts may have made them too large
+            enlarging = bool(doubt) and session.shared_errors is None
         held = held_out_of(session)
-        if not doubt and held is not None and held.doubtful:
-            doubt = held.verdict
+        if held is not None and held.doubtful:
+            doubt, enlarging = doubt or held.verdict, False
     centroid = None
     if any(r.magnitude is not None for r in requirements):
         if n_draws is None:
@@ -135,10 +139,11 @@ def margins_of(
     margins = check_requirements(
         requirements=requirements,
         doubt=doubt,
+        enlarging=enlarging,
         centroid=centroid,
         **_assessment(session, solution, n_draws),
     )
-    if doubt or n_draws is not None:
+    if n_draws is not None or (doubt and not enlarging):
         return margins
     return tuple(_where_stars_are(session, margin) for margin in margins)
 

@@ -16,6 +16,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from bayesdist import __version__
 from bayesdist.app.campaign.files import campaign_files
@@ -359,7 +360,15 @@ class RunDirectory:
     @property
     def config(self) -> Config:
         """The resolved configuration."""
-        return Config.model_validate(self.record["config"])
+        try:
+            return Config.model_validate(self.record["config"])
+        except ValidationError as error:  # made by a version that allowed other settings
+            fault = error.errors()[0]["msg"].removeprefix("Value error, ")
+            raise InputError(
+                f"holds a configuration that is none: {fault}",
+                where=str(self / "run.json"),
+                do="start again with --force",
+            ) from error
 
     @property
     def matches(self) -> Path | list[Path]:

@@ -355,7 +355,8 @@ class Session:
         """What it means that most pairs are false; empty where they are not."""
         posterior = self.posterior if self.run.done("sample") else None
         quoted = self.shards.survey.reference_sigma
-        return majority_sentence(self.fit, posterior, quoted=quoted)
+        things = "pairs" if self.things == "stars" else self.things
+        return majority_sentence(self.fit, posterior, quoted=quoted, things=things)
 
     @cached_property
     def stars(self) -> StarSample:

@@ -7,22 +7,25 @@ gradient of the log density by these shifts and C their curvature (Rao's score t
 
     g^T C^+ g
 
-over those patterns that the detections can tell, polynomials taken out.
+over those patterns that the detections can tell, the polynomials' means over cells taken out; what
+it leaves of chi-square is the unit (an F test).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from bayesdist.assess.misfit import Misfit, partitions_for
 from bayesdist.infer.selfcal import Solution
-from bayesdist.infer.selfcal.following import following
+from bayesdist.infer.selfcal.following import Following, following
+from bayesdist.infer.selfcal.normal import memberships
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 
@@ -31,7 +34,8 @@ __all__ = ["dithered_misfit"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_CELLS = 16  # along each side of a chip: the matrix of all shifts is decomposed
+MOST_SIDE = 16  # cells along each side of a chip
+MOST_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
 TOLD = 0.05  # of what detections would say of a cell if stars were known: less is not told
 
 
@@ -45,18 +49,37 @@ def dithered_misfit(solution: Solution) -> Misfit:
     Returns
     -------
     Misfit
-        Of all chips together, since they share stars; `told` is the share of the patterns over its
-        partition, polynomials apart, that the detections can tell from places of stars.
+        Of all chips together, since they share stars; `told` is the share of the patterns over
+        all partitions, polynomials apart, that the detections can tell from places of stars.
     """
-    model, n = solution.problem.model, len(solution.problem)
-    found = []
-    for name, (nx, ny) in partitions_for(n // len(model.chips)).items():
-        bins = (min(nx, MOST_CELLS), min(ny, MOST_CELLS)) if name == "cells" else (nx, ny)
-        shifts = _shifts(solution, bins)
-        found.append((*_test(shifts, _polynomials(model.order, len(model.chips), bins)), name))
-    p, pixels, told, name = min(found)
-    structure = pixels * model.pixel_size(solution.theta)
-    return Misfit(min(1.0, len(found) * p), name, structure, model.unit, told=told)
+    model = solution.problem.model
+    partitions = _partitions(len(solution.problem), len(model.chips))
+    tests = {
+        name: _test(shifts, _polynomials(model.order, len(model.chips), bins))
+        for (name, bins), shifts in zip(
+            partitions.items(), _shifts(solution, list(partitions.values())), strict=True
+        )
+    }
+    # several p-values may be zero in double precision: then the larger structure is the worse
+    name, worst = min(tests.items(), key=lambda item: (item[1].p_value, -item[1].pixels))
+    patterns = sum(one.patterns for one in tests.values())
+    return Misfit(
+        min(1.0, len(tests) * worst.p_value),
+        name,
+        worst.pixels * model.pixel_size(solution.theta),
+        model.unit,
+        told=sum(one.told for one in tests.values()) / max(patterns, 1),
+    )
+
+
+def _partitions(n: int, n_chips: int) -> dict[str, tuple[int, int]]:
+    """Bins on x and on y of each chip, by name."""
+    out, most = {}, MOST_CELLS // n_chips
+    for name, bins in partitions_for(n // n_chips).items():
+        side = min(MOST_SIDE, int(np.sqrt(most))) if name == "cells" else most
+        nx, ny = (min(b, max(side, 2)) for b in bins)
+        out[name] = nx, ny
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,44 +94,58 @@ class _Shifts:
         With the stars eliminated.
     weight : ndarray, shape (2 K,)
         Its diagonal if the stars were known.
-    scatter : float
-        Mean square of normalised residuals: errors that are too large or too small as a whole are
-        no structure.
+    chi2, dof : float
+        Of the residuals; the rest of it is the unit: errors that are too large or too small as a
+        whole are no structure.
     """
 
     gradient: Float
     curvature: Float
     weight: Float
-    scatter: float
+    chi2: float
+    dof: float
 
 
-def _shifts(solution: Solution, bins: tuple[int, int]) -> _Shifts:
-    p = solution.problem
-    n = 2 * len(p.model.chips) * bins[0] * bins[1]
-    gradient, curvature, weight = np.zeros(n), np.zeros((n, n)), np.zeros(n)
-    for some in following(solution):
-        w, ties = some.weight, some.ties
-        cell = _cells(p, some.rows, bins)
-        index = np.stack([cell, cell + n // 2], axis=1)
-        pull = w[:, None] * some.residual
-        gradient += np.bincount(index.ravel(), pull.ravel(), minlength=n)
-        weight += np.bincount(index.ravel(), np.repeat(w, 2), minlength=n)
-        q = ties.shape[1]
-        row = (some.star * q)[:, None, None] + np.arange(q)[:, None]
-        at = np.broadcast_arrays(row, index[:, None, :])
-        of_stars = csr_array(
-            (ties.ravel(), (at[0].ravel(), at[1].ravel())), shape=(q * (some.star[-1] + 1), n)
+def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
+    """What detections say of shifts of the cells of each partition, in one pass over them."""
+    p, dof = solution.problem, _degrees_of_freedom(solution)
+    out = []
+    for nx, ny in partitions:
+        n = 2 * len(p.model.chips) * nx * ny
+        out.append(
+            _Shifts(np.zeros(n), np.zeros((n, n)), np.zeros(n), solution.expansion.chi2, dof)
         )
-        curvature -= (of_stars.T @ of_stars).toarray()
-    curvature[np.diag_indices(n)] += weight
-    return _Shifts(gradient, curvature, weight, _scatter(solution))
+    for some in following(solution):
+        for sums, bins in zip(out, partitions, strict=True):
+            _add(sums, some, _cells(p, some.rows, bins))
+    for sums in out:
+        sums.curvature[np.diag_indices(len(sums.weight))] += sums.weight
+    return out
 
 
-def _scatter(solution: Solution) -> float:
-    """Mean square of normalised residuals, with what stars and distortion take of them."""
-    p, e = solution.problem, solution.expansion
-    taken = p.n_star * p.n_stars + len(solution.free)
-    return e.chi2 / max(2 * e.n_members - taken, 1.0)
+def _add(sums: _Shifts, some: Following, cell: Int) -> None:
+    """Add some stars; of the curvature what they take of it."""
+    w, ties, n = some.weight, some.ties, len(sums.weight)
+    index = np.stack([cell, cell + n // 2], axis=1)
+    pull = w[:, None] * some.residual
+    sums.gradient[:] += np.bincount(index.ravel(), pull.ravel(), minlength=n)
+    sums.weight[:] += np.bincount(index.ravel(), np.repeat(w, 2), minlength=n)
+    q = ties.shape[1]
+    row = (some.star * q)[:, None, None] + np.arange(q)[:, None]
+    at = np.broadcast_arrays(row, index[:, None, :])
+    of_stars = csr_array(
+        (ties.ravel(), (at[0].ravel(), at[1].ravel())), shape=(q * (some.star[-1] + 1), n)
+    )
+    sums.curvature[:] -= (of_stars.T @ of_stars).toarray()
+
+
+def _degrees_of_freedom(solution: Solution) -> float:
+    """Numbers that are left of the detections' by stars and distortion."""
+    p = solution.problem
+    member = memberships(p, solution.theta, solution.mixture, solution.stars)
+    of_star = np.bincount(p.star, member, minlength=p.n_stars)
+    taken = np.minimum(p.n_star, 2 * of_star).sum() + len(solution.free)
+    return max(2 * solution.expansion.n_members - taken, 1.0)
 
 
 def _cells(problem: Problem, rows: slice, bins: tuple[int, int]) -> Int:
@@ -134,25 +171,38 @@ def _polynomials(order: int, n_chips: int, bins: tuple[int, int]) -> Float:
     return np.kron(np.eye(2 * n_chips), one)
 
 
-def _test(shifts: _Shifts, fields: Float) -> tuple[float, float, float]:
-    """Probability, rms of the structure in pixels, and the share of patterns that can be told."""
+@dataclass(frozen=True)
+class _Test:
+    """Outcome for one partition: structure is rms in pixels, `told` of how many `patterns`."""
+
+    p_value: float
+    pixels: float
+    told: int
+    patterns: int
+
+
+def _test(shifts: _Shifts, fields: Float) -> _Test:
     seen = shifts.weight > 0
-    root = np.sqrt(shifts.weight[seen])
+    weight = shifts.weight[seen]
+    root = np.sqrt(weight)
     g, C = shifts.gradient[seen] / root, shifts.curvature[np.ix_(seen, seen)] / np.outer(root, root)
-    # what is orthogonal to the polynomials by C: of those the fit has made g zero
+    # what is orthogonal by C to the polynomials' means over the cells: of those, and nearly of
+    # what is lost to the exposures' frames, the fit has taken the gradient
     lost, singular, _ = np.linalg.svd(C @ (fields[seen] * root[:, None]), full_matrices=False)
     lost = lost[:, singular > 1e-9 * max(singular[0], 1.0)]
     free = np.linalg.svd(lost, full_matrices=True)[0][:, lost.shape[1] :]
     values, vectors = np.linalg.eigh(free.T @ C @ free)
     told = values > TOLD
     if not told.any():
-        return 1.0, 0.0, 0.0
+        return _Test(1.0, 0.0, 0, free.shape[1])
     values, vectors = values[told], free @ vectors[:, told]
     along = vectors.T @ g
-    total = float(np.sum(along**2 / values)) / shifts.scatter
-    # shifts that explain g, and their noise, back in pixels
-    shift = vectors @ (along / values) / root
-    noise = shifts.scatter * np.einsum("kn,n->k", vectors**2, 1 / values) / root**2
-    excess = float(np.mean(shift**2 - noise)) * 2  # both axes together
-    p = float(chi2.sf(total, len(values)))
-    return p, float(np.sqrt(max(excess, 0.0))), len(values) / free.shape[1]
+    k, explained = len(values), float(np.sum(along**2 / values))
+    left = max(shifts.dof - k, 1.0)
+    rest = max(shifts.chi2 - explained, 0.0) / left
+    # shifts that explain g, in pixels, and their noise: a cell counts by what is seen in it
+    square = (vectors @ (along / values)) ** 2
+    noise = rest * np.einsum("kn,n->k", vectors**2, 1 / values)
+    excess = 2 * float(np.sum(square - noise) / np.sum(weight))  # both axes together
+    p = float(f_distribution.sf(explained / k / rest, k, left)) if rest > 0 else 1.0
+    return _Test(p, float(np.sqrt(max(excess, 0.0))), k, free.shape[1])

@@ -17,7 +17,11 @@ WIDENED = 5.0  # times the quoted error: a mixture that widens the true matches 
 
 
 def majority_sentence(
-    fit: LinearFit, posterior: Posterior | None = None, *, quoted: float | None = None
+    fit: LinearFit,
+    posterior: Posterior | None = None,
+    *,
+    quoted: float | None = None,
+    things: str = "pairs",
 ) -> str:
     """What it means that most pairs are false, as a clause; empty where they are not.
 
@@ -27,6 +31,8 @@ def majority_sentence(
     posterior : Posterior, optional
     quoted : float, optional
         Usual quoted error of one axis, in the unit of u, v.
+    things : str
+        What is true or false.
 
     Returns
     -------
@@ -36,22 +42,22 @@ def majority_sentence(
         fraction = float(posterior.hyper["f"].mean())
         if fraction > MAJORITY:
             return (
-                f"the mixture takes {100 * fraction:.0f} % of the pairs for false matches: with "
+                f"the mixture takes {100 * fraction:.0f} % of the {things} for false ones: with "
                 "more false than true ones the solution may rest on chance alignments"
             )
     if posterior is not None and quoted and "j" in posterior.hyper:
         jitter = float(posterior.hyper["j"].mean())
         if jitter > WIDENED * quoted:
             return (
-                f"the mixture adds {jitter:.3g} {posterior.unit} to the errors of all pairs, "
+                f"the mixture adds {jitter:.3g} {posterior.unit} to the errors of all {things}, "
                 f"{jitter / quoted:.2g} times the quoted one: either that is far too small, or "
-                "most pairs are false matches that were taken for true ones"
+                f"most {things} are false ones that were taken for true"
             )
     share = fit.n_rejected / fit.n_rows
     if share > MAJORITY:
         return (
-            f"the least-squares fit left out {100 * share:.0f} % of the pairs: most of them are "
-            "false matches, or the quoted errors are far too small, and the solution may rest on "
+            f"the fit left out {100 * share:.0f} % of the {things}: most of them are "
+            "false, or the quoted errors are far too small, and the solution may rest on "
             "chance alignments"
         )
     return ""

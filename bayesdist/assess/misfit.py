@@ -24,6 +24,7 @@ Float = NDArray[np.float64]
 
 STARS_PER_BIN = 25
 MOST_BINS = 32  # along each side
+SEEN = 0.5  # of all patterns, below which that none is found says little
 SIGNIFICANT = 1e-4  # probability of as much structure by chance, over all tests together
 
 
@@ -45,7 +46,7 @@ class Misfit:
     chip : Chip or None
         The chip, where the detector has several.
     told : float
-        Share of the patterns over the partition that would have been seen: below 1 where fitted
+        Share of the patterns over the partitions that would have been seen: below 1 where fitted
         stars hide some.
     """
 
@@ -60,6 +61,11 @@ class Misfit:
     def significant(self) -> bool:
         """Whether the structure is more than chance."""
         return self.p_value < SIGNIFICANT
+
+    @property
+    def hidden(self) -> bool:
+        """Whether most structure would not have been seen."""
+        return self.told < SEEN
 
     @property
     def sentence(self) -> str:
@@ -113,7 +119,8 @@ def misfit_of(sums: Mapping[str, BinnedSums], *, order: int | None = None, unit:
     Misfit
     """
     found = [(*_test(one.residuals(), _absorbed(one, order)), name) for name, one in sums.items()]
-    p, structure, name = min(found)
+    # several p-values may be zero in double precision: then the larger structure is the worse
+    p, structure, name = min(found, key=lambda one: (one[0], -one[1]))
     return Misfit(min(1.0, len(found) * p), name, structure, unit)
 
 

@@ -103,6 +103,7 @@ def check_requirements(
     pixel_scale: float | None = None,
     converged: bool | None = None,
     doubt: str = "",
+    enlarging: bool = False,
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws of the position error.
 
@@ -148,7 +149,10 @@ def check_requirements(
         Whether the posterior may be trusted; by default what its convergence says.  If not, every
         verdict is 'undecided'.
     doubt : str
-        Any other reason why no verdict can be given: every one is then 'undecided'.
+        Any other reason why no verdict can be given: every one is then 'undecided', but for what
+        `enlarging` allows.
+    enlarging : bool
+        Whether errors can only be larger for that reason: what is missed is then missed for sure.
 
     Returns
     -------
@@ -198,13 +202,14 @@ def check_requirements(
                 error.cause, where=f"{owner.where}, {error.where}", do=error.do
             ) from None
 
-    doubt = _doubt(solution, converged) or doubt
+    unconverged = _doubt(solution, converged)
+    doubt, enlarging = unconverged or doubt, enlarging and not unconverged
     n_effective = effective_draws(solution, n_draws)
     margins = []
     for r, case in zip(requirements, cases, strict=True):
         factor = convert(1.0, unit, r.unit, pixel_scale)
         draws = [factor * found[judged][r.statistic] for judged in case]
-        margins.append(_margin(r, case, draws, errors, factor, n_effective, doubt))
+        margins.append(_margin(r, case, draws, errors, factor, n_effective, doubt, enlarging))
     return tuple(margins)
 
 
@@ -300,6 +305,7 @@ def _margin(
     factor: float,
     n_effective: float,
     doubt: str,
+    enlarging: bool,
 ) -> Margin:
     asked = requirement.probability
     draws = np.max(by_epoch, axis=0)
@@ -321,7 +327,7 @@ def _margin(
         margin=float(requirement.limit - reached),
         probability_met=met,
         mc_error=counting_error(met, n_effective),
-        verdict="undecided" if doubt else verdict,
+        verdict=verdict if not doubt or (enlarging and verdict == "missed") else "undecided",
         reason=doubt or reason,
         unit=requirement.unit,
         epoch=worst_epoch.epoch,

@@ -192,9 +192,9 @@ class SourceColumn:
             return own[self.values.codes], unique
         values = self._plain()
         if values.dtype.kind == "O":  # each object once: most are the same few
-            known: dict[Any, int] = {}
-            codes = np.array([known.setdefault(v, len(known)) for v in values], np.int64)
-            found: Iterable[Any] = known
+            known: dict[tuple[type, Any], int] = {}  # by their types, too: 1 is not True
+            codes = np.array([known.setdefault((type(v), v), len(known)) for v in values], np.int64)
+            found: Iterable[Any] = [v for _, v in known]
         else:
             codes, found = encoded(values)
         names = [_text(v) for v in found]

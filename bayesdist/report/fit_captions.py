@@ -29,7 +29,7 @@ def by_magnitude_caption(inputs: ReportInput) -> Caption:
     if inputs.magnitude_errors is not None:
         text += " The lines are ±1 σ as assigned to each magnitude: about two thirds of the"
         text += f" {words.things} lie between them"
-        text += ", and some more as stars follow them." if words.taken else "."
+        text += ", or somewhat more, because the stars were fitted to them." if words.taken else "."
     text += _sampled(inputs)
     return Caption(
         "Residuals against magnitude",

@@ -31,10 +31,10 @@ def structure_check(misfits: Sequence[Misfit], *, fit: str) -> Check:
     size = display_scale(worst.unit, worst.structure).text(worst.structure, 2)
     found = f"{size} rms in {worst.partition}{chip}" if worst.structure > 0 else "none"
     if worst.told < 1:
-        found += f" ({percent(worst.told)} of all patterns can be told from places of stars)"
+        found += f" ({percent(worst.told, 2)} of all patterns can be told from places of stars)"
     return Check(
         f"Structure in the residuals of {fit}, beyond noise",
         f"{found}, {probability(worst.p_value)}",
         f"p at least {number(SIGNIFICANT, 1)}",
-        "warn" if worst.significant else "pass",
+        "warn" if worst.significant or worst.hidden else "pass",
     )

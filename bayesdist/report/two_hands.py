@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,10 @@ class Hand:
         Where it finds what it is given, and both claim figures.
     """
 
-    FAILURES = (OSError, EOFError, pickle.PickleError, AttributeError, TypeError, ValueError)
+    FAILURES = (
+        *(OSError, EOFError, pickle.PickleError, AttributeError, TypeError, ValueError),
+        *(ImportError, IndexError),
+    )
 
     def __init__(self, process: subprocess.Popen[bytes], folder: Path) -> None:
         self.process, self.folder, self._given = process, folder, 0
@@ -57,8 +60,9 @@ class Hand:
             path.write_bytes(pickle.dumps((plan, arguments)))
             pipe.write(f"{path}\n".encode())
             pipe.flush()
-        except self.FAILURES:
-            self.process.kill()  # the answer says so
+        except self.FAILURES as error:
+            _failed(error)
+            self.process.kill()
 
     def answer(self) -> dict[str, Drawing]:
         """What it has drawn; it ends with that."""
@@ -66,11 +70,18 @@ class Hand:
         assert self.process.stdin is not None and pipe is not None
         try:
             self.process.stdin.close()
-            found: dict[str, Drawing] = pickle.loads(pipe.read())
+            answer = pipe.read()
+            if self.process.wait():
+                raise OSError(f"it ended with exit code {self.process.returncode}")
+            found: dict[str, Drawing] = pickle.loads(answer)
         except self.FAILURES as error:
-            log.warning("report: figures are drawn by one process, the other failed: %s", error)
+            _failed(error)
             return {}
         return found
+
+
+def _failed(error: Exception) -> None:
+    log.warning("report: figures are drawn by one process, the other failed: %s", error)
 
 
 @contextmanager
@@ -85,11 +96,22 @@ def second_hand(wanted: bool) -> Iterator[Hand | None]:
     Yields
     ------
     Hand or None
-        None where it is not wanted, or there is one processor.
+        None where it is not wanted or cannot be had, and on one processor.
     """
     if not wanted or (os.cpu_count() or 1) < 2 or not sys.executable:
         yield None
         return
+    with ExitStack() as stack:
+        try:
+            hand = stack.enter_context(_started())
+        except OSError as error:
+            _failed(error)
+            hand = None
+        yield hand
+
+
+@contextmanager
+def _started() -> Iterator[Hand]:
     code = "from bayesdist.report.two_hands import _draw; _draw()"
     with tempfile.TemporaryDirectory() as folder:  # of this user alone
         process = subprocess.Popen(

@@ -251,7 +251,7 @@ def significant_cells(binned: BinnedResiduals) -> NDArray[np.bool_]:
     ndarray of bool
         False where a standard error is unknown or zero.
     """
-    # the errors are those of as few stars as the cell has: the tails are Fisher's
+    # the errors are those of as few stars as the cell has: the tails are nearly Fisher's
     beyond = 2.0 * f_distribution.isf(CHANCE, 2, np.maximum(binned.count - 1, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         z2 = (binned.mean_u / binned.sem_u) ** 2 + (binned.mean_v / binned.sem_v) ** 2

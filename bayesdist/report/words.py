@@ -26,7 +26,7 @@ class Words:
     holder : str
         What holds parameters that the data say nothing of.
     taken : str
-        What makes residuals smaller than errors, as a clause.
+        What makes residuals smaller than errors, as a clause; empty where nothing does.
     """
 
     things: str
@@ -50,7 +50,7 @@ DETECTED = Words(
     things="detections",
     all_things="detections of stars",
     false="false detections",
-    chooser="statistics of residuals",
+    chooser="limits of residuals",
     fit="solution",
     holder="the gauge",
     taken=", less what the fitted stars take of them",

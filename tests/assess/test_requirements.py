@@ -210,6 +210,18 @@ def test_a_posterior_that_is_not_converged_leaves_everything_undecided(shifting)
         assert (m.verdict, m.reason) == ("undecided", "the posterior is not converged")
 
 
+def test_what_is_missed_is_missed_for_sure_where_errors_can_only_be_larger(shifting):
+    reqs = [Requirement("easy", "rms", 5.0), Requirement("hard", "rms", 1e-6)]
+    for enlarging, verdicts in ((False, ["undecided"] * 2), (True, ["undecided", "missed"])):
+        found = margins_of(shifting(), reqs, doubt="structure is left", enlarging=enlarging)
+        assert [m.verdict for m in found] == verdicts
+        assert {m.reason for m in found} == {"structure is left"}
+        assert all(m.remedy is None for m in found)
+    # draws that are not to be trusted decide nothing, in either direction
+    for m in margins_of(shifting(converged=False), reqs, doubt="structure", enlarging=True):
+        assert m.verdict == "undecided"
+
+
 @pytest.mark.parametrize("which", ["ess_bulk_min", "ess_tail_min"])
 def test_few_effective_samples_decide_nothing_however_many_draws(shifting, which):
     """All draws meet the limit; with n_eff of them the lower end is 0.005^(1 / n_eff)."""

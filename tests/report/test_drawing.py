@@ -124,14 +124,24 @@ def test_a_process_that_is_not_wanted_is_none(monkeypatch):
             assert hand is None
 
 
-def test_a_process_that_fails_is_made_up_for(converged, alone, monkeypatch, tmp_path):
+def test_a_process_that_fails_is_made_up_for(converged, alone, monkeypatch, tmp_path, caplog):
     monkeypatch.setattr(two_hands.os, "cpu_count", lambda: 2)
     broken = tmp_path / "python"
     broken.write_text(f"#!{sys.executable}\nraise SystemExit(3)\n")
     broken.chmod(0o755)
     monkeypatch.setattr(two_hands.sys, "executable", str(broken))
     with two_hands.second_hand(True) as hand:
+        (hand.folder / next(iter(alone))).touch()  # it has claimed a figure, and ends
         assert two_hands.drawn_report(converged, hand) == alone
+    assert "the other failed: it ended with exit code 3" in caplog.text
+
+
+def test_a_process_that_cannot_be_started_is_made_up_for(converged, monkeypatch, tmp_path, caplog):
+    monkeypatch.setattr(two_hands.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(two_hands.sys, "executable", str(tmp_path / "nowhere"))
+    with two_hands.second_hand(True) as hand:
+        assert hand is None
+    assert "the other failed" in caplog.text
 
 
 def test_both_kinds_are_saved(tmp_path):

@@ -52,6 +52,19 @@ def test_simulated_residuals_follow_the_curve(outliers):
     assert abs(chi2 - dof) < 5 * np.sqrt(2 * dof)
 
 
+def test_residuals_about_fitted_means_follow_the_curve():
+    """Stars of three detections each, placed at their mean: a third of the variance is gone."""
+    rng = np.random.default_rng(6)
+    r = 0.05 * rng.normal(size=(60_000, 3))
+    r = (r - r.mean(axis=1, keepdims=True)).ravel()
+    edges = np.linspace(-0.15, 0.15, 31)
+    counts, _ = np.histogram(r, edges)
+    curve = MixtureCurve(np.full(r.size, 0.04), jitter=0.03, taken=np.full(r.size, 1 / 3))
+    expected = sum(curve.expected(edges))
+    # three residuals of a star are not independent, and sum to zero
+    assert np.abs(counts - expected).max() < 6 * np.sqrt(expected.max())
+
+
 @pytest.mark.parametrize("per_cell", [250, 12])
 def test_noise_alone_makes_as_many_cells_dark_as_the_caption_says(per_cell):
     rng = np.random.default_rng(4)

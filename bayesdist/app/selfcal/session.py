@@ -358,7 +358,13 @@ class SelfcalSession(Session):
         """What cannot be known, and what the match found odd."""
         warnings = self.run.summary.get("selfcal", {}).get("warnings", [])
         known = self.known_for(self.model).contradictions(self.solved.theta)
-        return [*self.gauge.sentences, *known, *warnings]
+        hidden = [
+            f"{100 * (1 - one.told):.0f} % of the structure that the model might leave is hidden: "
+            "places of stars take it up where dithers are small"
+            for one in self.misfits
+            if one.hidden
+        ]
+        return [*self.gauge.sentences, *known, *warnings, *hidden]
 
     def fit_changed(self) -> None:
         """Forget what rests on the solution."""

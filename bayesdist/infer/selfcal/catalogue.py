@@ -67,19 +67,20 @@ def star_catalogue(solution: Solution) -> StarCatalogue:
         # A^-1 B = L^-T (L^-1 B)
         spread = np.swapaxes(back, 1, 2) @ (rows @ root)
         cov[some] = own[some] + spread @ np.swapaxes(spread, 1, 2)
+    w = memberships(problem, solution.theta, solution.mixture, solution.stars)
+    members = np.asarray(np.bincount(problem.star, w, minlength=S), float)
     # a star without members is somewhere in the match circle
     widest = problem.least_root**-2
-    lost = np.trace(own[:, :2, :2], axis1=1, axis2=2) > 2 * widest
+    lost = (members < 0.5) & (np.trace(own[:, :2, :2], axis1=1, axis2=2) > 2 * widest)
     for matrices in (own, cov):
         matrices[lost, :2] = matrices[lost, :, :2] = 0.0
         matrices[lost, :2, :2] = widest * np.eye(2)
-    w = memberships(problem, solution.theta, solution.mixture, solution.stars)
     return StarCatalogue(
         solution.stars,
         cov,
         own,
         problem.counts,
-        np.asarray(np.bincount(problem.star, w, minlength=S), float),
+        members,
         problem.epoch0,
         problem.model.unit,
     )

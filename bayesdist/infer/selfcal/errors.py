@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.selfcal.following import MOST_TAKEN
 from bayesdist.infer.selfcal.normal import Mixture, memberships
 from bayesdist.infer.selfcal.problem import Problem
 
@@ -40,7 +41,7 @@ def scatter_by_magnitude(
     precision = w / (problem.var + mixture.jitter**2)
     total = np.bincount(problem.star, precision, minlength=problem.n_stars)[problem.star]
     # of each axis a star costs q / 2 numbers, shared by weight
-    left = 1.0 - np.minimum(precision / np.maximum(total, 1e-300) * problem.n_star / 2, 0.99)
+    left = 1.0 - np.minimum(precision / np.maximum(total, 1e-300) * problem.n_star / 2, MOST_TAKEN)
     square = problem.squares(theta, stars)
     n_bins = int(np.clip(len(mag) // LEAST, 1, MOST_BINS))
     edges = np.quantile(mag, np.linspace(0, 1, n_bins + 1))

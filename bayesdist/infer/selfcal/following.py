@@ -12,10 +12,13 @@ from bayesdist.infer.selfcal.normal import STARS, memberships
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.solve import Solution
 
-__all__ = ["Following", "following", "taken_by_stars"]
+__all__ = ["MOST_TAKEN", "Following", "following", "taken_by_stars"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+MOST_TAKEN = 0.99  # of a residual's variance: a star of as many numbers as detections takes it all
+LOOSE = 1e-9  # relative curvature below which a combination of a star's numbers is not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,18 +60,29 @@ def following(solution: Solution) -> Iterator[Following]:
         by_star = np.swapaxes(to_pixels @ _by_star(p, rows), 1, 2)
         own = np.array(p.priors.precision[first:last])
         np.add.at(own, star, w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2))
-        roots = np.linalg.inv(np.linalg.cholesky(own))
+        roots = _inverse_roots(own)
         residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
         yield Following(rows, star, w, residual, w[:, None, None] * (roots[star] @ by_star))
 
 
 def taken_by_stars(solution: Solution) -> Float:
-    """Share (N,) of the variance of each detection that its star takes out of the residual."""
+    """Share (N,) of the variance of each detection that its star takes out of the residual.
+
+    At most `MOST_TAKEN`.
+    """
     out = np.empty(len(solution.problem))
     for some in following(solution):
         square = np.sum(some.ties**2, axis=(1, 2))
         out[some.rows] = square / (2 * np.maximum(some.weight, np.finfo(float).tiny))
-    return out
+    return np.minimum(out, MOST_TAKEN)
+
+
+def _inverse_roots(matrices: Float) -> Float:
+    """L^-1 of A = L L^T, (S, q, q); what hardly has curvature gets some, as it says nothing."""
+    scale = np.sqrt(np.einsum("sqq->sq", matrices))
+    scaled = matrices / (scale[:, :, None] * scale[:, None, :])
+    scaled += LOOSE * np.eye(matrices.shape[1])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)) / scale[:, None, :])
 
 
 def _by_star(problem: Problem, rows: slice) -> Float:

@@ -59,7 +59,9 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
 def _residual_note(inputs: ReportInput) -> str:
     notes = [f"From {inputs.sample}."] if inputs.sample else []
     if inputs.words.taken:
-        notes.append("Stars were fitted with them: residuals are smaller than errors by that.")
+        notes.append(
+            "The stars were fitted to these detections, so that residuals are smaller than errors."
+        )
     return " ".join(notes)
 
 

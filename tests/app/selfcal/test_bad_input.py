@@ -128,6 +128,10 @@ def test_a_single_exposure(truth, tmp_path):
         ({"model": {"order": 3, "frames": "affine"}}, ["model.frames", "selfcal.frames"]),
         ({"fit": {"clip_chi2": 9.0}}, ["fit", "[selfcal]"]),
         ({"outliers": {"match_radius": 1.0}}, ["selfcal.match_radius"]),
+        (
+            {"selfcal": {"frames": "shift"}, "gauge": {"offsets": "o", "roll_sigma_deg": 0.1}},
+            ["gauge.roll_sigma_deg", "selfcal.frames"],
+        ),
         ({"outliers": {"model": "gaussian"}}, ["outliers.model", "uniform"]),
         ({"sampler": {"second_stage": "never"}}, ["sampler.second_stage", "[selfcal]"]),
         ({"data": {"matches": "stars.ecsv"}}, ["[data]", "[selfcal]", "give one"]),
