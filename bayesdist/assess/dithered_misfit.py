@@ -68,7 +68,7 @@ def dithered_misfit(solution: Solution) -> Misfit:
         name,
         worst.pixels * model.pixel_size(solution.theta),
         model.unit,
-        told=sum(one.told for one in tests.values()) / max(patterns, 1),
+        told=sum(one.told for one in tests.values()) / patterns if patterns else 1.0,
     )
 
 

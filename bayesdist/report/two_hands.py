@@ -163,6 +163,8 @@ def _claimed(claims: Path, name: str) -> bool:
         (claims / name).touch(exist_ok=False)
     except FileExistsError:
         return False
+    except OSError:  # rather drawn twice than not at all
+        pass
     return True
 
 
