@@ -69,7 +69,8 @@ class Hand:
         pipe = self.process.stdout
         assert self.process.stdin is not None and pipe is not None
         try:
-            self.process.stdin.close()
+            with suppress(OSError):  # it may have left: its exit code says more
+                self.process.stdin.close()
             answer = pipe.read()
             if self.process.wait():
                 raise OSError(f"it ended with exit code {self.process.returncode}")
