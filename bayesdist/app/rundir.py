@@ -21,6 +21,7 @@ from pydantic import ValidationError
 from bayesdist import __version__
 from bayesdist.app.campaign.files import campaign_files
 from bayesdist.app.config import Config, load_config, load_text
+from bayesdist.app.config_errors import as_config_error
 from bayesdist.app.selfcal.files import selfcal_files
 from bayesdist.app.star_files import FOLDER, PAIRS, part_files
 from bayesdist.data import atomic_path, input_files, is_leftover, remove_leftovers, sha256_of
@@ -363,11 +364,9 @@ class RunDirectory:
         try:
             return Config.model_validate(self.record["config"])
         except ValidationError as error:  # made by a version that allowed other settings
-            fault = error.errors()[0]["msg"].removeprefix("Value error, ")
+            fault = as_config_error(Config, error, str(self / "run.json"))
             raise InputError(
-                f"holds a configuration that is none: {fault}",
-                where=str(self / "run.json"),
-                do="start again with --force",
+                fault.cause, where=fault.where, do="start again with --force"
             ) from error
 
     @property

@@ -361,6 +361,9 @@ class Session:
     @cached_property
     def stars(self) -> StarSample:
         """Some stars, or all of them, and what fit and posterior say of each."""
+        return self._sampled()
+
+    def _sampled(self) -> StarSample:
         matches = self.matches
         return star_sample(matches.sample(SAMPLE), len(matches), self.fit, self.posterior)
 

@@ -14,18 +14,16 @@ it leaves of chi-square is the unit (an F test).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.stats import f as f_distribution
 
-from bayesdist.assess.misfit import Misfit, partitions_for
+from bayesdist.assess.misfit import Misfit, bin_means, partitions_for, worst_misfit
 from bayesdist.infer.selfcal import Solution
 from bayesdist.infer.selfcal.following import Following, following
-from bayesdist.infer.selfcal.normal import memberships
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 
@@ -52,24 +50,16 @@ def dithered_misfit(solution: Solution) -> Misfit:
         Of all chips together, since they share stars; `told` is the share of the patterns over
         all partitions, polynomials apart, that the detections can tell from places of stars.
     """
-    model = solution.problem.model
+    model, unit = solution.problem.model, solution.problem.model.pixel_size(solution.theta)
     partitions = _partitions(len(solution.problem), len(model.chips))
-    tests = {
-        name: _test(shifts, _polynomials(model.order, len(model.chips), bins))
-        for (name, bins), shifts in zip(
-            partitions.items(), _shifts(solution, list(partitions.values())), strict=True
-        )
-    }
-    # several p-values may be zero in double precision: then the larger structure is the worse
-    name, worst = min(tests.items(), key=lambda item: (item[1].p_value, -item[1].pixels))
-    patterns = sum(one.patterns for one in tests.values())
-    return Misfit(
-        min(1.0, len(tests) * worst.p_value),
-        name,
-        worst.pixels * model.pixel_size(solution.theta),
-        model.unit,
-        told=sum(one.told for one in tests.values()) / patterns if patterns else 1.0,
-    )
+    found, told, patterns = [], 0, 0
+    for (name, bins), shifts in zip(
+        partitions.items(), _shifts(solution, list(partitions.values())), strict=True
+    ):
+        one = _test(shifts, _polynomials(model.order, len(model.chips), bins))
+        found.append(Misfit(one.p_value, name, one.pixels * unit, model.unit))
+        told, patterns = told + one.told, patterns + one.patterns
+    return replace(worst_misfit(found), told=told / patterns if patterns else 1.0)
 
 
 def _partitions(n: int, n_chips: int) -> dict[str, tuple[int, int]]:
@@ -102,25 +92,26 @@ class _Shifts:
     gradient: Float
     curvature: Float
     weight: Float
-    chi2: float
-    dof: float
+    chi2: float = 0.0
+    dof: float = 1.0
 
 
 def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
     """What detections say of shifts of the cells of each partition, in one pass over them."""
-    p, dof = solution.problem, _degrees_of_freedom(solution)
+    p, expansion = solution.problem, solution.expansion
     out = []
     for nx, ny in partitions:
         n = 2 * len(p.model.chips) * nx * ny
-        out.append(
-            _Shifts(np.zeros(n), np.zeros((n, n)), np.zeros(n), solution.expansion.chi2, dof)
-        )
+        out.append(_Shifts(np.zeros(n), np.zeros((n, n)), np.zeros(n)))
+    taken = float(len(solution.free))  # of the detections' numbers by distortion and stars
     for some in following(solution):
+        taken += np.minimum(p.n_star, 2 * np.bincount(some.star, some.member)).sum()
         for sums, bins in zip(out, partitions, strict=True):
             _add(sums, some, _cells(p, some.rows, bins))
+    dof = max(2 * expansion.n_members - taken, 1.0)
     for sums in out:
         sums.curvature[np.diag_indices(len(sums.weight))] += sums.weight
-    return out
+    return [replace(sums, chi2=expansion.chi2, dof=dof) for sums in out]
 
 
 def _add(sums: _Shifts, some: Following, cell: Int) -> None:
@@ -139,15 +130,6 @@ def _add(sums: _Shifts, some: Following, cell: Int) -> None:
     sums.curvature[:] -= (of_stars.T @ of_stars).toarray()
 
 
-def _degrees_of_freedom(solution: Solution) -> float:
-    """Numbers that are left of the detections' by stars and distortion."""
-    p = solution.problem
-    member = memberships(p, solution.theta, solution.mixture, solution.stars)
-    of_star = np.bincount(p.star, member, minlength=p.n_stars)
-    taken = np.minimum(p.n_star, 2 * of_star).sum() + len(solution.free)
-    return max(2 * solution.expansion.n_members - taken, 1.0)
-
-
 def _cells(problem: Problem, rows: slice, bins: tuple[int, int]) -> Int:
     """Cell (n,) of each detection, counted over all chips."""
     nx, ny = bins
@@ -161,12 +143,7 @@ def _cells(problem: Problem, rows: slice, bins: tuple[int, int]) -> Int:
 
 def _polynomials(order: int, n_chips: int, bins: tuple[int, int]) -> Float:
     """Means over the cells of what the polynomials of chips can do, (2 K, fields)."""
-    means = []
-    for n in bins:
-        edges = np.linspace(-1.0, 1.0, n + 1)
-        whole = [legendre.Legendre.basis(k).integ()(edges) for k in range(order + 1)]
-        means.append(np.diff(whole, axis=1))
-    of_x, of_y = means
+    of_x, of_y = (bin_means(n, order) for n in bins)
     one = np.stack([np.outer(of_y[j], of_x[i]).ravel() for i, j in polynomial_terms(order)], axis=1)
     return np.kron(np.eye(2 * n_chips), one)
 

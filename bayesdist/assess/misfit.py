@@ -18,7 +18,15 @@ from bayesdist.assess.residuals import BinnedResiduals, BinnedSums
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["MOST_BINS", "STARS_PER_BIN", "Misfit", "misfit_of", "partitions_for", "worst_misfit"]
+__all__ = [
+    "MOST_BINS",
+    "STARS_PER_BIN",
+    "Misfit",
+    "bin_means",
+    "misfit_of",
+    "partitions_for",
+    "worst_misfit",
+]
 
 Float = NDArray[np.float64]
 
@@ -118,19 +126,20 @@ def misfit_of(sums: Mapping[str, BinnedSums], *, order: int | None = None, unit:
     -------
     Misfit
     """
-    found = [(*_test(one.residuals(), _absorbed(one, order)), name) for name, one in sums.items()]
-    # several p-values may be zero in double precision: then the larger structure is the worse
-    p, structure, name = min(found, key=lambda one: (one[0], -one[1]))
-    return Misfit(min(1.0, len(found) * p), name, structure, unit)
+    found = []
+    for name, one in sums.items():
+        p, structure = _test(one.residuals(), _absorbed(one, order))
+        found.append(Misfit(p, name, structure, unit))
+    return worst_misfit(found)
 
 
 def worst_misfit(found: Sequence[Misfit]) -> Misfit:
-    """The most telling of several chips, its probability corrected for their number.
+    """The most telling of several chips or partitions, its probability corrected for their number.
 
     Parameters
     ----------
     found : sequence of Misfit
-        One for each chip.
+        One for each.
 
     Returns
     -------
@@ -155,11 +164,15 @@ def _absorbed(sums: BinnedSums, order: int | None) -> float:
 
 def _kept(n: int, order: int) -> Float:
     """Mean square of each Legendre polynomial, averaged over n equal bins, over its mean square."""
+    means = bin_means(n, order)
+    return (2 * np.arange(order + 1) + 1) * np.mean(means**2, axis=1)
+
+
+def bin_means(n: int, order: int) -> Float:
+    """Means of each Legendre polynomial over n equal bins, (order + 1, n)."""
     edges = np.linspace(-1.0, 1.0, n + 1)
-    degrees = np.arange(order + 1)
-    integrals = [legendre.Legendre.basis(k).integ()(edges) for k in degrees]
-    means = np.diff(integrals, axis=1) * n / 2
-    return (2 * degrees + 1) * np.mean(means**2, axis=1)
+    integrals = [legendre.Legendre.basis(k).integ()(edges) for k in range(order + 1)]
+    return np.asarray(np.diff(integrals, axis=1) * n / 2)
 
 
 def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:

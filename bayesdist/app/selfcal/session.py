@@ -25,7 +25,7 @@ from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.app.selfcal.matching import TURN_BACK, half_turned
 from bayesdist.app.selfcal.start import started
 from bayesdist.app.session import Session
-from bayesdist.assess import SAMPLE, StarSample, star_sample
+from bayesdist.assess import StarSample
 from bayesdist.assess.dithered_misfit import dithered_misfit
 from bayesdist.assess.misfit import Misfit
 from bayesdist.assess.solution import Solution as Assessed
@@ -324,13 +324,10 @@ class SelfcalSession(Session):
         """The same."""
         return self.magnitude_errors
 
-    @cached_property
-    def stars(self) -> StarSample:  # type: ignore[override]
-        """Some detections, or all of them, and what fit and posterior say of each."""
-        matches, solution = self.raw_matches, self.solved
+    def _sampled(self) -> StarSample:
+        sample, solution = super()._sampled(), self.solved
         taken = np.zeros(len(self.detections))
         taken[solution.problem.rows] = taken_by_stars(solution)
-        sample = star_sample(matches.sample(SAMPLE), len(matches), self.fit, self.posterior)
         return replace(sample, taken=taken[sample.table.row])
 
     @cached_property

@@ -31,8 +31,10 @@ class Following:
         Their detections, in the order of the problem.
     star : ndarray of int, shape (n,)
         Which of these stars each detection is of.
+    member : ndarray, shape (n,)
+        Probability to be the star's.
     weight : ndarray, shape (n,)
-        Inverse variance of each axis, times the probability to be the star's.
+        Inverse variance of each axis, times that.
     residual : ndarray, shape (n, 2)
         Detection minus star.
     ties : ndarray, shape (n, q, 2)
@@ -42,6 +44,7 @@ class Following:
 
     rows: slice
     star: Int
+    member: Float
     weight: Float
     residual: Float
     ties: Float
@@ -50,7 +53,8 @@ class Following:
 def following(solution: Solution) -> Iterator[Following]:
     """Go over the stars of a solution, some at a time."""
     p, theta, mixture = solution.problem, solution.theta, solution.mixture
-    weights = memberships(p, theta, mixture, solution.stars) / (p.var + mixture.jitter**2)
+    members = memberships(p, theta, mixture, solution.stars)
+    weights = members / (p.var + mixture.jitter**2)
     residuals = p.places(theta) - p.star_places(solution.stars)
     for first in range(0, p.n_stars, STARS):
         last = min(first + STARS, p.n_stars)
@@ -62,7 +66,8 @@ def following(solution: Solution) -> Iterator[Following]:
         np.add.at(own, star, w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2))
         roots = _inverse_roots(own)
         residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
-        yield Following(rows, star, w, residual, w[:, None, None] * (roots[star] @ by_star))
+        ties = w[:, None, None] * (roots[star] @ by_star)
+        yield Following(rows, star, members[rows], w, residual, ties)
 
 
 def taken_by_stars(solution: Solution) -> Float:

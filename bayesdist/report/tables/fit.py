@@ -134,16 +134,16 @@ def _chips_of_stars(inputs: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
 
 def outlier_table(inputs: ReportInput) -> TextTable | None:
     """The mixture's own parameters, and how many stars or detections it flags."""
-    post, told = inputs.posterior, inputs.words
+    post, words = inputs.posterior, inputs.words
     if post is None:
         return None
-    words = {
-        "f": (f"Fraction of {told.false}, f", ""),
+    named = {
+        "f": (f"Fraction of {words.false}, f", ""),
         "j": ("Jitter, j: error beyond the quoted one", inputs.unit),
-        "s_out": (f"Scale of the {told.false}, s_out", inputs.unit),
+        "s_out": (f"Scale of the {words.false}, s_out", inputs.unit),
     }
     rows = []
-    for key, (name, unit) in words.items():
+    for key, (name, unit) in named.items():
         if key not in post.hyper:
             continue
         draws = np.asarray(post.hyper[key], float)
@@ -153,7 +153,7 @@ def outlier_table(inputs: ReportInput) -> TextTable | None:
         sd = float(v.std())
         cells = (rounded(v.mean(), sd), number(sd, 2), interval(low, high, sd))
         rows.append((name, *(marked(inputs, c) for c in cells), scale.unit))
-    things, missing = told.things, (MISSING, MISSING)
+    things, missing = words.things, (MISSING, MISSING)
     flagged = marked(inputs, count(post.n_flagged))
     rows.append(
         (f"{things.capitalize()} flagged (probability above 0.5)", flagged, *missing, things)
@@ -161,7 +161,7 @@ def outlier_table(inputs: ReportInput) -> TextTable | None:
     expected = marked(inputs, number(post.n_false, 4))
     rows.append(
         (
-            f"{told.false.capitalize()} expected (sum of the probabilities)",
+            f"{words.false.capitalize()} expected (sum of the probabilities)",
             expected,
             *missing,
             things,
