@@ -1,0 +1,106 @@
+"""Scores, curvatures and squared scores summed over small cells of the detector: one pass.
+
+Cells are so small that all functions that are asked of them are smooth within one: what follows
+then needs no star again, however many there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.robust.scores import Scores
+from bayesdist.infer.stars import Stars
+from bayesdist.model import Groups, merge_groups
+
+__all__ = ["CellSums", "cell_sums", "cells_per_side"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+# cells along each side of a chip, by the number of groups at most: memory and time are bounded
+SIDES = ((8, 64), (32, 48), (10**9, 32))
+COLUMNS = 9  # n, g_u, g_v, h_uu, h_uv, h_vv, g_u^2, g_u g_v, g_v^2
+
+
+@dataclass(frozen=True, eq=False)
+class CellSums:
+    """Sums over the stars of each group and cell; those of pieces of the data add.
+
+    Parameters
+    ----------
+    groups : Groups
+    side : int
+        Cells on each side of a chip.
+    sums : ndarray, shape (G, C, 9)
+        Number of stars, gradient of the log-likelihood by the model's u and v, minus its second
+        derivatives uu, uv, vv, and products of the gradients uu, uv, vv.
+    position : ndarray, shape (chips, C, 3)
+        Number of stars and sums of their scaled positions X and Y.
+    """
+
+    groups: Groups
+    side: int
+    sums: Float
+    position: Float
+
+    def __add__(self, other: CellSums) -> CellSums:
+        groups, sums = self.groups, self.sums
+        if groups.same(other.groups):
+            sums = sums + other.sums
+        else:
+            groups, *index = merge_groups(self.groups, other.groups)
+            sums = np.zeros((len(groups), *self.sums.shape[1:]))
+            for part, at in zip((self, other), index, strict=True):
+                sums[at] += part.sums
+        return CellSums(groups, self.side, sums, self.position + other.position)
+
+    def centres(self, chip: int) -> tuple[Int, Float, Float]:
+        """Cells of a chip (by code) with stars, and the mean scaled position X, Y in each."""
+        n, x, y = self.position[chip].T
+        used = np.flatnonzero(n)
+        return used, x[used] / n[used], y[used] / n[used]
+
+
+def cells_per_side(n_groups: int) -> int:
+    """Cells on each side of a chip for so many groups."""
+    return next(side for most, side in SIDES if n_groups <= most)
+
+
+def cell_sums(stars: Stars, scores: Scores, side: int) -> CellSums:
+    """Sums over some stars: a task for `Shards.sum`.
+
+    Parameters
+    ----------
+    stars : Stars
+    scores : Scores
+    side : int
+        Cells on each side of a chip.
+
+    Returns
+    -------
+    CellSums
+    """
+    g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
+    # Where it is open whether a star is a false match its curvature is negative.  Such stars say
+    # nothing here, so that every sum of curvatures is that of a possible likelihood.
+    good = (h_uu > 0) & (h_vv > 0)
+    h_uu, h_uv, h_vv = (np.where(good, h, 0.0) for h in (h_uu, h_uv, h_vv))
+    columns = (None, g_u, g_v, h_uu, h_uv, h_vv, g_u**2, g_u * g_v, g_v**2)
+    ix, iy = (
+        np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (stars.X, stars.Y)
+    )
+    code, C, G = iy * side + ix, side * side, len(stars.groups)
+    sums = np.zeros((G, C, COLUMNS))
+    position = np.zeros((len(stars.model.chips), C, 3))
+    for g, chip in enumerate(stars.groups.chip):
+        rows = slice(stars.starts[g], stars.starts[g + 1])
+        for k, column in enumerate(columns):
+            weights = None if column is None else column[rows]
+            sums[g, :, k] = np.bincount(code[rows], weights, minlength=C)
+        position[chip, :, 0] += sums[g, :, 0]
+        for k, z in ((1, stars.X), (2, stars.Y)):
+            position[chip, :, k] += np.bincount(code[rows], z[rows], minlength=C)
+    return CellSums(stars.groups, side, sums, position)

@@ -1,0 +1,245 @@
+"""Linear deviations of exposures from one another, and the curvature of drifts.
+
+Both are seen in differences between exposures only, and few of these say little: two exposures say
+nothing of a curvature, and next to nothing of a scatter when a drift is fitted to them.  Then the
+prior decides, as it must where one extrapolates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from bayesdist.infer.discrepancy.information import GroupCells, Information
+from bayesdist.infer.discrepancy.priors import DiscrepancyPriors, log_half_cauchy
+from bayesdist.model import DistortionModel
+
+__all__ = ["LinearDeviations", "linear_deviations"]
+
+Float = NDArray[np.float64]
+
+# deviations of an exposure by what scatters together, and the frames that fit them already
+KINDS = {
+    "shift": ("shift", "shift_rotation", "shift_rotation_scale", "affine"),
+    "rotation": ("shift_rotation", "shift_rotation_scale", "affine"),
+    "scale": ("shift_rotation_scale", "affine"),
+    "shear": ("affine",),
+}
+SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
+CURVATURE = "curvature"
+MOST_EXPOSURES = 40
+STEPS = {"shape": 12, "shift": 5, "rotation": 5, CURVATURE: 6}
+RANGE = 30.0  # of amplitudes about the prior's median and what the data resolve
+
+
+@dataclass(frozen=True, eq=False)
+class LinearDeviations:
+    """Draws of the deviations of exposures, and of the curvature of the drift.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (n, D)
+        What the deviations did to the parameters of the fit, with the sign of its error.
+    terms : tuple of (int, int, int)
+        Chip (by code), axis and basis function that bends in time.
+    curvature : ndarray, shape (n, terms)
+        In the unit of u, v per squared year; half of it multiplies the squared time.
+    epoch : float
+        About which time is counted, in decimal years; NaN without curvature.
+    scatter : dict of str to ndarray, shape (n,)
+        Draws of each scatter.
+    n_exposures : int
+    """
+
+    model: DistortionModel
+    theta: Float
+    terms: tuple[tuple[int, int, int], ...]
+    curvature: Float
+    epoch: float
+    scatter: dict[str, Float]
+    n_exposures: int
+
+    def polynomials(self, epoch: float | None, chip: int) -> Float:
+        """Coefficients (n, 2, K) on a chip of the curvature alone, at an epoch."""
+        out = np.zeros((len(self.curvature), 2, self.model.n_terms))
+        code = self.model.chip_code(chip)
+        for k, (c, axis, term) in enumerate(self.terms):
+            if c == code and epoch is not None:
+                out[:, axis, term] += 0.5 * self.curvature[:, k] * (epoch - self.epoch) ** 2
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Functions whose coefficients scatter: each a displacement of the stars of some groups."""
+
+    scatter: tuple[str, ...]
+    terms: tuple[tuple[int, int, int], ...]
+    epoch: float
+
+
+def linear_deviations(
+    information: Information,
+    working: Information,
+    priors: DiscrepancyPriors,
+    n: int,
+    rng: np.random.Generator,
+) -> LinearDeviations | None:
+    """Posterior of the deviations of exposures and of the curvature of drifts, as draws.
+
+    Parameters
+    ----------
+    information : Information
+        With the excess of the scores.
+    working : Information
+        Of the likelihood that the solution was made with.
+    priors : DiscrepancyPriors
+    n : int
+        Draws.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    LinearDeviations or None
+        None for a single exposure, and for more than forty: a hierarchy of exposures is asked for
+        then.
+    """
+    model, groups = working.model, working.sums.groups
+    keys = np.column_stack([groups.exposure, groups.epoch])
+    exposures, of_group = np.unique(keys, axis=0, return_inverse=True)
+    of_group = of_group.ravel()
+    if not 2 <= len(exposures) <= MOST_EXPOSURES:
+        return None
+    kinds = [k for k, fitted in KINDS.items() if model.frames not in fitted]
+    per_exposure = [SCATTERS[k] for k in kinds for _ in range({"shift": 2, "shear": 2}.get(k, 1))]
+    terms = _bending(model)
+    dates = np.array([c.count.sum() for c in working.groups()])
+    middle = float(np.average(groups.epoch, weights=dates)) if terms else np.nan
+    Q = len(exposures) * len(per_exposure)
+    total = Q + len(terms)
+    if not total:
+        return None
+    scatter = np.array([*per_exposure * len(exposures), *[CURVATURE] * len(terms)])
+    size = model.pixel_size(working.theta) * max(max(c.size) for c in model.chips) / 2
+
+    def displacement(cells: GroupCells, g: int, centre: Float) -> Float:
+        out = np.zeros((len(cells.X), 2, total))
+        first = int(of_group[g]) * len(per_exposure)
+        own = _deviations(_positions(working, cells) - centre, kinds, size)
+        out[:, :, first : first + own.shape[2]] = own
+        for k, (chip, axis, term) in enumerate(terms):
+            if chip == cells.chip:
+                bent = 0.5 * (cells.epoch - middle) ** 2 * size
+                out[:, axis, Q + k] = bent * cells.phi[:, term]
+        return np.asarray(np.einsum("ab,cbq->caq", cells.frame, out))
+
+    centre = np.mean([_positions(working, c).mean(axis=0) for c in working.groups()], axis=0)
+    S, score = np.zeros((total, total)), np.zeros(total)
+    crossed = [np.zeros((model.n_params, total)) for _ in range(2)]
+    for which, source in enumerate((information, working)):
+        for g, cells in enumerate(source.groups()):
+            moved = displacement(cells, g, centre)
+            pulled = np.einsum("cab,cbq->caq", cells.curvature, moved, optimize=True)
+            crossed[which][cells.columns] += cells.onto_parameters(pulled)
+            if which == 0:
+                S += np.einsum("caq,car->qr", moved, pulled, optimize=True)
+                score += np.einsum("caq,ca->q", moved, cells.score, optimize=True)
+    through = information.covariance @ crossed[0]
+    S = S - crossed[0].T @ through
+    score = score - through.T @ information.score
+    S = (S + S.T) / 2
+    medians = {
+        "shift": priors.exposure,
+        "rotation": priors.exposure,
+        "shape": priors.exposure,
+        CURVATURE: priors.curvature,
+    }
+    names = list(dict.fromkeys(scatter.tolist()))
+    index = np.array([names.index(s) for s in scatter])
+    grids = []
+    for k, name in enumerate(names):
+        known = np.diag(S)[index == k]
+        known = known[known > 1e-8 * max(float(known.max()), 1e-300)]
+        resolved = 1 / np.sqrt(np.median(known)) if known.size else medians[name]
+        low = min(medians[name], resolved) / 5
+        high = RANGE * max(medians[name], resolved if resolved < 1e-2 else 0.0)
+        grids.append(np.geomspace(low, high, STEPS[name]))
+    values, vectors = np.linalg.eigh(S)
+    S = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    combinations = [np.array(c) for c in product(*grids)]
+    density = np.empty(len(combinations))
+    for k, amplitude in enumerate(combinations):
+        spread = amplitude[index]
+        scaled = S * np.outer(spread, spread) + np.eye(total)
+        factor = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
+        z = scipy.linalg.solve_triangular(factor, spread * score, lower=True)
+        density[k] = 0.5 * z @ z - np.log(np.diag(factor)).sum()
+        density[k] += sum(
+            log_half_cauchy(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
+        )
+    weight = np.exp(density - density.max())
+    counts = rng.multinomial(n, weight / weight.sum())
+    drawn, sizes = [], []
+    for amplitude, m in zip(combinations, counts, strict=True):
+        if m:
+            spread = amplitude[index]
+            scaled = S * np.outer(spread, spread) + np.eye(total)
+            factor = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
+            z = scipy.linalg.solve_triangular(factor, spread * score, lower=True)
+            z = z[:, None] + rng.standard_normal((total, m))
+            z = scipy.linalg.solve_triangular(factor, z, trans=1, lower=True)
+            drawn.append(spread * z.T)
+            sizes.append(np.tile(amplitude, (m, 1)))
+    order = rng.permutation(n)
+    coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
+    return LinearDeviations(
+        model=model,
+        # the fit takes a deviation for its own; the truth lies on the other side
+        theta=-coefficients @ (working.covariance @ crossed[1]).T,
+        terms=terms,
+        curvature=coefficients[:, Q:] * size,
+        epoch=middle,
+        scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
+        n_exposures=len(exposures),
+    )
+
+
+def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:
+    """Functions that may bend in time: those that the model lets drift, on each chip."""
+    if model.time is None:
+        return ()
+    out = []
+    for chip in range(len(model.chips)):
+        powers = model.basis(model.chips[chip].number).terms
+        for axis, i, j in model.time.terms:
+            out.append((chip, "uv".index(axis), powers.index((i, j))))
+    return tuple(out)
+
+
+def _positions(information: Information, cells: GroupCells) -> Float:
+    """Positions (C, 2) along the axes of the polynomials."""
+    poly = information.model.polynomials(
+        information.theta, np.array([cells.chip]), np.array([cells.epoch])
+    )[..., 0, :, :]
+    return np.asarray(cells.phi @ poly.T)
+
+
+def _deviations(position: Float, kinds: list[str], size: float) -> Float:
+    """Displacements (C, 2, q) by unit deviations of each kind; shifts in half sizes."""
+    p, q = position.T
+    zero, one = np.zeros_like(p), np.full_like(p, size)
+    fields = {
+        "shift": [(one, zero), (zero, one)],
+        "rotation": [(-q, p)],
+        "scale": [(p, q)],
+        "shear": [(p, -q), (q, p)],
+    }
+    chosen = [np.stack(field, axis=1) for kind in kinds for field in fields[kind]]
+    if not chosen:
+        return np.zeros((len(p), 2, 0))
+    return np.stack(chosen, axis=2)

@@ -1,0 +1,90 @@
+"""Draws of everything that a calibration may leave out, and what it does to the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.discrepancy.functions import StructureFunctions
+from bayesdist.infer.discrepancy.linear import LinearDeviations
+from bayesdist.model import DistortionModel
+
+__all__ = ["ChipStructure", "Discrepancy"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ChipStructure:
+    """Draws of the structure on one chip: what is added to the fitted polynomial.
+
+    Parameters
+    ----------
+    functions : StructureFunctions
+    waves : ndarray, shape (FINE, 2)
+        Of what is finer than the functions.
+    coefficients : ndarray, shape (n, 2, m)
+        Of functions and waves, along u and v of the polynomials.
+    """
+
+    functions: StructureFunctions
+    waves: Float
+    coefficients: Float
+
+    def evaluate(self, X: Float, Y: Float) -> Float:
+        """Values (N, m) of all functions at scaled positions."""
+        known = self.functions.evaluate(X, Y)
+        return np.concatenate([known, self.functions.evaluate_finer(self.waves, X, Y)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Discrepancy:
+    """What lies outside the fitted model, as independent draws.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    mean : ndarray, shape (D,)
+        Of the solution that errs.
+    formal : ndarray, shape (D, D)
+        Covariance of its parameters by the likelihood.
+    noise : ndarray, shape (D, D)
+        Covariance by the stars' errors as they scatter, and by the errors that a star of the
+        catalogue has in all of its exposures.
+    structure : dict of int to ChipStructure
+        By chip number.
+    structure_theta : ndarray, shape (n, D)
+        Error of the parameters that goes with each draw of the structure.
+    linear : LinearDeviations or None
+        Of exposures and drifts.
+    facts : mapping
+        Sizes, for summaries: JSON-able.
+    """
+
+    model: DistortionModel
+    mean: Float
+    formal: Float
+    noise: Float
+    structure: Mapping[int, ChipStructure]
+    structure_theta: Float
+    linear: LinearDeviations | None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def n_draws(self) -> int:
+        """Number of draws."""
+        return len(self.structure_theta)
+
+    @cached_property
+    def covariance(self) -> Float:
+        """Covariance (D, D) of the parameters' errors by all causes; about zero, not their mean."""
+        out = self.noise.copy()
+        for theta in (self.structure_theta, None if self.linear is None else self.linear.theta):
+            if theta is not None:
+                out += theta.T @ theta / len(theta)
+        return out

@@ -1,0 +1,206 @@
+"""The discrepancy of a solution from the truth, estimated from its residuals in one pass."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_side
+from bayesdist.infer.discrepancy.functions import StructureFunctions
+from bayesdist.infer.discrepancy.information import Information
+from bayesdist.infer.discrepancy.linear import linear_deviations
+from bayesdist.infer.discrepancy.noise import score_excess
+from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
+from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
+from bayesdist.infer.discrepancy.shared_stars import shared_star_errors
+from bayesdist.infer.discrepancy.structure import AxisStructure, axis_structure
+from bayesdist.infer.prior import GaussianPriors
+from bayesdist.infer.robust.scores import scores_of
+from bayesdist.infer.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.views import Solution
+
+__all__ = ["estimate_discrepancy"]
+
+Float = NDArray[np.float64]
+
+DRAWS = 2000
+
+
+# a second BLAS thread gains little here and loses much on a machine that has other work
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def estimate_discrepancy(
+    matches: Matches | Shards,
+    solution: Solution,
+    *,
+    rng: np.random.Generator,
+    priors: DiscrepancyPriors | None = None,
+    parameter_priors: GaussianPriors | None = None,
+    stars: MatchTable | None = None,
+    n_draws: int = DRAWS,
+    compute: Compute | None = None,
+) -> Discrepancy:
+    """Estimate what a solution leaves out, with priors on its size and never a decision against it.
+
+    Parameters
+    ----------
+    matches : MatchTable, PartitionedMatches or Shards
+        That the solution was made from.
+    solution : Posterior or LinearFit
+        Without extra weight in the corners.
+    rng : numpy.random.Generator
+    priors : DiscrepancyPriors, optional
+    parameter_priors : GaussianPriors, optional
+        That the solution was made with.
+    stars : MatchTable, optional
+        The same matches with codes of the catalogue's stars, which then have errors in common.
+    n_draws : int
+    compute : Compute, optional
+
+    Returns
+    -------
+    Discrepancy
+
+    Raises
+    ------
+    InputError
+        For a view of a solution.
+    """
+    model, scores = solution.model, scores_of(solution)
+    priors = priors or DiscrepancyPriors()
+    with opened(model, matches, compute) as shards:
+        sums: CellSums = shards.sum(cell_sums, scores, cells_per_side(len(shards.groups)))
+    working = Information(
+        model, scores.theta, sums, parameter_priors or GaussianPriors.none(model)
+    )
+    information = working.with_excess(score_excess(working))
+    pixel = model.pixel_size(scores.theta)
+    structure, theta, facts = _structures(information, working, priors, pixel, n_draws, rng)
+    linear = linear_deviations(information, working, priors, n_draws, rng)
+    formal, noise = working.covariance, working.sandwich()
+    if stars is not None and stars.star is not None:
+        extra, rms = shared_star_errors(
+            stars, scores, formal, model, priors.star * pixel
+        )
+        noise = noise + extra
+        facts["star_rms"] = rms
+    noise, ratio = _not_narrower(noise, formal)
+    facts |= {"unit": model.unit, "noise_ratio": ratio}
+    if linear is not None:
+        facts["exposures"] = linear.n_exposures
+        facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
+    return Discrepancy(
+        model, np.asarray(scores.theta), formal, noise, structure, theta, linear, facts
+    )
+
+
+def _not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
+    """The covariance by the stars' scatter, on the whole not below the formal one, and its ratio.
+
+    Quoted errors that are too large are the user's statement: residuals cannot tell them from
+    matches that were cut.
+    """
+    D = len(formal)
+    # a little of the formal one, so that no direction is without variance
+    share = min(0.5, D / (100 * D + 1))
+    noise = (1 - share) * noise + share * formal
+    scale = np.sqrt(np.diag(formal))
+    ratio = float(
+        np.trace(np.linalg.solve(formal / np.outer(scale, scale), noise / np.outer(scale, scale)))
+    )
+    ratio /= D
+    return noise * max(1.0, 1 / ratio), ratio
+
+
+def _structures(
+    information: Information,
+    working: Information,
+    priors: DiscrepancyPriors,
+    pixel: float,
+    n: int,
+    rng: np.random.Generator,
+) -> tuple[dict[int, ChipStructure], Float, dict[str, object]]:
+    """Structure of all chips, and what it does to the parameters."""
+    model, sums = working.model, working.sums
+    stars = sums.position[:, :, 0].sum(axis=1)
+    shift = information.covariance @ information.score
+    theta, out, rows = np.zeros((n, model.n_params)), {}, []
+    for code, chip in enumerate(model.chips):
+        functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
+        S, crossed, taken, score = _along_axes(information, working, functions, code)
+        waves = functions.finer_waves(rng)
+        coefficients = []
+        for a in (0, 1):
+            through = information.covariance @ crossed[a]
+            found: AxisStructure = axis_structure(
+                functions,
+                S[a] - crossed[a].T @ through,
+                score[a] - crossed[a].T @ shift,
+                noise=_star_error(information, code, a),
+                higher_order=priors.higher_order * pixel,
+                structure=priors.structure * pixel,
+            )
+            drawn = found.draws(n, rng)
+            coefficients.append(drawn)
+            # the fit takes structure for polynomials; the truth lies on the other side
+            theta -= drawn[:, : functions.n_known] @ (working.covariance @ taken[a]).T
+            rows.append(
+                {
+                    "chip": chip.number,
+                    "axis": "uv"[a],
+                    "field_rms": found.field_rms,
+                    "length_pix": found.length * max(chip.size) / 2,
+                    "rms": float(np.sqrt(np.mean((drawn**2).sum(axis=1)))),
+                }
+            )
+        out[chip.number] = ChipStructure(functions, waves, np.stack(coefficients, axis=1))
+    return out, theta, {"structure": rows}
+
+
+def _star_error(information: Information, chip: int, axis: int) -> float:
+    """Error of a typical star."""
+    rows = information.sums.groups.chip == chip
+    n, h = information.sums.sums[rows][:, :, [0, (3, 5)[axis]]].sum(axis=(0, 1))
+    return float(np.sqrt(n / h)) if h > 0 else 1.0
+
+
+def _along_axes(
+    information: Information, working: Information, functions: StructureFunctions, chip: int
+) -> tuple[list[Float], list[Float], list[Float], list[Float]]:
+    """Of u and v: information and score of the functions, and their products with the parameters.
+
+    The products are those of the flattened likelihood and of the working one.
+    """
+    model, side = working.model, working.sums.side
+    m, D = functions.n_known, model.n_params
+    crossed, taken = ([np.zeros((D, m)) for _ in "uv"] for _ in range(2))
+    weight, score = np.zeros((2, side * side)), np.zeros((2, side * side))
+    used, X, Y = working.sums.centres(chip)
+    B = functions.evaluate(X, Y)
+    row = np.full(side * side, -1)
+    row[used] = np.arange(len(used))
+    for source, into in ((information, crossed), (working, taken)):
+        for cells in source.groups():
+            if cells.chip != chip:
+                continue
+            at = _rows(cells.X, cells.Y, side, row)
+            here, M = B[at], cells.frame
+            turned = np.einsum("cab,bd->cad", cells.curvature, M)
+            for a in (0, 1):
+                block = np.stack(
+                    [(cells.phi * turned[:, b, a, None]).T @ here for b in (0, 1)]
+                )
+                into[a][cells.columns] += np.einsum("akm,akq->mq", cells.derivative, block)
+                if source is information:
+                    weight[a, at] += np.einsum("b,cb->c", M[:, a], turned[:, :, a])
+                    score[a, at] += cells.score @ M[:, a]
+    n = len(used)
+    S = [B.T @ (weight[a, :n, None] * B) for a in (0, 1)]
+    return S, crossed, taken, [B.T @ score[a, :n] for a in (0, 1)]
+
+
+def _rows(X: Float, Y: Float, side: int, row: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows of the chip's cells at their mean positions."""
+    ix, iy = (np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (X, Y))
+    return np.asarray(row[iy * side + ix])
