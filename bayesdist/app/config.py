@@ -23,12 +23,14 @@ from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.section import Section
 from bayesdist.app.selfcal.config import GaugeBlock, SelfcalBlock
 from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.discrepancy_terms import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.assess.linear_term import LINEAR_KINDS, LinearTerm
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms import GIVEN, said_by_user
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
+from bayesdist.infer.discrepancy import DiscrepancyPriors
 from bayesdist.infer.period_dates import check_periods, mjd_periods
 from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
 from bayesdist.products.wise_meta import ARRAYS
@@ -292,6 +294,20 @@ class RequirementBlock(Section):
     magnitude: float | None = None
 
 
+class DiscrepancyBlock(Section):
+    """Prior medians of what the model may leave out."""
+
+    higher_order: PositiveFloat = DiscrepancyPriors.higher_order
+    structure: PositiveFloat = DiscrepancyPriors.structure
+    exposure: PositiveFloat = DiscrepancyPriors.exposure
+    curvature: PositiveFloat = DiscrepancyPriors.curvature
+    star: PositiveFloat = DiscrepancyPriors.star
+
+    def priors(self) -> DiscrepancyPriors:
+        """The block as priors."""
+        return DiscrepancyPriors(**self.model_dump())
+
+
 class PriorBlock(Section):
     """A Gaussian prior on one parameter."""
 
@@ -334,7 +350,7 @@ class Products(Section):
 # rows of every budget, and what its totals are called
 MEASURED_TERMS = (
     *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME),
-    *("total", "model", "unmodelled structure", "look-up tables"),
+    *("total", "model", STRUCTURE, STRUCTURE_IN_FIT, DEVIATIONS, "look-up tables"),
 )
 
 
@@ -359,6 +375,7 @@ class Config(Section):
     budget: list[BudgetBlock] = Field(default_factory=list)
     requirement: list[RequirementBlock] = Field(default_factory=list)
     prior: list[PriorBlock] = Field(default_factory=list)
+    discrepancy: DiscrepancyBlock = DiscrepancyBlock()
     products: Products = Products()
 
     @model_validator(mode="after")

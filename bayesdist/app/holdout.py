@@ -104,13 +104,14 @@ def held_out_of(session: Session, *, anew: bool = False) -> HeldOutTruth | None:
 def predictive_of_run(session: Session) -> Predictive:
     """The solution as it is assessed, as it predicts.
 
-    Quoted errors and jitter hold what the model leaves out at a place, as each star errs by it;
+    Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
     neighbours err by it together.
     """
-    found, shared = predictive_of(session.solution), session.shared_errors
-    if shared is None or not shared.at_place or not shared.facts["patch_pix"]:
+    found, discrepancy = predictive_of(session.solution), session.discrepancy
+    rows = None if discrepancy is None else discrepancy.found.facts.get("structure")
+    if not rows:
         return found
-    side = shared.facts["patch_pix"]
+    side = max(row["length_pix"] for row in rows)
     return replace(found, local=local_errors(session), cell=(side, side), local_in_noise=True)
 
 

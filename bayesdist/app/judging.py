@@ -38,7 +38,7 @@ def _assessment(session: Session, solution: Solution | None, n_draws: int | None
     config = session.config
     what: dict[str, Any] = {"solution": solution}
     if solution is None:
-        solution = session.solution
+        solution = session.systematics.solution
         what = {
             "solution": solution,
             "fields": session.field_terms,
@@ -125,8 +125,7 @@ def margins_of(
         doubt = session.majority
         if not doubt:
             doubt = _unaccounted(session)
-            # a measurement of shared errors that has doubts may have made them too large
-            enlarging = bool(doubt) and session.shared_errors is None
+            enlarging = bool(doubt)
         held = held_out_of(session)
         if held is not None and held.doubtful:
             doubt, enlarging = doubt or held.verdict, False
@@ -150,8 +149,7 @@ def margins_of(
 
 def _unaccounted(session: Session) -> str:
     """Structure in the residuals that no error stands for; empty where there is none."""
-    shared = session.shared_errors
-    if not session.misfit.significant or (shared is not None and shared.trusted):
+    if not session.misfit.significant or session.discrepancy is not None:
         return ""
     return session.misfit.sentence
 

@@ -13,7 +13,7 @@ from astropy.table import Table
 
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
-from bayesdist.app.correlated import SharedErrors, kept_shared_errors, measure_shared_errors
+from bayesdist.app.discrepancy import RunDiscrepancy, keep_discrepancy, kept_discrepancy
 from bayesdist.app.holdout import predictive_of_run, split_of
 from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
@@ -33,9 +33,11 @@ from bayesdist.assess import (
 )
 from bayesdist.assess.centroid import centroid_scatter
 from bayesdist.assess.coverage import Coverage, coverage_of
+from bayesdist.assess.discrepancy_terms import STRUCTURE
 from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.holdout_predictive import Predictive
 from bayesdist.assess.majority import majority_sentence
+from bayesdist.assess.maps import UncertaintyMap, uncertainty_map, with_local
 from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.assess.solution import Solution
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
@@ -53,6 +55,7 @@ from bayesdist.infer import (
     load_fit,
     load_posterior,
 )
+from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.model import DistortionModel
 
 __all__ = ["ERROR_COLUMNS", "STAGES", "Session", "write_table"]
@@ -232,24 +235,51 @@ class Session:
     @cached_property
     def systematics(self) -> Systematics:
         """The posterior with all that is known of its errors."""
-        found = self.shared_errors
-        return Systematics(self.posterior if found is None else found.widened(self.posterior))
+        found = self.discrepancy
+        if found is None:
+            return Systematics(self.posterior)
+        return Systematics(found.with_noise(self.posterior), found.fields)
 
     @cached_property
-    def shared_errors(self) -> SharedErrors | None:
-        """What `assess` has measured of errors that stars have in common."""
-        return kept_shared_errors(self)
+    def discrepancy(self) -> RunDiscrepancy | None:
+        """What the model may leave out, as `assess` has estimated it."""
+        return kept_discrepancy(self)
+
+    def estimate_discrepancy(self) -> Discrepancy:
+        """What the model may leave out, from the residuals of all stars."""
+        matches = self.matches
+        return estimate_discrepancy(
+            self.shards,
+            self.posterior,
+            rng=self.rng("assess"),
+            priors=self.config.discrepancy.priors(),
+            parameter_priors=self.priors,
+            stars=matches if isinstance(matches, MatchTable) else None,
+        )
 
     def measure(self) -> None:
-        """What the assessment measures beside the posterior, anew."""
-        measure_shared_errors(self)
-        for name in ("shared_errors", "systematics", "field_terms", "centroid"):
+        """What the assessment estimates beside the posterior, anew."""
+        keep_discrepancy(self, self.estimate_discrepancy)
+        rest = ("systematics", "solution", "field_terms", "centroid", "local_terms")
+        for name in ("discrepancy", *rest):
             self.__dict__.pop(name, None)
 
-    @property
+    @cached_property
     def solution(self) -> Posterior:
-        """What is assessed, exported and shown: all errors of the parameters are in its draws."""
-        return self.systematics.solution
+        """What is exported and shown: all errors of the parameters are in its draws."""
+        found = self.discrepancy
+        return self.posterior if found is None else found.with_everything(self.posterior)
+
+    def position_map(self, **where: Any) -> UncertaintyMap:
+        """Uncertainty of positions over a chip: of coefficients, and of what they leave out.
+
+        Parameters
+        ----------
+        **where
+            As `uncertainty_map`, on the grid and at the epoch of the assessment.
+        """
+        local = {term.name: term for term in self.local_terms}
+        return with_local(uncertainty_map(self.solution, **where), local.get(STRUCTURE))
 
     @property
     def signed(self) -> Posterior:
@@ -259,21 +289,20 @@ class Session:
     @cached_property
     def field_terms(self) -> tuple[FieldTerm, ...]:
         """Errors that are fields over the detector: those of the run, then the user's."""
-        return (*self.systematics.fields, *self.config.linear_terms(self.solution))
+        return (*self.systematics.fields, *self.config.linear_terms(self.systematics.solution))
 
     @cached_property
     def centroid(self) -> MagnitudeErrors | None:
         """Errors of the centroids by magnitude, where the stars have magnitudes."""
         held = self.config.held_in_residuals(self.posterior.model.unit)
         errors = centroid_scatter(self.stars, held, n_params=self.posterior.model.n_params)
-        found = self.shared_errors
+        found = self.discrepancy
         return errors if found is None else found.of_centroids(errors)
 
     @property
     def doubts(self) -> list[str]:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
-        found = self.shared_errors
-        return [found.sentence] if found is not None and found.sentence else []
+        return []
 
     @property
     def gauge_words(self) -> str:
@@ -285,11 +314,11 @@ class Session:
         """The solution of relative positions, where the gauge is no part of it."""
         return None
 
-    @property
+    @cached_property
     def local_terms(self) -> tuple[LocalTerm, ...]:
         """Errors that were measured beside the solution, on the grid of the assessment."""
-        found = self.shared_errors
-        return () if found is None else found.local_term(self.config.assess.grid)
+        found = self.discrepancy
+        return () if found is None else found.local(self.config.assess.grid, self.epoch)
 
     @property
     def scale_arcsec(self) -> float | None:

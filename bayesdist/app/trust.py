@@ -19,10 +19,9 @@ def warnings_of(session: Session) -> list[str]:
     if session.majority:
         out.append(session.majority)
     if session.misfit.significant:
-        shared = session.shared_errors
-        held = shared is not None and shared.trusted
+        held = session.discrepancy is not None
         out.append(
-            f"{session.misfit.finding}; the budget holds what was measured of it"
+            f"{session.misfit.finding}; the budget holds what was estimated of it"
             if held
             else session.misfit.sentence
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 from bayesdist.assess.moments import position_moments
 from bayesdist.assess.solution import Solution, kind_of, place_of
+from bayesdist.assess.terms import LocalTerm
 
-__all__ = ["RELATIVE", "SigmaMap", "UncertaintyMap", "uncertainty_map"]
+__all__ = ["RELATIVE", "SigmaMap", "UncertaintyMap", "uncertainty_map", "with_local"]
 
 Float = NDArray[np.float64]
 
@@ -84,6 +85,31 @@ class UncertaintyMap(SigmaMap):
     def sigma_v_max(self) -> float:
         """Largest sigma_v."""
         return float(self.sigma_v.max())
+
+
+def with_local(found: UncertaintyMap, term: LocalTerm | None) -> UncertaintyMap:
+    """A map with what the model leaves out at each position; itself without such a term.
+
+    Parameters
+    ----------
+    found : UncertaintyMap
+    term : LocalTerm or None
+        On the grid of the map.
+
+    Returns
+    -------
+    UncertaintyMap
+    """
+    if term is None or found.chip not in term.sigma:
+        return found
+    u, v = term.on(found.chip, found.sigma_u.shape)  # type: ignore[arg-type]
+    sigma_u, sigma_v = np.hypot(found.sigma_u, u), np.hypot(found.sigma_v, v)
+    return replace(
+        found,
+        sigma_u=sigma_u,
+        sigma_v=sigma_v,
+        correlation=found.correlation * found.sigma_u * found.sigma_v / (sigma_u * sigma_v),
+    )
 
 
 def uncertainty_map(

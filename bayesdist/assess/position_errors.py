@@ -205,7 +205,7 @@ class PositionErrors:
 
     def _errors(self, judged: Judged, shrink: Mapping[str, float]) -> ErrorsOf:
         """All terms together; noise is the same at every epoch and for every what-if."""
-        fields, added = self._fields(judged), self._added(judged, shrink)
+        fields, added = self._fields(judged), self._added(judged, shrink, spread=False)
         shared, single = (
             np.sqrt(sum(s**2 for is_shared, s in added if is_shared == which))
             for which in (True, False)
@@ -215,6 +215,11 @@ class PositionErrors:
         own = [s for _, s in added[2 + len(self.terms) :][: len(self.local)]]
         model = self.fields.whole.solution.model
         chip = np.array([model.chip_code(number) for number in fields.places[0]])
+        common = [
+            (self._drawn_at(term, fields), shrink.get(term.name, 1.0))
+            for term in self.local
+            if term.drawn
+        ]
 
         def error_of(rows: slice, noise: Float) -> Float:
             error = fields.joint(rows, exact)
@@ -222,6 +227,9 @@ class PositionErrors:
             error += self.offsets[rows, None, :] * shared
             if np.any(single):
                 error += noise * resized(single, own, self.squares[rows], chip)
+            for drawn, size in common:
+                which = np.arange(rows.start, rows.stop) % len(drawn)
+                error += size * drawn[which]
             return error
 
         return error_of
@@ -239,8 +247,21 @@ class PositionErrors:
             return name in self.fields.added
         return self.fields.whole is self.fields.shown
 
-    def _added(self, judged: Judged, shrink: Mapping[str, float]) -> list[tuple[bool, Float]]:
-        """Whether all places share an error, and its sigmas (N, 2), of terms that are no fields."""
+    def _drawn_at(self, term: LocalTerm, fields: JudgedFields) -> NDArray[np.floating]:
+        """Draws (n, N, 2) of a local term at the judged points."""
+        on_chips = [
+            term.drawn[f.chip].reshape(len(term.drawn[f.chip]), -1, 2)[:, inside]
+            for f, inside in zip(fields.fields, fields.inside, strict=True)
+        ]
+        return np.concatenate(on_chips, axis=1)
+
+    def _added(
+        self, judged: Judged, shrink: Mapping[str, float], *, spread: bool = True
+    ) -> list[tuple[bool, Float]]:
+        """Whether all places share an error, and its sigmas (N, 2), of terms that are no fields.
+
+        Without `spread` those of terms that have draws of their own are zero.
+        """
         drawn = self._fields(judged)
         N = drawn.size
         out = [(True, np.zeros((N, 2))), (False, np.zeros((N, 2)))]
@@ -248,6 +269,9 @@ class PositionErrors:
             value = np.tile(sigma, (N, 1)) * shrink.get(term.name, 1.0)
             out.append((term.kind == "systematic", value))
         for one in self.local:
+            if one.drawn and not spread:
+                out.append((False, np.zeros((N, 2))))
+                continue
             on_chips = [
                 np.column_stack([s.ravel() for s in one.on(f.chip, self.grid[::-1])])[inside]
                 for f, inside in zip(drawn.fields, drawn.inside, strict=True)

@@ -110,15 +110,22 @@ class LocalTerm:
     source : str
     squares : mapping of int to MeanSquare
         By chip number: how well their mean squares are known themselves, where that is known.
+    drawn : mapping of int to ndarray, shape (n, ny, nx, 2)
+        By chip number: draws of the error on that grid, where neighbouring positions have some of
+        it in common; without them positions err independently of each other.
     """
 
     name: str
     sigma: dict[int, Float]
     source: str = MEASURED
     squares: Mapping[int, MeanSquare] = field(default_factory=dict)
+    drawn: Mapping[int, NDArray[np.floating]] = field(default_factory=dict)
 
     def relative_error(self, chip: int) -> float | None:
         """How well the sizes on a chip are known, relative to them; None where it is not known."""
+        if chip in self.drawn:
+            by_draw = np.sqrt(np.mean(np.square(self.drawn[chip]), axis=(1, 2, 3)))
+            return float(by_draw.std() / max(float(by_draw.mean()), 1e-300))
         return self.squares[chip].relative_error if chip in self.squares else None
 
     def on(self, chip: int, shape: tuple[int, int]) -> tuple[Float, Float]:

@@ -15,10 +15,13 @@ from bayesdist.app.campaign.holdout import predictive_of_campaign
 from bayesdist.app.campaign.inputs import Inputs, read_inputs
 from bayesdist.app.campaign.interpolation import interpolation_term
 from bayesdist.app.campaign.reference import FREE, rate_priors
-from bayesdist.app.campaign.shared import measured_shared_errors
-from bayesdist.app.campaign.systematics import systematics_of, with_kept_stars
+from bayesdist.app.campaign.systematics import (
+    errors_by_star,
+    kept_covariance,
+    systematics_of,
+    with_kept_stars,
+)
 from bayesdist.app.campaign.table_file import KeptTables, read_tables, write_tables
-from bayesdist.app.correlated import keep_shared_errors
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
@@ -30,6 +33,7 @@ from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centr
 from bayesdist.errors import NotSettledError
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, fit_by_magnitude
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
 from bayesdist.infer.series import Series
 from bayesdist.infer.settling import Settling
@@ -109,7 +113,7 @@ class CampaignSession(Session):
         """Look-up tables of an earlier stage: the detector's, and those of the filter."""
         return self._kept_tables.tables
 
-    @property
+    @cached_property
     def local_terms(self) -> tuple[LocalTerm, ...]:
         """What the errors of the tables leave of the position, and what lies between nodes."""
         kept, grid = self._kept_tables, self.config.assess.grid
@@ -155,8 +159,15 @@ class CampaignSession(Session):
     @property
     def signed(self) -> Posterior:
         """The solution with the errors of the catalogue as `assess` has kept them."""
-        posterior = with_kept_stars(self)
-        return posterior if self.shared_errors is None else self.shared_errors.widened(posterior)
+        posterior, found = with_kept_stars(self), self.discrepancy
+        if found is None:
+            return posterior
+        return found.with_everything(posterior, kept_covariance(self))
+
+    @cached_property
+    def solution(self) -> Posterior:  # type: ignore[override]
+        """What is exported and shown: all errors of the parameters are in its draws."""
+        return self.signed
 
     @property
     def predictive(self) -> Predictive:
@@ -196,16 +207,32 @@ class CampaignSession(Session):
         """Errors of the centroids, as the fit left them."""
         return self.kept_errors()
 
-    def measure(self) -> None:
-        """What stars have in common beyond scatter of exposures, tables and catalogue, anew."""
-        keep_shared_errors(self, measured_shared_errors(self))
-        for name in ("shared_errors", "systematics", "field_terms"):
-            self.__dict__.pop(name, None)
+    def estimate_discrepancy(self) -> Discrepancy:
+        """What the model may leave out, beyond what the campaign's own hierarchy describes.
+
+        Tables that were fitted in this run have taken the structure; their errors, and what they
+        leave between their nodes, are terms of the budget.  The catalogue's errors are counted by
+        star where it states them.
+        """
+        matches = self.matches
+        assert isinstance(matches, MatchTable)
+        stated = errors_by_star(self.inputs.catalog) is not None
+        return estimate_discrepancy(
+            self.shards,
+            self.posterior,
+            rng=self.rng("assess"),
+            priors=self.config.discrepancy.priors(),
+            parameter_priors=self.priors,
+            stars=None if stated else matches,
+            structure=self.config.tables.method == "none",
+            exposures=False,
+            settling=self.settling,
+        )
 
     @property
     def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
         """The same: the catalogue's errors have been taken off, and what is left out at a place."""
-        found = self.shared_errors
+        found = self.discrepancy
         return self.magnitude_errors if found is None else found.of_centroids(self.magnitude_errors)
 
     @cached_property
@@ -310,7 +337,7 @@ class CampaignSession(Session):
     def fit_changed(self) -> None:
         """Forget what rests on the fit."""
         self.errors_changed()
-        for name in ("fit", "model", "priors", "terms", "systematics", "shared_errors"):
+        for name in ("fit", "model", "priors", "terms", "systematics", "discrepancy", "solution"):
             self.__dict__.pop(name, None)
 
     def forget(self) -> None:

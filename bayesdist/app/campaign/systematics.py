@@ -31,6 +31,7 @@ __all__ = [
     "catalogue_terms",
     "covariance_of",
     "errors_by_star",
+    "kept_covariance",
     "shared_stars_of",
     "systematics_of",
     "with_kept_stars",
@@ -52,12 +53,14 @@ def systematics_of(session: CampaignSession) -> Systematics:
     """
     posterior, fields = session.posterior, list[FieldTerm]()
     solution = posterior
-    stars, shared = shared_stars_of(session), session.shared_errors
+    stars, found = shared_stars_of(session), session.discrepancy
     if stars is not None:
         solution = with_shared_stars(posterior, session.fit, stars)
         fields += catalogue_terms(posterior, stars, session.inputs.catalog.source)
-    if shared is not None:
-        solution = shared.widened(solution)
+    if found is not None:
+        before = covariance_of(session.posterior, session.fit, stars)
+        solution = found.with_noise(solution, before)
+        fields += found.fields
     scatter = ExposureScatter(posterior.model, posterior.mean, *session.scatter)
     aberration = aberration_term(session, solution)
     return Systematics(solution, (*fields, scatter, aberration), aligned=True)
@@ -161,11 +164,22 @@ def with_kept_stars(session: CampaignSession) -> Posterior:
 
     Neither catalogue nor pairs are needed; where nothing is kept it is the posterior alone.
     """
-    posterior, path = session.posterior, session.run / CATALOGUE_ERRORS
+    stars = _kept_stars(session)
+    if stars is None:
+        return session.posterior
+    return with_shared_stars(session.posterior, session.fit, stars)
+
+
+def kept_covariance(session: CampaignSession) -> Float:
+    """Covariance of that posterior, without the noise of its draws."""
+    return covariance_of(session.posterior, session.fit, _kept_stars(session))
+
+
+def _kept_stars(session: CampaignSession) -> StarCovariance | None:
+    path = session.run / CATALOGUE_ERRORS
     if not path.exists():
-        return posterior
-    stars = _kept(path, fingerprint_of(session.fit, posterior))
-    return with_shared_stars(posterior, session.fit, stars)
+        return None
+    return _kept(path, fingerprint_of(session.fit, session.posterior))
 
 
 def _kept(path: Path, fingerprint: str) -> StarCovariance:

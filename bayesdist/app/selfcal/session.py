@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.correlated import keep_shared_errors
 from bayesdist.app.selfcal.config import SelfcalBlock
 from bayesdist.app.selfcal.gauge import Known, fixed_by, gauge_words
 from bayesdist.app.selfcal.inputs import (
@@ -337,8 +336,7 @@ class SelfcalSession(Session):
 
     def measure(self) -> None:
         """Nothing beside the posterior: stars that are free take up what detections share."""
-        keep_shared_errors(self, None)
-        self.__dict__.pop("shared_errors", None)
+        self.run.summarise(discrepancy=None)
 
     @property
     def relative(self) -> Assessed:

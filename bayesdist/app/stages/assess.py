@@ -41,7 +41,7 @@ def run_assess(session: Session) -> None:
     solution, grid, epoch = session.solution, config.assess.grid, session.epoch
     places = [{"grid": grid, "epoch": epoch, "chip": c.number} for c in solution.model.chips]
     formal = [uncertainty_map(session.fit, **place) for place in places]
-    maps = [uncertainty_map(solution, **place) for place in places]
+    maps = [session.position_map(**place) for place in places]
     areas = [area_map(solution, **place) for place in places]
     relative = relative_maps(session, places)
     state = trust(session)

@@ -175,7 +175,7 @@ def _chip_results(session: Session) -> tuple[ChipResults, ...]:
             ChipResults(
                 chip=chip,
                 formal_map=uncertainty_map(fit, **on_chip),
-                posterior_map=uncertainty_map(posterior, **on_chip),
+                posterior_map=session.position_map(**on_chip),
                 displacement=distortion_vectors(posterior, part="no_constant", **vectors),
                 non_linear=distortion_vectors(posterior, part="non_linear", **vectors),
                 area=area_map(posterior, **on_chip),

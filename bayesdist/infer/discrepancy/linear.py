@@ -89,6 +89,8 @@ def linear_deviations(
     priors: DiscrepancyPriors,
     n: int,
     rng: np.random.Generator,
+    *,
+    exposures: bool = True,
 ) -> LinearDeviations | None:
     """Posterior of the deviations of exposures and of the curvature of drifts, as draws.
 
@@ -102,29 +104,31 @@ def linear_deviations(
     n : int
         Draws.
     rng : numpy.random.Generator
+    exposures : bool
+        Whether single exposures deviate; not where a hierarchy of them has been fitted.
 
     Returns
     -------
     LinearDeviations or None
-        None for a single exposure, and for more than forty: a hierarchy of exposures is asked for
-        then.
+        None where nothing can deviate: for a single exposure, and without a drift for more than
+        forty, whose scatter averages out.
     """
     model, groups = working.model, working.sums.groups
     keys = np.column_stack([groups.exposure, groups.epoch])
-    exposures, of_group = np.unique(keys, axis=0, return_inverse=True)
-    of_group = of_group.ravel()
-    if not 2 <= len(exposures) <= MOST_EXPOSURES:
-        return None
+    distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
+    of_group, n_exposures = of_group.ravel(), len(distinct)
     kinds = [k for k, fitted in KINDS.items() if model.frames not in fitted]
+    if n_exposures < 2 or n_exposures > MOST_EXPOSURES or not exposures:
+        kinds = []
     per_exposure = [SCATTERS[k] for k in kinds for _ in range({"shift": 2, "shear": 2}.get(k, 1))]
     terms = _bending(model)
     dates = np.array([c.count.sum() for c in working.groups()])
     middle = float(np.average(groups.epoch, weights=dates)) if terms else np.nan
-    Q = len(exposures) * len(per_exposure)
+    Q = n_exposures * len(per_exposure)
     total = Q + len(terms)
     if not total:
         return None
-    scatter = np.array([*per_exposure * len(exposures), *[CURVATURE] * len(terms)])
+    scatter = np.array([*per_exposure * n_exposures, *[CURVATURE] * len(terms)])
     size = model.pixel_size(working.theta) * max(max(c.size) for c in model.chips) / 2
 
     def displacement(cells: GroupCells, g: int, centre: Float) -> Float:
@@ -205,7 +209,7 @@ def linear_deviations(
         curvature=coefficients[:, Q:] * size,
         epoch=middle,
         scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
-        n_exposures=len(exposures),
+        n_exposures=n_exposures,
     )
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
@@ -18,6 +21,7 @@ from bayesdist.infer.discrepancy.shared_stars import shared_star_errors
 from bayesdist.infer.discrepancy.structure import AxisStructure, axis_structure
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.robust.scores import scores_of
+from bayesdist.infer.settling import Settling
 from bayesdist.infer.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.views import Solution
 
@@ -38,6 +42,9 @@ def estimate_discrepancy(
     priors: DiscrepancyPriors | None = None,
     parameter_priors: GaussianPriors | None = None,
     stars: MatchTable | None = None,
+    structure: bool = True,
+    exposures: bool = True,
+    settling: Settling | None = None,
     n_draws: int = DRAWS,
     compute: Compute | None = None,
 ) -> Discrepancy:
@@ -55,6 +62,12 @@ def estimate_discrepancy(
         That the solution was made with.
     stars : MatchTable, optional
         The same matches with codes of the catalogue's stars, which then have errors in common.
+    structure : bool
+        Whether there is structure beyond the model; not where look-up tables were fitted to it.
+    exposures : bool
+        Whether single exposures deviate; not where a hierarchy of them was fitted.
+    settling : Settling, optional
+        What was done to the shifts of single chips after sampling.
     n_draws : int
     compute : Compute, optional
 
@@ -71,28 +84,28 @@ def estimate_discrepancy(
     priors = priors or DiscrepancyPriors()
     with opened(model, matches, compute) as shards:
         sums: CellSums = shards.sum(cell_sums, scores, cells_per_side(len(shards.groups)))
-    working = Information(
-        model, scores.theta, sums, parameter_priors or GaussianPriors.none(model)
-    )
+    working = Information(model, scores.theta, sums, parameter_priors or GaussianPriors.none(model))
     information = working.with_excess(score_excess(working))
     pixel = model.pixel_size(scores.theta)
-    structure, theta, facts = _structures(information, working, priors, pixel, n_draws, rng)
-    linear = linear_deviations(information, working, priors, n_draws, rng)
+    chips = range(len(model.chips)) if structure else ()
+    found, theta, facts = _structures(information, working, chips, priors, pixel, n_draws, rng)
+    linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
     formal, noise = working.covariance, working.sandwich()
     if stars is not None and stars.star is not None:
-        extra, rms = shared_star_errors(
-            stars, scores, formal, model, priors.star * pixel
-        )
+        extra, rms = shared_star_errors(stars, scores, formal, model, priors.star * pixel)
         noise = noise + extra
         facts["star_rms"] = rms
     noise, ratio = _not_narrower(noise, formal)
+    if settling is not None:
+        formal, noise = (settling.mean(settling.mean(c).T).T for c in (formal, noise))
+        theta = settling.mean(theta)
+        if linear is not None:
+            linear = replace(linear, theta=settling.mean(linear.theta))
     facts |= {"unit": model.unit, "noise_ratio": ratio}
     if linear is not None:
         facts["exposures"] = linear.n_exposures
         facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
-    return Discrepancy(
-        model, np.asarray(scores.theta), formal, noise, structure, theta, linear, facts
-    )
+    return Discrepancy(model, np.asarray(scores.theta), formal, noise, found, theta, linear, facts)
 
 
 def _not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
@@ -116,24 +129,26 @@ def _not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
 def _structures(
     information: Information,
     working: Information,
+    chips: Sequence[int],
     priors: DiscrepancyPriors,
     pixel: float,
     n: int,
     rng: np.random.Generator,
 ) -> tuple[dict[int, ChipStructure], Float, dict[str, object]]:
-    """Structure of all chips, and what it does to the parameters."""
+    """Structure of chips (by code), and what it does to the parameters."""
     model, sums = working.model, working.sums
     stars = sums.position[:, :, 0].sum(axis=1)
     shift = information.covariance @ information.score
     theta, out, rows = np.zeros((n, model.n_params)), {}, []
-    for code, chip in enumerate(model.chips):
+    for code in chips:
+        chip = model.chips[code]
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
         S, crossed, taken, score = _along_axes(information, working, functions, code)
         waves = functions.finer_waves(rng)
         coefficients = []
         for a in (0, 1):
             through = information.covariance @ crossed[a]
-            found: AxisStructure = axis_structure(
+            posterior: AxisStructure = axis_structure(
                 functions,
                 S[a] - crossed[a].T @ through,
                 score[a] - crossed[a].T @ shift,
@@ -141,7 +156,7 @@ def _structures(
                 higher_order=priors.higher_order * pixel,
                 structure=priors.structure * pixel,
             )
-            drawn = found.draws(n, rng)
+            drawn = posterior.draws(n, rng)
             coefficients.append(drawn)
             # the fit takes structure for polynomials; the truth lies on the other side
             theta -= drawn[:, : functions.n_known] @ (working.covariance @ taken[a]).T
@@ -149,9 +164,10 @@ def _structures(
                 {
                     "chip": chip.number,
                     "axis": "uv"[a],
-                    "field_rms": found.field_rms,
-                    "length_pix": found.length * max(chip.size) / 2,
+                    "field_rms": posterior.field_rms,
+                    "length_pix": posterior.length * max(chip.size) / 2,
                     "rms": float(np.sqrt(np.mean((drawn**2).sum(axis=1)))),
+                    "seen": float(np.sqrt((drawn.mean(axis=0) ** 2).sum())),
                 }
             )
         out[chip.number] = ChipStructure(functions, waves, np.stack(coefficients, axis=1))
@@ -188,9 +204,7 @@ def _along_axes(
             here, M = B[at], cells.frame
             turned = np.einsum("cab,bd->cad", cells.curvature, M)
             for a in (0, 1):
-                block = np.stack(
-                    [(cells.phi * turned[:, b, a, None]).T @ here for b in (0, 1)]
-                )
+                block = np.stack([(cells.phi * turned[:, b, a, None]).T @ here for b in (0, 1)])
                 into[a][cells.columns] += np.einsum("akm,akq->mq", cells.derivative, block)
                 if source is information:
                     weight[a, at] += np.einsum("b,cb->c", M[:, a], turned[:, :, a])

@@ -98,7 +98,7 @@ class AxisStructure:
 
     @property
     def length(self) -> float:
-        """Mean posterior correlation length of the field, weighed by its variance, in half sides."""
+        """Posterior mean correlation length of the field, weighed by variance, in half sides."""
         by_point = self.weight.sum(axis=1) * [p.amplitude**2 for p in self.points]
         return float(by_point @ [p.length for p in self.points] / by_point.sum())
 

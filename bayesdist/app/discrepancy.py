@@ -1,0 +1,142 @@
+"""What a run's model may leave out: estimated by `assess`, kept in the run's folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.fingerprint import fingerprint_of
+from bayesdist.assess.centroid import without
+from bayesdist.assess.discrepancy_terms import DeviationsTerm, StructureInFit, structure_term
+from bayesdist.assess.field_terms import FieldTerm
+from bayesdist.assess.terms import LocalTerm
+from bayesdist.data import MagnitudeErrors
+from bayesdist.errors import InputError
+from bayesdist.infer import Posterior
+from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.discrepancy import Discrepancy
+from bayesdist.infer.discrepancy.storage import discrepancy_from_arrays, discrepancy_to_arrays
+from bayesdist.infer.recoloured import with_spread
+
+if TYPE_CHECKING:
+    from bayesdist.app.session import Session
+
+__all__ = ["RunDiscrepancy", "keep_discrepancy", "kept_discrepancy"]
+
+Float = NDArray[np.float64]
+
+FILE = "discrepancy.h5"
+
+log = logging.getLogger("bayesdist")
+
+
+@dataclass(frozen=True, eq=False)
+class RunDiscrepancy:
+    """The discrepancy of a run's posterior, as the assessment takes it.
+
+    Parameters
+    ----------
+    found : Discrepancy
+    """
+
+    found: Discrepancy
+
+    def with_noise(self, posterior: Posterior, before: Float | None = None) -> Posterior:
+        """The posterior with its draws spread by the errors of the stars as they scatter.
+
+        Parameters
+        ----------
+        posterior : Posterior
+        before : ndarray, shape (D, D), optional
+            Its covariance where that is not the formal one, as in a hierarchy of exposures.
+        """
+        return self._widened(posterior, self.found.noise, before)
+
+    def with_everything(self, posterior: Posterior, before: Float | None = None) -> Posterior:
+        """The posterior with its draws spread by all that is known of errors of parameters."""
+        return self._widened(posterior, self.found.covariance, before)
+
+    def _widened(self, posterior: Posterior, cov: Float, before: Float | None) -> Posterior:
+        formal = self.found.formal
+        if before is None:
+            return with_spread(posterior, formal, cov)
+        # frames follow as they are correlated with polynomials and drift
+        D = self.found.model.n_distortion
+        follow = np.linalg.solve(before[:D, :D], before[:D]).T
+        more = follow @ (cov - formal)[:D, :D] @ follow.T
+        return with_spread(posterior, before, before + _least(before, (more + more.T) / 2))
+
+    @property
+    def fields(self) -> tuple[FieldTerm, ...]:
+        """Errors of parameters, as terms of the budget."""
+        terms: list[FieldTerm] = []
+        if self.found.structure:
+            terms.append(StructureInFit(self.found))
+        if self.found.linear is not None:
+            terms.append(DeviationsTerm(self.found))
+        return tuple(terms)
+
+    def local(self, grid: tuple[int, int], epoch: float | None) -> tuple[LocalTerm, ...]:
+        """What is left out at a position, as a term of the budget."""
+        if not self.found.structure:
+            return ()
+        return (structure_term(self.found, grid, epoch),)
+
+    def of_centroids(self, errors: MagnitudeErrors | None) -> MagnitudeErrors | None:
+        """Scatter by magnitude less the structure that residuals show, which has its own term."""
+        rows = self.found.facts.get("structure")
+        if errors is None or not rows:
+            return errors
+        u, v = (
+            np.sqrt(np.mean([r["seen"] ** 2 for r in rows if r["axis"] == axis])) for axis in "uv"
+        )
+        return without(errors, u, v)
+
+
+def _least(before: Float, more: Float) -> Float:
+    """What is added to a covariance, so that no direction loses more than half its variance."""
+    scale = np.sqrt(np.diag(before))
+    root = np.linalg.cholesky(before / np.outer(scale, scale)) * scale[:, None]
+    white = np.linalg.solve(root, np.linalg.solve(root, more).T)
+    values, vectors = np.linalg.eigh((white + white.T) / 2)
+    turned = root @ vectors
+    return np.asarray((turned * np.maximum(values, -0.5)) @ turned.T)
+
+
+def keep_discrepancy(session: Session, estimate: Callable[[], Discrepancy]) -> None:
+    """Estimate the discrepancy and write it for the stages that follow.
+
+    Raises
+    ------
+    InputError
+        When it cannot be estimated: no verdict could rest on anything then.
+    """
+    found = estimate()
+    arrays, facts = discrepancy_to_arrays(found)
+    write_arrays(session.run / FILE, fingerprint_of(session.fit, session.posterior), arrays)
+    session.run.summarise(discrepancy=facts)
+    for row in facts.get("structure", []):
+        log.info(
+            "assess: structure beyond the model on chip %s, %s: %.2g %s rms, correlated over "
+            "%.0f pixels",
+            *(row["chip"], row["axis"], row["rms"], facts["unit"], row["length_pix"]),
+        )
+
+
+def kept_discrepancy(session: Session) -> RunDiscrepancy | None:
+    """What `assess` has estimated; None before, and of another posterior."""
+    facts: dict[str, Any] | None = session.run.summary.get("discrepancy")
+    path = session.run / FILE
+    if not facts or not path.exists():
+        return None
+    try:
+        arrays = read_arrays(path, fingerprint_of(session.fit, session.posterior), do="")
+    except InputError:
+        return None
+    found = discrepancy_from_arrays(session.posterior.model, arrays)
+    return RunDiscrepancy(replace(found, facts=facts))

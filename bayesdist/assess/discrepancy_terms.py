@@ -1,0 +1,138 @@
+"""What a calibration may leave out, as terms of the error budget."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.field_terms import FieldDraws
+from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.assess.terms import MEASURED, LocalTerm
+from bayesdist.infer.discrepancy import Discrepancy
+from bayesdist.infer.discrepancy.linear import LinearDeviations
+
+__all__ = [
+    "DEVIATIONS",
+    "STRUCTURE",
+    "STRUCTURE_IN_FIT",
+    "DeviationsTerm",
+    "StructureInFit",
+    "structure_term",
+]
+
+Float = NDArray[np.float64]
+
+STRUCTURE = "unmodelled structure"
+STRUCTURE_IN_FIT = "unmodelled structure in coefficients"
+DEVIATIONS = "exposure-to-exposure variation"
+SOURCE = f"{MEASURED}, with a prior on its size"
+
+
+@dataclass(frozen=True, eq=False)
+class StructureInFit:
+    """Error of the parameters that were drawn towards what the model leaves out.
+
+    Parameters
+    ----------
+    discrepancy : Discrepancy
+    name, source : str
+    """
+
+    discrepancy: Discrepancy
+    name: str = STRUCTURE_IN_FIT
+    source: str = SOURCE
+    without: None = None
+
+    def draws(self, n: int, rng: np.random.Generator) -> FieldDraws:
+        """The first n draws, over and over: they belong to those of the structure itself."""
+        return _theta(self.discrepancy, self.discrepancy.structure_theta, n)
+
+
+@dataclass(frozen=True, eq=False)
+class DeviationsTerm:
+    """Error by deviations of single exposures, and by a curvature of the drift.
+
+    Parameters
+    ----------
+    discrepancy : Discrepancy
+        With `linear`.
+    name, source : str
+    """
+
+    discrepancy: Discrepancy
+    name: str = DEVIATIONS
+    source: str = SOURCE
+    without: None = None
+
+    def draws(self, n: int, rng: np.random.Generator) -> FieldDraws:
+        """Draws in random order, as they have nothing to do with other terms."""
+        linear = self.discrepancy.linear
+        assert linear is not None
+        rows = rng.integers(len(linear.theta), size=n)
+        found = _theta(self.discrepancy, linear.theta[rows], n)
+        return _Bending(found.model, found.mean, found.theta, linear=linear, rows=rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _Bending(FieldDraws):
+    """Draws of an error of parameters with what bends in time beside."""
+
+    linear: LinearDeviations = None  # type: ignore[assignment]
+    rows: NDArray[np.int64] = None  # type: ignore[assignment]
+
+    def polynomials(self, *, epoch: float | None, chip: int) -> Float:
+        """Legendre coefficients (n, 2, K) of the error."""
+        bent = self.linear.polynomials(epoch, chip)[self.rows]
+        return super().polynomials(epoch=epoch, chip=chip) + bent
+
+
+def _theta(discrepancy: Discrepancy, shift: Float, n: int) -> FieldDraws:
+    """Polynomials and drift moved by shifts of the parameters."""
+    model, mean = discrepancy.model, discrepancy.mean
+    theta = np.tile(mean, (n, 1))
+    D = model.n_distortion
+    theta[:, :D] += shift[np.arange(n) % len(shift), :D]
+    return FieldDraws(model, mean, theta)
+
+
+def structure_term(
+    discrepancy: Discrepancy, grid: tuple[int, int], epoch: float | None
+) -> LocalTerm:
+    """What the model leaves out at a position, on a grid.
+
+    The fit was drawn towards it, so that the two errors are correlated: the squares of this term
+    are those of both together less those of `StructureInFit`, and its draws belong to those.
+
+    Parameters
+    ----------
+    discrepancy : Discrepancy
+    grid : tuple of int
+        Points on x and y.
+    epoch : float or None
+        Decimal years; needed by a model with time dependence.
+
+    Returns
+    -------
+    LocalTerm
+    """
+    model = discrepancy.model
+    followed = StructureInFit(discrepancy).draws(discrepancy.n_draws, np.random.default_rng(0))
+    sigma, drawn = {}, {}
+    for chip in model.chips:
+        if chip.number not in discrepancy.structure:
+            continue
+        x, y = grid_pixels(chip.size, grid)
+        basis, at = model.basis(chip.number), mesh(x, y)
+        X, Y = basis.scaled(*at)
+        found = discrepancy.structure[chip.number]
+        functions = found.evaluate(X, Y).astype(found.coefficients.dtype)
+        left = np.swapaxes(found.coefficients @ functions.T, 1, 2)
+        e = followed.polynomials(epoch=epoch, chip=chip.number)
+        fit = np.swapaxes(e @ basis.evaluate(*at).T, 1, 2)
+        square = np.mean((fit + left) ** 2, axis=0) - np.mean(fit**2, axis=0)
+        shape = (len(y), len(x), 2)
+        sigma[chip.number] = np.sqrt(np.maximum(square, 0.0)).reshape(shape)
+        drawn[chip.number] = left.reshape(-1, *shape)
+    return LocalTerm(STRUCTURE, sigma, SOURCE, drawn=drawn)
