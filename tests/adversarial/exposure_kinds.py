@@ -117,6 +117,20 @@ def campaign(
     return Truth(stars, true_map, config, assessed, frames)
 
 
+@kind("inside_exposures", n=3000, inside=True)
+def inside_exposures(rng: np.random.Generator, n: int) -> Truth:
+    """Exposures differ by shifts and rotations only, which are fitted."""
+    return campaign(rng, n, mapped(fields.distortion(rng)), exposures=16)
+
+
+@kind("inside_drift", n=3000, inside=True)
+def inside_drift(rng: np.random.Generator, n: int) -> Truth:
+    """The drift is linear, as is fitted, and assessed four years on."""
+    rate = linear(*(0.005 * rng.standard_normal(3)))
+    true_map = drifting(mapped(fields.distortion(rng)), rate)
+    return campaign(rng, n, true_map, exposures=12, dates=(2002.0, 2012.0))
+
+
 @kind("breathing_t", *OF_EXPOSURES, n=3000, deviations=heavy_deviations)
 @kind("breathing", *OF_EXPOSURES, n=3000, deviations=normal_deviations)
 def breathing(rng: np.random.Generator, n: int, deviations: Scatter) -> Truth:

@@ -30,7 +30,7 @@ GRID, DRAWS = (17, 17), 2000
 STAGES = ("fit", "sample", "assess")
 # name, statistic, limit in units of what the actual error has
 ASKED = (("below p95", "p95", 0.9), ("above p95", "p95", 1.6), ("below max", "max", 0.9))
-DEFAULTS = {
+DEFAULTS: dict[str, dict[str, Any]] = {
     "data": {"matches": "stars.parquet", "unit": "pix"},
     "detector": {"name": "A", "size": [SIDE, SIDE]},
     "sampler": {"target_ess": 400},
@@ -50,16 +50,21 @@ def toml_text(config: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def assessed(truth: Truth, folder: Path, seed: int) -> Session:
-    """A session of a run of these stars, its assessment made."""
-    Table(truth.stars).write(folder / "stars.parquet")
+def configuration(truth: Truth, seed: int) -> dict[str, Any]:
+    """What a user writes for these stars, by block."""
     config = {name: dict(block) for name, block in DEFAULTS.items()}
     config["sampler"]["seed"] = seed + 1
     if truth.epoch is not None:
         config["assess"]["epoch"] = truth.epoch
     for name, block in truth.config.items():
         config[name] = config.get(name, {}) | block if isinstance(block, dict) else block
-    (folder / "config.toml").write_text(toml_text(config))
+    return config
+
+
+def assessed(truth: Truth, folder: Path, seed: int) -> Session:
+    """A session of a run of these stars, its assessment made."""
+    Table(truth.stars).write(folder / "stars.parquet")
+    (folder / "config.toml").write_text(toml_text(configuration(truth, seed)))
     settings, text = load_config(folder / "config.toml")
     directory = RunDirectory.plan(folder / "run", settings, text, folder)
     session = session_of(directory)

@@ -24,6 +24,17 @@ def centroid_sigma(mag: np.ndarray) -> np.ndarray:
     return np.hypot(0.01, 0.04 * 10 ** (0.2 * (mag - FAINT)))
 
 
+@kind("inside_magnitudes", inside=True)
+def inside_magnitudes(rng: np.random.Generator, n: int) -> Truth:
+    """Errors are as quoted, by magnitude; nothing depends on magnitude or colour."""
+    true_map = mapped(fields.distortion(rng))
+    (x, y), mag = pixels(rng, n), magnitudes(rng, n)
+    columns = {"mag": mag, "colour": 1.0 + 0.6 * rng.standard_normal(n)}
+    sigma = centroid_sigma(mag)[:, None]
+    stars = observed(rng, x, y, true_map(x, y, None), sigma=sigma, **columns)
+    return Truth(stars, true_map, order_config(3))
+
+
 @kind("noise_corner", *QUOTED, "corner")
 def noise_corner(rng: np.random.Generator, n: int) -> Truth:
     """Errors are five times the quoted ones in one corner, a sixteenth of the detector."""
