@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,18 @@ def breathing(rng: np.random.Generator, n: int, deviations: Scatter) -> Truth:
     """Scale and shears vary from exposure to exposure."""
     true_map = mapped(fields.distortion(rng))
     return campaign(rng, n, true_map, exposures=16, deviations=deviations)
+
+
+@kind("breathing_new_exposure", *OF_EXPOSURES, n=3000)
+def breathing_new(rng: np.random.Generator, n: int) -> Truth:
+    """Scale and shears vary, and the positions are those in an exposure that is yet to come."""
+    truth = breathing(rng, n, normal_deviations)
+    own = normal_deviations(rng, 1)
+
+    def true_map(x: np.ndarray, y: np.ndarray, epoch: Any = None) -> np.ndarray:
+        return deviating(truth.true_map(x, y, epoch), own)
+
+    return replace(truth, true_map=true_map)
 
 
 @kind("drift_two_dates", *OF_EXPOSURES, *OF_TIME, n=3000)
