@@ -14,11 +14,13 @@ MOST_FALSE_MET = 0.05  # of verdicts on limits that the actual error exceeds, ov
 WITHIN_68 = (0.60, 0.85)
 LEAST_WITHIN_95 = 0.90
 LEAST_EXCUSED = 0.9  # of the runs of a kind: undecided with a right reason
-LEAST_MET = 0.8  # inside the family, of limits 1.6 times the actual p95
+# Inside the family, of limits 1.6 times the actual p95 that exact errors would let be called met:
+# 45 to 90 % of all, as the actual p95 is often well below its 95 % quantile.
+LEAST_MET = 0.8
 WIDTH = 1.3  # inside the family: stated over actual rms, or the inverse
 
 HEAD = (
-    "| kind | runs | rms error/stated | cover 68/95 % | false met (0.9) | met at 1.6 | undecided "
+    "| kind | runs | rms error/stated | cover 68/95 % | false met (0.9) | met at 1.6, of attainable | undecided "
     "| warned | reason right |\n|---|---|---|---|---|---|---|---|---|"
 )
 
@@ -37,8 +39,9 @@ class Row:
         Fractions of positions and axes whose error is within the stated intervals.
     false_met : float
         Fraction of verdicts 'met' on limits that are 0.9 times the actual p95 or max.
-    met : float
-        Fraction of verdicts 'met' on limits that are 1.6 times the actual p95.
+    met, attainable : float
+        Fraction of verdicts 'met' on limits that are 1.6 times the actual p95, and what it is on
+        the mean where stated errors are exact.
     undecided : float
         Fraction of all verdicts.
     warned : float
@@ -56,6 +59,7 @@ class Row:
     within_95: float
     false_met: float
     met: float
+    attainable: float
     undecided: float
     warned: float
     right: float
@@ -80,7 +84,7 @@ class Row:
     @property
     def decides(self) -> bool:
         """Inside the family: whether what is clearly met is called met."""
-        return not self.inside or self.met >= LEAST_MET
+        return not self.inside or self.met >= LEAST_MET * self.attainable
 
     @property
     def of_right_width(self) -> bool:
@@ -108,6 +112,7 @@ def row_of(kind: str, runs: Sequence[dict[str, Any]]) -> Row:
         mean(r["within_95"] for r in runs),
         mean(v == "met" for r in runs for v in verdicts(r, "below")),
         mean(v == "met" for r in runs for v in verdicts(r, "above")),
+        mean(m["attainable"] for r in runs for m in r["margins"] if m["name"] == "above p95"),
         mean(v == "undecided" for r in runs for v in verdicts(r, "")),
         mean(bool(r["warnings"]) for r in runs),
         mean(r["right_reason"] for r in runs),
@@ -145,7 +150,7 @@ def _line(row: Row, *, over_all: bool = False) -> str:
                 "" if over_all else cell(f"{row.ratio:.2f}", row.of_right_width),
                 cell(f"{row.within_68:.2f} / {row.within_95:.2f}", over_all or row.honest),
                 cell(f"{row.false_met:.2f}", row.false_met <= MOST_FALSE_MET),
-                cell(f"{row.met:.2f}", row.decides),
+                cell(f"{row.met:.2f} of {row.attainable:.2f}", row.decides),
                 f"{row.undecided:.2f}",
                 f"{row.warned:.2f}",
                 "" if wordless else f"{row.right:.2f}",

@@ -19,9 +19,10 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import rehearse, run_stage
-from bayesdist.assess import Requirement
+from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.verdict import clopper_pearson
 
 from .fields import SIDE
 from .truth import KINDS, Truth
@@ -102,6 +103,20 @@ def stated_sigma(session: Session) -> np.ndarray:
     return np.column_stack([chip.total_u.ravel(), chip.total_v.ravel()])
 
 
+def attainable(margin: Margin, factor: float) -> float:
+    """How often a limit of so many times the actual statistic is called met, if errors are exact.
+
+    The actual statistic is then one of the margin's draws: some are far below what is met with the
+    probability asked for, and no honest verdict on so small a limit is 'met'.
+    """
+    asked, draws = margin.requirement.probability, np.sort(margin.draws)
+    fractions = np.linspace(asked, 1.0, 501)
+    lower = np.array([clopper_pearson(f, margin.n_effective)[0] for f in fractions])
+    enough = fractions[lower >= asked]
+    at_or_under = np.searchsorted(draws, factor * draws, side="right") / draws.size
+    return float(np.mean(at_or_under >= enough[0])) if enough.size else 0.0
+
+
 def judged(session: Session, error: np.ndarray) -> list[dict[str, Any]]:
     """Verdicts on requirements whose limits are a little under and over the actual error's."""
     requirements = tuple(
@@ -114,10 +129,11 @@ def judged(session: Session, error: np.ndarray) -> list[dict[str, Any]]:
             "limit": m.requirement.limit,
             "value": m.value,
             "probability_met": m.probability_met,
+            "attainable": attainable(m, factor),
             "verdict": m.verdict,
             "reason": m.reason,
         }
-        for m in margins_of(session, requirements)
+        for m, (_, _, factor) in zip(margins_of(session, requirements), ASKED, strict=True)
     ]
 
 
@@ -129,7 +145,8 @@ def measured(name: str, seed: int, n: int | None = None) -> dict[str, Any]:
     dict
         kind, seed, n; rms_error, rms_stated (pixels, over grid and axes), within_68, within_95
         (fractions of positions and axes whose error is less than 1 and 1.96 stated sigmas), p95,
-        max (of the actual radial error), margins (one dict for each of `ASKED`), warnings,
+        max (of the actual radial error), margins (one dict for each of `ASKED`, with
+        the fraction of 'met' that is `attainable` at such a limit), warnings,
         right_reason (whether a reason or a warning names the kind's cause), converged, seconds.
     """
     one = KINDS[name]

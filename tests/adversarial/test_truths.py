@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bayesdist.app.config import parse_config
+from bayesdist.assess import Requirement
+from bayesdist.assess.verdict import verdict_of
 
 from . import KINDS
 from .fields import SIDE, distortion, even_pixels, of_rms, smooth, tree_rings
 from .goals import row_of, rows_of, table_of
-from .measure import configuration, names_cause, toml_text
+from .measure import attainable, configuration, names_cause, toml_text
 from .truth import Truth
 
 
@@ -73,7 +77,9 @@ def test_a_field_has_the_rms_that_is_asked_for(rng):
 def run(kind: str, verdicts: tuple[str, str, str], *, right: bool = False, **numbers) -> dict:
     names = ("below p95", "above p95", "below max")
     known = {"rms_error": 1.0, "rms_stated": 1.0, "within_68": 0.7, "within_95": 0.95}
-    margins = [{"name": n, "verdict": v} for n, v in zip(names, verdicts, strict=True)]
+    margins = [
+        {"name": n, "verdict": v, "attainable": 0.7} for n, v in zip(names, verdicts, strict=True)
+    ]
     given = {"kind": kind, "seed": 0, "margins": margins, "warnings": [], "right_reason": right}
     return given | known | numbers
 
@@ -97,6 +103,18 @@ def test_what_does_not_cover_is_excused_by_the_right_reason_only():
     assert row.honest
     (row,) = rows_of([run("smooth_100", ("missed", "met", "missed"), right=True, **outside)])
     assert not row.honest
+
+
+@pytest.mark.parametrize("factor", [1.6, 2.2])
+def test_attainable_is_how_often_exact_errors_let_a_limit_be_met(rng, factor):
+    draws = rng.gamma(20, 1, 4000)
+    requirement = Requirement("a", "p95", 1.0)
+    margin = SimpleNamespace(requirement=requirement, draws=draws, n_effective=1000.0)
+    met = 0
+    for actual in rng.gamma(20, 1, 500):
+        fraction = np.mean(draws <= factor * actual)
+        met += verdict_of(fraction, 1000.0, 0.95)[0] == "met"
+    assert attainable(margin, factor) == pytest.approx(met / 500, abs=0.06)
 
 
 def test_words_are_found_in_any_case():
