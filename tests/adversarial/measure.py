@@ -1,0 +1,183 @@
+"""One truth carried through a run, and what the run claims of its positions."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.config import load_config
+from bayesdist.app.judging import budget_of, margins_of
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.session import Session
+from bayesdist.app.sessions import session_of
+from bayesdist.app.stages import rehearse, run_stage
+from bayesdist.assess import Margin, Requirement
+from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.verdict import clopper_pearson
+
+from .fields import SIDE
+from .truth import KINDS, Truth
+
+GRID, DRAWS = (17, 17), 2000
+STAGES = ("fit", "sample", "assess")
+# name, statistic, limit in units of what the actual error has
+ASKED = (("below p95", "p95", 0.9), ("above p95", "p95", 1.6), ("below max", "max", 0.9))
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "data": {"matches": "stars.parquet", "unit": "pix"},
+    "detector": {"name": "A", "size": [SIDE, SIDE]},
+    "sampler": {"target_ess": 400},
+    "assess": {"grid": list(GRID), "draws": DRAWS},
+}
+
+
+def toml_text(config: Mapping[str, Any]) -> str:
+    """A configuration of blocks, and of lists of blocks, as TOML."""
+    lines: list[str] = []
+    for name, block in config.items():
+        for one in block if isinstance(block, list) else [block]:
+            lines.append(f"[[{name}]]" if isinstance(block, list) else f"[{name}]")
+            inner = {k: v for k, v in one.items() if isinstance(v, dict)}
+            lines += [f"{k} = {json.dumps(v)}" for k, v in one.items() if k not in inner]
+            lines += [toml_text({f"{name}.{k}": v}) for k, v in inner.items()]
+    return "\n".join(lines)
+
+
+def configuration(truth: Truth, seed: int) -> dict[str, Any]:
+    """What a user writes for these stars, by block."""
+    config = {name: dict(block) for name, block in DEFAULTS.items()}
+    config["sampler"]["seed"] = seed + 1
+    if truth.epoch is not None:
+        config["assess"]["epoch"] = truth.epoch
+    for name, block in truth.config.items():
+        config[name] = config.get(name, {}) | block if isinstance(block, dict) else block
+    return config
+
+
+def assessed(truth: Truth, folder: Path, seed: int) -> Session:
+    """A session of a run of these stars, its assessment made."""
+    Table(truth.stars).write(folder / "stars.parquet")
+    (folder / "config.toml").write_text(toml_text(configuration(truth, seed)))
+    settings, text = load_config(folder / "config.toml")
+    directory = RunDirectory.plan(folder / "run", settings, text, folder)
+    session = session_of(directory)
+    rehearse(session)
+    directory.begin()
+    session.begun()
+    for stage in STAGES:
+        run_stage(session, stage)
+    return session
+
+
+def actual_error(session: Session, truth: Truth, rng: np.random.Generator) -> np.ndarray:
+    """Predicted less true positions (ny * nx, 2) over the grid of the assessment.
+
+    Of a model with frames a position is one in an exposure chosen at random among those whose
+    frames were fitted, along the axes of the polynomials, as the budget has it.  It is compared
+    with the map that all exposures have in common, seen as that exposure points.
+    """
+    solution = session.solution
+    model, mean = solution.model, np.asarray(solution.mean)
+    x, y = mesh(*grid_pixels(model.chips[0].size, session.config.assess.grid))
+    epoch = session.epoch
+    when: dict[str, Any] = {"epoch": None if epoch is None else np.full(x.size, epoch)}
+    true = truth.true_map(x, y, epoch)
+    if model.frames == "none":
+        return np.asarray(model.predict(mean, x, y, **when)) - true
+    code = int(rng.integers(1, len(model.exposures)))
+    seen = model.predict(mean, x, y, exposure=np.full(x.size, code), **when)
+    return truth.frames[model.exposures[code]].undone(np.asarray(seen)) - true
+
+
+def stated_sigma(session: Session) -> np.ndarray:
+    """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid."""
+    (chip,) = budget_of(session).chips
+    return np.column_stack([chip.total_u.ravel(), chip.total_v.ravel()])
+
+
+def attainable(margin: Margin, factor: float) -> float:
+    """How often a limit of so many times the actual statistic is called met, if errors are exact.
+
+    The actual statistic is then one of the margin's draws: some are far below what is met with the
+    probability asked for, and no honest verdict on so small a limit is 'met'.
+    """
+    asked, draws = margin.requirement.probability, np.sort(margin.draws)
+    fractions = np.linspace(asked, 1.0, 501)
+    lower = np.array([clopper_pearson(f, margin.n_effective)[0] for f in fractions])
+    enough = fractions[lower >= asked]
+    at_or_under = np.searchsorted(draws, factor * draws, side="right") / draws.size
+    return float(np.mean(at_or_under >= enough[0])) if enough.size else 0.0
+
+
+def judged(session: Session, error: np.ndarray) -> list[dict[str, Any]]:
+    """Verdicts on requirements whose limits are a little under and over the actual error's."""
+    requirements = tuple(
+        Requirement(name, statistic, factor * float(field_statistic(statistic, error)))
+        for name, statistic, factor in ASKED
+    )
+    return [
+        {
+            "name": m.requirement.name,
+            "limit": m.requirement.limit,
+            "value": m.value,
+            "probability_met": m.probability_met,
+            "attainable": attainable(m, factor),
+            "verdict": m.verdict,
+            "reason": m.reason,
+        }
+        for m, (_, _, factor) in zip(margins_of(session, requirements), ASKED, strict=True)
+    ]
+
+
+def measured(name: str, seed: int, n: int | None = None) -> dict[str, Any]:
+    """What became of one truth of a kind: numbers and texts that JSON holds.
+
+    Returns
+    -------
+    dict
+        kind, seed, n; rms_error, rms_stated (pixels, over grid and axes), within_68, within_95
+        (fractions of positions and axes whose error is less than 1 and 1.96 stated sigmas), p95,
+        max (of the actual radial error), margins (one dict for each of `ASKED`, with
+        the fraction of 'met' that is `attainable` at such a limit), warnings,
+        right_reason (whether a reason or a warning names the kind's cause), converged, seconds.
+    """
+    one = KINDS[name]
+    truth = one.truth(seed, n)
+    began = time.perf_counter()
+    with TemporaryDirectory() as folder, closing(assessed(truth, Path(folder), seed)) as session:
+        error = actual_error(session, truth, np.random.default_rng([7, seed]))
+        stated = stated_sigma(session)
+        margins = judged(session, error)
+        warnings = list(session.run.summary["warnings"])
+        converged = bool(session.posterior.convergence.converged)
+    pull = np.abs(error) / stated
+    return {
+        "kind": name,
+        "seed": seed,
+        "n": truth.stars["x"].size,
+        "rms_error": float(np.sqrt(np.mean(error**2))),
+        "rms_stated": float(np.sqrt(np.mean(stated**2))),
+        "within_68": float(np.mean(pull < 1.0)),
+        "within_95": float(np.mean(pull < 1.96)),
+        "p95": float(field_statistic("p95", error)),
+        "max": float(field_statistic("max", error)),
+        "margins": margins,
+        "warnings": warnings,
+        "right_reason": names_cause(one.words, [*(m["reason"] for m in margins), *warnings]),
+        "converged": converged,
+        "seconds": time.perf_counter() - began,
+    }
+
+
+def names_cause(words: Iterable[str], texts: Iterable[str]) -> bool:
+    """Whether one of the words stands in one of the texts, in any case of letters."""
+    said = " ".join(texts).lower()
+    return any(word in said for word in words)
