@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from bayesdist.app.holdout import held_out_of
+from bayesdist.app.caveats import caveats_of, rests_on
 from bayesdist.app.horizon import horizons_of
 from bayesdist.app.product_terms import product_terms
 from bayesdist.app.session import Session
@@ -120,15 +120,7 @@ def margins_of(
     n_draws: int | None = None,
 ) -> tuple[Margin, ...]:
     """Margins of a solution, as in `budget_of`; as many draws as configured by default."""
-    doubt, enlarging = "", False
-    if n_draws is None:
-        doubt = session.majority
-        if not doubt:
-            doubt = _unaccounted(session)
-            enlarging = bool(doubt)
-        held = held_out_of(session)
-        if held is not None and held.doubtful:
-            doubt, enlarging = doubt or held.verdict, False
+    caveats = caveats_of(session) if n_draws is None else ()
     centroid = None
     if any(r.magnitude is not None for r in requirements):
         if n_draws is None:
@@ -137,21 +129,16 @@ def margins_of(
             requirements = tuple(_of_any_star(session, r) for r in requirements)
     margins = check_requirements(
         requirements=requirements,
-        doubt=doubt,
-        enlarging=enlarging,
+        caveats=caveats,
         centroid=centroid,
         **_assessment(session, solution, n_draws),
     )
-    if n_draws is not None or (doubt and not enlarging):
+    if n_draws is not None:
         return margins
-    return tuple(_where_stars_are(session, margin) for margin in margins)
-
-
-def _unaccounted(session: Session) -> str:
-    """Structure in the residuals that no error stands for; empty where there is none."""
-    if not session.misfit.significant or session.discrepancy is not None:
-        return ""
-    return session.misfit.sentence
+    return tuple(
+        replace(_where_stars_are(session, margin), rests_on=rests_on(session, margin.epoch))
+        for margin in margins
+    )
 
 
 def _of_any_star(session: Session, requirement: Requirement) -> Requirement:

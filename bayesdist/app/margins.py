@@ -39,6 +39,7 @@ def margin_rows(margins: tuple[Margin, ...]) -> list[dict[str, Any]]:
             "mc_error": m.mc_error,
             "verdict": m.verdict,
             "reason": m.reason,
+            "rests_on": list(m.rests_on),
             "worst": {"chip": m.worst.chip, "x": m.worst.x, "y": m.worst.y, "rms": m.worst.rms},
             "remedy": None if m.remedy is None else m.remedy.sentence,
         }
@@ -52,10 +53,11 @@ def write_margins(session: Session, margins: tuple[Margin, ...]) -> None:
     several = len(session.posterior.model.chips) > 1
     columns: dict[str, list[Any]] = {}
     for m, row in zip(margins, rows, strict=True):
-        flat = {k: v for k, v in row.items() if k not in ("interval", "worst", *SCOPE)}
+        flat = {k: v for k, v in row.items() if k not in ("interval", "worst", "rests_on", *SCOPE)}
         flat["epoch"] = np.nan if flat["epoch"] is None else flat["epoch"]
         flat["chip"] = "all" if flat["chip"] is None else str(flat["chip"])
         flat["remedy"] = flat["remedy"] or ""
+        flat["rests_on"] = "; ".join(row["rests_on"])
         flat |= {"scope": m.requirement.scope, "lo95": m.interval[0], "hi95": m.interval[1]}
         flat |= {f"worst_{key}": value for key, value in row["worst"].items()}
         if not several:

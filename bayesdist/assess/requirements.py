@@ -16,7 +16,7 @@ from bayesdist.assess.requirement import Requirement
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms import LocalTerm, UserTerm
 from bayesdist.assess.units import convert, pixel_scale_of
-from bayesdist.assess.verdict import counting_error, effective_draws, verdict_of
+from bayesdist.assess.verdict import Caveat, counting_error, effective_draws, verdict_of
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
@@ -60,6 +60,8 @@ class Margin:
         The statistic of every draw; over a range of epochs the largest.
     worst : Place
         Where the error is largest, at that epoch; its size in `unit`.
+    rests_on : tuple of str
+        What the verdict takes for granted or has measured, as clauses.
     remedy : Remedy or None
         The term that would have to shrink, and how far, for the requirement to be met; None where
         it is met, and where there is doubt about all numbers.
@@ -79,6 +81,7 @@ class Margin:
     draws: Float
     worst: Place
     remedy: Remedy | None = None
+    rests_on: tuple[str, ...] = ()
 
     @property
     def percent(self) -> float:
@@ -102,8 +105,7 @@ def check_requirements(
     rng: np.random.Generator,
     pixel_scale: float | None = None,
     converged: bool | None = None,
-    doubt: str = "",
-    enlarging: bool = False,
+    caveats: Sequence[Caveat] = (),
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws of the position error.
 
@@ -148,11 +150,8 @@ def check_requirements(
     converged : bool, optional
         Whether the posterior may be trusted; by default what its convergence says.  If not, every
         verdict is 'undecided'.
-    doubt : str
-        Any other reason why no verdict can be given: every one is then 'undecided', but for what
-        `enlarging` allows.
-    enlarging : bool
-        Whether errors can only be larger for that reason: what is missed is then missed for sure.
+    caveats : sequence of Caveat
+        Other reasons why the errors may not be as stated.
 
     Returns
     -------
@@ -202,14 +201,13 @@ def check_requirements(
                 error.cause, where=f"{owner.where}, {error.where}", do=error.do
             ) from None
 
-    unconverged = _doubt(solution, converged)
-    doubt, enlarging = unconverged or doubt, enlarging and not unconverged
+    caveats = (*_not_converged(solution, converged), *caveats)
     n_effective = effective_draws(solution, n_draws)
     margins = []
     for r, case in zip(requirements, cases, strict=True):
         factor = convert(1.0, unit, r.unit, pixel_scale)
         draws = [factor * found[judged][r.statistic] for judged in case]
-        margins.append(_margin(r, case, draws, errors, factor, n_effective, doubt, enlarging))
+        margins.append(_margin(r, case, draws, errors, factor, n_effective, caveats))
     return tuple(margins)
 
 
@@ -286,15 +284,16 @@ def _chips_of(
     return (place_of(model, epoch=epoch, chip=number).chip,)
 
 
-def _doubt(solution: Solution, converged: bool | None) -> str:
-    """Why no verdict can be given; '' where the draws can be trusted."""
+def _not_converged(solution: Solution, converged: bool | None) -> tuple[Caveat, ...]:
+    """Why draws cannot be trusted, where they cannot."""
     convergence = getattr(solution, "convergence", None)
     if converged is None:
         converged = convergence is None or bool(convergence.converged)
     if converged:
-        return ""
+        return ()
     reasons = "; ".join(getattr(convergence, "reasons", ()))
-    return "the posterior is not converged" + (f": {reasons}" if reasons else "")
+    text = "the posterior is not converged" + (f": {reasons}" if reasons else "")
+    return (Caveat(text, larger=False),)
 
 
 def _margin(
@@ -304,8 +303,7 @@ def _margin(
     errors: PositionErrors,
     factor: float,
     n_effective: float,
-    doubt: str,
-    enlarging: bool,
+    caveats: Sequence[Caveat],
 ) -> Margin:
     asked = requirement.probability
     draws = np.max(by_epoch, axis=0)
@@ -314,11 +312,11 @@ def _margin(
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
     # the empirical quantile without interpolation, so that its side of the limit agrees with `met`
     reached = np.quantile(draws, asked, method="inverted_cdf")
-    verdict, reason = verdict_of(met, n_effective, asked)
+    verdict, reason = verdict_of(met, n_effective, asked, caveats)
     axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""
     place = errors.worst(worst_epoch, axis)
     remedy = None
-    if verdict != "met" and not doubt:
+    if verdict != "met" and not caveats:
         remedy = find_remedy(errors, requirement, worst_epoch, factor)
     return Margin(
         requirement=requirement,
@@ -327,8 +325,8 @@ def _margin(
         margin=float(requirement.limit - reached),
         probability_met=met,
         mc_error=counting_error(met, n_effective),
-        verdict=verdict if not doubt or (enlarging and verdict == "missed") else "undecided",
-        reason=doubt or reason,
+        verdict=verdict,
+        reason=reason,
         unit=requirement.unit,
         epoch=worst_epoch.epoch,
         n_effective=n_effective,

@@ -1,14 +1,16 @@
-"""Whether a probability that was counted from draws is above the one asked for."""
+"""The verdict on a requirement: a probability counted from draws, and what it rests on."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from scipy.stats import beta
 
 from bayesdist.assess.solution import Solution
 
-__all__ = ["VERDICTS", "clopper_pearson", "counting_error", "effective_draws", "verdict_of"]
+__all__ = ["VERDICTS", "Caveat", "clopper_pearson", "counting_error", "effective_draws", "verdict_of"]
 
 VERDICTS = ("met", "missed", "undecided")
 
@@ -75,7 +77,26 @@ def counting_error(fraction: float, n: float) -> float:
     return float(beta.std(k + 0.5, n - k + 0.5))
 
 
-def verdict_of(fraction: float, n: float, asked: float) -> tuple[str, str]:
+@dataclass(frozen=True)
+class Caveat:
+    """Reason why the actual errors may not be as stated.
+
+    Parameters
+    ----------
+    text : str
+        A clause.
+    larger : bool
+        Whether the actual errors can only be larger for it: what is missed all the same is then
+        missed for sure.
+    """
+
+    text: str
+    larger: bool = True
+
+
+def verdict_of(
+    fraction: float, n: float, asked: float, caveats: Sequence[Caveat] = ()
+) -> tuple[str, str]:
     """Verdict on the probability of meeting a limit, and its reason.
 
     Parameters
@@ -86,20 +107,35 @@ def verdict_of(fraction: float, n: float, asked: float) -> tuple[str, str]:
         Effective number of draws.
     asked : float
         The probability asked for.
+    caveats : sequence of Caveat
+        Nothing is met while there is one.
 
     Returns
     -------
     verdict : str
         'met' or 'missed' where the 99 % Clopper-Pearson interval lies wholly above or below the
-        probability asked for, else 'undecided'.
+        probability asked for, else 'undecided'.  With caveats 'missed' where the interval says so
+        and all of them make errors larger, else 'undecided'.
     reason : str
+        What decided, and with caveats what the draws alone point to.
     """
     low, high = clopper_pearson(fraction, n)
     interval = f"the probability is {low:.4g} to {high:.4g} (99 % Monte-Carlo interval)"
     if low >= asked:
-        return "met", f"{interval}, at or above the {asked:g} asked for"
-    if high < asked:
-        return "missed", f"{interval}, below the {asked:g} asked for"
-    return "undecided", (
-        f"{interval}, on both sides of the {asked:g} asked for: {n:.0f} effective draws are too few"
-    )
+        verdict, reason = "met", f"{interval}, at or above the {asked:g} asked for"
+    elif high < asked:
+        verdict, reason = "missed", f"{interval}, below the {asked:g} asked for"
+    else:
+        verdict, reason = "undecided", (
+            f"{interval}, on both sides of the {asked:g} asked for: {n:.0f} effective draws are "
+            "too few"
+        )
+    if not caveats or (verdict == "missed" and all(c.larger for c in caveats)):
+        return verdict, reason
+    texts = "; ".join(c.text for c in caveats)
+    alone = {
+        "met": f"the stated errors alone would meet it ({reason})",
+        "missed": f"the stated errors alone would miss it ({reason})",
+        "undecided": reason,
+    }[verdict]
+    return "undecided", f"{texts}; {alone}"
