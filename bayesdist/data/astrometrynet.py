@@ -26,6 +26,7 @@ COLUMNS = {
     "chip": "",
     "filter": "",
     "mag": "",
+    "colour": "",
     "star": "",
 }
 

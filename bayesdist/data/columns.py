@@ -46,6 +46,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "chip": ("chip", "ccdchip", "ccd_chip"),
     "filter": ("filter", "filt", "filter_name"),
     "mag": ("mag", "magnitude"),
+    "colour": ("colour", "color"),
     "star": ("star",),
 }
 
@@ -223,8 +224,8 @@ def matches_from_table(
     data : astropy Table or mapping of arrays
     columns : mapping of str to str, optional
         Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag
-        star.  What is not named is looked for under its usual names (`ALIASES`), in any case of
-        letters; an empty name leaves a quantity out.  With ra and dec, u and v are the tangent
+        colour star.  What is not named is looked for under its usual names (`ALIASES`), in any case
+        of letters; an empty name leaves a quantity out.  With ra and dec, u and v are the tangent
         plane in arcsec.
     source : str, optional
         File, for errors.
@@ -360,8 +361,9 @@ def match_columns(
             out[key] = _sigma(column(key), out["unit"])
     if "epoch" in found:
         out["epoch"] = column("epoch").years()
-    if "mag" in found:
-        out["mag"] = column("mag").numbers()
+    for key in ("mag", "colour"):
+        if key in found:
+            out[key] = column(key).numbers()
     if "exposure" in found:
         out["exposure"], out["exposure_names"] = column("exposure").labels()
     if "filter" in found:

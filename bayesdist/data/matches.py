@@ -24,7 +24,7 @@ Int = NDArray[np.int64]
 
 _POSITIONS = ("x", "y", "u", "v")
 _SIGMAS = ("sigma_u", "sigma_v")
-_OPTIONAL = ("epoch", "mag")
+_OPTIONAL = ("epoch", "mag", "colour")
 _CODES = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
 _INTEGERS = ("row", "source", "star", *_CODES)
 
@@ -51,6 +51,8 @@ class MatchTable:
         Decimal years.
     mag : ndarray, optional
         Magnitudes; any zero point.
+    colour : ndarray, optional
+        Colour indices, in magnitudes; any zero point.
     exposure, chip, filter : ndarray of int, optional
         Codes into `exposure_names`, `chip_numbers` and `filter_names`.
     exposure_names, filter_names : tuple of str
@@ -88,6 +90,7 @@ class MatchTable:
     unit: str = "pix"
     epoch: Float | None = None
     mag: Float | None = None
+    colour: Float | None = None
     exposure: Int = None  # type: ignore[assignment]
     exposure_names: tuple[str, ...] = ("1",)
     chip: Int = None  # type: ignore[assignment]

@@ -36,7 +36,7 @@ PathLike = str | os.PathLike[str]
 Errors = MagnitudeErrors | tuple[float, float]
 Segment = tuple[int, int, int]  # part, first row, row after the last
 
-_ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "star")
+_ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour", "star")
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["write_partitioned"]
 
-_NUMBERS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag")
+_NUMBERS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour")
 _LABELS = {
     "exposure": ("exposure_names", ("1",)),
     "chip": ("chip_numbers", (1,)),

@@ -24,7 +24,7 @@ def test_usual_names_in_any_case():
     t = Table(
         {"X": [1.0, 2], "Y": [1.0, 2], "U": [3.0, 4], "V": [3.0, 4], "SU": [0.1, 0.2],
          "u_error": [9.0, 9], "sv": [0.3, 0.4], "CCDCHIP": [2, 1], "FRAME": ["b", "a"],
-         "Mag": [1.0, 2], "filter": ["F606W", "F606W"]}
+         "Mag": [1.0, 2], "Color": [0.5, 0.7], "filter": ["F606W", "F606W"]}
     )  # fmt: skip
     m = read(t)
     assert m.sigma_u.tolist() == [0.1, 0.2] and m.sigma_v.tolist() == [0.3, 0.4]
@@ -32,11 +32,13 @@ def test_usual_names_in_any_case():
     # the first exposure defines the gauge, so the order is that of the file
     assert m.exposure_names == ("b", "a") and m.exposure.tolist() == [0, 1]
     assert m.filter_names == ("F606W",) and m.mag.tolist() == [1, 2]
+    assert m.colour.tolist() == [0.5, 0.7]
 
 
 def test_a_mapping_wins_over_usual_names_and_can_leave_out():
-    t = stars(mag=np.arange(6.0), xc=np.arange(6.0) + 0.5)
-    m = read(t, {"x": "xc", "mag": ""})
+    t = stars(mag=np.arange(6.0), xc=np.arange(6.0) + 0.5, colour=np.ones(6), bv=np.arange(6.0))
+    m = read(t, {"x": "xc", "mag": "", "colour": "bv"})
+    assert m.colour.tolist() == [0, 1, 2, 3, 4, 5]
     assert m.x.tolist() == [0.5, 1.5, 2.5, 3.5, 4.5, 5.5] and m.mag is None
 
 

@@ -22,7 +22,7 @@ from bayesdist.data.partitioned import PartPiece
 from bayesdist.data.writing import write_partitioned
 from bayesdist.errors import FormatError, InputError
 
-ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag")
+ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour")
 CODES = ("exposure", "chip", "filter", "row", "source")
 SHARED = (
     "unit", "exposure_names", "chip_numbers", "filter_names", "sources", "n_rows", "rejected",
@@ -93,7 +93,8 @@ def assert_same(path, *, monkeypatch, piece=150, **options):
 
 
 def test_one_file(rng, tmp_path, monkeypatch):
-    path = write(tmp_path / "a.parquet", stars(rng, mag=rng.uniform(10, 20, 500)))
+    columns = {"mag": rng.uniform(10, 20, 500), "colour": rng.uniform(0, 2, 500)}
+    path = write(tmp_path / "a.parquet", stars(rng, **columns))
     assert len(assert_same(path, monkeypatch=monkeypatch).pieces()) == 5
     assert_same(path, monkeypatch=monkeypatch, columns={"mag": ""})
 
@@ -502,6 +503,7 @@ def some_tables(rng):
             **{name: rng.uniform(1, 1000, n) for name in "xyuv"},
             sigma_u=rng.uniform(0.1, 1, n), sigma_v=rng.uniform(0.1, 1, n), unit="mas",
             epoch=rng.uniform(2002, 2014, n), mag=rng.uniform(10, 20, n),
+            colour=rng.uniform(-1, 2, n),
             exposure=rng.integers(3, size=n), exposure_names=("j1", "j2", "é"),
             chip=rng.integers(2, size=n), chip_numbers=(2, 4),
             filter=rng.integers(2, size=n), filter_names=("F606W", ""),

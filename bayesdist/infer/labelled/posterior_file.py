@@ -119,7 +119,7 @@ def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[n
         "outlier_probability": outlier_probability(posterior, matches),
         "row": matches.row,
     }
-    for name in ("epoch", "mag"):
+    for name in ("epoch", "mag", "colour"):
         if getattr(matches, name) is not None:
             columns[name] = getattr(matches, name)
     return xr.Dataset(

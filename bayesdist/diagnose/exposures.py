@@ -1,0 +1,241 @@
+"""Test of linear deviations of single exposures that their frames do not fit.
+
+Every exposure e has a statistic T_e of its own, of the shift, rotation, scale and shears that are
+no parameters of its frame.  Exposures deviate in ways of their own, and their sum is what is
+tested: it does not need the covariance of hundreds of scores.  Through the polynomials, which all
+fit together, the T_e are slightly dependent; mean and variance of the sum are those of a scaled
+chi-square (Satterthwaite 1946).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.linalg import cho_solve
+
+from bayesdist.diagnose.projection import Projection
+from bayesdist.diagnose.result import Outcome, noncentrality
+from bayesdist.diagnose.sample import Block
+from bayesdist.diagnose.score import independent_directions
+from bayesdist.model.frames import frame_names
+
+__all__ = ["exposure_test"]
+
+Float = NDArray[np.float64]
+
+STARS_PER_DIRECTION = 4  # of an exposure that is tested
+INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
+
+_LINEAR = {
+    "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
+    "rotation": np.array([[0.0, -1.0], [1.0, 0.0]]),
+    "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
+    "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Deviations:
+    """One exposure's deviations, all parameters projected out.
+
+    Parameters
+    ----------
+    score : ndarray, shape (n,)
+    information : ndarray, shape (n, n)
+        Beside all parameters.
+    own : ndarray, shape (n, n)
+        Beside those of the exposure alone.
+    cross : ndarray, shape (n, G)
+        With the global parameters.
+    covariance : ndarray, shape (n, n)
+        Of the score, from those of single detections.
+    square : ndarray, shape (n, n)
+        Mean square of the deviations over the detector.
+    """
+
+    score: Float
+    information: Float
+    own: Float
+    cross: Float
+    covariance: Float
+    square: Float
+
+    def along(self, N: Float) -> _Deviations:
+        """Some directions of them."""
+        return _Deviations(
+            N.T @ self.score,
+            N.T @ self.information @ N,
+            N.T @ self.own @ N,
+            N.T @ self.cross,
+            N.T @ self.covariance @ N,
+            N.T @ self.square @ N,
+        )
+
+
+def exposure_test(projection: Projection) -> Outcome | None:
+    """Test of the exposures' own deviations.
+
+    Parameters
+    ----------
+    projection : Projection
+
+    Returns
+    -------
+    Outcome or None
+        None where there is one exposure, where the frames fit all linear terms, and where no two
+        exposures have stars enough.
+    """
+    model = projection.sample.model
+    names = [name for name in frame_names("affine") if name not in frame_names(model.frames)]
+    if not names or len({block.exposure for block in projection.sample.blocks}) < 2:
+        return None
+    found = list(_deviations(projection, names))
+    if len(found) < 2:
+        return None
+    T, n, size2, noise2 = 0.0, 0, 0.0, 0.0
+    inverse = cho_solve(projection.root, np.eye(projection.n_global))
+    together, apart = np.zeros_like(inverse), 0.0
+    for one in found:
+        T += float(one.score @ np.linalg.solve(one.covariance, one.score))
+        n += len(one.score)
+        shared = inverse @ one.cross.T @ np.linalg.solve(one.information, one.cross)
+        together += shared
+        apart += float(np.trace(shared @ shared))
+        back = np.linalg.inv(one.own)
+        step = back @ one.score
+        noise = float(np.trace(one.square @ back @ one.covariance @ back))
+        size2 += (float(step @ one.square @ step) - noise) / len(found)
+        noise2 += noise / len(found)
+    # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
+    stretch = 1.0 + (float(np.trace(together @ together)) - apart) / n
+    dof = n / stretch
+    return Outcome(
+        name="exposures",
+        statistic=T / stretch,
+        dof=dof,
+        dof_residual=None,
+        p_value=float(stats.chi2.sf(T / stretch, dof)),
+        size=float(np.sqrt(max(size2, 0.0))),
+        smallest=partial(_smallest, float(np.sqrt(noise2)), dof),
+        unit=model.unit,
+        remedy=_remedy(model.frames),
+        present="exposures deviate from each other in linear terms that their frames do not fit",
+        absent="no deviations of single exposures are left in the residuals",
+    )
+
+
+def _remedy(frames: str) -> str:
+    hierarchy = "use a campaign, whose exposures have a hierarchy of deviations"
+    return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
+
+
+def _smallest(noise: float, dof: float, level: float) -> float:
+    return float(noise * np.sqrt(noncentrality(level, dof) / dof))
+
+
+def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
+    """Deviations of every exposure with stars enough, along the directions that it has left."""
+    meat = _global_meat(projection)
+    by_exposure: dict[int, list[Block]] = {}
+    for block in projection.sample.blocks:
+        by_exposure.setdefault(block.exposure, []).append(block)
+    for blocks in by_exposure.values():
+        n = sum(int(projection.sample.used[block.rows].sum()) for block in blocks)
+        if n < STARS_PER_DIRECTION * len(names):
+            continue
+        whole, one = _of_exposure(projection, blocks, names, meat)
+        N = independent_directions(whole, one.information, INDEPENDENT)
+        if N.shape[1]:
+            yield one.along(N)
+
+
+def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Float:
+    """What each deviation does to the polynomial of a block, (2, K, n)."""
+    out = np.zeros((*block.effective.shape, len(names)))
+    about = block.effective.copy()
+    about[:, 0] -= origin
+    for k, name in enumerate(names):
+        if name in _LINEAR:
+            out[..., k] = _LINEAR[name] @ about
+        else:
+            out["uv".index(name[-1]), 0, k] = 1.0
+    return out
+
+
+def _of_exposure(
+    projection: Projection, blocks: list[Block], names: list[str], meat: Float
+) -> tuple[Float, _Deviations]:
+    """Information before anything is projected out, and one exposure's deviations."""
+    sample, model, G = projection.sample, projection.sample.model, projection.n_global
+    K, n = model.n_terms, len(names)
+    local = projection.exposures.get(blocks[0].frame_exposure)
+    whole, cross, score = np.zeros((n, n)), np.zeros((n, G)), np.zeros(n)
+    square = np.zeros((n, n))
+    to_local = np.zeros((0 if local is None else len(local.index), n))
+    area = np.array([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in model.basis().terms])
+    fields = [_fields(block, names, model.origin) for block in blocks]
+    parts = [projection.parts(block) for block in blocks]
+    for block, Z, (by_global, by_local) in zip(blocks, fields, parts, strict=True):
+        F = projection.functions.at(sample, block.rows)[:K]
+        WZ = projection.weighted(F, block, Z)
+        whole += np.einsum("akm,akn->mn", Z, WZ)
+        columns = block.columns[: by_global.shape[2]]
+        cross[:, columns] += np.einsum("akn,akm->nm", WZ, by_global)
+        score += np.einsum("akn,ak->n", Z, sample.score[:, block.rows] @ F.T)
+        square += np.einsum("akm,k,akn->mn", Z, area, Z) / len(blocks)
+        if local is not None:
+            at = np.searchsorted(local.index, block.columns[by_global.shape[2] :])
+            to_local[at] += np.einsum("akl,akn->ln", by_local, WZ)
+    own, own_gain = whole, np.zeros((0, n))
+    if local is not None:
+        own_gain = local.inverse @ to_local
+        own = whole - to_local.T @ own_gain
+        cross = cross - to_local.T @ local.gain[:, :G]
+        score = score - own_gain.T @ local.score
+    nuisance = cho_solve(projection.root, cross.T)
+    # stars of the exposure itself, in place of what they say of the parameters alone
+    covariance = nuisance.T @ meat @ nuisance
+    for block, Z, (_, by_local) in zip(blocks, fields, parts, strict=True):
+        F = projection.functions.at(sample, block.rows)[:K]
+        through = projection.reduced(block) @ nuisance
+        direct = Z - through
+        if local is not None:
+            at = np.searchsorted(local.index, block.columns[block.columns >= G])
+            direct -= by_local @ own_gain[at]
+        for sign, coefficients in ((1.0, direct), (-1.0, through)):
+            psi = projection.star_scores(F, block, coefficients)
+            covariance += sign * psi.T @ psi
+    if local is not None:
+        before = local.gain[:, :G] @ nuisance
+        after = own_gain - before
+        P = local.precision[:, None]
+        covariance += after.T @ (P * after) - before.T @ (P * before)
+    information = own - cross @ nuisance
+    return whole, _Deviations(
+        score - nuisance.T @ projection.score[:G],
+        (information + information.T) / 2,
+        (own + own.T) / 2,
+        cross,
+        (covariance + covariance.T) / 2,
+        square,
+    )
+
+
+def _global_meat(projection: Projection) -> Float:
+    """Covariance (G, G) of the scores of the global parameters, from those of single detections."""
+    sample, G = projection.sample, projection.n_global
+    K = sample.model.n_terms
+    out = np.diag(projection.precision[:G])
+    for block in sample.blocks:
+        F = projection.functions.at(sample, block.rows)[:K]
+        psi = projection.star_scores(F, block, projection.reduced(block))
+        out += psi.T @ psi
+    for one in projection.exposures.values():
+        gain = one.gain[:, :G]
+        out += gain.T @ (one.precision[:, None] * gain)
+    return np.asarray(out)

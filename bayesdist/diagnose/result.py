@@ -1,0 +1,156 @@
+"""Results of tests for what a model may lack, and which of many are more than chance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special, stats
+
+__all__ = ["FAMILY_LEVEL", "POWER", "Outcome", "ScoreTest", "corrected", "noncentrality"]
+
+FAMILY_LEVEL = 1e-3  # probability that any of a run's tests finds something where nothing is
+POWER = 0.9  # with which the smallest effect that is told would have been found
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """One thing that a model may lack, and what the data say of it.
+
+    Parameters
+    ----------
+    name : str
+    statistic : float
+        About `dof` on average where the model lacks nothing.
+    dof : float
+        Directions that are tested.
+    dof_residual : float or None
+        Stars beyond them that the noise is known from; None where that is of no concern.
+    p_value : float
+        Probability of as much by chance, of this test by itself.
+    size : float
+        What was found: rms over the detector, of both axes together, without the part of noise; of
+        tests of the noise, the rms difference of its standard deviation along each axis.  0 or
+        more, in `unit`.
+    smallest : float
+        Size that would have been found with probability `POWER`, in all these tests together.
+    unit : str
+        Of u and v.
+    remedy : str
+        What to do about it, as a clause.
+    finding : str
+        What it means, as a sentence.
+    significant : bool
+        More than chance, corrected for the number of tests (Holm 1979, at `FAMILY_LEVEL`).
+    """
+
+    name: str
+    statistic: float
+    dof: float
+    dof_residual: float | None
+    p_value: float
+    size: float
+    smallest: float
+    unit: str
+    remedy: str
+    finding: str
+    significant: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One test by itself, before it is known how many there are.
+
+    Parameters
+    ----------
+    name, statistic, dof, dof_residual, p_value, size, unit, remedy
+        As of `ScoreTest`.
+    smallest : callable
+        Size that is found with probability `POWER`, by the level of the test.
+    present, absent : str
+        Subject and verb of the finding, where there is something and where there is not.
+    """
+
+    name: str
+    statistic: float
+    dof: float
+    dof_residual: float | None
+    p_value: float
+    size: float
+    smallest: Callable[[float], float]
+    unit: str
+    remedy: str
+    present: str
+    absent: str
+
+    def judged(self, significant: bool, level: float) -> ScoreTest:
+        """The test among others, by whether it is significant and by the level of each."""
+        smallest = self.smallest(level)
+        # tails underflow: no probability is zero
+        p = "p < 1e-300" if self.p_value < 1e-300 else f"p = {self.p_value:.1g}"
+        if significant:
+            finding = f"{self.present} ({self.size:.2g} {self.unit} rms, {p})"
+        else:
+            finding = f"{self.absent} ({smallest:.2g} {self.unit} rms would have been found)"
+        return ScoreTest(
+            name=self.name,
+            statistic=self.statistic,
+            dof=self.dof,
+            dof_residual=self.dof_residual,
+            p_value=self.p_value,
+            size=self.size,
+            smallest=smallest,
+            unit=self.unit,
+            remedy=self.remedy,
+            finding=finding,
+            significant=significant,
+        )
+
+
+def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
+    """Tests with their verdicts, corrected for how many there are (Holm 1979).
+
+    Parameters
+    ----------
+    outcomes : sequence of Outcome
+
+    Returns
+    -------
+    tuple of ScoreTest
+        In the same order.
+    """
+    n = len(outcomes)
+    order = np.argsort([one.p_value for one in outcomes], kind="stable")
+    significant: NDArray[np.bool_] = np.zeros(n, bool)
+    for rank, k in enumerate(order):
+        if outcomes[k].p_value > FAMILY_LEVEL / (n - rank):
+            break
+        significant[k] = True
+    # what is alone has to pass the first step
+    return tuple(
+        one.judged(bool(found), FAMILY_LEVEL / n)
+        for one, found in zip(outcomes, significant, strict=True)
+    )
+
+
+def noncentrality(level: float, dof: float, dof_residual: float | None = None) -> float:
+    """Noncentrality at which a chi-square or F test has the power `POWER`.
+
+    Parameters
+    ----------
+    level : float
+        Of the test.
+    dof : float
+    dof_residual : float, optional
+        Of the F test.
+
+    Returns
+    -------
+    float
+    """
+    if dof_residual is None or dof_residual > 1e5:  # where F is no longer told from chi-square
+        return float(special.chndtrinc(stats.chi2.isf(level, dof), dof, 1 - POWER))
+    limit = stats.f.isf(level, dof, dof_residual)
+    return float(special.ncfdtrinc(dof, dof_residual, 1 - POWER, limit))

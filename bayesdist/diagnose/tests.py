@@ -1,0 +1,64 @@
+"""All tests of one solution, corrected for their number."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.exposures import exposure_test
+from bayesdist.diagnose.noise import noise_tests
+from bayesdist.diagnose.projection import projection_of
+from bayesdist.diagnose.regressors import functions_for
+from bayesdist.diagnose.result import ScoreTest, corrected
+from bayesdist.diagnose.sample import scored_sample
+from bayesdist.diagnose.score import regressor_tests
+from bayesdist.diagnose.tails import truncation_test
+from bayesdist.infer.prior import GaussianPriors
+from bayesdist.infer.views import Solution
+
+__all__ = ["score_tests"]
+
+
+def score_tests(
+    table: MatchTable,
+    solution: Solution,
+    *,
+    priors: GaussianPriors | None = None,
+    match_radius: float | None = None,
+) -> tuple[ScoreTest, ...]:
+    """Targeted tests for what a model lacks, and for noise that is not as the errors say.
+
+    A test is left out where the data cannot be asked: without magnitudes or dates, of one exposure,
+    with too few stars.
+
+    Parameters
+    ----------
+    table : MatchTable
+        The matches that the solution was made from, or some of them; of more than `SAMPLE` rows,
+        every k-th is taken, and the tests are as strong as that sample is.
+    solution : Posterior or LinearFit
+    priors : GaussianPriors, optional
+        Those of the solution; flat by default.
+    match_radius : float, optional
+        Within which the stars were matched, in the unit of u and v.
+
+    Returns
+    -------
+    tuple of ScoreTest
+
+    Raises
+    ------
+    InputError
+        When the table does not go with the solution's model, or the solution does not say how it
+        was fitted.
+    """
+    sample = scored_sample(table, solution)
+    projection = projection_of(
+        sample,
+        functions_for(sample),
+        np.asarray(solution.mean, float),
+        priors or GaussianPriors.none(solution.model),
+    )
+    others = (exposure_test(projection), truncation_test(projection, match_radius))
+    found = [*regressor_tests(projection), *noise_tests(projection)]
+    return corrected([*found, *(one for one in others if one is not None)])
