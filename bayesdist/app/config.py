@@ -563,6 +563,11 @@ class Config(Section):
         """Where the work is done."""
         return Compute(**self.compute.model_dump())
 
+    def states(self, *words: str) -> bool:
+        """Whether a [[budget]] row names one of some words in its name or its source."""
+        texts = [f"{row.name} {row.source or ''}".lower() for row in self.budget]
+        return any(word in text for text in texts for word in words)
+
     def user_terms(self) -> tuple[UserTerm, ...]:
         """The user's terms of the error budget that are the same at every place."""
         return tuple(

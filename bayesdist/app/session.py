@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
@@ -18,6 +19,7 @@ from bayesdist.app.holdout import predictive_of_run, split_of
 from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.rvb import RvbInput
+from bayesdist.app.score_tests import keep_score_tests, kept_score_tests
 from bayesdist.app.systematics import Systematics
 from bayesdist.assess import (
     SAMPLE,
@@ -42,6 +44,7 @@ from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.assess.solution import Solution
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.data.holdout import Split
+from bayesdist.diagnose import ScoreTest, score_tests
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -58,7 +61,11 @@ from bayesdist.infer import (
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.model import DistortionModel
 
+Float = NDArray[np.float64]
+
 __all__ = ["ERROR_COLUMNS", "STAGES", "Session", "write_table"]
+
+CATALOGUE_WORDS = ("catalog", "reference")
 
 STAGES = ("match", "fit", "sample", "assess", "export", "report")
 
@@ -260,9 +267,41 @@ class Session:
     def measure(self) -> None:
         """What the assessment estimates beside the posterior, anew."""
         keep_discrepancy(self, self.estimate_discrepancy)
-        rest = ("systematics", "solution", "field_terms", "centroid", "local_terms")
+        keep_score_tests(self.run, self.made_score_tests())
+        rest = ("systematics", "solution", "field_terms", "centroid", "local_terms", "score_tests")
         for name in ("discrepancy", *rest):
             self.__dict__.pop(name, None)
+
+    def made_score_tests(self) -> tuple[ScoreTest, ...]:
+        """Targeted tests of the residuals for what the model lacks."""
+        return score_tests(
+            self.matches.sample(SAMPLE),
+            self.posterior,
+            priors=self.priors,
+            match_radius=self.config.outliers.match_radius,
+        )
+
+    @cached_property
+    def score_tests(self) -> tuple[ScoreTest, ...]:
+        """Those that `assess` has made."""
+        return kept_score_tests(self.run)
+
+    @cached_property
+    def dates(self) -> Float:
+        """Distinct dates of the matches, in decimal years; none where they have none."""
+        raw = self.raw_matches
+        table = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
+        return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
+
+    @property
+    def catalogue_stated(self) -> bool | None:
+        """Whether an error of the reference catalogue is stated; None without a catalogue."""
+        return self.config.states(*CATALOGUE_WORDS)
+
+    @property
+    def motions_stated(self) -> bool | None:
+        """Whether an error of the catalogue's proper motions is; None without a catalogue."""
+        return self.config.states("motion")
 
     @cached_property
     def solution(self) -> Posterior:
@@ -302,7 +341,7 @@ class Session:
     @property
     def doubts(self) -> list[str]:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
-        return []
+        return [f"{t.finding}: {t.remedy}" for t in self.score_tests if t.significant]
 
     @property
     def gauge_words(self) -> str:

@@ -10,7 +10,14 @@ from scipy.stats import beta
 
 from bayesdist.assess.solution import Solution
 
-__all__ = ["VERDICTS", "Caveat", "clopper_pearson", "counting_error", "effective_draws", "verdict_of"]
+__all__ = [
+    "VERDICTS",
+    "Caveat",
+    "clopper_pearson",
+    "counting_error",
+    "effective_draws",
+    "verdict_of",
+]
 
 VERDICTS = ("met", "missed", "undecided")
 
@@ -126,9 +133,12 @@ def verdict_of(
     elif high < asked:
         verdict, reason = "missed", f"{interval}, below the {asked:g} asked for"
     else:
-        verdict, reason = "undecided", (
-            f"{interval}, on both sides of the {asked:g} asked for: {n:.0f} effective draws are "
-            "too few"
+        verdict, reason = (
+            "undecided",
+            (
+                f"{interval}, on both sides of the {asked:g} asked for: {n:.0f} effective draws are "
+                "too few"
+            ),
         )
     if not caveats or (verdict == "missed" and all(c.larger for c in caveats)):
         return verdict, reason

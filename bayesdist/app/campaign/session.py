@@ -268,6 +268,16 @@ class CampaignSession(Session):
         return GaussianPriors(arrays["prior_centre"], arrays["prior_precision"])
 
     @property
+    def catalogue_stated(self) -> bool:
+        """Whether the catalogue has errors of its own, or a row of the budget names it."""
+        return self.inputs.catalog.sigma_u is not None or bool(super().catalogue_stated)
+
+    @property
+    def motions_stated(self) -> bool:
+        """Whether the catalogue has errors of its motions, or a row of the budget names them."""
+        return self.inputs.catalog.sigma_pm_u is not None or bool(super().motions_stated)
+
+    @property
     def doubts(self) -> list[str]:
         """What the stages found odd, and what the campaign cannot tell."""
         found = self.run.summary

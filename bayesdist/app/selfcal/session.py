@@ -336,7 +336,10 @@ class SelfcalSession(Session):
 
     def measure(self) -> None:
         """Nothing beside the posterior: stars that are free take up what detections share."""
-        self.run.summarise(discrepancy=None)
+        self.run.summarise(discrepancy=None, score_tests=None)
+
+    catalogue_stated = None
+    motions_stated = None
 
     @property
     def relative(self) -> Assessed:

@@ -30,6 +30,7 @@ __all__ = ["estimate_discrepancy"]
 Float = NDArray[np.float64]
 
 DRAWS = 2000
+POINTS = 12  # on each axis
 
 
 # a second BLAS thread gains little here and loses much on a machine that has other work
@@ -145,6 +146,7 @@ def _structures(
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
         S, crossed, taken, score = _along_axes(information, working, functions, code)
         waves = functions.finer_waves(rng)
+        here = ChipStructure(functions, waves, np.empty(0)).evaluate(*_even_points())
         coefficients = []
         for a in (0, 1):
             through = information.covariance @ crossed[a]
@@ -166,12 +168,19 @@ def _structures(
                     "axis": "uv"[a],
                     "field_rms": posterior.field_rms,
                     "length_pix": posterior.length * max(chip.size) / 2,
-                    "rms": float(np.sqrt(np.mean((drawn**2).sum(axis=1)))),
-                    "seen": float(np.sqrt((drawn.mean(axis=0) ** 2).sum())),
+                    "rms": float(np.sqrt(np.mean((drawn @ here.T) ** 2))),
+                    "seen": float(np.sqrt(np.mean((here @ drawn.mean(axis=0)) ** 2))),
                 }
             )
         out[chip.number] = ChipStructure(functions, waves, np.stack(coefficients, axis=1))
     return out, theta, {"structure": rows}
+
+
+def _even_points() -> tuple[Float, Float]:
+    """Scaled positions over which sizes are averaged."""
+    line = (np.arange(POINTS) + 0.5) * 2 / POINTS - 1
+    X, Y = np.meshgrid(line, line)
+    return X.ravel(), Y.ravel()
 
 
 def _star_error(information: Information, chip: int, axis: int) -> float:
