@@ -18,7 +18,7 @@ from bayesdist.infer.discrepancy.noise import score_excess
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_star_errors
-from bayesdist.infer.discrepancy.structure import AxisStructure, axis_structure
+from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.robust.scores import scores_of
 from bayesdist.infer.settling import Settling
@@ -147,32 +147,28 @@ def _structures(
         S, crossed, taken, score = _along_axes(information, working, functions, code)
         waves = functions.finer_waves(rng)
         here = ChipStructure(functions, waves, np.empty(0)).evaluate(*_even_points())
-        coefficients = []
+        posterior = chip_structure(
+            functions,
+            [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)],
+            [score[a] - crossed[a].T @ shift for a in (0, 1)],
+            noise=_star_error(information, code),
+            higher_order=priors.higher_order * pixel,
+            structure=priors.structure * pixel,
+        )
+        drawn = posterior.draws(n, rng)
         for a in (0, 1):
-            through = information.covariance @ crossed[a]
-            posterior: AxisStructure = axis_structure(
-                functions,
-                S[a] - crossed[a].T @ through,
-                score[a] - crossed[a].T @ shift,
-                noise=_star_error(information, code, a),
-                higher_order=priors.higher_order * pixel,
-                structure=priors.structure * pixel,
-            )
-            drawn = posterior.draws(n, rng)
-            coefficients.append(drawn)
             # the fit takes structure for polynomials; the truth lies on the other side
-            theta -= drawn[:, : functions.n_known] @ (working.covariance @ taken[a]).T
+            theta -= drawn[:, a, : functions.n_known] @ (working.covariance @ taken[a]).T
             rows.append(
                 {
                     "chip": chip.number,
                     "axis": "uv"[a],
-                    "field_rms": posterior.field_rms,
+                    "rms": float(np.sqrt(np.mean((drawn[:, a] @ here.T) ** 2))),
+                    "seen": float(np.sqrt(np.mean((here @ drawn[:, a].mean(axis=0)) ** 2))),
                     "length_pix": posterior.length * max(chip.size) / 2,
-                    "rms": float(np.sqrt(np.mean((drawn @ here.T) ** 2))),
-                    "seen": float(np.sqrt(np.mean((here @ drawn.mean(axis=0)) ** 2))),
                 }
             )
-        out[chip.number] = ChipStructure(functions, waves, np.stack(coefficients, axis=1))
+        out[chip.number] = ChipStructure(functions, waves, drawn)
     return out, theta, {"structure": rows}
 
 
@@ -183,11 +179,11 @@ def _even_points() -> tuple[Float, Float]:
     return X.ravel(), Y.ravel()
 
 
-def _star_error(information: Information, chip: int, axis: int) -> float:
-    """Error of a typical star."""
+def _star_error(information: Information, chip: int) -> float:
+    """Error of a typical star on an axis."""
     rows = information.sums.groups.chip == chip
-    n, h = information.sums.sums[rows][:, :, [0, (3, 5)[axis]]].sum(axis=(0, 1))
-    return float(np.sqrt(n / h)) if h > 0 else 1.0
+    n, uu, vv = information.sums.sums[rows][:, :, [0, 3, 5]].sum(axis=(0, 1))
+    return float(np.sqrt(2 * n / (uu + vv))) if uu + vv > 0 else 1.0
 
 
 def _along_axes(
