@@ -54,7 +54,7 @@ class DiscrepancyPriors:
     higher_order: float = 3e-4
     structure: float = 1.5e-4
     exposure: float = 3e-6
-    curvature: float = 3e-7
+    curvature: float = 5e-8
     star: float = 1e-3
 
     def __post_init__(self) -> None:

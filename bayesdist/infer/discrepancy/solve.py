@@ -17,7 +17,7 @@ from bayesdist.infer.discrepancy.linear import linear_deviations
 from bayesdist.infer.discrepancy.noise import score_excess
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
-from bayesdist.infer.discrepancy.shared_stars import shared_star_errors
+from bayesdist.infer.discrepancy.shared_stars import shared_stars
 from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.robust.scores import scores_of
@@ -86,16 +86,19 @@ def estimate_discrepancy(
     with opened(model, matches, compute) as shards:
         sums: CellSums = shards.sum(cell_sums, scores, cells_per_side(len(shards.groups)))
     working = Information(model, scores.theta, sums, parameter_priors or GaussianPriors.none(model))
-    information = working.with_excess(score_excess(working))
     pixel = model.pixel_size(scores.theta)
+    repeated = None
+    if stars is not None and stars.star is not None:
+        repeated = shared_stars(stars, scores, model, priors.star * pixel)
+    excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
+    information = working.with_excess(excess)
     chips = range(len(model.chips)) if structure else ()
     found, theta, facts = _structures(information, working, chips, priors, pixel, n_draws, rng)
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
     formal, noise = working.covariance, working.sandwich()
-    if stars is not None and stars.star is not None:
-        extra, rms = shared_star_errors(stars, scores, formal, model, priors.star * pixel)
-        noise = noise + extra
-        facts["star_rms"] = rms
+    if repeated is not None:
+        noise = noise + repeated.covariance(model, scores.theta, formal)
+        facts["star_rms"] = repeated.rms
     noise, ratio = _not_narrower(noise, formal)
     if settling is not None:
         formal, noise = (settling.mean(settling.mean(c).T).T for c in (formal, noise))

@@ -171,9 +171,7 @@ def chip_structure(
     """
     T = functions.n_terms
     scale = functions.decline()
-    resolved = min(
-        1 / np.sqrt(max(float(np.median(np.diag(S)[:T])), 1e-300)) for S in information
-    )
+    resolved = min(1 / np.sqrt(max(float(np.median(np.diag(S)[:T])), 1e-300)) for S in information)
     low = 0.2 * min(higher_order, structure, resolved)
     high = max(3 * noise, 10 * structure)
     amplitudes = np.geomspace(low, 3 * high, TERM_STEPS)
