@@ -19,9 +19,9 @@ from scipy import stats
 from scipy.linalg import cho_solve
 
 from bayesdist.diagnose.projection import Projection
-from bayesdist.diagnose.result import Outcome, noncentrality
+from bayesdist.diagnose.result import Outcome
 from bayesdist.diagnose.sample import Block
-from bayesdist.diagnose.score import independent_directions
+from bayesdist.diagnose.score import independent_directions, smallest_pattern
 from bayesdist.model.frames import frame_names
 
 __all__ = ["exposure_test"]
@@ -29,6 +29,7 @@ __all__ = ["exposure_test"]
 Float = NDArray[np.float64]
 
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
+MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
 
 _LINEAR = {
@@ -98,21 +99,23 @@ def exposure_test(projection: Projection) -> Outcome | None:
     if len(found) < 2:
         return None
     T, n, size2, noise2 = 0.0, 0, 0.0, 0.0
-    inverse = cho_solve(projection.root, np.eye(projection.n_global))
-    together, apart = np.zeros_like(inverse), 0.0
+    shared, apart = np.zeros((projection.n_global, projection.n_global)), 0.0
     for one in found:
         T += float(one.score @ np.linalg.solve(one.covariance, one.score))
         n += len(one.score)
-        shared = inverse @ one.cross.T @ np.linalg.solve(one.information, one.cross)
-        together += shared
-        apart += float(np.trace(shared @ shared))
+        shared += one.cross.T @ np.linalg.solve(one.information, one.cross)
+        alone = np.linalg.solve(
+            one.information, one.cross @ cho_solve(projection.root, one.cross.T)
+        )
+        apart += float(np.trace(alone @ alone))
         back = np.linalg.inv(one.own)
         step = back @ one.score
         noise = float(np.trace(one.square @ back @ one.covariance @ back))
         size2 += (float(step @ one.square @ step) - noise) / len(found)
         noise2 += noise / len(found)
+    together = cho_solve(projection.root, shared)
     # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
-    stretch = 1.0 + (float(np.trace(together @ together)) - apart) / n
+    stretch = 1.0 + (float((together * together.T).sum()) - apart) / n
     dof = n / stretch
     return Outcome(
         name="exposures",
@@ -121,7 +124,7 @@ def exposure_test(projection: Projection) -> Outcome | None:
         dof_residual=None,
         p_value=float(stats.chi2.sf(T / stretch, dof)),
         size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(_smallest, float(np.sqrt(noise2)), dof),
+        smallest=partial(smallest_pattern, float(np.sqrt(noise2)), dof, None),
         unit=model.unit,
         remedy=_remedy(model.frames),
         present="exposures deviate from each other in linear terms that their frames do not fit",
@@ -134,13 +137,10 @@ def _remedy(frames: str) -> str:
     return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
 
 
-def _smallest(noise: float, dof: float, level: float) -> float:
-    return float(noise * np.sqrt(noncentrality(level, dof) / dof))
-
-
 def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
     """Deviations of every exposure with stars enough, along the directions that it has left."""
-    meat = _global_meat(projection)
+    G = projection.n_global
+    meat = _global_meat(projection) if len(projection.sample) * G**2 < MOST_PRODUCTS else None
     by_exposure: dict[int, list[Block]] = {}
     for block in projection.sample.blocks:
         by_exposure.setdefault(block.exposure, []).append(block)
@@ -168,11 +168,15 @@ def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Floa
 
 
 def _of_exposure(
-    projection: Projection, blocks: list[Block], names: list[str], meat: Float
+    projection: Projection, blocks: list[Block], names: list[str], meat: Float | None
 ) -> tuple[Float, _Deviations]:
-    """Information before anything is projected out, and one exposure's deviations."""
+    """Information before anything is projected out, and one exposure's deviations.
+
+    Without the covariance `meat` of the global parameters' scores, that of other exposures is taken
+    to be as wrong as errors are on average.
+    """
     sample, model, G = projection.sample, projection.sample.model, projection.n_global
-    K, n = model.n_terms, len(names)
+    n = len(names)
     local = projection.exposures.get(blocks[0].frame_exposure)
     whole, cross, score = np.zeros((n, n)), np.zeros((n, G)), np.zeros(n)
     square = np.zeros((n, n))
@@ -181,7 +185,7 @@ def _of_exposure(
     fields = [_fields(block, names, model.origin) for block in blocks]
     parts = [projection.parts(block) for block in blocks]
     for block, Z, (by_global, by_local) in zip(blocks, fields, parts, strict=True):
-        F = projection.functions.at(sample, block.rows)[:K]
+        F = projection.functions.polynomials(block.rows)
         WZ = projection.weighted(F, block, Z)
         whole += np.einsum("akm,akn->mn", Z, WZ)
         columns = block.columns[: by_global.shape[2]]
@@ -198,24 +202,34 @@ def _of_exposure(
         cross = cross - to_local.T @ local.gain[:, :G]
         score = score - own_gain.T @ local.score
     nuisance = cho_solve(projection.root, cross.T)
-    # stars of the exposure itself, in place of what they say of the parameters alone
-    covariance = nuisance.T @ meat @ nuisance
+    information = own - cross @ nuisance
+    # detections of the exposure itself, in place of what they say of the parameters alone
+    covariance, others = np.zeros((n, n)), information.copy()
+    if meat is not None:
+        others = nuisance.T @ meat @ nuisance
     for block, Z, (_, by_local) in zip(blocks, fields, parts, strict=True):
-        F = projection.functions.at(sample, block.rows)[:K]
-        through = projection.reduced(block) @ nuisance
+        F = projection.functions.polynomials(block.rows)
+        through = projection.through(block, nuisance)
         direct = Z - through
         if local is not None:
             at = np.searchsorted(local.index, block.columns[block.columns >= G])
             direct -= by_local @ own_gain[at]
-        for sign, coefficients in ((1.0, direct), (-1.0, through)):
-            psi = projection.star_scores(F, block, coefficients)
-            covariance += sign * psi.T @ psi
-    if local is not None:
+        psi = projection.star_scores(F, block, direct)
+        covariance += psi.T @ psi
+        if meat is None:
+            others -= np.einsum("akm,akn->mn", direct, projection.weighted(F, block, direct))
+        else:
+            psi = projection.star_scores(F, block, through)
+            others -= psi.T @ psi
+    if meat is None:
+        others *= projection.score_ratio
+    elif local is not None:
         before = local.gain[:, :G] @ nuisance
         after = own_gain - before
         P = local.precision[:, None]
-        covariance += after.T @ (P * after) - before.T @ (P * before)
-    information = own - cross @ nuisance
+        covariance += after.T @ (P * after)
+        others -= before.T @ (P * before)
+    covariance += others
     return whole, _Deviations(
         score - nuisance.T @ projection.score[:G],
         (information + information.T) / 2,
@@ -229,11 +243,10 @@ def _of_exposure(
 def _global_meat(projection: Projection) -> Float:
     """Covariance (G, G) of the scores of the global parameters, from those of single detections."""
     sample, G = projection.sample, projection.n_global
-    K = sample.model.n_terms
     out = np.diag(projection.precision[:G])
     for block in sample.blocks:
-        F = projection.functions.at(sample, block.rows)[:K]
-        psi = projection.star_scores(F, block, projection.reduced(block))
+        F = projection.functions.polynomials(block.rows)
+        psi = projection.star_scores(F, block, projection.through(block, np.eye(G)))
         out += psi.T @ psi
     for one in projection.exposures.values():
         gain = one.gain[:, :G]

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.projection import Projection
-from bayesdist.diagnose.result import Outcome, noncentrality
+from bayesdist.diagnose.result import Outcome
+from bayesdist.diagnose.score import smallest_pattern
 
 __all__ = ["noise_tests"]
 
@@ -175,7 +176,7 @@ def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
         dof_residual=None,
         p_value=float(stats.chi2.sf(T, m - 1)),
         size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(_smallest, float(np.sqrt(noise)), m - 1),
+        smallest=partial(smallest_pattern, float(np.sqrt(noise)), m - 1, None),
         unit=squares.unit,
         remedy=_REMEDIES[name],
         present=f"the noise differs from {over}, from {low * squares.sigma:.2g} to "
@@ -214,13 +215,9 @@ def _by_axis(squares: _Squares) -> Outcome | None:
         dof_residual=float(n - 1),
         p_value=float(stats.beta.sf(min(T / n, 1.0), 0.5, (n - 1) / 2)),
         size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(_smallest, noise, 1),
+        smallest=partial(smallest_pattern, noise, 1, None),
         unit=squares.unit,
         remedy=_REMEDIES["axis"],
         present=f"the noise along {larger} is larger than along the other axis, beside its errors",
         absent="the noise is described equally well along u and v",
     )
-
-
-def _smallest(noise: float, dof: float, level: float) -> float:
-    return float(noise * np.sqrt(noncentrality(level, dof) / dof))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -77,17 +78,19 @@ class Functions:
 
     Parameters
     ----------
+    sample : ScoredSample
     order : int
         Highest total order of the polynomials.
     factors : tuple of Factor
     regressors : tuple of Regressors
     """
 
+    sample: ScoredSample
     order: int
     factors: tuple[Factor, ...]
     regressors: tuple[Regressors, ...]
 
-    @property
+    @cached_property
     def terms(self) -> tuple[tuple[int, int], ...]:
         """Powers (i, j) of every function, by the polynomial and then by the factors."""
         out = list(polynomial_terms(self.order))
@@ -103,14 +106,30 @@ class Functions:
         sizes += [np.full(one.n_terms, np.mean(one.values**2)) for one in self.factors]
         return np.concatenate(sizes) / ((2 * i + 1) * (2 * j + 1))
 
-    def at(self, sample: ScoredSample, rows: slice) -> Float:
-        """Values (L, n) at some detections."""
-        top = max([self.order, *(one.order for one in self.factors)])
-        P = np.ascontiguousarray(legendre.legvander(sample.X[rows], top).T)
-        Q = np.ascontiguousarray(legendre.legvander(sample.Y[rows], top).T)
-        i, j = np.array(polynomial_terms(top)).T
-        products = P[i] * Q[j]
-        parts = [products[: len(polynomial_terms(self.order))]]
+    @cached_property
+    def _tables(self) -> tuple[Float, Float]:
+        """Legendre polynomials (order + 1, N) of both coordinates."""
+        X, Y = self.sample.X, self.sample.Y
+        return legendre.legvander(X, self.order).T, legendre.legvander(Y, self.order).T
+
+    @cached_property
+    def _powers(self) -> tuple[Int, Int]:
+        i, j = np.array(polynomial_terms(self.order), np.int64).T
+        return i, j
+
+    def polynomials(self, rows: slice) -> Float:
+        """Values (K, n) of the model's own functions at some detections."""
+        K = self.sample.model.n_terms
+        P, Q = self._tables
+        i, j = self._powers
+        return np.asarray(P[i[:K], rows] * Q[j[:K], rows])
+
+    def at(self, rows: slice) -> Float:
+        """Values (L, n) of all functions at some detections."""
+        P, Q = self._tables
+        i, j = self._powers
+        products = P[i, rows] * Q[j, rows]
+        parts = [products]
         parts += [products[: one.n_terms] * one.values[rows] for one in self.factors]
         return np.concatenate(parts)
 
@@ -149,7 +168,7 @@ def functions_for(sample: ScoredSample) -> Functions:
         half = (sample.epoch - (dates[0] + dates[-1]) / 2) / (np.ptp(dates) / 2)
         order = max([LINEAR, *(i + j for _, i, j in time.terms)])
         add(Factor(_beyond_steps(half, time, sample.epoch), order), _curved)
-    return Functions(n + HIGHER, tuple(factors), tuple(regressors))
+    return Functions(sample, n + HIGHER, tuple(factors), tuple(regressors))
 
 
 def _standing_out(values: Float) -> Float:

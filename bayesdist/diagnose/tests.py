@@ -52,10 +52,8 @@ def score_tests(
         When the table does not go with the solution's model, or the solution does not say how it
         was fitted.
     """
-    sample = scored_sample(table, solution)
     projection = projection_of(
-        sample,
-        functions_for(sample),
+        functions_for(scored_sample(table, solution)),
         np.asarray(solution.mean, float),
         priors or GaussianPriors.none(solution.model),
     )
