@@ -24,8 +24,9 @@ __all__ = ["noise_tests"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-STARS_PER_PART = 100  # of a part of the data; smaller ones are joined
-STARS_PER_CELL = 250
+STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
+STARS_PER_CELL = 60
+STARS_PER_BIN = 150  # of magnitudes
 MOST_CELLS = 8  # along each side of a chip
 MOST_MAGNITUDES = 10
 
@@ -117,7 +118,7 @@ def _cells(projection: Projection, rows: Int) -> Int:
 
 def _magnitudes(mag: Float) -> Int:
     """Bins with equal numbers of stars."""
-    n = int(np.clip(len(mag) // STARS_PER_CELL, 1, MOST_MAGNITUDES))
+    n = int(np.clip(len(mag) // STARS_PER_BIN, 1, MOST_MAGNITUDES))
     edges = np.quantile(mag, np.linspace(0, 1, n + 1)[1:-1])
     return np.searchsorted(np.unique(edges), mag)
 

@@ -3,7 +3,8 @@
 The regressors Z of a test are functions of the detections; the parameters of the model are
 nuisance.  With J the derivatives of positions by the parameters, H the curvature of each detection
 and P the precision of the priors, what is left of Z is Z - J C^-1 (Z^T H J)^T, C = J^T H J + P.
-Parameters of single exposures are eliminated exposure by exposure, so that nothing large is ever built.
+Parameters of single exposures are eliminated exposure by exposure, so that nothing large is ever
+built.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from bayesdist.diagnose.regressors import Functions
 from bayesdist.diagnose.sample import Block, ScoredSample
 from bayesdist.infer.prior import GaussianPriors
 
-__all__ = ["Eliminated", "Projection", "projection_of"]
+__all__ = ["LARGEST_LEVERAGE", "Eliminated", "Projection", "projection_of"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -110,7 +110,8 @@ class Functions:
     def _tables(self) -> tuple[Float, Float]:
         """Legendre polynomials (order + 1, N) of both coordinates."""
         X, Y = self.sample.X, self.sample.Y
-        return legendre.legvander(X, self.order).T, legendre.legvander(Y, self.order).T
+        P, Q = (np.asarray(legendre.legvander(z, self.order).T, float) for z in (X, Y))
+        return P, Q
 
     @cached_property
     def _powers(self) -> tuple[Int, Int]:

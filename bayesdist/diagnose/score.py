@@ -1,12 +1,13 @@
 """Score tests of regressors: would the fit be better with these terms?
 
-    T = U^T V^-1 U        U = sum of psi_i        psi_i = Z_i^T g_i, parameters projected out
+    T = U^T V^-1 U        U = sum of Z_i^T g_i        V = sum of (Z_i^T g'_i) (Z_i^T g'_i)^T
 
-V is the sum of psi psi^T over the stars, with the scores g given back what the fit has taken of
-them: no more is assumed of the noise than that stars are independent.  Detections of one star are
-not, and are added up first.  Where errors are symmetric T has exactly the mean of a chi-square and
-no larger a variance; T / N has the distribution of Hotelling's statistic about zero, Beta(q / 2,
-(N - q) / 2), with N stars and q regressors, and falls below it where stars count unequally.
+Z is what the parameters leave of the regressors, g the score of a detection, g' what is left of it
+when the fit has moved by one step along Z, given back what fit and step have taken (HC2).  No more
+is assumed of the noise than that stars are independent; detections of one star are not, and are
+added up first.  V scatters as a Wishart matrix of fewer degrees of freedom than there are stars, as
+those at the edge count most, and T as Hotelling's statistic (Bell and McCaffrey 2002; Pustejovsky
+and Tipton 2018).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from bayesdist.diagnose.projection import Projection
+from bayesdist.diagnose.projection import LARGEST_LEVERAGE, Projection
 from bayesdist.diagnose.regressors import Regressors
 from bayesdist.diagnose.result import Outcome, noncentrality
 from bayesdist.diagnose.sample import Block
@@ -29,7 +30,7 @@ __all__ = ["independent_directions", "regressor_tests", "smallest_pattern"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
+LEAST_DOF = 3  # of the noise: below, its covariance says nothing
 MOST_CHIPS = 4  # that are tested together, with the covariance of all their scores
 SQUARES = ("size2", "noise2")
 
@@ -106,84 +107,139 @@ def _outcome(projection: Projection, family: Regressors, parts: Sequence[_Part])
 
 def _parts_of(projection: Projection, chips: list[int], meat: str) -> Iterator[tuple[str, _Part]]:
     """Tests of all families on some chips, with the names of the families."""
-    sample = projection.sample
-    blocks = [block for block in sample.blocks if block.chip in chips]
-    used = sample.used
-    n_stars = len(np.unique(np.concatenate([sample.star[b.rows][used[b.rows]] for b in blocks])))
-    families = projection.functions.regressors
-    which = [
-        np.concatenate([projection.columns(one.functions, chip) for chip in chips])
-        for one in families
-    ]
+    tried = []
+    for family in projection.functions.regressors:
+        columns = np.concatenate([projection.columns(family.functions, chip) for chip in chips])
+        one = _Directions.of(projection, family, columns)
+        if one.q:
+            tried.append(one)
     if meat == "robust":
-        meats = _robust_meats(projection, blocks, which)
+        sums = _star_sums(projection, chips, tried)
     else:
-        meats = [projection.efficient_information(columns) for columns in which]
-    for family, columns, V in zip(families, which, meats, strict=True):
-        whole = projection.whole_information(columns)
-        S = projection.efficient_information(columns)
-        N = independent_directions(whole, S, family.least)
-        q = N.shape[1]
-        if q == 0 or n_stars < STARS_PER_DIRECTION * q + 2:
-            continue
-        U, S, V = N.T @ projection.efficient_score[columns], N.T @ S @ N, N.T @ V @ N
-        dof = float(n_stars - q)
+        sums = [(np.eye(one.q), 0.0) for one in tried]
+    for one, (V, spread) in zip(tried, sums, strict=True):
         if meat == "robust":
-            T = float(U @ np.linalg.solve(V, U))
-            p = float(stats.beta.sf(min(T / n_stars, 1.0), q / 2, dof / 2))
+            # as a Wishart matrix that scatters as much
+            dof = one.q * (one.q + 1) / spread
+            dof_residual = dof - one.q + 1
+            shrink = dof_residual / dof
         else:
-            dof, scale = _scale(projection, float(U @ np.linalg.solve(S, U)), q)
-            V = V * scale
-            T = float(U @ np.linalg.solve(V, U))
-            p = float(stats.f.sf(T / q, q, dof))
-        square = np.repeat(projection.functions.mean_square[family.functions], 2)
-        Q = (N.T * np.tile(square, len(chips)) / len(chips)) @ N
-        inverse = np.linalg.inv(S)
-        step = inverse @ U
-        noise2 = float(np.trace(Q @ inverse @ V @ inverse))
-        yield family.name, _Part(T, p, q, dof, float(step @ Q @ step), noise2)
+            dof_residual, scale = _scale(projection, float(one.score @ one.score), one.q)
+            V, shrink = V * scale, 1.0
+        if dof_residual < LEAST_DOF:
+            continue
+        T = shrink * float(one.score @ np.linalg.solve(V, one.score))
+        p = float(stats.f.sf(T / one.q, one.q, dof_residual))
+        square = np.repeat(projection.functions.mean_square[one.family.functions], 2)
+        Q = (one.basis.T * np.tile(square, len(chips)) / len(chips)) @ one.basis
+        size2, noise2 = float(one.score @ Q @ one.score), float(np.trace(Q @ V))
+        yield one.family.name, _Part(T, p, one.q, dof_residual, size2, noise2)
 
 
-def _robust_meats(
-    projection: Projection, blocks: Sequence[Block], which: Sequence[Int]
-) -> list[Float]:
-    """Covariance of the scores of each family, from those of single stars."""
+@dataclass(frozen=True, eq=False)
+class _Directions:
+    """Regressors of one family that the parameters have left, in units of their information.
+
+    Parameters
+    ----------
+    family : Regressors
+    columns : ndarray of int, shape (n,)
+    basis : ndarray, shape (n, q)
+        With unit information beside all parameters.
+    score : ndarray, shape (q,)
+        Also the step by which the fit would move.
+    """
+
+    family: Regressors
+    columns: Int
+    basis: Float
+    score: Float
+
+    @property
+    def q(self) -> int:
+        """How many."""
+        return self.basis.shape[1]
+
+    @classmethod
+    def of(cls, projection: Projection, family: Regressors, columns: Int) -> _Directions:
+        """Those of a family."""
+        S = projection.efficient_information(columns)
+        N = independent_directions(projection.whole_information(columns), S, family.least)
+        # eigenvectors: their information is diagonal
+        basis = N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True))
+        return cls(family, columns, basis, basis.T @ projection.efficient_score[columns])
+
+
+def _star_sums(
+    projection: Projection, chips: list[int], tried: Sequence[_Directions]
+) -> list[tuple[Float, float]]:
+    """Covariance of the scores of each family, from those of single stars, and how it scatters."""
     sample = projection.sample
-    edges = np.cumsum([0, *map(len, which)])
-    every = np.concatenate(which)
-    n_stars = int(sample.star.max()) + 1
+    n_stars = int(sample.star.max(initial=0)) + 1
     single = n_stars == len(sample)
-    of_star = np.zeros((0 if single else n_stars, len(every)))
-    meats = [np.zeros((len(columns), len(columns))) for columns in which]
-
-    def add(psi: Float) -> None:
-        for k, meat in enumerate(meats):
-            part = psi[:, edges[k] : edges[k + 1]]
-            meat += part.T @ part
-
-    all_chips = len(blocks) == len(sample.blocks)
-    seen = np.zeros((len(every), len(every)))
-    for block in blocks:
+    V = [np.zeros((one.q, one.q)) for one in tried]
+    seen = [np.zeros((one.q, one.q)) for one in tried]
+    by_star = [np.zeros((0 if single else n_stars, one.q)) for one in tried]
+    trace, norm = np.zeros((2, len(tried), n_stars))
+    edges = np.cumsum([0, *(len(one.columns) for one in tried)])
+    every = np.concatenate([one.columns for one in tried]) if tried else np.zeros(0, np.int64)
+    all_chips = True
+    for block in sample.blocks:
+        if block.chip not in chips:
+            all_chips = False
+            continue
         coefficients = projection.regressor_map(block, every)
         F = projection.functions.at(block.rows)
-        psi = projection.star_scores(F, block, coefficients)
-        if single:
-            add(psi)
-        else:
-            np.add.at(of_star, sample.star[block.rows], psi)
-        if not all_chips:
-            weighted = projection.weighted(F, block, coefficients)
-            seen += np.einsum("aln,alm->nm", coefficients, weighted, optimize=True)
-    if not single:
-        add(of_star)
-    for k, columns in enumerate(which):
+        star = sample.star[block.rows]
+        for k, one in enumerate(tried):
+            part = coefficients[..., edges[k] : edges[k + 1]] @ one.basis
+            x = [F.T @ part[axis] for axis in (0, 1)]
+            psi, G = _left_scores(projection, block, x, one.score)
+            both = G[0] + G[2], np.sqrt(G[0] ** 2 + 2 * G[1] ** 2 + G[2] ** 2)
+            if single:
+                V[k] += psi.T @ psi
+                trace[k, star], norm[k, star] = both
+            else:
+                np.add.at(by_star[k], star, psi)
+                np.add.at(trace[k], star, both[0])
+                np.add.at(norm[k], star, both[1])
+            if len(chips) < len(sample.model.chips):
+                uu, uv, vv = sample.curvature[:, block.rows]
+                cross = (x[0].T * uv) @ x[1]
+                seen[k] += (x[0].T * uu) @ x[0] + (x[1].T * vv) @ x[1] + cross + cross.T
+    out = []
+    for k, one in enumerate(tried):
+        if not single:
+            V[k] += by_star[k].T @ by_star[k]
         if all_chips:
-            meats[k] += projection.prior_meat(columns)
+            V[k] += one.basis.T @ projection.prior_meat(one.columns) @ one.basis
         else:  # what other chips and priors say, through the frames: little
-            part = slice(edges[k], edges[k + 1])
-            others = projection.efficient_information(columns) - seen[part, part]
-            meats[k] += projection.score_ratio * others
-    return meats
+            V[k] += projection.score_ratio * (np.eye(one.q) - seen[k])
+        out.append((V[k], float((trace[k] ** 2 + norm[k] ** 2).sum())))
+    return out
+
+
+def _left_scores(
+    projection: Projection, block: Block, x: Sequence[Float], step: Float
+) -> tuple[Float, Float]:
+    """Scores (n, q) of detections when regressors x (n, q) of both axes are fitted too.
+
+    Also the information (3, n) that each has of the regressors: uu, uv, vv.
+    """
+    sample = projection.sample
+    h = sample.curvature[:, block.rows]
+    moved = [one @ step for one in x]
+    g = sample.score[:, block.rows] - np.stack(
+        [h[0] * moved[0] + h[1] * moved[1], h[1] * moved[0] + h[2] * moved[1]]
+    )
+    G = np.empty((3, len(moved[0])))
+    for k, (a, b) in enumerate(((0, 0), (0, 1), (1, 1))):
+        size = np.sqrt(np.abs(h[2 * a] * h[2 * b]))
+        G[k] = size * np.einsum("nq,nq->n", x[a], x[b])
+    own = np.where(h[0::2] > 0, G[0::2], 0.0)
+    leverage = np.minimum(projection.leverage[:, block.rows] + own, LARGEST_LEVERAGE)
+    g = g / np.sqrt(1.0 - leverage)
+    return g[0][:, None] * x[0] + g[1][:, None] * x[1], G
 
 
 def independent_directions(whole: Float, left: Float, least: float) -> Float:
