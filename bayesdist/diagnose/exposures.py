@@ -27,6 +27,7 @@ from bayesdist.model.frames import frame_names
 __all__ = ["exposure_test"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
 MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
@@ -76,6 +77,58 @@ class _Deviations:
             N.T @ self.covariance @ N,
             N.T @ self.square @ N,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Meat:
+    """Scores of the global parameters, by stars.
+
+    Parameters
+    ----------
+    by_star : ndarray, shape (stars, G)
+        Sums over the detections of each.
+    total : ndarray, shape (G, G)
+        Sum of their squares, and what the priors add.
+    """
+
+    by_star: Float
+    total: Float
+
+    @classmethod
+    def of(cls, projection: Projection) -> _Meat:
+        """Those of all stars."""
+        sample, G = projection.sample, projection.n_global
+        by_star = np.zeros((int(sample.star.max()) + 1, G))
+        for block in sample.blocks:
+            F = projection.functions.polynomials(block.rows)
+            psi = projection.star_scores(F, block, projection.through(block, np.eye(G)))
+            np.add.at(by_star, sample.star[block.rows], psi)
+        total = by_star.T @ by_star + np.diag(projection.precision[:G])
+        for one in projection.exposures.values():
+            gain = one.gain[:, :G]
+            total += gain.T @ (one.precision[:, None] * gain)
+        return cls(by_star, total)
+
+    def covariance(self, nuisance: Float, star: Int, own: Float) -> Float:
+        """Covariance (n, n) of an exposure's scores.
+
+        Parameters
+        ----------
+        nuisance : ndarray, shape (G, n)
+            Parameters that the deviations are taken for.
+        star : ndarray of int, shape (N,)
+            Stars of the exposure's detections.
+        own : ndarray, shape (N, n)
+            Scores of the detections before the parameters are projected out.
+        """
+        which, of = np.unique(star, return_inverse=True)
+        direct = np.zeros((len(which), own.shape[1]))
+        np.add.at(direct, of, own)
+        # a star is one, in this exposure and in all others
+        through = self.by_star[which] @ nuisance
+        left = direct - through
+        rest = nuisance.T @ self.total @ nuisance - through.T @ through
+        return np.asarray(left.T @ left + rest)
 
 
 def exposure_test(projection: Projection) -> Outcome | None:
@@ -139,8 +192,9 @@ def _remedy(frames: str) -> str:
 
 def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
     """Deviations of every exposure with stars enough, along the directions that it has left."""
-    G = projection.n_global
-    meat = _global_meat(projection) if len(projection.sample) * G**2 < MOST_PRODUCTS else None
+    meat = None
+    if len(projection.sample) * projection.n_global**2 < MOST_PRODUCTS:
+        meat = _Meat.of(projection)
     by_exposure: dict[int, list[Block]] = {}
     for block in projection.sample.blocks:
         by_exposure.setdefault(block.exposure, []).append(block)
@@ -168,12 +222,12 @@ def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Floa
 
 
 def _of_exposure(
-    projection: Projection, blocks: list[Block], names: list[str], meat: Float | None
+    projection: Projection, blocks: list[Block], names: list[str], meat: _Meat | None
 ) -> tuple[Float, _Deviations]:
     """Information before anything is projected out, and one exposure's deviations.
 
-    Without the covariance `meat` of the global parameters' scores, that of other exposures is taken
-    to be as wrong as errors are on average.
+    Without the scores of the global parameters, the part of other exposures in the covariance is
+    taken to be as wrong as errors are on average.
     """
     sample, model, G = projection.sample, projection.sample.model, projection.n_global
     n = len(names)
@@ -203,10 +257,7 @@ def _of_exposure(
         score = score - own_gain.T @ local.score
     nuisance = cho_solve(projection.root, cross.T)
     information = own - cross @ nuisance
-    # detections of the exposure itself, in place of what they say of the parameters alone
-    covariance, others = np.zeros((n, n)), information.copy()
-    if meat is not None:
-        others = nuisance.T @ meat @ nuisance
+    others, psi = information.copy(), []
     for block, Z, (_, by_local) in zip(blocks, fields, parts, strict=True):
         F = projection.functions.polynomials(block.rows)
         through = projection.through(block, nuisance)
@@ -214,22 +265,22 @@ def _of_exposure(
         if local is not None:
             at = np.searchsorted(local.index, block.columns[block.columns >= G])
             direct -= by_local @ own_gain[at]
-        psi = projection.star_scores(F, block, direct)
-        covariance += psi.T @ psi
         if meat is None:
             others -= np.einsum("akm,akn->mn", direct, projection.weighted(F, block, direct))
         else:
-            psi = projection.star_scores(F, block, through)
-            others -= psi.T @ psi
+            direct += through
+        psi.append(projection.star_scores(F, block, direct))
+    own_scores = np.concatenate(psi)
     if meat is None:
-        others *= projection.score_ratio
-    elif local is not None:
-        before = local.gain[:, :G] @ nuisance
-        after = own_gain - before
-        P = local.precision[:, None]
-        covariance += after.T @ (P * after)
-        others -= before.T @ (P * before)
-    covariance += others
+        covariance = own_scores.T @ own_scores + projection.score_ratio * others
+    else:
+        star = np.concatenate([sample.star[block.rows] for block in blocks])
+        covariance = meat.covariance(nuisance, star, own_scores)
+        if local is not None:
+            before = local.gain[:, :G] @ nuisance
+            after = own_gain - before
+            P = local.precision[:, None]
+            covariance += after.T @ (P * after) - before.T @ (P * before)
     return whole, _Deviations(
         score - nuisance.T @ projection.score[:G],
         (information + information.T) / 2,
@@ -238,17 +289,3 @@ def _of_exposure(
         (covariance + covariance.T) / 2,
         square,
     )
-
-
-def _global_meat(projection: Projection) -> Float:
-    """Covariance (G, G) of the scores of the global parameters, from those of single detections."""
-    sample, G = projection.sample, projection.n_global
-    out = np.diag(projection.precision[:G])
-    for block in sample.blocks:
-        F = projection.functions.polynomials(block.rows)
-        psi = projection.star_scores(F, block, projection.through(block, np.eye(G)))
-        out += psi.T @ psi
-    for one in projection.exposures.values():
-        gain = one.gain[:, :G]
-        out += gain.T @ (one.precision[:, None] * gain)
-    return np.asarray(out)

@@ -31,6 +31,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 LEAST_DOF = 3  # of the noise: below, its covariance says nothing
+LEAST_P = 1e-300
 MOST_CHIPS = 4  # that are tested together, with the covariance of all their scores
 SQUARES = ("size2", "noise2")
 
@@ -87,9 +88,11 @@ def _outcome(projection: Projection, family: Regressors, parts: Sequence[_Part])
     """Outcome of one family, from its parts."""
     T, dof = (float(sum(getattr(one, name) for one in parts)) for name in ("statistic", "dof"))
     size2, noise2 = (float(np.mean([getattr(p, name) for p in parts])) for name in SQUARES)
-    residual, p = None, float(stats.chi2.sf(T, dof))
-    if len(parts) == 1:
-        residual, p = parts[0].dof_residual, parts[0].p_value
+    residual: float | None = parts[0].dof_residual
+    p = parts[0].p_value
+    if len(parts) > 1:  # chi-square of the same probabilities, which can be added up
+        T = float(sum(stats.chi2.isf(max(one.p_value, LEAST_P), one.dof) for one in parts))
+        residual, p = None, float(stats.chi2.sf(T, dof))
     return Outcome(
         name=family.name,
         statistic=T,
