@@ -287,16 +287,14 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
             X[..., n_own:] = _added(block, L - K, K, added)
             WX = _weighted(F, sample.curvature[:, block.rows], X)
             R = F @ sample.score[:, block.rows].T  # (L, 2)
-            information[np.ix_(columns, columns)] += np.einsum("alm,aln->mn", X, WX, optimize=True)
-            score[columns] += np.einsum("alm,la->m", X, R)
+            information[np.ix_(columns, columns)] += _contracted(X, WX)
+            score[columns] += _contracted(X, R.T[..., None])[:, 0]
             if by_local.shape[2]:
                 at = np.searchsorted(index, block.columns[n_own:])
-                cross[np.ix_(at, columns)] += np.einsum(
-                    "akl,akm->lm", by_local, WX[:, :K], optimize=True
-                )
+                cross[np.ix_(at, columns)] += _contracted(by_local, WX[:, :K])
                 Wl = _weighted(F[:K], sample.curvature[:, block.rows], by_local)
-                inner[np.ix_(at, at)] += np.einsum("akl,akm->lm", by_local, Wl, optimize=True)
-                own[at] += np.einsum("akl,ka->l", by_local, R[:K])
+                inner[np.ix_(at, at)] += _contracted(by_local, Wl)
+                own[at] += _contracted(by_local, R[:K].T[..., None])[:, 0]
         if len(index):
             inverse = _inverse(inner)
             gain = inverse @ cross
@@ -332,6 +330,11 @@ def _added(block: Block, n_added: int, n_terms: int, which: Int) -> Float:
     function, axis = np.divmod(rest[here], 2)
     out[:, n_terms + function, here] = block.frame[:, axis]
     return out
+
+
+def _contracted(A: Float, B: Float) -> Float:
+    """Sums over axes and functions: (2, L, m) and (2, L, n) to (m, n)."""
+    return A.reshape(-1, A.shape[2]).T @ B.reshape(-1, B.shape[2])
 
 
 def _weighted(F: Float, curvature: Float, X: Float) -> Float:

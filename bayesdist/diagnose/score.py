@@ -15,10 +15,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.linalg import block_diag
 
 from bayesdist.diagnose.projection import LARGEST_LEVERAGE, Projection
 from bayesdist.diagnose.regressors import Regressors
@@ -177,72 +179,103 @@ def _star_sums(
     projection: Projection, chips: list[int], tried: Sequence[_Directions]
 ) -> list[tuple[Float, float]]:
     """Covariance of the scores of each family, from those of single stars, and how it scatters."""
+    if not tried:
+        return []
     sample = projection.sample
-    n_stars = int(sample.star.max(initial=0)) + 1
+    n_stars = int(sample.star.max()) + 1
     single = n_stars == len(sample)
+    together = _Together.of(tried)
+    parts = [slice(a, b) for a, b in pairwise([*together.starts, len(together.step)])]
     V = [np.zeros((one.q, one.q)) for one in tried]
     seen = [np.zeros((one.q, one.q)) for one in tried]
-    by_star = [np.zeros((0 if single else n_stars, one.q)) for one in tried]
-    trace, norm = np.zeros((2, len(tried), n_stars))
-    edges = np.cumsum([0, *(len(one.columns) for one in tried)])
-    every = np.concatenate([one.columns for one in tried]) if tried else np.zeros(0, np.int64)
-    all_chips = True
-    for block in sample.blocks:
-        if block.chip not in chips:
-            all_chips = False
-            continue
-        coefficients = projection.regressor_map(block, every)
+    by_star = np.zeros((0 if single else n_stars, len(together.step)))
+    trace, norm = np.zeros((2, n_stars, len(tried)))
+    blocks = [block for block in sample.blocks if block.chip in chips]
+    all_chips = len(blocks) == len(sample.blocks)
+    for block in blocks:
+        coefficients = projection.regressor_map(block, together.columns) @ together.basis
         F = projection.functions.at(block.rows)
+        x = np.stack([F.T @ coefficients[axis] for axis in (0, 1)])
+        psi, both = together.left_scores(projection, block, x)
         star = sample.star[block.rows]
-        for k, one in enumerate(tried):
-            part = coefficients[..., edges[k] : edges[k + 1]] @ one.basis
-            x = [F.T @ part[axis] for axis in (0, 1)]
-            psi, G = _left_scores(projection, block, x, one.score)
-            both = G[0] + G[2], np.sqrt(G[0] ** 2 + 2 * G[1] ** 2 + G[2] ** 2)
-            if single:
-                V[k] += psi.T @ psi
-                trace[k, star], norm[k, star] = both
-            else:
-                np.add.at(by_star[k], star, psi)
-                np.add.at(trace[k], star, both[0])
-                np.add.at(norm[k], star, both[1])
-            if len(chips) < len(sample.model.chips):
-                uu, uv, vv = sample.curvature[:, block.rows]
-                cross = (x[0].T * uv) @ x[1]
-                seen[k] += (x[0].T * uu) @ x[0] + (x[1].T * vv) @ x[1] + cross + cross.T
-    out = []
-    for k, one in enumerate(tried):
+        if single:
+            trace[star], norm[star] = both
+            for k, part in enumerate(parts):
+                V[k] += psi[:, part].T @ psi[:, part]
+        else:
+            np.add.at(by_star, star, psi)
+            np.add.at(trace, star, both[0])
+            np.add.at(norm, star, both[1])
+        if not all_chips:
+            uu, uv, vv = sample.curvature[:, block.rows]
+            for k, part in enumerate(parts):
+                u, v = x[..., part]
+                cross = (u.T * uv) @ v
+                seen[k] += (u.T * uu) @ u + (v.T * vv) @ v + cross + cross.T
+    for k, (one, part) in enumerate(zip(tried, parts, strict=True)):
         if not single:
-            V[k] += by_star[k].T @ by_star[k]
+            V[k] += by_star[:, part].T @ by_star[:, part]
         if all_chips:
             V[k] += one.basis.T @ projection.prior_meat(one.columns) @ one.basis
         else:  # what other chips and priors say, through the frames: little
             V[k] += projection.score_ratio * (np.eye(one.q) - seen[k])
-        out.append((V[k], float((trace[k] ** 2 + norm[k] ** 2).sum())))
-    return out
+    spread = (trace**2 + norm**2).sum(axis=0)
+    return [(one, float(many)) for one, many in zip(V, spread, strict=True)]
 
 
-def _left_scores(
-    projection: Projection, block: Block, x: Sequence[Float], step: Float
-) -> tuple[Float, Float]:
-    """Scores (n, q) of detections when regressors x (n, q) of both axes are fitted too.
+@dataclass(frozen=True, eq=False)
+class _Together:
+    """Directions of several families, one after the other.
 
-    Also the information (3, n) that each has of the regressors: uu, uv, vv.
+    Parameters
+    ----------
+    columns : ndarray of int, shape (n,)
+    basis : ndarray, shape (n, q)
+    step : ndarray, shape (q,)
+    starts : ndarray of int, shape (families,)
+        Where the directions of each family begin.
     """
-    sample = projection.sample
-    h = sample.curvature[:, block.rows]
-    moved = [one @ step for one in x]
-    g = sample.score[:, block.rows] - np.stack(
-        [h[0] * moved[0] + h[1] * moved[1], h[1] * moved[0] + h[2] * moved[1]]
-    )
-    G = np.empty((3, len(moved[0])))
-    for k, (a, b) in enumerate(((0, 0), (0, 1), (1, 1))):
-        size = np.sqrt(np.abs(h[2 * a] * h[2 * b]))
-        G[k] = size * np.einsum("nq,nq->n", x[a], x[b])
-    own = np.where(h[0::2] > 0, G[0::2], 0.0)
-    leverage = np.minimum(projection.leverage[:, block.rows] + own, LARGEST_LEVERAGE)
-    g = g / np.sqrt(1.0 - leverage)
-    return g[0][:, None] * x[0] + g[1][:, None] * x[1], G
+
+    columns: Int
+    basis: Float
+    step: Float
+    starts: Int
+
+    @classmethod
+    def of(cls, tried: Sequence[_Directions]) -> _Together:
+        """Those of some families."""
+        return cls(
+            np.concatenate([one.columns for one in tried]),
+            np.asarray(block_diag(*(one.basis for one in tried))),
+            np.concatenate([one.score for one in tried]),
+            np.cumsum([0, *(one.q for one in tried[:-1])]),
+        )
+
+    def left_scores(self, projection: Projection, block: Block, x: Float) -> tuple[Float, Float]:
+        """Scores (n, q) of detections when each family by itself is fitted too.
+
+        Also trace and norm (2, n, families) of the information that each detection has of the
+        directions x (2, n, q).
+        """
+
+        def of_families(values: Float) -> Float:
+            return np.add.reduceat(values, self.starts, axis=1)
+
+        sample = projection.sample
+        uu, uv, vv = sample.curvature[:, block.rows, None]
+        moved = [of_families(one * self.step) for one in x]
+        g = sample.score[:, block.rows, None] - np.stack(
+            [uu * moved[0] + uv * moved[1], uv * moved[0] + vv * moved[1]]
+        )
+        G_uu, G_vv = np.abs(uu) * of_families(x[0] ** 2), np.abs(vv) * of_families(x[1] ** 2)
+        G_uv = np.sqrt(np.abs(uu * vv)) * of_families(x[0] * x[1])
+        leverage = projection.leverage[:, block.rows, None] + np.stack(
+            [np.where(uu > 0, G_uu, 0.0), np.where(vv > 0, G_vv, 0.0)]
+        )
+        g = g / np.sqrt(1.0 - np.minimum(leverage, LARGEST_LEVERAGE))
+        family = np.repeat(np.arange(len(self.starts)), np.diff([*self.starts, len(self.step)]))
+        psi = g[0][:, family] * x[0] + g[1][:, family] * x[1]
+        return psi, np.stack([G_uu + G_vv, np.sqrt(G_uu**2 + 2 * G_uv**2 + G_vv**2)])
 
 
 def independent_directions(whole: Float, left: Float, least: float) -> Float:
