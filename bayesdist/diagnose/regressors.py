@@ -26,6 +26,7 @@ OUTSIDE = 0.5  # per cent of the values at either end that are moved to the othe
 SHORTEST = 0.1  # years over which a drift is looked for
 # information that a direction has kept beside the parameters, over what it had: below, it is theirs
 INDEPENDENT = 1e-6
+CONSTANT = 1e-9  # scatter of a factor, in magnitudes or of the time from -1 to 1
 OWN_OF_TIME = 0.02  # frames take up drifts but for what the curvature of the polynomial leaves
 
 
@@ -153,22 +154,23 @@ def functions_for(sample: ScoredSample) -> Functions:
 
     def add(factor: Factor, make: Callable[[Int], Regressors]) -> None:
         nonlocal start
+        if np.std(factor.values) < CONSTANT:
+            return
         factors.append(factor)
         regressors.append(make(start + np.arange(factor.n_terms)))
         start += factor.n_terms
 
     for values, make in ((sample.mag, _by_magnitude), (sample.colour, _by_colour)):
-        if values is not None and np.ptp(values) > 0:
+        if values is not None:
             add(Factor(_standing_out(values), LINEAR), make)
-    time = sample.model.time
-    dates = np.unique(sample.epoch) if sample.epoch is not None else np.zeros(0)
-    if sample.epoch is not None and time is None and len(dates) > 1:
-        if np.ptp(dates) > SHORTEST:
-            add(Factor(sample.epoch - sample.epoch.mean(), LINEAR), _drift)
-    elif sample.epoch is not None and time is not None and len(dates) > 2:
-        half = (sample.epoch - (dates[0] + dates[-1]) / 2) / (np.ptp(dates) / 2)
-        order = max([LINEAR, *(i + j for _, i, j in time.terms)])
-        add(Factor(_beyond_steps(half, time, sample.epoch), order), _curved)
+    time, epoch = sample.model.time, sample.epoch
+    if epoch is not None and np.ptp(epoch) > SHORTEST:
+        # from -1 to 1
+        half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)
+        add(Factor(half - half.mean(), LINEAR), _drift)
+        if time is not None and len(np.unique(epoch)) > 2:
+            order = max([LINEAR, *(i + j for _, i, j in time.terms)])
+            add(Factor(_beyond_lines(half, time, epoch), order), _curved)
     return Functions(sample, n + HIGHER, tuple(factors), tuple(regressors))
 
 
@@ -179,7 +181,7 @@ def _standing_out(values: Float) -> Float:
     return np.asarray(inside - inside.mean())
 
 
-def _beyond_steps(half: Float, time: TimeDependence, epoch: Float) -> Float:
+def _beyond_lines(half: Float, time: TimeDependence, epoch: Float) -> Float:
     """Square of time, without what a constant and the segments' own lines say of it."""
     design = np.column_stack([np.ones(len(half)), time.weights(epoch)])
     dates, of = np.unique(half, return_inverse=True)
@@ -229,8 +231,8 @@ def _drift(functions: Int) -> Regressors:
         "drift",
         functions,
         OWN_OF_TIME,
-        "add time-dependent terms (model.tdd)",
-        "the linear terms drift with time, and the model does not",
+        "add time-dependent terms to model.tdd",
+        "linear terms drift with time, and the model's do not",
         "no drift of the linear terms is left in the residuals",
     )
 
