@@ -24,6 +24,7 @@ __all__ = ["truncation_test"]
 Float = NDArray[np.float64]
 
 FEWEST_STARS = 50
+FEW = 0.5  # expected matches whose absence says nothing
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
@@ -52,6 +53,8 @@ class _Deficit:
     @property
     def p_value(self) -> float:
         """Probability of so few, over what the scale may be."""
+        if self.expected < FEW:
+            return 1.0
         at = self.expected * np.exp(self.spread * NODES)
         chance = special.gammaincc(self.beyond + 1, at)
         return float(WEIGHTS @ chance / WEIGHTS.sum())
