@@ -27,6 +27,8 @@ COLUMNS = {
     "filter": "",
     "mag": "",
     "star": "",
+    "u_nominal": "",
+    "v_nominal": "",
 }
 
 
