@@ -457,6 +457,40 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _matched_in_a_circle(self) -> Config:
+        columns = (self.data.columns or {}) if self.data is not None else {}
+        if columns.get("u_nominal") or columns.get("v_nominal"):
+            self.refuse_circle()
+        return self
+
+    def refuse_circle(self) -> None:
+        """Refuse what cannot go with matches in a circle about their nominal positions.
+
+        Raises
+        ------
+        ValueError
+            As validators raise it.
+        """
+        if self.outliers.match_radius is None:
+            return
+        head = "matches with nominal positions and outliers.match_radius are"
+        if self.data is not None and self.data.sigma == "by_magnitude":
+            raise ValueError(
+                f"{head} cut by the match circle, and so are residuals, from which data.sigma = "
+                "'by_magnitude' takes the errors; give columns of errors, or a number"
+            )
+        if self.holdout is not None:
+            raise ValueError(
+                f"{head} cut by the match circle, which the prediction of [holdout] does not "
+                "know; leave [holdout] out, or the nominal positions"
+            )
+        if self.periods is not None:
+            raise ValueError(
+                f"{head} cut by the match circle, which draws the least-squares fits of [periods] "
+                "to the nominal solution; leave [periods] out, or the nominal positions"
+            )
+
+    @model_validator(mode="after")
     def _periods_of_polynomials(self) -> Config:
         if self.periods is None:
             return self

@@ -38,7 +38,10 @@ STEEP = 512.0**-2
 CANCELLED = 1e3  # sum of moduli over the sum, from which on the rest is taken by itself
 EDGE = 0.02  # q below which E is a series
 
-COUNTS = (16, 24, 32, 40, 48, 64, 80, 96, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096, 8192)
+COUNTS = (
+    *(12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 56, 64, 72, 80, 96, 112, 128, 160, 192, 224),
+    *(256, 320, 384, 448, 512, 640, 768, 1024, 1536, 2048, 3072, 4096, 6144, 8192),
+)
 MOST = COUNTS[-1]
 
 
@@ -66,7 +69,7 @@ def inside(du, dv, A, B, R):
 def nodes_for(du, dv, A, B, R, counts):
     """Which set of nodes resolves the integrand."""
     bend = R * math.sqrt(du * du / (A * A) + dv * dv / (B * B)) + R * R * abs(1.0 / A - 1.0 / B)
-    wanted = 12.0 + 8.0 * math.sqrt(bend)
+    wanted = 9.0 + 7.2 * math.sqrt(bend)
     if du * du + dv * dv > R * R:
         wanted *= 1.8
     k = 0
@@ -85,6 +88,28 @@ def _total(values, n):
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _flux(e, away):
+    """What a node adds to the sum: E(e) times the way out."""
+    series = 1.0 - e * (1.0 / 2 - e * (1.0 / 6 - e * (1.0 / 24 - e * (1.0 / 120 - e / 720))))
+    safe = max(e, EDGE)
+    return away * (series if e < EDGE else (1.0 - exp_negative(-safe)) / safe)
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work):
+    """Logarithm of the probability, where the Gaussian's centre lies in the circle.
+
+    No term is negative.
+    """
+    half_a, half_b = 0.5 / A, 0.5 / B
+    for k in range(n):
+        c, s = cosine[first + k], sine[first + k]
+        x, y = du + R * c, dv + R * s
+        work[k] = _flux(x * x * half_a + y * y * half_b, R + du * c + dv * s)
+    return math.log(R / (2.0 * n * math.sqrt(A * B)) * _total(work, n))
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _exponents(du, dv, A, B, R, n, first, cosine, sine, q):
     """q at the nodes, and the least of them."""
     half_a, half_b = 0.5 / A, 0.5 / B
@@ -98,25 +123,19 @@ def _exponents(du, dv, A, B, R, n, first, cosine, sine, q):
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _log_of(du, dv, A, B, R, n, first, cosine, sine, q, least, work):
-    """Logarithm of the probability, from q at the nodes."""
+def _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work):
+    """Logarithm of the probability, where it does not, from q at the nodes."""
     scale = R / (2.0 * n * math.sqrt(A * B))
     for k in range(n):
-        e = q[k]
-        series = 1.0 - e * (1.0 / 2 - e * (1.0 / 6 - e * (1.0 / 24 - e * (1.0 / 120 - e / 720))))
-        safe = max(e, EDGE)
-        flux = R + du * cosine[first + k] + dv * sine[first + k]
-        work[k] = flux * (series if e < EDGE else (1.0 - exp_negative(-safe)) / safe)
+        work[k] = _flux(q[k], R + du * cosine[first + k] + dv * sine[first + k])
     total = _total(work, n)
-    if du * du + dv * dv <= R * R:  # no term is negative
-        return math.log(scale * total)
     for k in range(n):
         work[k] = abs(work[k])
     if _total(work, n) < CANCELLED * total:
         return math.log(scale * total)
     for k in range(n):
-        flux = R + du * cosine[first + k] + dv * sine[first + k]
-        work[k] = -flux * exp_negative(least - q[k]) / q[k]
+        away = R + du * cosine[first + k] + dv * sine[first + k]
+        work[k] = -away * exp_negative(least - q[k]) / q[k]
     return math.log(scale * _total(work, n)) - least
 
 
@@ -132,8 +151,10 @@ def log_circle(du, dv, A, B, R, nodes, q, work):
     counts, begin, cosine, sine = nodes
     k = nodes_for(du, dv, A, B, R, counts)
     n, first = counts[k], begin[k]
+    if du * du + dv * dv <= R * R:
+        return _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work)
     least = _exponents(du, dv, A, B, R, n, first, cosine, sine, q)
-    return _log_of(du, dv, A, B, R, n, first, cosine, sine, q, least, work)
+    return _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work)
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
@@ -156,7 +177,10 @@ def slopes(du, dv, A, B, R, nodes, q, work, out):
     k = nodes_for(du, dv, A, B, R, counts)
     n, first = counts[k], begin[k]
     least = _exponents(du, dv, A, B, R, n, first, cosine, sine, q)
-    log_z = _log_of(du, dv, A, B, R, n, first, cosine, sine, q, least, work)
+    if du * du + dv * dv <= R * R:
+        log_z = _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work)
+    else:
+        log_z = _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work)
     for k in range(n):
         work[k] = exp_negative(least - q[k])
     ia, ib = 1.0 / A, 1.0 / B
