@@ -458,8 +458,17 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _matched_in_a_circle(self) -> Config:
-        columns = (self.data.columns or {}) if self.data is not None else {}
-        if columns.get("u_nominal") or columns.get("v_nominal"):
+        if self.selfcal is not None and _names_nominal(self.selfcal.columns):
+            raise ValueError(
+                "nominal positions are of matches in [data], and a [selfcal] finds its matches "
+                "itself; leave u_nominal and v_nominal out"
+            )
+        if self.data is not None and _names_nominal(self.data.columns):
+            if self.data.format not in ("auto", "table"):
+                raise ValueError(
+                    f"nominal positions are columns of tables, and data.format is "
+                    f"{self.data.format!r}; leave u_nominal and v_nominal out"
+                )
             self.refuse_circle()
         return self
 
@@ -609,6 +618,10 @@ class Config(Section):
     def requirements(self) -> tuple[Requirement, ...]:
         """The requirements."""
         return tuple(Requirement(**r.model_dump()) for r in self.requirement)
+
+
+def _names_nominal(columns: dict[str, str] | None) -> bool:
+    return any((columns or {}).get(key) for key in ("u_nominal", "v_nominal"))
 
 
 class _RequirementFile(Section):
