@@ -23,6 +23,7 @@ Int = NDArray[np.int64]
 LINEAR = 1  # order of the terms that go with magnitude, colour and time
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
+NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
 # information that a direction has kept beside the parameters, over what it had: below, it is theirs
 INDEPENDENT = 1e-6
@@ -201,6 +202,17 @@ def _higher(order: int, total: int) -> Regressors:
         f"raise model.order to {total}" if total <= MAX_ORDER else table,
         f"the residuals hold terms of order {total}, and the model ends at order {order}",
         f"no terms of order {total} are left in the residuals",
+    )
+
+
+def _at_edges(functions: Int) -> Regressors:
+    return Regressors(
+        "edges",
+        functions,
+        INDEPENDENT,
+        "leave out the margins of the detector, or fit a look-up table",
+        "the residuals rise towards the edges of the detector",
+        "the residuals do not rise towards the edges of the detector",
     )
 
 

@@ -244,9 +244,7 @@ def test_equal_errors_give_the_f_test_of_least_squares(order):
         large = np.column_stack([small, terms_of(total, table)[0]])
 
         def rss(A):
-            return sum(
-                ((y - A @ np.linalg.lstsq(A, y)[0]) ** 2).sum() for y in (table.u, table.v)
-            )
+            return sum(((y - A @ np.linalg.lstsq(A, y)[0]) ** 2).sum() for y in (table.u, table.v))
 
         q, dof = 2 * (total + 1), 2 * (200 - large.shape[1])
         F = (rss(small) - rss(large)) / q / (rss(large) / dof)
