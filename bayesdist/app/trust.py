@@ -40,8 +40,8 @@ def warnings_of(session: Session) -> list[str]:
             )
     elif ratio < LEAST_CHI2:
         out.append(
-            f"chi-square per degree of freedom is {ratio:.2g}: the quoted errors are too large, "
-            "and with them all uncertainties"
+            f"chi-square per degree of freedom is {ratio:.2g}: the match radius has cut the "
+            "residuals, or the quoted errors are too large, and with them all uncertainties"
         )
     if ratio > MOST_CHI2:
         out.append(

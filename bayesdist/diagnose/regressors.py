@@ -23,6 +23,7 @@ Int = NDArray[np.int64]
 LINEAR = 1  # order of the terms that go with magnitude, colour and time
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
+FEWEST_AT_EDGES = 200  # detections: some in each margin
 NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
 # information that a direction has kept beside the parameters, over what it had: below, it is theirs
@@ -164,6 +165,11 @@ def functions_for(sample: ScoredSample) -> Functions:
     for values, make in ((sample.mag, _by_magnitude), (sample.colour, _by_colour)):
         if values is not None:
             add(Factor(_standing_out(values), LINEAR), make)
+    edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
+    if len(sample) >= FEWEST_AT_EDGES:
+        factors += [Factor(one - one.mean(), 0) for one in edges]
+        regressors.append(_at_edges(start + np.arange(len(edges))))
+        start += len(edges)
     time, epoch = sample.model.time, sample.epoch
     if epoch is not None and np.ptp(epoch) > SHORTEST:
         # from -1 to 1

@@ -9,6 +9,7 @@ import numpy as np
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.exposures import exposure_test
 from bayesdist.diagnose.noise import noise_tests
+from bayesdist.diagnose.patterns import pattern_test
 from bayesdist.diagnose.projection import projection_of
 from bayesdist.diagnose.regressors import functions_for
 from bayesdist.diagnose.result import FAMILY_LEVEL, Outcome, ScoreTest, corrected
@@ -65,7 +66,8 @@ def score_tests(
     found = regressor_tests(projection)
     if exposures is not None and exposures.p_value < FAMILY_LEVEL:
         found = [_doubtful(one) if one.name in OF_TIME else one for one in found]
-    others = (exposures, truncation_test(projection, match_radius))
+    truncation = truncation_test(projection, match_radius)
+    others = (exposures, pattern_test(projection), truncation)
     found += noise_tests(projection)
     return corrected([*found, *(one for one in others if one is not None)])
 
