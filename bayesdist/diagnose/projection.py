@@ -53,6 +53,11 @@ class Eliminated:
     score: Float
     precision: Float
 
+    def rows(self, block: Block) -> Int:
+        """Which of them move the detections of a block: those of another chip do not."""
+        columns = block.columns[block.columns >= self.index[0]]
+        return np.searchsorted(self.index, columns)
+
 
 @dataclass(frozen=True, eq=False)
 class Projection:
@@ -130,7 +135,8 @@ class Projection:
         out = np.zeros((*by_global.shape[:2], self.n_global))
         out[..., block.columns[: by_global.shape[2]]] = by_global
         if by_local.shape[2]:
-            out -= by_local @ self.exposures[block.frame_exposure].gain[:, : self.n_global]
+            one = self.exposures[block.frame_exposure]
+            out -= by_local @ one.gain[one.rows(block), : self.n_global]
         return out
 
     def parts(self, block: Block) -> tuple[Float, Float]:
@@ -159,7 +165,9 @@ class Projection:
             for axis in (0, 1):
                 covariance = reduced[axis] @ inverse @ reduced[axis].T
                 if by_local.shape[2]:
-                    own = self.exposures[block.frame_exposure].inverse
+                    one = self.exposures[block.frame_exposure]
+                    rows = one.rows(block)
+                    own = one.inverse[np.ix_(rows, rows)]
                     covariance += by_local[axis] @ own @ by_local[axis].T
                 follows = np.einsum("kn,kn->n", phi, covariance @ phi)
                 out[axis, block.rows] = follows * sample.curvature[2 * axis, block.rows]
@@ -197,7 +205,7 @@ class Projection:
             if by_local.shape[2]:
                 gain = self.exposures[block.frame_exposure].gain
                 follows = gain[:, G + which] - gain[:, :G] @ nuisance
-                out[:, :K] -= by_local @ follows
+                out[:, :K] -= by_local @ follows[self.exposures[block.frame_exposure].rows(block)]
             yield block, out, follows
 
     def prior_meat(self, which: Int) -> Float:

@@ -26,6 +26,7 @@ Float = NDArray[np.float64]
 FEWEST_STARS = 50
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
+TINY, LARGEST = 1e-300, 50.0
 ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
 
 
@@ -52,7 +53,9 @@ class _Deficit:
     @property
     def p_value(self) -> float:
         """Probability of so few, over what the scale may be."""
-        at = self.expected * np.exp(self.spread * NODES)
+        # far out nothing is expected, or anything; neither is a number that floats hold
+        exponent = np.log(max(self.expected, TINY)) + self.spread * NODES
+        at = np.exp(np.minimum(exponent, LARGEST))
         chance = special.gammaincc(self.beyond + 1, at)
         return float(WEIGHTS @ chance / WEIGHTS.sum())
 
