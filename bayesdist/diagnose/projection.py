@@ -1,9 +1,9 @@
 """Regressors with the parameters of the model projected out: scores, information and covariances.
 
 The regressors Z of a test are functions of the detections; the parameters of the model are
-nuisance.  With J the derivatives of positions by the parameters, H the curvature of each detection and P the
-precision of the priors, what is left of Z is Z - J C^-1 (Z^T H J)^T, C = J^T H J + P.  Parameters
-of single exposures are eliminated exposure by exposure, so that nothing large is ever built.
+nuisance.  With J the derivatives of positions by the parameters, H the curvature of each detection
+and P the precision of the priors, what is left of Z is Z - J C^-1 (Z^T H J)^T, C = J^T H J + P.
+Parameters of single exposures are eliminated exposure by exposure, so that nothing large is built.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ functions through a score s and an information S, so that for amplitudes eta
     log p(eta | data) = log p(eta) + (s^T (S + P)^-1 s - log|S + P| + log|P|) / 2
 
 The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
-are gone through on a grid that is refined where the density is.
+are gone through on a grid that is refined where the density is.  What the field has at frequencies
+above the functions' is seen in pairs of stars (`SharedVariance`), whose likelihood is a factor.
 """
 
 from __future__ import annotations
@@ -19,15 +20,16 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.functions import FINE, StructureFunctions
+from bayesdist.infer.discrepancy.neighbours import SharedVariance
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
 
 __all__ = ["AxisStructure", "axis_structure"]
 
 Float = NDArray[np.float64]
 
-LENGTHS = np.geomspace(0.08, 0.6, 5)  # of the field, in longer half sides; all alike beforehand
+LENGTHS = np.geomspace(0.02, 0.6, 7)  # of the field, in longer half sides; all alike beforehand
 STEPS = 8  # of the amplitude, before the grid is refined
-HALVINGS = 2
+HALVINGS = 3
 NEGLIGIBLE = 12.0  # in log density, below the largest
 TERM_STEPS = 24  # of the amplitude of the higher orders
 
@@ -111,6 +113,7 @@ def axis_structure(
     noise: float,
     higher_order: float,
     structure: float,
+    pairs: SharedVariance | None = None,
 ) -> AxisStructure:
     """Posterior of the coefficients of structure functions on one axis.
 
@@ -125,6 +128,8 @@ def axis_structure(
         Typical error of one star: no amplitude beyond a few of it is looked at.
     higher_order, structure : float
         Prior medians of the amplitudes, in the unit of the positions.
+    pairs : SharedVariance, optional
+        What neighbouring stars say of the field at frequencies above those of the functions.
 
     Returns
     -------
@@ -155,8 +160,11 @@ def axis_structure(
         by_terms = 0.5 * (left**2 / (values + amplitudes[:, None] ** -2)).sum(axis=1)
         by_terms -= 0.5 * np.log1p(values * amplitudes[:, None] ** 2).sum(axis=1)
         density = by_terms + prior + evidence + log_half_cauchy(np.array(amplitude), structure)
+        if pairs is not None:
+            density = density + pairs.log_density(amplitude, shared[length])
         return _Point(length, amplitude, factor, right, through, values, vectors, left, density)
 
+    shared = {} if pairs is None else {a: pairs.correlation(functions, a) for a in LENGTHS}
     found: list[tuple[_Point, float]] = []
     for length in LENGTHS:
         grid = list(np.linspace(np.log(low), np.log(high), STEPS))
