@@ -183,14 +183,15 @@ def _structures(
             coefficients.append(drawn)
             # the fit takes structure for polynomials; the truth lies on the other side
             theta -= drawn @ (working.covariance @ taken[a]).T
+            by_draw = np.sqrt(np.mean((drawn @ here.T) ** 2, axis=1))
             rows.append(
                 {
                     "chip": chip.number,
                     "axis": "uv"[a],
                     "field_rms": posterior.field_rms,
                     "length_pix": posterior.length * max(chip.size) / 2,
-                    "rms": float(np.sqrt(np.mean((drawn @ here.T) ** 2))),
-                    "seen": float(np.sqrt(np.mean((here @ drawn.mean(axis=0)) ** 2))),
+                    "rms": float(np.sqrt(np.mean(by_draw**2))),
+                    "median": float(np.median(by_draw)),
                 }
             )
         out[chip.number] = replace(chip_structure, coefficients=np.stack(coefficients, axis=1))

@@ -29,8 +29,9 @@ Float = NDArray[np.float64]
 
 LENGTHS = np.geomspace(0.02, 0.6, 7)  # of the field, in longer half sides; all alike beforehand
 STEPS = 8  # of the amplitude, before the grid is refined
-HALVINGS = 3
-NEGLIGIBLE = 12.0  # in log density, below the largest
+HALVINGS = 6  # at most: neighbouring stars may say an amplitude to some percent
+NEGLIGIBLE = 9.0  # in log density, below the largest
+SMOOTH = 0.7  # in log density, from one point of the grid to the next
 TERM_STEPS = 24  # of the amplitude of the higher orders
 
 
@@ -172,7 +173,10 @@ def axis_structure(
         for _ in range(HALVINGS):
             tops = [p.log_density.max() for p in points]
             best = max([*tops, *(p.log_density.max() for p, _ in found)])
+            n = len(grid)
             grid, points = _refined(grid, points, tops, best - NEGLIGIBLE, length, at)
+            if len(grid) == n:
+                break
         widths = np.gradient(grid)
         found += [
             (p, w)
@@ -188,7 +192,7 @@ def _refined(grid, points, tops, least, length, at):  # type: ignore[no-untyped-
     """The grid with a point in the middle of each interval that has some of the density."""
     new_grid, new_points = grid[:1], points[:1]
     for k in range(1, len(grid)):
-        if max(tops[k - 1], tops[k]) > least and abs(tops[k] - tops[k - 1]) > 0.3:
+        if max(tops[k - 1], tops[k]) > least and abs(tops[k] - tops[k - 1]) > SMOOTH:
             middle = 0.5 * (grid[k - 1] + grid[k])
             new_grid.append(middle)
             new_points.append(at(length, middle))
