@@ -65,7 +65,8 @@ def _of_time(session: Session) -> Iterator[Caveat]:
     if dates.size and counts[counts > 0].min() <= 2:
         yield Caveat(
             f"a drift is fitted to {counts[counts > 0].min()} dates, so that neither the variation "
-            "between exposures nor the curvature of the drift is measured"
+            "between exposures nor the curvature of the drift is measured",
+            larger=False,
         )
     if session.motions_stated is False:
         yield Caveat(
@@ -73,6 +74,21 @@ def _of_time(session: Session) -> Iterator[Caveat]:
             "against them: give a [[budget]] row that names the motions, of size 0 with its source "
             "where they have none"
         )
+
+
+def _exposures(session: Session, n: int) -> str:
+    """Of which exposures the position is one."""
+    if session.systematics.aligned:
+        return f"a position in a new exposure, which deviates as {n} exposures do"
+    found = session.discrepancy
+    linear = None if found is None else found.found.linear
+    if linear is None or "shape" not in linear.scatter:
+        return f"{n} exposures" if n > 1 else "one exposure, or the mean of several"
+    size = float(np.median(linear.scatter["shape"]))
+    what = f"whose scale and shears scatter by {size:.1g}"
+    if session.config.assess.exposure == "single":
+        return f"a position in a single exposure, as {linear.n_exposures} exposures, {what}"
+    return f"a position in the mean of {linear.n_exposures} exposures, {what}"
 
 
 def rests_on(session: Session, epoch: float | None) -> tuple[str, ...]:
@@ -93,7 +109,7 @@ def rests_on(session: Session, epoch: float | None) -> tuple[str, ...]:
     given = [b.name for b in session.config.budget]
     out.append(f"errors given by the user: {', '.join(given) or 'none'}")
     n = len(session.fit.model.exposures)
-    out.append(f"{n} exposures" if n > 1 else "one exposure, or their mean")
+    out.append(_exposures(session, n))
     dates = session.dates
     if epoch is not None and dates.size:
         first, last = float(dates.min()), float(dates.max())

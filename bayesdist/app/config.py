@@ -36,6 +36,7 @@ from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
 from bayesdist.products.wise_meta import ARRAYS
 
 __all__ = [
+    "CATALOGUE_WORDS",
     "ChipBlock",
     "Config",
     "Detector",
@@ -239,7 +240,12 @@ class Assess(Section):
     epoch: float | None = None
     grid: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] = (33, 17)
     draws: Annotated[int, Field(ge=100)] = 4000
+    exposure: Literal["mean", "single"] = "mean"
     horizon: Annotated[float, Field(ge=0)] = 10.0
+
+
+# by which a row of the budget says that it is the error of the reference catalogue
+CATALOGUE_WORDS = ("catalog", "reference")
 
 
 class BudgetBlock(Section):
@@ -253,6 +259,11 @@ class BudgetBlock(Section):
     unit: Unit = "pix"
     source: str = GIVEN
     in_residuals: bool = False
+
+    def names(self, *words: str) -> bool:
+        """Whether one of some words is in the row's name or source."""
+        text = f"{self.name} {self.source}".lower()
+        return any(word in text for word in words)
 
     @model_validator(mode="after")
     def _sigma_of_its_kind(self) -> BudgetBlock:
@@ -565,13 +576,20 @@ class Config(Section):
 
     def states(self, *words: str) -> bool:
         """Whether a [[budget]] row names one of some words in its name or its source."""
-        texts = [f"{row.name} {row.source or ''}".lower() for row in self.budget]
-        return any(word in text for text in texts for word in words)
+        return any(row.names(*words) for row in self.budget)
 
     def user_terms(self) -> tuple[UserTerm, ...]:
         """The user's terms of the error budget that are the same at every place."""
         return tuple(
-            UserTerm(b.name, b.kind, b.sigma_u, b.sigma_v, b.unit, said_by_user(b.source))
+            UserTerm(
+                b.name,
+                b.kind,
+                b.sigma_u,
+                b.sigma_v,
+                b.unit,
+                said_by_user(b.source),
+                varies=b.names(*CATALOGUE_WORDS),
+            )
             for b in self.budget
             if b.sigma_u is not None and b.sigma_v is not None
         )

@@ -71,14 +71,13 @@ class RunDiscrepancy:
         more = follow @ (cov - formal)[:D, :D] @ follow.T
         return with_spread(posterior, before, before + _least(before, (more + more.T) / 2))
 
-    @property
-    def fields(self) -> tuple[FieldTerm, ...]:
-        """Errors of parameters, as terms of the budget."""
+    def fields(self, *, single: bool = False) -> tuple[FieldTerm, ...]:
+        """Errors of parameters, as terms of the budget; with the deviation of single exposures."""
         terms: list[FieldTerm] = []
         if self.found.structure:
             terms.append(StructureInFit(self.found))
         if self.found.linear is not None:
-            terms.append(DeviationsTerm(self.found))
+            terms.append(DeviationsTerm(self.found, single))
         return tuple(terms)
 
     def local(self, grid: tuple[int, int], epoch: float | None) -> tuple[LocalTerm, ...]:

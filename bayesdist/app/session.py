@@ -13,7 +13,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.chips import check_chips
-from bayesdist.app.config import Config
+from bayesdist.app.config import CATALOGUE_WORDS, Config
 from bayesdist.app.discrepancy import RunDiscrepancy, keep_discrepancy, kept_discrepancy
 from bayesdist.app.holdout import predictive_of_run, split_of
 from bayesdist.app.matches import load_matches
@@ -64,8 +64,6 @@ from bayesdist.model import DistortionModel
 Float = NDArray[np.float64]
 
 __all__ = ["ERROR_COLUMNS", "STAGES", "Session", "write_table"]
-
-CATALOGUE_WORDS = ("catalog", "reference")
 
 STAGES = ("match", "fit", "sample", "assess", "export", "report")
 
@@ -245,7 +243,8 @@ class Session:
         found = self.discrepancy
         if found is None:
             return Systematics(self.posterior)
-        return Systematics(found.with_noise(self.posterior), found.fields)
+        single = self.config.assess.exposure == "single"
+        return Systematics(found.with_noise(self.posterior), found.fields(single=single))
 
     @cached_property
     def discrepancy(self) -> RunDiscrepancy | None:

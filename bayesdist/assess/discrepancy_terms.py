@@ -58,10 +58,14 @@ class DeviationsTerm:
     ----------
     discrepancy : Discrepancy
         With `linear`.
+    single : bool
+        Whether the position is one in a single exposure that is yet to come, whose own deviation
+        is in the error; else one in the mean of the exposures.
     name, source : str
     """
 
     discrepancy: Discrepancy
+    single: bool = False
     name: str = DEVIATIONS
     source: str = SOURCE
     without: None = None
@@ -72,7 +76,8 @@ class DeviationsTerm:
         assert linear is not None
         rows = rng.integers(len(linear.theta), size=n)
         found = _theta(self.discrepancy, linear.theta[rows], n)
-        return _Bending(found.model, found.mean, found.theta, linear=linear, rows=rows)
+        seed = int(rng.integers(2**63)) if self.single else None
+        return _Bending(found.model, found.mean, found.theta, linear=linear, rows=rows, seed=seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +86,17 @@ class _Bending(FieldDraws):
 
     linear: LinearDeviations = None  # type: ignore[assignment]
     rows: NDArray[np.int64] = None  # type: ignore[assignment]
+    seed: int | None = None
 
     def polynomials(self, *, epoch: float | None, chip: int) -> Float:
         """Legendre coefficients (n, 2, K) of the error."""
-        bent = self.linear.polynomials(epoch, chip)[self.rows]
-        return super().polynomials(epoch=epoch, chip=chip) + bent
+        out = super().polynomials(epoch=epoch, chip=chip)
+        out = out + self.linear.polynomials(epoch, chip)[self.rows]
+        if self.seed is not None:
+            # one exposure has the same deviation on all chips, at all epochs
+            rng = np.random.default_rng(self.seed)
+            out += self.linear.of_single_exposures(self.mean, chip, rng)[self.rows]
+        return out
 
 
 def _theta(discrepancy: Discrepancy, shift: Float, n: int) -> FieldDraws:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.field_terms import FieldTerm
 from bayesdist.assess.fields import MODEL, ErrorDraws, draw_errors
+from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.assess.judged import Judged, JudgedFields, Place, judged_fields
 from bayesdist.assess.judged_statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.sizes import drawn_squares, resized
@@ -22,6 +23,7 @@ from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms import LocalTerm, UserTerm
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
+from bayesdist.model import PolynomialBasis
 
 __all__ = ["CENTROID", "Judged", "Place", "PositionErrors", "position_errors"]
 
@@ -30,6 +32,8 @@ Float = NDArray[np.float64]
 CENTROID = "centroid"
 
 BLOCK = 200_000  # places times draws whose errors a thread holds at once
+SMOOTH_ORDER = 3  # of fields that stand for what may vary over the detector
+SMOOTH_DRAWS = 1000
 BEYOND = 0.5  # magnitudes by which the outermost bins may be left
 
 
@@ -72,6 +76,52 @@ class PositionErrors:
     seed: int
     squares: Float
     _kept: dict[Judged, JudgedFields] = field(default_factory=dict, repr=False)
+
+    def varied(self) -> tuple[PositionErrors, ...]:
+        """The same draws with what may vary over the field varying: smoothly, and everywhere.
+
+        None where no term may vary.
+        """
+        moving = [t.varies and t.kind == "systematic" and any(s) for t, s in self._sized]
+        if not any(moving):
+            return ()
+        everywhere = [
+            replace(t, kind="random") if moves else t
+            for t, moves in zip(self.terms, moving, strict=True)
+        ]
+        still = [pair for pair, moves in zip(self._sized, moving, strict=True) if not moves]
+        smooth = [
+            self._smooth(*pair) for pair, moves in zip(self._sized, moving, strict=True) if moves
+        ]
+        shape = (self.n_draws, len(smooth), *self.squares.shape[2:])
+        return (
+            replace(
+                self,
+                terms=tuple(t for t, _ in still),
+                sigmas=tuple(s for _, s in still),
+                local=(*self.local, *smooth),
+                squares=np.concatenate([self.squares, np.ones(shape)], axis=1),
+            ),
+            replace(self, terms=tuple(everywhere)),
+        )
+
+    def _smooth(self, term: UserTerm, sigma: tuple[float, float]) -> LocalTerm:
+        """A term as a smooth field over each chip, of the same size at every position."""
+        rng = np.random.default_rng(self.seed)
+        n, drawn = min(self.n_draws, SMOOTH_DRAWS), {}
+        for chip in self.fields.whole.solution.model.chips:
+            basis = PolynomialBasis(SMOOTH_ORDER, chip.size, chip.reference_pixel)
+            phi = basis.evaluate(*mesh(*grid_pixels(chip.size, self.grid)))
+            phi = phi / np.linalg.norm(phi, axis=1, keepdims=True)
+            field = rng.standard_normal((n, 2, phi.shape[1])) @ phi.T
+            field = np.swapaxes(field, 1, 2) * sigma
+            drawn[chip.number] = field.reshape(n, *self.grid[::-1], 2)
+        one = {c: np.broadcast_to(np.array(sigma), d.shape[1:]) for c, d in drawn.items()}
+        return LocalTerm(term.name, one, term.source, drawn=drawn)
+
+    @property
+    def _sized(self) -> list[tuple[UserTerm, tuple[float, float]]]:
+        return list(zip(self.terms, self.sigmas, strict=True))
 
     def names(self, judged: Judged) -> tuple[str, ...]:
         """All terms that an error is made of there."""

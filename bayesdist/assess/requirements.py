@@ -191,11 +191,11 @@ def check_requirements(
     for r, case in zip(requirements, cases, strict=True):
         for judged in case:
             wanted.setdefault(judged, set()).add(r.statistic)
-    found = {}
+    ways, found = (errors, *errors.varied()), {}
     for judged, names in wanted.items():
         owner = next(r for r, case in zip(requirements, cases, strict=True) if judged in case)
         try:
-            found[judged] = errors.statistics(judged, sorted(names))
+            found[judged] = [one.statistics(judged, sorted(names)) for one in ways]
         except InputError as error:  # of its region, separation or magnitude
             raise InputError(
                 error.cause, where=f"{owner.where}, {error.where}", do=error.do
@@ -206,8 +206,14 @@ def check_requirements(
     margins = []
     for r, case in zip(requirements, cases, strict=True):
         factor = convert(1.0, unit, r.unit, pixel_scale)
-        draws = [factor * found[judged][r.statistic] for judged in case]
-        margins.append(_margin(r, case, draws, errors, factor, n_effective, caveats))
+        extremes = [
+            _margin(r, case, draws, errors, factor, n_effective, caveats)
+            for draws in zip(
+                *([factor * one[r.statistic] for one in found[judged]] for judged in case),
+                strict=True,
+            )
+        ]
+        margins.append(_of_extremes(extremes, [t.name for t in terms if t.varies]))
     return tuple(margins)
 
 
@@ -282,6 +288,20 @@ def _chips_of(
     if number is None:
         return model.chips
     return (place_of(model, epoch=epoch, chip=number).chip,)
+
+
+def _of_extremes(margins: Sequence[Margin], names: Sequence[str]) -> Margin:
+    """The less favourable margin, with a verdict that holds for all of them."""
+    worse = min(margins, key=lambda m: m.probability_met)
+    if worse.verdict != "missed" or all(m.verdict == "missed" for m in margins):
+        return worse
+    better = max(margins, key=lambda m: m.probability_met)
+    reason = (
+        f"it depends on how {' and '.join(names)} varies over the field: as one offset, a smooth "
+        f"field, or independent errors, P(met) is {worse.probability_met:.3g} to "
+        f"{better.probability_met:.3g}"
+    )
+    return replace(worse, verdict="undecided", reason=reason)
 
 
 def _not_converged(solution: Solution, converged: bool | None) -> tuple[Caveat, ...]:

@@ -61,6 +61,10 @@ class UserTerm:
         'pix', 'arcsec', 'mas' or 'deg'.
     source : str
         Where the number comes from: 'given by the user', or a publication.
+    varies : bool
+        Of a systematic term: whether it may differ from place to place in a way that is not known,
+        as the errors of a catalogue do.  Requirements are then judged for one offset of the whole
+        field, for a smooth field, and for independent errors at every position.
 
     Raises
     ------
@@ -74,6 +78,7 @@ class UserTerm:
     sigma_v: float
     unit: str = "pix"
     source: str = GIVEN
+    varies: bool = False
 
     def __post_init__(self) -> None:
         where = f"budget term {self.name!r}"

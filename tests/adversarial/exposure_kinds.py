@@ -149,7 +149,8 @@ def breathing_new(rng: np.random.Generator, n: int) -> Truth:
     def true_map(x: np.ndarray, y: np.ndarray, epoch: Any = None) -> np.ndarray:
         return deviating(truth.true_map(x, y, epoch), own)
 
-    return replace(truth, true_map=true_map)
+    config = truth.config | {"assess": truth.config.get("assess", {}) | {"exposure": "single"}}
+    return replace(truth, true_map=true_map, config=config)
 
 
 @kind("drift_two_dates", *OF_EXPOSURES, *OF_TIME, n=3000)

@@ -60,7 +60,7 @@ def systematics_of(session: CampaignSession) -> Systematics:
     if found is not None:
         before = covariance_of(session.posterior, session.fit, stars)
         solution = found.with_noise(solution, before)
-        fields += found.fields
+        fields += found.fields()
     scatter = ExposureScatter(posterior.model, posterior.mean, *session.scatter)
     aberration = aberration_term(session, solution)
     return Systematics(solution, (*fields, scatter, aberration), aligned=True)

@@ -33,7 +33,7 @@ SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear":
 CURVATURE = "curvature"
 MOST_EXPOSURES = 40
 STEPS = {"shape": 12, "shift": 5, "rotation": 5, CURVATURE: 6}
-RANGE = 30.0  # of amplitudes about the prior's median and what the data resolve
+RANGE = 10.0  # of amplitudes about the prior's median and what the data resolve
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +73,30 @@ class LinearDeviations:
                 out[:, axis, term] += 0.5 * self.curvature[:, k] * (epoch - self.epoch) ** 2
         return out
 
+    def of_single_exposures(self, mean: Float, chip: int, rng: np.random.Generator) -> Float:
+        """Coefficients (n, 2, K) of the deviation of an exposure that is yet to come.
 
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    """Functions whose coefficients scatter: each a displacement of the stars of some groups."""
-
-    scatter: tuple[str, ...]
-    terms: tuple[tuple[int, int, int], ...]
-    epoch: float
+        Parameters
+        ----------
+        mean : ndarray, shape (D,)
+            Parameters, whose polynomials are deformed.
+        chip : int
+            Number.
+        rng : numpy.random.Generator
+        """
+        code, n = self.model.chip_code(chip), len(self.theta)
+        at = np.array([self.model.time.epoch0[0] if self.model.time else 0.0])
+        P = self.model.polynomials(mean, np.array([code]), at)[0].copy()
+        P[:, 0] = 0.0
+        turned = {
+            "rotation": [np.stack([-P[1], P[0]])],
+            "shape": [P, np.stack([P[0], -P[1]]), P[::-1]],
+        }
+        out = np.zeros((n, *P.shape))
+        for name, scatter in self.scatter.items():
+            for field in turned.get(name, []):
+                out += (scatter * rng.standard_normal(n))[:, None, None] * field
+        return out
 
 
 def linear_deviations(

@@ -9,6 +9,7 @@ C(d) sum h_i h_j.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,10 +78,15 @@ class SharedVariance:
     product: Float
     variance: Float
 
-    def log_density(self, amplitude: float, correlation: Float) -> float:
-        """Log likelihood of a field's amplitude, given its correlation (b,) in each bin."""
-        expected = self.weight * correlation * amplitude**2
-        return float(-0.5 * np.sum((self.product - expected) ** 2 / self.variance))
+    def of_field(self, functions: StructureFunctions, length: float) -> Callable[[float], float]:
+        """Log likelihood of a field's amplitude, for a correlation length in longer half sides."""
+        at_unit = self.weight * self.correlation(functions, length)
+
+        def log_likelihood(amplitude: float) -> float:
+            left = self.product - at_unit * amplitude**2
+            return float(-0.5 * np.sum(left**2 / self.variance))
+
+        return log_likelihood
 
     def correlation(self, functions: StructureFunctions, length: float) -> Float:
         """Covariance (b,) of what is finer than the functions, of a field of unit variance.

@@ -51,10 +51,10 @@ class DiscrepancyPriors:
         For a median that is not positive.
     """
 
-    higher_order: float = 5e-4
-    structure: float = 3e-4
+    higher_order: float = 3e-4
+    structure: float = 1.5e-4
     exposure: float = 3e-6
-    curvature: float = 3e-7
+    curvature: float = 5e-8
     star: float = 1e-3
 
     def __post_init__(self) -> None:

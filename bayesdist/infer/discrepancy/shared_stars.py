@@ -2,27 +2,85 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
 from bayesdist.infer.robust.scores import Scores
-from bayesdist.infer.stars import prepare
+from bayesdist.infer.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = ["shared_star_errors"]
+__all__ = ["SharedStars", "shared_stars"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 STEPS = 60
 RANGE = 300.0
 
 
-def shared_star_errors(
-    table: MatchTable, scores: Scores, covariance: Float, model: DistortionModel, median: float
-) -> tuple[Float, float]:
-    """What is added to the covariance of the parameters, and the rms error of a star on an axis.
+@dataclass(frozen=True, eq=False)
+class SharedStars:
+    """Errors that stars of the catalogue have in all of their matches.
+
+    Parameters
+    ----------
+    rms : float
+        Of a star on an axis, in the unit of u, v; 0 where no star is matched twice.
+    repetition : float
+        Mean factor, over the matches, by which a star's matches tell less of what lies at its
+        position than as many stars would.
+    stars : Stars
+    code : ndarray of int, shape (N,)
+        Star of each match, in the order of `stars`.
+    curvature : ndarray, shape (N, 2, 2)
+    """
+
+    rms: float
+    repetition: float
+    stars: Stars
+    code: Int
+    curvature: Float
+
+    def covariance(self, model: DistortionModel, theta: Float, formal: Float) -> Float:
+        """Covariance (D, D) beyond what independent errors of the same size would do.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        theta : ndarray, shape (D,)
+        formal : ndarray, shape (D, D)
+            Of the parameters, by their likelihood.
+        """
+        D = model.n_distortion  # frames follow as they are correlated
+        together = np.zeros((int(self.code.max()) + 1, D, 2))
+        alone = np.zeros((D, D))
+        stars = self.stars
+        for g, (columns, derivative) in enumerate(model.effective_jacobian(theta, stars.groups)):
+            rows = slice(stars.starts[g], stars.starts[g + 1])
+            own = columns < D
+            phi = model.basis(model.chips[stars.groups.chip[g]].number).evaluate_scaled(
+                stars.X[rows], stars.Y[rows]
+            )
+            pull = np.einsum(
+                "nk,nab,bkm->nma", phi, self.curvature[rows], derivative[:, :, own], optimize=True
+            )
+            columns = columns[own]
+            alone[np.ix_(columns, columns)] += np.einsum("nma,nla->ml", pull, pull, optimize=True)
+            np.add.at(together, (self.code[rows][:, None], columns), pull)
+        shared = np.einsum("sma,sla->ml", together, together, optimize=True)
+        by_scores = formal[:, :D]
+        extra = self.rms**2 * by_scores @ (shared - alone) @ by_scores.T
+        return np.asarray((extra + extra.T) / 2)
+
+
+def shared_stars(
+    table: MatchTable, scores: Scores, model: DistortionModel, median: float
+) -> SharedStars | None:
+    """Size of the errors that stars have in all of their matches; None where none is repeated.
 
     A star with an error a of its own in all of its matches has a summed score of mean a h, h its
     summed curvature, so that with a ~ N(0, w^2)
@@ -38,57 +96,38 @@ def shared_star_errors(
         Matches with codes of the stars.
     scores : Scores
         Of the solution.
-    covariance : ndarray, shape (D, D)
-        Of its parameters, by its likelihood.
     model : DistortionModel
     median : float
         Of the half-Cauchy prior of w, in the unit of u, v.
 
     Returns
     -------
-    covariance : ndarray, shape (D, D)
-        Beyond what errors of the same size that are independent from match to match would do.
-    rms : float
+    SharedStars or None
     """
     assert table.star is not None
     stars, order = prepare(model, table)
     code = table.star[order]
-    repeated = np.bincount(code) > 1
+    n_matches = np.bincount(code)
+    repeated = n_matches > 1
     if repeated.sum() < 2:
-        return np.zeros_like(covariance), 0.0
+        return None
     g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
     good = (h_uu > 0) & (h_vv > 0)
     size = np.geomspace(median / RANGE, median * RANGE, STEPS)
     log_density = log_half_cauchy(size, median)
+    summed = []
     for g, h in ((g_u, h_uu), (g_v, h_vv)):
-        top, bottom = (
-            np.bincount(code[good], w[good], minlength=len(repeated))[repeated] for w in (g, h)
-        )
+        top, bottom = (np.bincount(code[good], w[good], minlength=len(repeated)) for w in (g, h))
+        summed.append(bottom)
+        top, bottom = top[repeated], bottom[repeated]
         widened = 1 + size[:, None] ** 2 * bottom
         log_density = log_density + 0.5 * (
             size[:, None] ** 2 * top**2 / widened - np.log(widened)
         ).sum(axis=1)
     weight = np.exp(log_density - log_density.max())
     square = float(weight @ size**2 / weight.sum())
-
-    D = model.n_distortion  # frames follow as they are correlated
-    together = np.zeros((len(repeated), D, 2))
-    alone = np.zeros((D, D))
     curvature = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2) * good[:, None, None]
-    jacobians = model.effective_jacobian(scores.theta, stars.groups)
-    for g, (columns, derivative) in enumerate(jacobians):
-        rows = slice(stars.starts[g], stars.starts[g + 1])
-        own = columns < D
-        phi = model.basis(model.chips[stars.groups.chip[g]].number).evaluate_scaled(
-            stars.X[rows], stars.Y[rows]
-        )
-        pull = np.einsum(
-            "nk,nab,bkm->nma", phi, curvature[rows], derivative[:, :, own], optimize=True
-        )
-        columns = columns[own]
-        alone[np.ix_(columns, columns)] += np.einsum("nma,nla->ml", pull, pull, optimize=True)
-        np.add.at(together, (code[rows][:, None], columns), pull)
-    shared = np.einsum("sma,sla->ml", together, together, optimize=True)
-    by_scores = covariance[:, :D]
-    extra = square * by_scores @ (shared - alone) @ by_scores.T
-    return (extra + extra.T) / 2, float(np.sqrt(square))
+    # the matches of a star share its error, of which one match alone would show its own part
+    rest = np.mean(summed, axis=0) * (1 - 1 / np.maximum(n_matches, 1))
+    repetition = float(np.average(1 + square * rest, weights=n_matches))
+    return SharedStars(float(np.sqrt(square)), repetition, stars, code, curvature)

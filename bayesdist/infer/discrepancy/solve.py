@@ -16,14 +16,15 @@ from bayesdist.infer.discrepancy.information import Information
 from bayesdist.infer.discrepancy.linear import linear_deviations
 from bayesdist.infer.discrepancy.neighbours import (
     Neighbours,
+    SharedVariance,
     neighbours_of,
     shared_variance,
 )
 from bayesdist.infer.discrepancy.noise import score_excess
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
-from bayesdist.infer.discrepancy.shared_stars import shared_star_errors
-from bayesdist.infer.discrepancy.structure import AxisStructure, axis_structure
+from bayesdist.infer.discrepancy.shared_stars import shared_stars
+from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.robust.scores import scores_of
 from bayesdist.infer.settling import Settling
@@ -94,8 +95,12 @@ def estimate_discrepancy(
     with opened(model, matches, compute) as shards:
         sums: CellSums = shards.sum(cell_sums, scores, cells_per_side(len(shards.groups)))
     working = Information(model, scores.theta, sums, parameter_priors or GaussianPriors.none(model))
-    information = working.with_excess(score_excess(working))
     pixel = model.pixel_size(scores.theta)
+    repeated = None
+    if stars is not None and stars.star is not None:
+        repeated = shared_stars(stars, scores, model, priors.star * pixel)
+    excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
+    information = working.with_excess(excess)
     chips = range(len(model.chips)) if structure else ()
     beside = {}
     if structure and sample is not None:
@@ -105,10 +110,9 @@ def estimate_discrepancy(
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
     formal, noise = working.covariance, working.sandwich()
-    if stars is not None and stars.star is not None:
-        extra, rms = shared_star_errors(stars, scores, formal, model, priors.star * pixel)
-        noise = noise + extra
-        facts["star_rms"] = rms
+    if repeated is not None:
+        noise = noise + repeated.covariance(model, scores.theta, formal)
+        facts["star_rms"] = repeated.rms
     noise, ratio = _not_narrower(noise, formal)
     if settling is not None:
         formal, noise = (settling.mean(settling.mean(c).T).T for c in (formal, noise))
@@ -158,43 +162,42 @@ def _structures(
     for code in chips:
         chip = model.chips[code]
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
-        chip_structure = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
-        S, crossed, taken, score = _along_axes(information, working, chip_structure, code)
-        here = chip_structure.evaluate(*_even_points())
-        coefficients = []
+        chip_waves = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
+        S, crossed, taken, score = _along_axes(information, working, chip_waves, code)
+        here = chip_waves.evaluate(*_even_points())
+        left = [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)]
+        pull = [score[a] - crossed[a].T @ shift for a in (0, 1)]
+        pairs: list[SharedVariance | None] = [None, None]
+        if code in neighbours:
+            near = neighbours[code]
+            pairs = [
+                shared_variance(near, information, functions, code, a, left[a], pull[a])
+                for a in (0, 1)
+            ]
+        posterior = chip_structure(
+            functions,
+            left,
+            pull,
+            noise=_star_error(information, code),
+            higher_order=priors.higher_order * pixel,
+            structure=priors.structure * pixel,
+            pairs=pairs,
+        )
+        drawn = posterior.draws(n, rng)
         for a in (0, 1):
-            left = S[a] - crossed[a].T @ (information.covariance @ crossed[a])
-            pull = score[a] - crossed[a].T @ shift
-            shared = None
-            if code in neighbours:
-                shared = shared_variance(
-                    neighbours[code], information, functions, code, a, left, pull
-                )
-            posterior: AxisStructure = axis_structure(
-                functions,
-                left,
-                pull,
-                pairs=shared,
-                noise=_star_error(information, code, a),
-                higher_order=priors.higher_order * pixel,
-                structure=priors.structure * pixel,
-            )
-            drawn = posterior.draws(n, rng)
-            coefficients.append(drawn)
             # the fit takes structure for polynomials; the truth lies on the other side
-            theta -= drawn @ (working.covariance @ taken[a]).T
-            by_draw = np.sqrt(np.mean((drawn @ here.T) ** 2, axis=1))
+            theta -= drawn[:, a] @ (working.covariance @ taken[a]).T
+            by_draw = np.sqrt(np.mean((drawn[:, a] @ here.T) ** 2, axis=1))
             rows.append(
                 {
                     "chip": chip.number,
                     "axis": "uv"[a],
-                    "field_rms": posterior.field_rms,
-                    "length_pix": posterior.length * max(chip.size) / 2,
                     "rms": float(np.sqrt(np.mean(by_draw**2))),
                     "median": float(np.median(by_draw)),
+                    "length_pix": posterior.length * max(chip.size) / 2,
                 }
             )
-        out[chip.number] = replace(chip_structure, coefficients=np.stack(coefficients, axis=1))
+        out[chip.number] = replace(chip_waves, coefficients=drawn)
     return out, theta, {"structure": rows}
 
 
@@ -205,11 +208,11 @@ def _even_points() -> tuple[Float, Float]:
     return X.ravel(), Y.ravel()
 
 
-def _star_error(information: Information, chip: int, axis: int) -> float:
-    """Error of a typical star."""
+def _star_error(information: Information, chip: int) -> float:
+    """Error of a typical star on an axis."""
     rows = information.sums.groups.chip == chip
-    n, h = information.sums.sums[rows][:, :, [0, (3, 5)[axis]]].sum(axis=(0, 1))
-    return float(np.sqrt(n / h)) if h > 0 else 1.0
+    n, uu, vv = information.sums.sums[rows][:, :, [0, 3, 5]].sum(axis=(0, 1))
+    return float(np.sqrt(2 * n / (uu + vv))) if uu + vv > 0 else 1.0
 
 
 def _along_axes(

@@ -1,4 +1,4 @@
-"""Posterior of what a polynomial leaves out on one axis of one chip, amplitudes marginalised.
+"""Posterior of what a polynomial leaves out on a chip, amplitudes marginalised.
 
 With what the fit has taken eliminated, the data speak of the coefficients z of the structure's
 functions through a score s and an information S, so that for amplitudes eta
@@ -8,12 +8,14 @@ functions through a score s and an information S, so that for amplitudes eta
 
 The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
 are gone through on a grid that is refined where the density is.  What the field has at frequencies
-above the functions' is seen in pairs of stars (`SharedVariance`), whose likelihood is a factor.
+above the functions' is seen in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
@@ -23,36 +25,73 @@ from bayesdist.infer.discrepancy.functions import FINE, StructureFunctions
 from bayesdist.infer.discrepancy.neighbours import SharedVariance
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
 
-__all__ = ["AxisStructure", "axis_structure"]
+__all__ = ["Structure", "chip_structure"]
 
 Float = NDArray[np.float64]
 
 LENGTHS = np.geomspace(0.02, 0.6, 7)  # of the field, in longer half sides; all alike beforehand
 STEPS = 8  # of the amplitude, before the grid is refined
-HALVINGS = 6  # at most: neighbouring stars may say an amplitude to some percent
-NEGLIGIBLE = 9.0  # in log density, below the largest
-SMOOTH = 0.7  # in log density, from one point of the grid to the next
+HALVINGS = 5  # at most: neighbouring stars may tell an amplitude to some percent
+CHANGE = 0.7  # of the log density between two points, below which none is put between them
+NEGLIGIBLE = 10.0  # in log density, below the largest
+UNLIKE = 0.2  # prior probability that the field differs on the two axes, by a factor e or so
 TERM_STEPS = 24  # of the amplitude of the higher orders
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
-    """One length and amplitude of the field, and what follows for all amplitudes of the terms."""
+class _Axis:
+    """What the data say of one axis, given length and amplitude of the field.
 
-    length: float
-    amplitude: float
-    factor: Float  # lower Cholesky factor of the sines' precision
-    right: Float  # that factor's inverse times the sines' score
-    tied: Float  # and times what ties them to the terms
-    values: Float  # eigenvalues of the terms' information without the sines
+    Parameters
+    ----------
+    factor : ndarray
+        Lower Cholesky factor of the sines' precision.
+    right : ndarray
+        Its inverse times the sines' score.
+    tied : ndarray
+        And times what ties them to the terms.
+    values, vectors : ndarray
+        Of the terms' information without the sines.
+    score : ndarray
+        Of the terms, along these.
+    """
+
+    factor: Float
+    right: Float
+    tied: Float
+    values: Float
     vectors: Float
-    score: Float  # of the terms, along these
-    log_density: Float  # (TERM_STEPS,), by amplitude of the terms
+    score: Float
+
+    def log_evidence(self, amplitudes: Float) -> Float:
+        """By the amplitude of the terms, but for what the spectrum of the sines adds."""
+        out = 0.5 * self.right @ self.right - np.log(np.diag(self.factor)).sum()
+        out += 0.5 * (self.score**2 / (self.values + amplitudes[:, None] ** -2)).sum(axis=1)
+        return np.asarray(out - 0.5 * np.log1p(self.values * amplitudes[:, None] ** 2).sum(axis=1))
+
+    def draws(self, amplitude: Float, rng: np.random.Generator) -> tuple[Float, Float]:
+        """Terms (m, T) and sines (m, n_sines), given amplitudes (m,) of the terms."""
+        precision = self.values + amplitude[:, None] ** -2
+        along = self.score / precision
+        along = along + rng.standard_normal(along.shape) / np.sqrt(precision)
+        terms = along @ self.vectors.T
+        right = self.right[:, None] - self.tied @ terms.T
+        right += rng.standard_normal(right.shape)
+        return terms, _solve(self.factor, right, trans=1).T
 
 
 @dataclass(frozen=True, eq=False)
-class AxisStructure:
-    """Posterior of the structure on one axis of a chip.
+class _Point:
+    """A correlation length, and an amplitude of the field on each axis."""
+
+    length: float
+    amplitudes: tuple[float, float]
+    axes: tuple[_Axis, _Axis]
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Posterior of the structure on a chip.
 
     Parameters
     ----------
@@ -71,9 +110,8 @@ class AxisStructure:
     weight: Float
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Coefficients (n, n_known + 2 FINE) of terms, sines and finer waves."""
-        functions, T = self.functions, self.functions.n_terms
-        decline = functions.decline()
+        """Coefficients (n, 2, n_known + 2 FINE) of terms, sines and finer waves on both axes."""
+        functions, decline = self.functions, self.functions.decline()
         counts = rng.multinomial(n, self.weight.ravel()).reshape(self.weight.shape)
         out = []
         for point, by_terms in zip(self.points, counts, strict=True):
@@ -81,124 +119,154 @@ class AxisStructure:
             if not m:
                 continue
             amplitude = np.repeat(self.terms_amplitude, by_terms)
-            precision = point.values + amplitude[:, None] ** -2
-            along = point.score / precision
-            along = along + rng.standard_normal((m, T)) / np.sqrt(precision)
-            terms = along @ point.vectors.T
-            right = point.right[:, None] - point.tied @ terms.T
-            right += rng.standard_normal(right.shape)
-            sines = _solve(point.factor, right, trans=1).T
-            fine = point.amplitude * np.sqrt(functions.finer(point.length))
-            waves = fine * rng.standard_normal((m, 2 * FINE))
-            out.append(np.concatenate([terms * decline, sines, waves], axis=1))
+            fine = np.sqrt(functions.finer(point.length))
+            both = []
+            for size, axis in zip(point.amplitudes, point.axes, strict=True):
+                terms, sines = axis.draws(amplitude, rng)
+                waves = size * fine * rng.standard_normal((m, 2 * FINE))
+                both.append(np.concatenate([terms * decline, sines, waves], axis=1))
+            out.append(np.stack(both, axis=1))
         return rng.permutation(np.concatenate(out))
-
-    @property
-    def field_rms(self) -> float:
-        """Root of the mean posterior square of the field's amplitude."""
-        by_point = self.weight.sum(axis=1)
-        return float(np.sqrt(by_point @ [p.amplitude**2 for p in self.points]))
 
     @property
     def length(self) -> float:
         """Posterior mean correlation length of the field, weighed by variance, in half sides."""
-        by_point = self.weight.sum(axis=1) * [p.amplitude**2 for p in self.points]
+        by_point = self.weight.sum(axis=1)
+        by_point = by_point * [np.square(p.amplitudes).sum() for p in self.points]
         return float(by_point @ [p.length for p in self.points] / by_point.sum())
 
 
-def axis_structure(
+def chip_structure(
     functions: StructureFunctions,
-    information: Float,
-    score: Float,
+    information: Sequence[Float],
+    score: Sequence[Float],
     *,
     noise: float,
     higher_order: float,
     structure: float,
-    pairs: SharedVariance | None = None,
-) -> AxisStructure:
-    """Posterior of the coefficients of structure functions on one axis.
+    pairs: Sequence[SharedVariance | None] = (None, None),
+) -> Structure:
+    """Posterior of the coefficients of structure functions on the two axes of a chip.
+
+    Length and amplitudes are those of both axes: what bends light or silicon bends it along both,
+    and few data tell little of each.  But the field may differ, as a pattern of columns does.
 
     Parameters
     ----------
     functions : StructureFunctions
-    information : ndarray, shape (n_known, n_known)
-        Of their coefficients, with what the fit takes eliminated.
-    score : ndarray, shape (n_known,)
+    information : sequence of ndarray, shape (n_known, n_known)
+        Of the coefficients on each axis, with what the fit takes eliminated.
+    score : sequence of ndarray, shape (n_known,)
         Gradient of the log-likelihood where they are zero, in the same way.
     noise : float
         Typical error of one star: no amplitude beyond a few of it is looked at.
     higher_order, structure : float
         Prior medians of the amplitudes, in the unit of the positions.
-    pairs : SharedVariance, optional
-        What neighbouring stars say of the field at frequencies above those of the functions.
+    pairs : sequence of SharedVariance or None
+        What neighbouring stars tell of the field above the functions' frequencies, on each axis.
 
     Returns
     -------
-    AxisStructure
+    Structure
     """
     T = functions.n_terms
     scale = functions.decline()
-    tied = information[T:, :T] * scale
-    terms = (information[:T, :T] * np.outer(scale, scale), score[:T] * scale)
-    resolved = 1 / np.sqrt(max(float(np.median(np.diag(information)[:T])), 1e-300))
+    resolved = min(1 / np.sqrt(max(float(np.median(np.diag(S)[:T])), 1e-300)) for S in information)
     low = 0.2 * min(higher_order, structure, resolved)
     high = max(3 * noise, 10 * structure)
     amplitudes = np.geomspace(low, 3 * high, TERM_STEPS)
     prior = log_half_cauchy(amplitudes, higher_order)
 
-    def at(length: float, log_amplitude: float) -> _Point:
+    def axis_at(S: Float, s: Float, variance: Float) -> _Axis:
+        matrix = S[T:, T:] + np.diag(1 / variance)
+        factor = scipy.linalg.cholesky(matrix, lower=True, check_finite=False)
+        solved = _solve(factor, np.column_stack([s[T:], S[T:, :T] * scale]))
+        right, tied = solved[:, 0], solved[:, 1:]
+        values, vectors = np.linalg.eigh(S[:T, :T] * np.outer(scale, scale) - tied.T @ tied)
+        along = vectors.T @ (s[:T] * scale - tied.T @ right)
+        return _Axis(factor, right, tied, np.maximum(values, 0.0), vectors, along)
+
+    def at(length: float, log_amplitude: float) -> _Sized:
         amplitude = float(np.exp(log_amplitude))
         variance = amplitude**2 * functions.spectrum(length)
-        matrix = information[T:, T:] + np.diag(1 / variance)
-        factor = scipy.linalg.cholesky(matrix, lower=True, check_finite=False)
-        solved = _solve(factor, np.column_stack([score[T:], tied]))
-        right, through = solved[:, 0], solved[:, 1:]
-        values, vectors = np.linalg.eigh(terms[0] - through.T @ through)
-        values = np.maximum(values, 0.0)
-        left = vectors.T @ (terms[1] - through.T @ right)
-        evidence = 0.5 * right @ right - np.log(np.diag(factor)).sum()
-        evidence -= 0.5 * np.log(variance).sum()
-        by_terms = 0.5 * (left**2 / (values + amplitudes[:, None] ** -2)).sum(axis=1)
-        by_terms -= 0.5 * np.log1p(values * amplitudes[:, None] ** 2).sum(axis=1)
-        density = by_terms + prior + evidence + log_half_cauchy(np.array(amplitude), structure)
-        if pairs is not None:
-            density = density + pairs.log_density(amplitude, shared[length])
-        return _Point(length, amplitude, factor, right, through, values, vectors, left, density)
+        axes, evidence = [], []
+        for S, s, known in zip(information, score, shared[length], strict=True):
+            axes.append(axis_at(S, s, variance))
+            found = axes[-1].log_evidence(amplitudes) - 0.5 * np.log(variance).sum()
+            evidence.append(found if known is None else found + known(amplitude))
+        return _Sized(amplitude, (axes[0], axes[1]), np.stack(evidence))
 
-    shared = {} if pairs is None else {a: pairs.correlation(functions, a) for a in LENGTHS}
-    found: list[tuple[_Point, float]] = []
+    shared = {
+        length: [None if p is None else p.of_field(functions, length) for p in pairs]
+        for length in LENGTHS
+    }
+    best, points, log_weight = np.full(3, -np.inf), list[_Point](), list[Float]()
     for length in LENGTHS:
         grid = list(np.linspace(np.log(low), np.log(high), STEPS))
-        points = [at(length, a) for a in grid]
+        sized = [at(length, a) for a in grid]
         for _ in range(HALVINGS):
-            tops = [p.log_density.max() for p in points]
-            best = max([*tops, *(p.log_density.max() for p, _ in found)])
-            n = len(grid)
-            grid, points = _refined(grid, points, tops, best - NEGLIGIBLE, length, at)
-            if len(grid) == n:
+            tops = np.array([(prior + one.views).max(axis=1) for one in sized])
+            tops += log_half_cauchy(np.exp(grid), structure)[:, None]
+            best = np.maximum(best, tops.max(axis=0))
+            # axis by axis only where they may differ
+            views = (0, 1, 2) if best[1] + best[2] > best[0] + prior.max() + CHANGE else (0,)
+            middles = set[float]()
+            for k in views:
+                middles.update(_middles(grid, tops[:, k], best[k] - NEGLIGIBLE))
+            if not middles:
                 break
-        widths = np.gradient(grid)
-        found += [
-            (p, w)
-            for p, w in zip(points, widths, strict=True)
-            if p.log_density.max() > best - NEGLIGIBLE
-        ]
-    log_weight = np.array([p.log_density + np.log(w) for p, w in found])
-    weight = np.exp(log_weight - log_weight.max())
-    return AxisStructure(functions, amplitudes, tuple(p for p, _ in found), weight / weight.sum())
+            sized += [at(length, a) for a in middles]
+            grid += middles
+            order = np.argsort(grid)
+            grid, sized = [grid[k] for k in order], [sized[k] for k in order]
+        for point, density in _combined(length, grid, sized, structure):
+            points.append(point)
+            log_weight.append(prior + density)
+    every = np.array(log_weight)
+    kept = every.max(axis=1) > every.max() - NEGLIGIBLE
+    weight = np.exp(every[kept] - every.max())
+    points = [p for p, k in zip(points, kept, strict=True) if k]
+    return Structure(functions, amplitudes, tuple(points), weight / weight.sum())
 
 
-def _refined(grid, points, tops, least, length, at):  # type: ignore[no-untyped-def]
-    """The grid with a point in the middle of each interval that has some of the density."""
-    new_grid, new_points = grid[:1], points[:1]
-    for k in range(1, len(grid)):
-        if max(tops[k - 1], tops[k]) > least and abs(tops[k] - tops[k - 1]) > SMOOTH:
-            middle = 0.5 * (grid[k - 1] + grid[k])
-            new_grid.append(middle)
-            new_points.append(at(length, middle))
-        new_grid.append(grid[k])
-        new_points.append(points[k])
-    return new_grid, new_points
+@dataclass(frozen=True, eq=False)
+class _Sized:
+    """One amplitude of the field, and the evidence (2, TERM_STEPS) of each axis for it."""
+
+    amplitude: float
+    axes: tuple[_Axis, _Axis]
+    evidence: Float
+
+    @property
+    def views(self) -> Float:
+        """Evidence (3, TERM_STEPS) of both axes together, and of each."""
+        return np.stack([self.evidence.sum(axis=0), *self.evidence])
+
+
+def _combined(
+    length: float, grid: Sequence[float], sized: Sequence[_Sized], median: float
+) -> Iterator[tuple[_Point, Float]]:
+    """Amplitudes of the field on both axes, and the density of each for all of the terms."""
+    width = np.log(np.gradient(grid))
+    for i, u in enumerate(sized):
+        for j, v in enumerate(sized):
+            both = (u.amplitude, v.amplitude)
+            density = float(log_half_cauchy(np.sqrt(np.mean(np.square(both))), median)) + width[i]
+            if i == j:
+                density += np.log(1 - UNLIKE)
+            else:
+                density += np.log(UNLIKE / 2) - abs(grid[i] - grid[j]) + width[j]
+            point = _Point(length, both, (u.axes[0], v.axes[1]))
+            yield point, density + u.evidence[0] + v.evidence[1]
+
+
+def _middles(grid: Sequence[float], tops: Sequence[float], least: float) -> list[float]:
+    """Middles of the intervals that have some of the density, and over which it changes."""
+    return [
+        0.5 * (a + b)
+        for (a, top_a), (b, top_b) in pairwise(zip(grid, tops, strict=True))
+        if max(top_a, top_b) > least and abs(top_a - top_b) > CHANGE
+    ]
 
 
 def _solve(factor: Float, right: Float, trans: int = 0) -> Float:
