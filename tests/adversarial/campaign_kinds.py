@@ -27,14 +27,35 @@ def quiet_deviations(rng: np.random.Generator, n: int) -> np.ndarray:
     return QUIET / BREATHING * normal_deviations(rng, n)
 
 
+def chip_by_chip(field: fields.Field) -> fields.Field:
+    """A field about the middle of each of two chips: the gap between them has no drift."""
+
+    def of_chip(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        half = fields.SIDE / 4
+        return field(x, np.asarray(y) - np.where(np.asarray(y) > 2 * half + 0.5, half, -half))
+
+    return of_chip
+
+
 def usual(rng: np.random.Generator, **other: object) -> CampaignTruth:
     """A campaign of exposures whose linear terms drift, and what comes beside it."""
     options = {"rate": drift(rng), "deviations": quiet_deviations, "beyond": 1.0} | other
     return made(rng, Recipe(**options))  # type: ignore[arg-type]
 
 
+@kind("campaign_inside_chips", inside=True, n=300)
+def inside_chips(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """The same on two chips, each of which drifts about its middle."""
+    return usual(rng, stars=n, chips=TWO, rate=chip_by_chip(drift(rng)))
+
+
+@kind("campaign_gap", "gap", "between exposures", *STRUCTURE, *OF_TIME, n=300)
+def gap(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Two chips drift as one detector: the distance between them changes, which is not fitted."""
+    return usual(rng, stars=n, chips=TWO)
+
+
 @kind("campaign_inside_breathing", inside=True, n=300, deviations=normal_deviations)
-@kind("campaign_inside_chips", inside=True, n=300, chips=TWO)
 @kind("campaign_inside", inside=True, n=300)
 def inside(rng: np.random.Generator, n: int, **options: object) -> CampaignTruth:
     """What is fitted is what is true: breathing that is normal, a drift that is linear."""

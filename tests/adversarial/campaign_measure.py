@@ -16,7 +16,7 @@ from bayesdist.app.stages import run_stage
 from bayesdist.app.stages.assess import run_assess
 from bayesdist.assess.grid import grid_pixels, mesh
 
-from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, TERMS, CampaignTruth
+from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth
 from .written import toml_text
 
 STAGES = ("match", "fit", "sample", "assess")
@@ -65,22 +65,24 @@ def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Session:
 
 
 def actual_error(session: Session, truth: CampaignTruth) -> np.ndarray:
-    """Predicted less true positions (chips * ny * nx, 2) in an exposure that is yet to come.
+    """Predicted less true positions (NEW, chips * ny * nx, 2) in exposures that are yet to come.
 
     Whoever uses the calibration there fits shift and rotation, with stars all over the chips.
     """
     solution, epoch = session.solution, session.epoch
     assert epoch is not None
     mean = np.asarray(solution.mean)
-    predicted, true = [], []
+    predicted, mosaic = [], []
     for chip in solution.model.chips:
         x, y = mesh(*grid_pixels(chip.size, session.config.assess.grid))
         predicted.append(
             solution.model.predict(mean, x, y, chip=chip.number, epoch=np.full(x.size, epoch))
         )
         piece = next(one for one in truth.chips if one.number == chip.number)
-        true.append(truth.true_map(*piece.mosaic(x, y), epoch))
-    return _aligned(np.concatenate(predicted), np.concatenate(true))
+        mosaic.append(np.stack(piece.mosaic(x, y)))
+    x, y = np.concatenate(mosaic, axis=1)
+    seen = np.concatenate(predicted)
+    return np.stack([_aligned(seen, truth.true_map(x, y, epoch, k)) for k in range(NEW)])
 
 
 def _aligned(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ BLEND = 0.3  # px: scatter of blended detections
 REACH = 1750.0  # px: the catalogue's half side
 DITHER = 150.0  # px
 ARCSEC = 0.05  # a pixel, in the known distortion
+NEW = 12  # exposures that are yet to come: one by itself says little of how they deviate
 TERMS = [["u", 1, 0], ["v", 1, 0], ["v", 0, 1]]
 
 Map = Callable[[np.ndarray, np.ndarray, Any], np.ndarray]  # mosaic x, y, epoch -> (N, 2)
@@ -59,8 +60,8 @@ class CampaignTruth:
         Columns of the star list of each exposure.
     chips : tuple of Piece
     true_map : callable
-        Mosaic x, y and epoch to true (u, v) (N, 2), without frames: what an exposure shows that
-        deviates from the others as they do from each other.
+        Mosaic x, y, epoch and number to true (u, v) (N, 2), without frames: what one of `NEW`
+        exposures shows that deviates from the others as they do from each other.
     known : callable
         The known distortion that matching begins with, in the same way.
     config : dict
@@ -73,7 +74,7 @@ class CampaignTruth:
     log: dict[str, np.ndarray]
     lists: dict[str, dict[str, np.ndarray]]
     chips: tuple[Piece, ...]
-    true_map: Map
+    true_map: Callable[..., np.ndarray]
     known: Map
     config: dict[str, Any]
     epoch: float
@@ -155,9 +156,9 @@ def made(rng: np.random.Generator, recipe: Recipe) -> CampaignTruth:
     n = recipe.exposures
     epochs = np.sort(rng.uniform(FIRST, LAST, n))
     epochs[[0, -1]] = FIRST, LAST
-    deviations = np.zeros((n + 1, 3))
+    deviations = np.zeros((n + NEW, 3))
     if recipe.deviations is not None:
-        deviations = recipe.deviations(rng, n + 1)
+        deviations = recipe.deviations(rng, n + NEW)
     sky = _Sky(rng, recipe)
     va = 1 + 5e-5 * np.sin(2 * np.pi * epochs + rng.uniform(0, 2 * np.pi))
     names = [f"e{k:02d}" for k in range(n)]
@@ -166,17 +167,17 @@ def made(rng: np.random.Generator, recipe: Recipe) -> CampaignTruth:
         frame = Frame(tuple(rng.uniform(-DITHER, DITHER, 2)), rng.uniform(0, 2 * np.pi))
         target = frame.undone(sky.at(epoch) / factor)
         lists[name] = _detected(rng, recipe, sky.mag, target, common, epoch, deviation)
-    own, last = deviations[n], LAST + recipe.beyond
+    own = deviations[n:]
     return CampaignTruth(
         catalogue=sky.catalogue(rng),
         log={"exposure": np.array(names), "epoch": epochs, "vafactor": va}
         | {"filter": np.full(n, "F606W"), "pa_v3": np.zeros(n)},
         lists=lists,
         chips=recipe.chips,
-        true_map=lambda x, y, epoch: deviating(common(x, y, epoch), own),
+        true_map=lambda x, y, epoch, k=0: deviating(common(x, y, epoch), own[k]),
         known=lambda x, y, epoch: common(x, y, EPOCH0) + nearly(x, y),
         config={},
-        epoch=last,
+        epoch=LAST + recipe.beyond,
     )
 
 

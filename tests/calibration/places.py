@@ -39,6 +39,7 @@ from .campaigns import (
 LEVELS = (0.683, 0.954)
 LIMITS = [float(norm.ppf(0.5 + level / 2)) for level in LEVELS]  # standard deviations
 PLACES, DATES = 50, 10  # so many places at each date and of each magnitude
+EVEN = 160  # points on each axis, over which a pattern is fitted
 PLACE_TOTAL = "total of a place"  # without a star there
 
 
@@ -98,6 +99,8 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
         offset = OFFSET * rng.standard_normal(2)
         true = model_errors(truth, solution.model, np.asarray(solution.mean), x, y, epoch, exposure)
         pattern = truth.pattern(x, y)
+        # what a polynomial could follow of the pattern belongs to the coefficients
+        true[COEFFICIENTS] = true[COEFFICIENTS] - _followed(truth, x, y)
         true[CENTROID] = of_star
         true[PLACE_TOTAL] = true.pop(MODEL) - pattern + offset
         true[TOTAL] = true[PLACE_TOTAL] + of_star
@@ -112,6 +115,15 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
                 "expected": np.array([(np.abs(drawn[term]) < z).sum(axis=(1, 2)) for z in LIMITS]),
             }
         return out
+
+
+def _followed(truth: Campaign, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The polynomial (N, 2) that is next to the pattern over the whole detector."""
+    basis = truth.model.basis(1)
+    line = (np.arange(EVEN) + 0.5) * SIDE / EVEN + 0.5
+    at = [a.ravel() for a in np.meshgrid(line, line)]
+    fitted = np.linalg.lstsq(basis.evaluate(*at), truth.pattern(*at), rcond=None)[0]
+    return basis.evaluate(x, y) @ fitted
 
 
 def _together(n: int) -> list[slice]:
