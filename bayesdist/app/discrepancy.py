@@ -87,12 +87,15 @@ class RunDiscrepancy:
         return (structure_term(self.found, grid, epoch),)
 
     def of_centroids(self, errors: MagnitudeErrors | None) -> MagnitudeErrors | None:
-        """Scatter by magnitude less the structure that residuals show, which has its own term."""
+        """Scatter by magnitude less the structure that is among the residuals, as it has a term.
+
+        The median of its size: a prior's tail is in no residual.
+        """
         rows = self.found.facts.get("structure")
         if errors is None or not rows:
             return errors
         u, v = (
-            np.sqrt(np.mean([r["seen"] ** 2 for r in rows if r["axis"] == axis])) for axis in "uv"
+            np.sqrt(np.mean([r["median"] ** 2 for r in rows if r["axis"] == axis])) for axis in "uv"
         )
         return without(errors, u, v)
 

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from bayesdist.errors import DegenerateError
 from bayesdist.infer.arrow import Arrow, ArrowFactor
 from bayesdist.infer.piecewise import PiecewiseExponential
 
@@ -37,8 +36,9 @@ DEGREES = 4.0  # of freedom of the prior on tau, a half-Student-t
 MESH = np.concatenate([np.arange(-10.0, -3.0), np.arange(-3.0, 4.25, 0.5), [5.0, 7.0]])  # sigmas
 WIDENED = 0.9  # factor on the logarithm of the proposals' density
 LEAST_CURVATURE = 0.3
-LEAST_EFFICIENCY = 0.05  # effective share of the proposals
+LEAST_EFFICIENCY = 0.05  # effective fraction of the proposals; below, a chain is run
 PROPOSALS = 4  # for each draw of tau that is asked for
+BURN_IN, BETWEEN = 40, 3  # sweeps of a chain over all kinds, before the first draw and from then on
 SMALLEST, LARGEST = 1e-6, 1e3  # of the prior's scale: where the search for tau ends
 OUTLYING = 10.0  # times tau: scatter of the deviations of exposures that went wrong
 OUTLYING_FRACTION = 0.02  # of the exposures, expected to have gone wrong
@@ -214,13 +214,9 @@ class Scatter:
         """Draws of tau from its posterior, shape (n, k), of equal weight.
 
         Importance sampling of log tau, resampled.  The kinds are proposed independently, each from
-        its density with the others at the mode, made a little wider: what one kind scatters says
-        little of the others.
-
-        Raises
-        ------
-        DegenerateError
-            When the proposals do not reach the posterior.
+        its density with the others at the mode, made a little wider: what one kind scatters mostly
+        says little of the others.  Where it says much, a Markov chain begins at the best of the
+        proposals.
         """
         proposals = self._proposals(self.mode())
         u = rng.uniform(size=(PROPOSALS * n, len(proposals)))
@@ -229,14 +225,42 @@ class Scatter:
         log_w = np.array([self.log_density(t) for t in np.exp(x)]) - log_q
         w = np.exp(log_w - logsumexp(log_w))
         if 1 / (w**2).sum() < LEAST_EFFICIENCY * len(w):
-            raise DegenerateError(
-                "the posterior of the scatter between exposures has no simple shape",
-                where="model.frames",
-                do="fit fewer deviations (frames 'shift_rotation_scale') or give more exposures",
-            )
+            return np.exp(self._chain(x[int(np.argmax(w))], proposals, n, rng))
         # systematic resampling
         at = (np.arange(n) + rng.uniform()) / n
         return np.exp(x[np.minimum(np.searchsorted(np.cumsum(w), at), len(w) - 1)])
+
+    def _chain(
+        self,
+        start: Float,
+        proposals: list[PiecewiseExponential],
+        n: int,
+        rng: np.random.Generator,
+    ) -> Float:
+        """Draws (n, k) of log tau by a Metropolis chain, one kind after another.
+
+        A step is one from the kind's proposal, or a normal one of about its width: the first
+        crosses a density that is wide, the second follows one that moves with the other kinds.
+        """
+        x = start.copy()
+        value, out = self.log_density(np.exp(x)), np.empty((n, len(x)))
+        ends = np.array([one.quantile(np.array([0.16, 0.84])) for one in proposals])
+        width = np.diff(ends, axis=1)[:, 0] / 2
+        for sweep in range(BURN_IN + BETWEEN * n):
+            for k, one in enumerate(proposals):
+                new = x.copy()
+                gain = 0.0
+                if rng.uniform() < 0.5:
+                    new[k] = one.quantile(rng.uniform(size=1))[0]
+                    gain = float(np.subtract(*one.log_density(np.array([x[k], new[k]]))))
+                else:
+                    new[k] += width[k] * rng.standard_normal()
+                there = self.log_density(np.exp(new))
+                if np.log(rng.uniform()) < there - value + gain:
+                    x, value = new, there
+            if sweep >= BURN_IN:
+                out[(sweep - BURN_IN) // BETWEEN] = x
+        return out
 
     def _proposals(self, mode: Float) -> list[PiecewiseExponential]:
         """A density of log tau for each kind, given the others at the mode."""

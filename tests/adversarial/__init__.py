@@ -5,7 +5,12 @@ run, as far as its assessment, and makes a table: do the stated errors cover, is
 called met that the truth misses, and is a refusal given for the right reason?
 """
 
-from . import exposure_kinds, star_kinds, static_kinds  # noqa: F401  (each enters its kinds)
+from . import (  # noqa: F401  (each enters its kinds)
+    campaign_kinds,
+    exposure_kinds,
+    star_kinds,
+    static_kinds,
+)
 from .truth import KINDS
 
 __all__ = ["KINDS"]

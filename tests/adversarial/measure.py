@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,11 +23,15 @@ from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.assess.verdict import clopper_pearson
 
+from . import campaign_measure
+from .campaign_truth import CampaignTruth
 from .fields import SIDE
 from .truth import KINDS, Truth
+from .written import toml_text
 
 GRID, DRAWS = (17, 17), 2000
 STAGES = ("fit", "sample", "assess")
+JUDGED = 3  # exposures for which requirements are judged, at most
 # name, statistic, limit in units of what the actual error has
 ASKED = (("below p95", "p95", 0.9), ("above p95", "p95", 1.6), ("below max", "max", 0.9))
 DEFAULTS: dict[str, dict[str, Any]] = {
@@ -37,18 +40,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "sampler": {"target_ess": 400},
     "assess": {"grid": list(GRID), "draws": DRAWS},
 }
-
-
-def toml_text(config: Mapping[str, Any]) -> str:
-    """A configuration of blocks, and of lists of blocks, as TOML."""
-    lines: list[str] = []
-    for name, block in config.items():
-        for one in block if isinstance(block, list) else [block]:
-            lines.append(f"[[{name}]]" if isinstance(block, list) else f"[{name}]")
-            inner = {k: v for k, v in one.items() if isinstance(v, dict)}
-            lines += [f"{k} = {json.dumps(v)}" for k, v in one.items() if k not in inner]
-            lines += [toml_text({f"{name}.{k}": v}) for k, v in inner.items()]
-    return "\n".join(lines)
 
 
 def configuration(truth: Truth, seed: int) -> dict[str, Any]:
@@ -103,6 +94,27 @@ def stated_sigma(session: Session) -> np.ndarray:
     return np.column_stack([chip.total_u.ravel(), chip.total_v.ravel()])
 
 
+def carried(truth: Truth | CampaignTruth, folder: Path, seed: int) -> Session:
+    """A session of a run of whatever kind, its assessment made."""
+    if isinstance(truth, CampaignTruth):
+        return campaign_measure.assessed(truth, folder, seed)
+    return assessed(truth, folder, seed)
+
+
+def compared(
+    session: Session, truth: Truth | CampaignTruth, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Actual errors (m, N, 2) and stated ones (N, 2) over the grid, and how many stars there are.
+
+    In m exposures, or once.
+    """
+    if isinstance(truth, CampaignTruth):
+        error = campaign_measure.actual_error(session, truth)
+        return error, campaign_measure.stated_sigma(session), len(session.matches)
+    error = actual_error(session, truth, rng)[None]
+    return error, stated_sigma(session), truth.stars["x"].size
+
+
 def attainable(margin: Margin, factor: float) -> float:
     """How often a limit of so many times the actual statistic is called met, if errors are exact.
 
@@ -152,23 +164,23 @@ def measured(name: str, seed: int, n: int | None = None) -> dict[str, Any]:
     one = KINDS[name]
     truth = one.truth(seed, n)
     began = time.perf_counter()
-    with TemporaryDirectory() as folder, closing(assessed(truth, Path(folder), seed)) as session:
-        error = actual_error(session, truth, np.random.default_rng([7, seed]))
-        stated = stated_sigma(session)
-        margins = judged(session, error)
+    with TemporaryDirectory() as folder, closing(carried(truth, Path(folder), seed)) as session:
+        rng = np.random.default_rng([7, seed])
+        error, stated, n_stars = compared(session, truth, rng)
+        margins = [margin for one in error[:JUDGED] for margin in judged(session, one)]
         warnings = list(session.run.summary["warnings"])
         converged = bool(session.posterior.convergence.converged)
     pull = np.abs(error) / stated
     return {
         "kind": name,
         "seed": seed,
-        "n": truth.stars["x"].size,
+        "n": n_stars,
         "rms_error": float(np.sqrt(np.mean(error**2))),
         "rms_stated": float(np.sqrt(np.mean(stated**2))),
         "within_68": float(np.mean(pull < 1.0)),
         "within_95": float(np.mean(pull < 1.96)),
-        "p95": float(field_statistic("p95", error)),
-        "max": float(field_statistic("max", error)),
+        "p95": float(field_statistic("p95", error[0])),
+        "max": float(field_statistic("max", error[0])),
         "margins": margins,
         "warnings": warnings,
         "right_reason": names_cause(one.words, [*(m["reason"] for m in margins), *warnings]),

@@ -20,7 +20,7 @@ from .places import model_errors, one_thread
 STATISTICS = ("rms", "p95", "max")
 PILOTS = 1_000_000  # seeds of campaigns that only set the limits
 KEPT = 250  # draws of each
-SPREAD = 0.4  # of the logarithm of limits: three errors of a pattern's measured size
+SPREAD = 0.2  # of the logarithm of limits: a few errors of a pattern's measured size
 
 
 def _judged(name: str, seed: int, limits: dict[str, float]) -> tuple[list[Margin], dict]:

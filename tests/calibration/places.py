@@ -11,12 +11,13 @@ import numba
 import numpy as np
 from scipy.stats import norm
 
-from bayesdist.app.correlated import UNMODELLED
 from bayesdist.app.judging import errors_of
 from bayesdist.assess.budget import TOTAL
+from bayesdist.assess.discrepancy_terms import STRUCTURE_IN_FIT
 from bayesdist.assess.fields import COEFFICIENTS, MODEL, TIME_DEPENDENCE
 from bayesdist.assess.place_budget import place_budget
 from bayesdist.assess.position_errors import CENTROID, PositionErrors
+from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.model import DistortionModel
 
 from .campaigns import (
@@ -36,7 +37,9 @@ from .campaigns import (
 )
 
 LEVELS = (0.683, 0.954)
+LIMITS = [float(norm.ppf(0.5 + level / 2)) for level in LEVELS]  # standard deviations
 PLACES, DATES = 50, 10  # so many places at each date and of each magnitude
+EVEN = 160  # points on each axis, over which a pattern is fitted
 PLACE_TOTAL = "total of a place"  # without a star there
 
 
@@ -84,6 +87,7 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
         truth = campaign(kind, seed)
         with closing(assessed(kind, seed, truth.stars, Path(folder))) as session:
             solution, errors = session.solution, errors_of(session)
+            discrepancy = session.discrepancy.found
         rng = truth.rng
         x, y = rng.uniform(0.5, SIDE + 0.5, (2, PLACES))
         mag = np.repeat(rng.uniform(BRIGHT, FAINT, DATES), PLACES // DATES)
@@ -95,30 +99,31 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
         offset = OFFSET * rng.standard_normal(2)
         true = model_errors(truth, solution.model, np.asarray(solution.mean), x, y, epoch, exposure)
         pattern = truth.pattern(x, y)
-        true |= {UNMODELLED: pattern, CENTROID: of_star}
+        # what a polynomial could follow of the pattern belongs to the coefficients
+        true[COEFFICIENTS] = true[COEFFICIENTS] - _followed(truth, x, y)
+        true[CENTROID] = of_star
         true[PLACE_TOTAL] = true.pop(MODEL) - pattern + offset
         true[TOTAL] = true[PLACE_TOTAL] + of_star
         said = _said(errors, x, y, epoch, mag)
-        drawn = _drawn(errors, x, y, epoch, said, rng)
+        drawn = _drawn(errors, discrepancy, x, y, epoch, said, rng)
         out = {}
-        if not kind.pattern:  # what a false alarm finds has no truth
-            true.pop(UNMODELLED)
         for term in said.keys() & true.keys():
-            limits = _limits(term, drawn[term])
             pull = true[term] / said[term]
             out[term] = {
                 "pull": pull,
-                "inside": np.array([(np.abs(pull) < z).sum() for z in limits]),
-                "expected": np.array([(np.abs(drawn[term]) < z).sum(axis=(1, 2)) for z in limits]),
+                "inside": np.array([(np.abs(pull) < z).sum() for z in LIMITS]),
+                "expected": np.array([(np.abs(drawn[term]) < z).sum(axis=(1, 2)) for z in LIMITS]),
             }
         return out
 
 
-def _limits(term: str, drawn: np.ndarray) -> list[float]:
-    """Half the central intervals, in standard deviations; of draws where these have an error."""
-    if term == UNMODELLED:
-        return [float(np.quantile(np.abs(drawn), level)) for level in LEVELS]
-    return [float(norm.ppf(0.5 + level / 2)) for level in LEVELS]
+def _followed(truth: Campaign, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The polynomial (N, 2) that is next to the pattern over the whole detector."""
+    basis = truth.model.basis(1)
+    line = (np.arange(EVEN) + 0.5) * SIDE / EVEN + 0.5
+    at = [a.ravel() for a in np.meshgrid(line, line)]
+    fitted = np.linalg.lstsq(basis.evaluate(*at), truth.pattern(*at), rcond=None)[0]
+    return basis.evaluate(x, y) @ fitted
 
 
 def _together(n: int) -> list[slice]:
@@ -137,12 +142,20 @@ def _said(errors: PositionErrors, x, y, epoch, mag) -> dict[str, np.ndarray]:
             out.setdefault(one.name, []).append(np.column_stack([one.u, one.v]))
     said = {name: np.concatenate(parts) for name, parts in out.items()}
     said[PLACE_TOTAL] = np.sqrt(said[TOTAL] ** 2 - said[CENTROID] ** 2)
+    # the coefficients err by the noise of the stars, and by what drew the fit towards itself
+    said[COEFFICIENTS] = np.hypot(said[COEFFICIENTS], said.pop(STRUCTURE_IN_FIT))
     # a term that is nothing on an axis covers nothing
     return {name: np.maximum(rows, np.finfo(float).tiny) for name, rows in said.items()}
 
 
 def _drawn(
-    errors: PositionErrors, x, y, epoch, said: dict[str, np.ndarray], rng: np.random.Generator
+    errors: PositionErrors,
+    discrepancy: Discrepancy,
+    x,
+    y,
+    epoch,
+    said: dict[str, np.ndarray],
+    rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
     """Draws (n, N, 2) of the claimed errors, in units of what is said of each."""
     parts: dict[str, list] = {}
@@ -152,12 +165,14 @@ def _drawn(
         for part in fields.parts:
             parts.setdefault(part, []).append(fields.field(part))
     out = {part: np.concatenate(found, axis=1) for part, found in parts.items()}
+    out[COEFFICIENTS] = out[COEFFICIENTS] + out.pop(STRUCTURE_IN_FIT)
     shape = out[MODEL].shape
-    if UNMODELLED in said:
-        size = np.sqrt(errors.squares[:, 0])  # of the one local term, on one chip
-        out[UNMODELLED] = rng.standard_normal(shape) * size * said[UNMODELLED]
+    found = discrepancy.structure[1]
+    functions = found.evaluate(*discrepancy.model.basis(1).scaled(x, y))
+    left = np.swapaxes(found.coefficients @ functions.T, 1, 2)
+    assert len(left) == shape[0]  # draws of the structure belong to those of the fit's error
     out[CENTROID] = rng.standard_normal(shape) * said[CENTROID]
     offset = OFFSET * rng.standard_normal((shape[0], 1, 2))
-    out[PLACE_TOTAL] = out.pop(MODEL) + out.get(UNMODELLED, 0.0) + offset
+    out[PLACE_TOTAL] = out.pop(MODEL) + left + offset
     out[TOTAL] = out[PLACE_TOTAL] + out[CENTROID]
     return {name: rows / said[name] for name, rows in out.items() if name in said}

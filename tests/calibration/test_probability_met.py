@@ -1,4 +1,4 @@
-"""`probability_met` is a probability: of calibrations said to meet a limit with p, p do.
+"""`probability_met` is a probability: of calibrations said to meet a limit with p, at least p do.
 
 It is the share of draws of the error, draw less posterior mean, whose statistic over the detector
 is at or under the limit.  The error that a calibration truly has is its mean less the truth.  With
@@ -9,11 +9,12 @@ limit must not know the data that it is for: it is set beforehand, from other ca
 same kind.  What is drawn beside the solution (the reference catalogue's offset, what the model
 leaves out at a place) is drawn anew in each truth as well.
 
-The size of a pattern is not drawn, but measured, to some 13 %, and then the argument needs truths
-that are spread more widely than that, as a flat prior has them.  All patterns here have the same
-size; what counts is the distance from the limit, so that the limits are spread instead, evenly in
-the logarithm.  Limits that are more often above that size than below it would be met more often
-than is said.
+The size of what the model leaves out has a prior, and truths here are not drawn from it: nothing is
+left out, or a pattern of one size.  Where nothing is, more calibrations meet their limit than is
+said, as the prior cannot exclude what the data cannot; where the pattern is, the distance from the
+limit counts, and limits are spread evenly in the logarithm in place of sizes.  The probability is
+a lower bound: no fewer meet their limit than is said.  That it is not a useless one is what
+`test_total_errors` shows of widths, and tests/adversarial of verdicts.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def found(request, full):
     return request.param, *probabilities(request.param, full=full)
 
 
-def test_as_many_meet_their_limit_as_is_said(found, full, capsys):
+def test_no_fewer_meet_their_limit_than_is_said(found, full, capsys):
     kind, said, met = found
     bins = reliability(said, met)
     with capsys.disabled():
@@ -46,15 +47,14 @@ def test_as_many_meet_their_limit_as_is_said(found, full, capsys):
             )
         print(f"\n{kind}: more than is said, in standard deviations: {excess(said, met):.2f}")
     for one in bins:
-        assert one.within(len(bins)), one
-    assert abs(excess(said, met)) < norm.ppf(0.5 + CONFIDENCE / 2)
+        assert one.met >= one.band(len(bins))[0], one
+    assert excess(said, met) > -norm.ppf(0.5 + CONFIDENCE / 2)
     if full:
         # what the claim is about: enough of them, and their own band
         near = (said >= 0.8) & (said < 0.95)
         assert near.sum() >= 20
         n, share = int(near.sum()), float(said[near].mean())
-        low, high = binom.ppf([0.005, 0.995], n, share)
-        assert low <= met[near].sum() <= high
+        assert met[near].sum() >= binom.ppf(0.005, n, share)
 
 
 def test_the_limits_are_near_the_errors(found):

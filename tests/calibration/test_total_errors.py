@@ -3,17 +3,22 @@
 Campaigns of a polynomial, with drift assessed up to five years beyond the data, and with a pattern
 on 64-px nodes that the model leaves out, each carried from matched stars to the budget as the
 application does it.  50 random places, dates and magnitudes in each: what is there against what the
-budget says of that place.  The bands are binomial, with as many independent errors as the claimed
-ones are worth: all places of a campaign share its coefficients.  Reduced, the suite shows errors
-that are wrong by about a fifth; in full, by about a tenth.
+budget says of that place.  The bands are binomial, with
+as many independent errors as the claimed ones are worth: all places of a campaign share its
+coefficients.  Reduced, the suite shows errors that are wrong by about a fifth; in full, by about a
+tenth.
+
+What the model may leave out is marginalised, never tested to zero.  So where nothing is left out
+the errors of a place are larger than they need be, and where there is a pattern they hold it.
+Such errors cover at least what they claim, and are not much too wide.
 """
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from scipy.stats import binom
 
-from bayesdist.app.correlated import UNMODELLED
 from bayesdist.assess.budget import TOTAL
 from bayesdist.assess.fields import COEFFICIENTS, TIME_DEPENDENCE
 from bayesdist.assess.position_errors import CENTROID
@@ -25,17 +30,16 @@ from .summary import CONFIDENCE, Covered, band, covered_by_term
 
 pytestmark = pytest.mark.slow
 
+OF_A_PLACE = {COEFFICIENTS, CENTROID, PLACE_TOTAL, TOTAL}
 EXPECTED = {
-    "polynomial": {COEFFICIENTS, CENTROID, PLACE_TOTAL, TOTAL},
-    "pattern": {COEFFICIENTS, CENTROID, UNMODELLED, PLACE_TOTAL, TOTAL},
-    "drift": {COEFFICIENTS, TIME_DEPENDENCE, CENTROID, PLACE_TOTAL, TOTAL},
-    "drift and pattern": {
-        *(COEFFICIENTS, TIME_DEPENDENCE, CENTROID, UNMODELLED, PLACE_TOTAL, TOTAL)
-    },
+    "polynomial": OF_A_PLACE,
+    "pattern": OF_A_PLACE,
+    "drift": OF_A_PLACE | {TIME_DEPENDENCE},
+    "drift and pattern": OF_A_PLACE | {TIME_DEPENDENCE},
 }
-# No combination of parameters may get a smaller variance than the formal one, and what chance
-# leaves below it is raised: where frames leave few combinations to pool, errors are too large.
-TOO_LARGE = {("drift and pattern", COEFFICIENTS), ("drift and pattern", TIME_DEPENDENCE)}
+# Terms with errors of what the model leaves out in them: wider than need be where that is nothing.
+MARGINALISED = {COEFFICIENTS, PLACE_TOTAL}
+WIDEST = 1.35  # times the actual errors
 # The scatter of residuals less the pattern: of bright stars a small difference of two measured
 # variances.  It is too small as often as too large, and intervals of its size cover too little; in
 # the total both come together again.
@@ -59,9 +63,7 @@ def test_total_and_terms_cover(found, capsys):
                 end="",
             )
     judged = [
-        one
-        for one in every
-        if (one.kind, one.term) not in TOO_LARGE and (one.kind, one.term) not in ROUGH
+        one for one in every if one.term not in MARGINALISED and (one.kind, one.term) not in ROUGH
     ]
     outside = [one for one in judged if not one.within(len(judged))]
     assert not outside, outside
@@ -71,8 +73,8 @@ def test_total_and_terms_cover(found, capsys):
     )
 
 
-def test_errors_that_are_too_large_cover_at_least(found):
-    for kind, term in TOO_LARGE:
-        for one in found[kind]:
-            if one.term == term:
-                assert one.share >= band(one.level, one.worth)[0]
+def test_errors_with_what_may_be_left_out_cover_and_are_not_much_too_wide(found):
+    wide = [one for v in found.values() for one in v if one.term in MARGINALISED]
+    for one in wide:
+        assert one.share >= band(one.level, one.worth, len(wide))[0], one
+        assert one.pull > 1 / WIDEST - 2 / np.sqrt(2 * one.worth), one

@@ -10,6 +10,7 @@ from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, sample
+from bayesdist.infer import scatter as scatter_module
 from bayesdist.infer.arrow import Arrow
 from bayesdist.infer.exposures_alone import fit_exposures
 from bayesdist.infer.hierarchy import fit_hierarchical, held_in_reference
@@ -144,6 +145,29 @@ def test_draws_of_tau_are_its_posterior():
         mode = np.exp(scatter.mode())
         assert abs(scatter.gradient(mode)[0]) < 1e-2
         np.testing.assert_allclose(scatter.mode()[0], x[np.argmax(density)], atol=0.02)
+
+
+def test_kinds_that_are_hard_to_tell_apart_are_sampled_by_a_chain(monkeypatch):
+    """Of two kinds only the sum is known well: against the density on a mesh of both."""
+    rng, n = np.random.default_rng(5), 8
+    both = np.kron([[1.0, 1.0], [1.0, 1.0]], np.eye(n)) * 1e12
+    S = both + 4e8 * np.eye(2 * n)  # each by itself is known to 5e-5
+    b = np.concatenate([2e-5 * rng.standard_normal(n), np.zeros(n)])
+    scatter = dense(KINDS[:2], np.repeat([0, 1], n), S, S @ b, 1e-4)
+    x = np.linspace(-20, -7, 90)
+    density = np.array([[scatter.log_density(np.exp([s, t])) for t in x] for s in x])
+    weight = np.exp(density - density.max())
+    monkeypatch.setattr(scatter_module, "LEAST_EFFICIENCY", 2.0)  # whatever the proposals reach
+    draws = np.log(scatter.draws(800, rng))
+    for axis in (0, 1):
+        cdf = np.cumsum(weight.sum(axis=1 - axis))
+        p = np.interp(draws[:, axis], x, cdf / cdf[-1])
+        assert stats.kstest(p, "uniform").statistic < 0.1
+    mean = [x @ weight.sum(axis=1 - a) / weight.sum() for a in (0, 1)]
+    product = (x - mean[0]) @ weight @ (x - mean[1]) / weight.sum()
+    assert np.cov(draws.T)[0, 1] == pytest.approx(
+        product, abs=0.25 * np.sqrt(np.cov(draws.T)[0, 0])
+    )
 
 
 # -- against other routes -------------------------------------------------------------------------

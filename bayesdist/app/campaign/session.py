@@ -25,7 +25,7 @@ from bayesdist.app.campaign.table_file import KeptTables, read_tables, write_tab
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
-from bayesdist.assess import LocalTerm
+from bayesdist.assess import SAMPLE, LocalTerm
 from bayesdist.assess.between_nodes import BetweenNodes
 from bayesdist.assess.holdout_predictive import Predictive
 from bayesdist.assess.terms import GIVEN, MEASURED
@@ -223,6 +223,7 @@ class CampaignSession(Session):
             rng=self.rng("assess"),
             priors=self.config.discrepancy.priors(),
             parameter_priors=self.priors,
+            sample=matches.sample(SAMPLE),
             stars=None if stated else matches,
             structure=self.config.tables.method == "none",
             exposures=False,

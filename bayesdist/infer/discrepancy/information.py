@@ -159,8 +159,11 @@ class Information:
 
     @cached_property
     def score(self) -> Float:
-        """Gradient (D,) by all parameters: zero at a mode without `excess`, but for priors."""
-        out = np.zeros(self.model.n_params)
+        """Gradient (D,) by all parameters, of likelihood and priors: zero at a mode without `excess`.
+
+        Priors pull at the deviations of exposures as hard as the stars do.
+        """
+        out = self.priors.pull(self.theta)
         for cells in self.groups():
             out[cells.columns] += cells.onto_parameters(cells.score[..., None])[:, 0]
         return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,12 @@ from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_sid
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.information import Information
 from bayesdist.infer.discrepancy.linear import linear_deviations
+from bayesdist.infer.discrepancy.neighbours import (
+    Neighbours,
+    SharedVariance,
+    neighbours_of,
+    shared_variance,
+)
 from bayesdist.infer.discrepancy.noise import score_excess
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
@@ -42,6 +48,7 @@ def estimate_discrepancy(
     rng: np.random.Generator,
     priors: DiscrepancyPriors | None = None,
     parameter_priors: GaussianPriors | None = None,
+    sample: MatchTable | None = None,
     stars: MatchTable | None = None,
     structure: bool = True,
     exposures: bool = True,
@@ -61,6 +68,8 @@ def estimate_discrepancy(
     priors : DiscrepancyPriors, optional
     parameter_priors : GaussianPriors, optional
         That the solution was made with.
+    sample : MatchTable, optional
+        Some of the matches, or all: what is finer than the functions is seen in neighbouring stars.
     stars : MatchTable, optional
         The same matches with codes of the catalogue's stars, which then have errors in common.
     structure : bool
@@ -93,7 +102,12 @@ def estimate_discrepancy(
     excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
     information = working.with_excess(excess)
     chips = range(len(model.chips)) if structure else ()
-    found, theta, facts = _structures(information, working, chips, priors, pixel, n_draws, rng)
+    beside = {}
+    if structure and sample is not None:
+        beside = neighbours_of(sample, scores, information)
+    found, theta, facts = _structures(
+        information, working, chips, beside, priors, pixel, n_draws, rng
+    )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
     formal, noise = working.covariance, working.sandwich()
     if repeated is not None:
@@ -134,6 +148,7 @@ def _structures(
     information: Information,
     working: Information,
     chips: Sequence[int],
+    neighbours: Mapping[int, Neighbours],
     priors: DiscrepancyPriors,
     pixel: float,
     n: int,
@@ -147,31 +162,42 @@ def _structures(
     for code in chips:
         chip = model.chips[code]
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
-        S, crossed, taken, score = _along_axes(information, working, functions, code)
-        waves = functions.finer_waves(rng)
-        here = ChipStructure(functions, waves, np.empty(0)).evaluate(*_even_points())
+        chip_waves = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
+        S, crossed, taken, score = _along_axes(information, working, chip_waves, code)
+        here = chip_waves.evaluate(*_even_points())
+        left = [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)]
+        pull = [score[a] - crossed[a].T @ shift for a in (0, 1)]
+        pairs: list[SharedVariance | None] = [None, None]
+        if code in neighbours:
+            near = neighbours[code]
+            pairs = [
+                shared_variance(near, information, functions, code, a, left[a], pull[a])
+                for a in (0, 1)
+            ]
         posterior = chip_structure(
             functions,
-            [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)],
-            [score[a] - crossed[a].T @ shift for a in (0, 1)],
+            left,
+            pull,
             noise=_star_error(information, code),
             higher_order=priors.higher_order * pixel,
             structure=priors.structure * pixel,
+            pairs=pairs,
         )
         drawn = posterior.draws(n, rng)
         for a in (0, 1):
             # the fit takes structure for polynomials; the truth lies on the other side
-            theta -= drawn[:, a, : functions.n_known] @ (working.covariance @ taken[a]).T
+            theta -= drawn[:, a] @ (working.covariance @ taken[a]).T
+            by_draw = np.sqrt(np.mean((drawn[:, a] @ here.T) ** 2, axis=1))
             rows.append(
                 {
                     "chip": chip.number,
                     "axis": "uv"[a],
-                    "rms": float(np.sqrt(np.mean((drawn[:, a] @ here.T) ** 2))),
-                    "seen": float(np.sqrt(np.mean((here @ drawn[:, a].mean(axis=0)) ** 2))),
+                    "rms": float(np.sqrt(np.mean(by_draw**2))),
+                    "median": float(np.median(by_draw)),
                     "length_pix": posterior.length * max(chip.size) / 2,
                 }
             )
-        out[chip.number] = ChipStructure(functions, waves, drawn)
+        out[chip.number] = replace(chip_waves, coefficients=drawn)
     return out, theta, {"structure": rows}
 
 
@@ -190,26 +216,28 @@ def _star_error(information: Information, chip: int) -> float:
 
 
 def _along_axes(
-    information: Information, working: Information, functions: StructureFunctions, chip: int
+    information: Information, working: Information, structure: ChipStructure, chip: int
 ) -> tuple[list[Float], list[Float], list[Float], list[Float]]:
     """Of u and v: information and score of the functions, and their products with the parameters.
 
-    The products are those of the flattened likelihood and of the working one.
+    The products are those of the flattened likelihood and of the working one, these with the finer
+    waves as well.
     """
     model, side = working.model, working.sums.side
-    m, D = functions.n_known, model.n_params
-    crossed, taken = ([np.zeros((D, m)) for _ in "uv"] for _ in range(2))
+    m, D = structure.functions.n_known, model.n_params
     weight, score = np.zeros((2, side * side)), np.zeros((2, side * side))
     used, X, Y = working.sums.centres(chip)
-    B = functions.evaluate(X, Y)
+    every = structure.evaluate(X, Y)
+    B = every[:, :m]
+    crossed, taken = ([np.zeros((D, n)) for _ in "uv"] for n in (m, every.shape[1]))
     row = np.full(side * side, -1)
     row[used] = np.arange(len(used))
-    for source, into in ((information, crossed), (working, taken)):
+    for source, into, values in ((information, crossed, B), (working, taken, every)):
         for cells in source.groups():
             if cells.chip != chip:
                 continue
             at = _rows(cells.X, cells.Y, side, row)
-            here, M = B[at], cells.frame
+            here, M = values[at], cells.frame
             turned = np.einsum("cab,bd->cad", cells.curvature, M)
             for a in (0, 1):
                 block = np.stack([(cells.phi * turned[:, b, a, None]).T @ here for b in (0, 1)])

@@ -7,12 +7,13 @@ functions through a score s and an information S, so that for amplitudes eta
     log p(eta | data) = log p(eta) + (s^T (S + P)^-1 s - log|S + P| + log|P|) / 2
 
 The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
-are gone through on a grid that is refined where the density is.
+are gone through on a grid that is refined where the density is.  What the field has at frequencies
+above the functions' is seen in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -21,17 +22,19 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.functions import FINE, StructureFunctions
+from bayesdist.infer.discrepancy.neighbours import SharedVariance
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
 
 __all__ = ["Structure", "chip_structure"]
 
 Float = NDArray[np.float64]
 
-LENGTHS = np.geomspace(0.08, 0.6, 5)  # of the field, in longer half sides; all alike beforehand
+LENGTHS = np.geomspace(0.02, 0.6, 7)  # of the field, in longer half sides; all alike beforehand
 STEPS = 8  # of the amplitude, before the grid is refined
-HALVINGS = 2
-CHANGE = 0.3  # of the log density between two points, below which none is put between them
-NEGLIGIBLE = 12.0  # in log density, below the largest
+HALVINGS = 5  # at most: neighbouring stars may tell an amplitude to some percent
+CHANGE = 0.7  # of the log density between two points, below which none is put between them
+NEGLIGIBLE = 10.0  # in log density, below the largest
+UNLIKE = 0.2  # prior probability that the field differs on the two axes, by a factor e or so
 TERM_STEPS = 24  # of the amplitude of the higher orders
 
 
@@ -79,12 +82,11 @@ class _Axis:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """One length and amplitude of the field, and the density by amplitudes of the terms."""
+    """A correlation length, and an amplitude of the field on each axis."""
 
     length: float
-    amplitude: float
-    axes: tuple[_Axis, ...]
-    log_density: Float
+    amplitudes: tuple[float, float]
+    axes: tuple[_Axis, _Axis]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,25 +119,20 @@ class Structure:
             if not m:
                 continue
             amplitude = np.repeat(self.terms_amplitude, by_terms)
-            fine = point.amplitude * np.sqrt(functions.finer(point.length))
+            fine = np.sqrt(functions.finer(point.length))
             both = []
-            for axis in point.axes:
+            for size, axis in zip(point.amplitudes, point.axes, strict=True):
                 terms, sines = axis.draws(amplitude, rng)
-                waves = fine * rng.standard_normal((m, 2 * FINE))
+                waves = size * fine * rng.standard_normal((m, 2 * FINE))
                 both.append(np.concatenate([terms * decline, sines, waves], axis=1))
             out.append(np.stack(both, axis=1))
         return rng.permutation(np.concatenate(out))
 
     @property
-    def field_rms(self) -> float:
-        """Root of the mean posterior square of the field's amplitude."""
-        by_point = self.weight.sum(axis=1)
-        return float(np.sqrt(by_point @ [p.amplitude**2 for p in self.points]))
-
-    @property
     def length(self) -> float:
         """Posterior mean correlation length of the field, weighed by variance, in half sides."""
-        by_point = self.weight.sum(axis=1) * [p.amplitude**2 for p in self.points]
+        by_point = self.weight.sum(axis=1)
+        by_point = by_point * [np.square(p.amplitudes).sum() for p in self.points]
         return float(by_point @ [p.length for p in self.points] / by_point.sum())
 
 
@@ -147,11 +144,12 @@ def chip_structure(
     noise: float,
     higher_order: float,
     structure: float,
+    pairs: Sequence[SharedVariance | None] = (None, None),
 ) -> Structure:
     """Posterior of the coefficients of structure functions on the two axes of a chip.
 
-    Amplitudes and length are those of both axes: what bends light or silicon bends it along both,
-    and few data tell little of each.
+    Length and amplitudes are those of both axes: what bends light or silicon bends it along both,
+    and few data tell little of each.  But the field may differ, as a pattern of columns does.
 
     Parameters
     ----------
@@ -164,6 +162,8 @@ def chip_structure(
         Typical error of one star: no amplitude beyond a few of it is looked at.
     higher_order, structure : float
         Prior medians of the amplitudes, in the unit of the positions.
+    pairs : sequence of SharedVariance or None
+        What neighbouring stars tell of the field above the functions' frequencies, on each axis.
 
     Returns
     -------
@@ -186,36 +186,78 @@ def chip_structure(
         along = vectors.T @ (s[:T] * scale - tied.T @ right)
         return _Axis(factor, right, tied, np.maximum(values, 0.0), vectors, along)
 
-    def at(length: float, log_amplitude: float) -> _Point:
+    def at(length: float, log_amplitude: float) -> _Sized:
         amplitude = float(np.exp(log_amplitude))
         variance = amplitude**2 * functions.spectrum(length)
-        axes = tuple(axis_at(S, s, variance) for S, s in zip(information, score, strict=True))
-        density = prior + log_half_cauchy(np.array(amplitude), structure)
-        for axis in axes:
-            density = density + axis.log_evidence(amplitudes) - 0.5 * np.log(variance).sum()
-        return _Point(length, amplitude, axes, density)
+        axes, evidence = [], []
+        for S, s, known in zip(information, score, shared[length], strict=True):
+            axes.append(axis_at(S, s, variance))
+            found = axes[-1].log_evidence(amplitudes) - 0.5 * np.log(variance).sum()
+            evidence.append(found if known is None else found + known(amplitude))
+        return _Sized(amplitude, (axes[0], axes[1]), np.stack(evidence))
 
-    best, found = -np.inf, list[tuple[_Point, float]]()
+    shared = {
+        length: [None if p is None else p.of_field(functions, length) for p in pairs]
+        for length in LENGTHS
+    }
+    best, points, log_weight = np.full(3, -np.inf), list[_Point](), list[Float]()
     for length in LENGTHS:
         grid = list(np.linspace(np.log(low), np.log(high), STEPS))
-        points = [at(length, a) for a in grid]
+        sized = [at(length, a) for a in grid]
         for _ in range(HALVINGS):
-            tops = [float(p.log_density.max()) for p in points]
-            best = max(best, *tops)
-            middles = _middles(grid, tops, best - NEGLIGIBLE)
-            points += [at(length, a) for a in middles]
+            tops = np.array([(prior + one.views).max(axis=1) for one in sized])
+            tops += log_half_cauchy(np.exp(grid), structure)[:, None]
+            best = np.maximum(best, tops.max(axis=0))
+            # axis by axis only where they may differ
+            views = (0, 1, 2) if best[1] + best[2] > best[0] + prior.max() + CHANGE else (0,)
+            middles = set[float]()
+            for k in views:
+                middles.update(_middles(grid, tops[:, k], best[k] - NEGLIGIBLE))
+            if not middles:
+                break
+            sized += [at(length, a) for a in middles]
             grid += middles
             order = np.argsort(grid)
-            grid, points = [grid[k] for k in order], [points[k] for k in order]
-        widths = np.gradient(grid)
-        found += [
-            (p, w)
-            for p, w in zip(points, widths, strict=True)
-            if p.log_density.max() > best - NEGLIGIBLE
-        ]
-    log_weight = np.array([p.log_density + np.log(w) for p, w in found])
-    weight = np.exp(log_weight - log_weight.max())
-    return Structure(functions, amplitudes, tuple(p for p, _ in found), weight / weight.sum())
+            grid, sized = [grid[k] for k in order], [sized[k] for k in order]
+        for point, density in _combined(length, grid, sized, structure):
+            points.append(point)
+            log_weight.append(prior + density)
+    every = np.array(log_weight)
+    kept = every.max(axis=1) > every.max() - NEGLIGIBLE
+    weight = np.exp(every[kept] - every.max())
+    points = [p for p, k in zip(points, kept, strict=True) if k]
+    return Structure(functions, amplitudes, tuple(points), weight / weight.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Sized:
+    """One amplitude of the field, and the evidence (2, TERM_STEPS) of each axis for it."""
+
+    amplitude: float
+    axes: tuple[_Axis, _Axis]
+    evidence: Float
+
+    @property
+    def views(self) -> Float:
+        """Evidence (3, TERM_STEPS) of both axes together, and of each."""
+        return np.stack([self.evidence.sum(axis=0), *self.evidence])
+
+
+def _combined(
+    length: float, grid: Sequence[float], sized: Sequence[_Sized], median: float
+) -> Iterator[tuple[_Point, Float]]:
+    """Amplitudes of the field on both axes, and the density of each for all of the terms."""
+    width = np.log(np.gradient(grid))
+    for i, u in enumerate(sized):
+        for j, v in enumerate(sized):
+            both = (u.amplitude, v.amplitude)
+            density = float(log_half_cauchy(np.sqrt(np.mean(np.square(both))), median)) + width[i]
+            if i == j:
+                density += np.log(1 - UNLIKE)
+            else:
+                density += np.log(UNLIKE / 2) - abs(grid[i] - grid[j]) + width[j]
+            point = _Point(length, both, (u.axes[0], v.axes[1]))
+            yield point, density + u.evidence[0] + v.evidence[1]
 
 
 def _middles(grid: Sequence[float], tops: Sequence[float], least: float) -> list[float]:

@@ -1,0 +1,136 @@
+"""Kinds of campaigns: star lists of many exposures, whose truth is outside the fitted family."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import fields
+from .campaign_truth import BRIGHT, LAST, REACH, TWO, CampaignTruth, Recipe, made
+from .exposure_kinds import BREATHING, OF_TIME, heavy_deviations, linear, normal_deviations
+from .star_kinds import OF_MAGNITUDE
+from .static_kinds import CATALOGUE_WORDS, ORDER, STRUCTURE
+from .truth import kind
+
+QUIET = 3e-6  # scatter of scale and shears, where breathing is not what is asked about
+RATE = 0.004  # px a year at half a side: of each of the linear terms that drift
+BEGIN = 2008.5  # trails of charge are noticed from then on
+MAS = 0.02  # px a year: 1 mas a year of a detector with 50 mas a pixel
+
+
+def drift(rng: np.random.Generator) -> fields.Field:
+    """The three linear terms that are fitted."""
+    return linear(*(RATE * rng.standard_normal(3)))
+
+
+def quiet_deviations(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Scale and both shears (n, 3) of exposures, which hardly vary."""
+    return QUIET / BREATHING * normal_deviations(rng, n)
+
+
+def chip_by_chip(field: fields.Field) -> fields.Field:
+    """A field about the middle of each of two chips: the gap between them has no drift."""
+
+    def of_chip(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        half = fields.SIDE / 4
+        return field(x, np.asarray(y) - np.where(np.asarray(y) > 2 * half + 0.5, half, -half))
+
+    return of_chip
+
+
+def usual(rng: np.random.Generator, **other: object) -> CampaignTruth:
+    """A campaign of exposures whose linear terms drift, and what comes beside it."""
+    options = {"rate": drift(rng), "deviations": quiet_deviations, "beyond": 1.0} | other
+    return made(rng, Recipe(**options))  # type: ignore[arg-type]
+
+
+@kind("campaign_inside_chips", inside=True, n=300)
+def inside_chips(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """The same on two chips, each of which drifts about its middle."""
+    return usual(rng, stars=n, chips=TWO, rate=chip_by_chip(drift(rng)))
+
+
+@kind("campaign_gap", "gap", "between exposures", *STRUCTURE, *OF_TIME, n=300)
+def gap(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Two chips drift as one detector: the distance between them changes, which is not fitted."""
+    return usual(rng, stars=n, chips=TWO)
+
+
+@kind("campaign_inside_breathing", inside=True, n=300, deviations=normal_deviations)
+@kind("campaign_inside", inside=True, n=300)
+def inside(rng: np.random.Generator, n: int, **options: object) -> CampaignTruth:
+    """What is fitted is what is true: breathing that is normal, a drift that is linear."""
+    return usual(rng, stars=n, **options)
+
+
+@kind("campaign_breathing_t", "breathing", "exposure-to-exposure", n=300)
+def breathing_t(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Scale and shears vary with the tails of Student's t of 4 degrees of freedom."""
+    return usual(rng, stars=n, deviations=heavy_deviations)
+
+
+@kind("campaign_lithography", *STRUCTURE, n=300)
+def lithography(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Columns are displaced by 0.01 px either way, with a period of 68 px and sharp edges."""
+    phase = rng.uniform(0, 68.0)
+
+    def ridges(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        side = np.where((np.asarray(x) + phase) % 68.0 < 34.0, 1.0, -1.0)
+        return 0.01 * np.stack([side, np.zeros_like(side)], axis=-1)
+
+    return usual(rng, stars=n, beside=(ridges,))
+
+
+@kind("campaign_order_4", *ORDER, n=300)
+def order_4(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """The truth has terms of one order more than is fitted, 0.005 px rms together."""
+    more = fields.of_rms(fields.random_polynomial(rng, {4: 1.0}), 0.005)
+    return usual(rng, stars=n, beside=(more,))
+
+
+@kind("campaign_trails", *OF_MAGNITUDE, "charge transfer", "cte", n=300)
+def trails(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Trails draw stars along y in the last years, 0.008 px per magnitude fainter than the
+    brightest, at full distance from the amplifier and at the end; the true map is without them."""
+
+    def displaced(x: np.ndarray, y: np.ndarray, mag: np.ndarray, epoch: float) -> np.ndarray:
+        size = 0.008 * max(epoch - BEGIN, 0.0) / (LAST - BEGIN)
+        trail = size * (mag - BRIGHT) * (fields.SIDE - y) / fields.SIDE
+        return np.stack([np.zeros_like(trail), trail], axis=-1)
+
+    return usual(rng, stars=n, displaced=displaced)
+
+
+@kind("campaign_motions", *CATALOGUE_WORDS, "motion", n=300)
+def motions(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """A fifth of the stars move by 1 to 5 mas a year that the catalogue does not have, half of
+    them all in one direction."""
+    angle = rng.uniform(0, 2 * np.pi)
+
+    def moving(rng: np.random.Generator, n: int) -> np.ndarray:
+        some = rng.uniform(size=n) < 0.2
+        way = np.where(rng.uniform(size=n) < 0.5, angle, rng.uniform(0, 2 * np.pi, n))
+        size = some * MAS * rng.uniform(1.0, 5.0, n)
+        return size[:, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
+
+    return usual(rng, stars=n, moving=moving)
+
+
+@kind("campaign_curved", *OF_TIME, *STRUCTURE, n=300)
+def curved(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """A drift whose rate changes by a twentieth of its size a year, four years on."""
+    rate = linear(*(RATE * rng.choice([-1, 1], 3)))
+    bend = linear(*(0.025 * RATE * rng.choice([-1, 1], 3)))
+    return usual(rng, stars=n, rate=rate, bend=bend, beyond=4.0)
+
+
+@kind("campaign_catalogue", *CATALOGUE_WORDS, *STRUCTURE, n=300)
+def catalogue(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """The catalogue has a distortion of its own, 0.01 px rms on each axis."""
+    low = fields.random_polynomial(rng, {k: 1.0 for k in range(1, 4)})
+    own = fields.of_rms(fields.total(low, fields.smooth(rng, 300, 0.3)), 0.01)
+
+    def astray(sky: np.ndarray) -> np.ndarray:
+        x, y = (sky / REACH * fields.SIDE / 2 + fields.MIDDLE).T
+        return own(x, y)
+
+    return usual(rng, stars=n, astray=astray)

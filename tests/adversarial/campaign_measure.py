@@ -1,0 +1,102 @@
+"""A campaign carried through a run, and what is claimed of an exposure that is yet to come."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.config import load_config
+from bayesdist.app.judging import budget_of
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.session import Session
+from bayesdist.app.sessions import own_stages, rehearse_run, session_of
+from bayesdist.app.stages import run_stage
+from bayesdist.app.stages.assess import run_assess
+from bayesdist.assess.grid import grid_pixels, mesh
+
+from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth
+from .written import toml_text
+
+STAGES = ("match", "fit", "sample", "assess")
+GRID, DRAWS = (17, 17), 2000
+
+
+def configuration(truth: CampaignTruth, seed: int) -> dict[str, Any]:
+    """What a user writes for this campaign, by block."""
+    files = {"catalog": "catalog.ecsv", "exposures": "exposures.ecsv", "lists": "lists"}
+    chips = [
+        {
+            "number": chip.number,
+            "name": f"CHIP{chip.number}",
+            "size": [chip.columns, chip.rows],
+            "reference_pixel": [(chip.columns + 1) / 2, (chip.rows + 1) / 2],
+            "reference": k == 0,
+        }
+        for k, chip in enumerate(truth.chips)
+    ]
+    return {
+        "campaign": files | {"start": "start_idc.fits", "mag": [BRIGHT, FAINT]},
+        "tables": {"method": "none"},
+        "detector": {"scale_mas": 1000 * ARCSEC},
+        "chip": chips,
+        "model": {"order": 3, "tdd": {"epoch0": EPOCH0, "terms": TERMS}},
+        "sampler": {"target_ess": 400, "seed": seed + 1},
+        "assess": {"grid": list(GRID), "draws": DRAWS, "epoch": truth.epoch},
+    } | truth.config
+
+
+def assessed(truth: CampaignTruth, folder: Path, seed: int) -> Session:
+    """A session of a run of this campaign, its assessment made."""
+    truth.write(folder)
+    (folder / "config.toml").write_text(toml_text(configuration(truth, seed)))
+    settings, text = load_config(folder / "config.toml")
+    directory = RunDirectory.plan(folder / "run", settings, text, folder)
+    session = session_of(directory)
+    rehearse_run(session)
+    directory.begin()
+    session.begun()
+    own = own_stages(session)
+    for stage in STAGES:
+        # how the linear terms went with time takes longer than all the rest, and no error has it
+        run_stage(session, stage, run_assess if stage == "assess" else own.get(stage))
+    return session
+
+
+def actual_error(session: Session, truth: CampaignTruth) -> np.ndarray:
+    """Predicted less true positions (NEW, chips * ny * nx, 2) in exposures that are yet to come.
+
+    Whoever uses the calibration there fits shift and rotation, with stars all over the chips.
+    """
+    solution, epoch = session.solution, session.epoch
+    assert epoch is not None
+    mean = np.asarray(solution.mean)
+    predicted, mosaic = [], []
+    for chip in solution.model.chips:
+        x, y = mesh(*grid_pixels(chip.size, session.config.assess.grid))
+        predicted.append(
+            solution.model.predict(mean, x, y, chip=chip.number, epoch=np.full(x.size, epoch))
+        )
+        piece = next(one for one in truth.chips if one.number == chip.number)
+        mosaic.append(np.stack(piece.mosaic(x, y)))
+    x, y = np.concatenate(mosaic, axis=1)
+    seen = np.concatenate(predicted)
+    return np.stack([_aligned(seen, truth.true_map(x, y, epoch, k)) for k in range(NEW)])
+
+
+def _aligned(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Difference (N, 2) that no shift and rotation takes up."""
+    a, b = predicted - predicted.mean(axis=0), true - true.mean(axis=0)
+    left, _, right = np.linalg.svd(b.T @ a)
+    return a - b @ (left @ right)
+
+
+def stated_sigma(session: Session) -> np.ndarray:
+    """Standard deviations (N, 2) of all terms of the budget together, over the same grid."""
+    return np.concatenate(
+        [
+            np.column_stack([chip.total_u.ravel(), chip.total_v.ravel()])
+            for chip in budget_of(session).chips
+        ]
+    )
