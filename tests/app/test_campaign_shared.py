@@ -7,11 +7,11 @@ from contextlib import closing
 import numpy as np
 import pytest
 from astropy.table import Table
-
 from bayesdist.app.campaign.shared import measured_shared_errors
+from bayesdist.app.correlated import UNMODELLED
+
 from bayesdist.app.campaign.stages import CAMPAIGN_STAGES
 from bayesdist.app.config import load_config
-from bayesdist.app.correlated import UNMODELLED
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import run_stage
