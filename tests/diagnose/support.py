@@ -61,7 +61,7 @@ class Scene:
             origin=(500.0, 400.0),
         )
         several = self.n_exposures > 1
-        epochs = 2002 + 8 * rng.permutation(self.n_exposures) / self.n_exposures
+        epochs = 2002 + 8 * (rng.permutation(self.n_exposures) / self.n_exposures) ** 1.5
         theta = truth_of(model, rng)
         table, _ = simulate_matches(
             model,

@@ -150,21 +150,18 @@ def test_curvature_in_time_is_what_the_lines_leave():
     table, fit = scene.fitted(5)
     found = {one.name: one for one in regressor_tests(projected(table, fit))}
     t = table.epoch - table.epoch.mean()
-    X, Y = CHIP_SCALED(table)
+    X, Y = terms_of(1, table)[0].T
+    square = t**2 - np.polyval(np.polyfit(t, t**2, 1), t)
     # shifts are those of the exposures
-    z = np.stack([X * t**2, Y * t**2], 1)
+    z = np.stack([X * square, Y * square], 1)
     T, q, dof = Dense(table, fit).statistic(added(table, fit.model, fit.mean, z))
     assert found["curvature in time"].dof == q == 4
     assert found["curvature in time"].statistic == pytest.approx(T, rel=1e-6)
     # u_1_0 and v_0_1 have their drift
     z = added(table, fit.model, fit.mean, np.stack([X * t, Y * t], 1))[:, :, [1, 2]]
-    T, q, dof = Dense(table, fit).statistic(z)
+    T, q, _ = Dense(table, fit).statistic(z)
     assert found["drift"].dof == q == 2
     assert found["drift"].statistic == pytest.approx(T, rel=1e-6)
-
-
-def CHIP_SCALED(table):
-    return (terms_of(1, table)[0][:, k] for k in (0, 1))
 
 
 @pytest.mark.parametrize("solved_before", [False, True])
@@ -174,9 +171,8 @@ def test_priors_are_data_of_their_own(solved_before):
     fit = fit_linear(table, model, priors=priors if solved_before else None, clip_abs=None)
     assert solved_before or np.abs(priors.pull(fit.mean)).max() > 1
     found = {one.name: one for one in regressor_tests(projected(table, fit, priors))}
-    T, q, _ = Dense(table, fit, priors).statistic(
-        added(table, model, fit.mean, terms_of(3, table)[0])
-    )
+    z = added(table, model, fit.mean, terms_of(3, table)[0])
+    T = Dense(table, fit, priors).statistic(z)[0]
     assert found["order 3"].statistic == pytest.approx(T, rel=1e-6)
 
 
