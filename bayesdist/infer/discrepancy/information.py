@@ -159,9 +159,10 @@ class Information:
 
     @cached_property
     def score(self) -> Float:
-        """Gradient (D,) by all parameters, of likelihood and priors: zero at a mode without `excess`.
+        """Gradient (D,) by all parameters, of likelihood and priors.
 
-        Priors pull at the deviations of exposures as hard as the stars do.
+        It is zero at a mode without `excess`.  Priors pull at the deviations of exposures as hard
+        as the stars do.
         """
         out = self.priors.pull(self.theta)
         for cells in self.groups():

@@ -14,12 +14,7 @@ from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_sid
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.information import Information
 from bayesdist.infer.discrepancy.linear import linear_deviations
-from bayesdist.infer.discrepancy.neighbours import (
-    Neighbours,
-    SharedVariance,
-    neighbours_of,
-    shared_variance,
-)
+from bayesdist.infer.discrepancy.neighbours import SharedVariance, shared_variances
 from bayesdist.infer.discrepancy.noise import score_excess
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
@@ -102,11 +97,9 @@ def estimate_discrepancy(
     excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
     information = working.with_excess(excess)
     chips = range(len(model.chips)) if structure else ()
-    beside = {}
-    if structure and sample is not None:
-        beside = neighbours_of(sample, scores, information)
+    near = {} if sample is None or not structure else shared_variances(sample, scores, model)
     found, theta, facts = _structures(
-        information, working, chips, beside, priors, pixel, n_draws, rng
+        information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
     formal, noise = working.covariance, working.sandwich()
@@ -148,7 +141,7 @@ def _structures(
     information: Information,
     working: Information,
     chips: Sequence[int],
-    neighbours: Mapping[int, Neighbours],
+    neighbours: Mapping[int, tuple[SharedVariance | None, SharedVariance | None]],
     priors: DiscrepancyPriors,
     pixel: float,
     n: int,
@@ -167,13 +160,6 @@ def _structures(
         here = chip_waves.evaluate(*_even_points())
         left = [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)]
         pull = [score[a] - crossed[a].T @ shift for a in (0, 1)]
-        pairs: list[SharedVariance | None] = [None, None]
-        if code in neighbours:
-            near = neighbours[code]
-            pairs = [
-                shared_variance(near, information, functions, code, a, left[a], pull[a])
-                for a in (0, 1)
-            ]
         posterior = chip_structure(
             functions,
             left,
@@ -181,7 +167,7 @@ def _structures(
             noise=_star_error(information, code),
             higher_order=priors.higher_order * pixel,
             structure=priors.structure * pixel,
-            pairs=pairs,
+            pairs=neighbours.get(code, (None, None)),
         )
         drawn = posterior.draws(n, rng)
         for a in (0, 1):

@@ -7,8 +7,8 @@ functions through a score s and an information S, so that for amplitudes eta
     log p(eta | data) = log p(eta) + (s^T (S + P)^-1 s - log|S + P| + log|P|) / 2
 
 The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
-are gone through on a grid that is refined where the density is.  What the field has at frequencies
-above the functions' is seen in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
+are gone through on a grid that is refined where the density is.  What is too fine
+for the functions is seen in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Float = NDArray[np.float64]
 
 LENGTHS = np.geomspace(0.02, 0.6, 7)  # of the field, in longer half sides; all alike beforehand
 STEPS = 8  # of the amplitude, before the grid is refined
-HALVINGS = 5  # at most: neighbouring stars may tell an amplitude to some percent
+HALVINGS = 6  # at most: neighbouring stars may tell an amplitude to some percent
 CHANGE = 0.7  # of the log density between two points, below which none is put between them
 NEGLIGIBLE = 10.0  # in log density, below the largest
 UNLIKE = 0.2  # prior probability that the field differs on the two axes, by a factor e or so
@@ -163,7 +163,7 @@ def chip_structure(
     higher_order, structure : float
         Prior medians of the amplitudes, in the unit of the positions.
     pairs : sequence of SharedVariance or None
-        What neighbouring stars tell of the field above the functions' frequencies, on each axis.
+        What neighbouring stars tell of the field, on each axis.
 
     Returns
     -------
@@ -197,22 +197,21 @@ def chip_structure(
         return _Sized(amplitude, (axes[0], axes[1]), np.stack(evidence))
 
     shared = {
-        length: [None if p is None else p.of_field(functions, length) for p in pairs]
-        for length in LENGTHS
+        length: [None if p is None else p.of_field(length) for p in pairs] for length in LENGTHS
     }
-    best, points, log_weight = np.full(3, -np.inf), list[_Point](), list[Float]()
+    points, log_weight = list[_Point](), list[Float]()
     for length in LENGTHS:
         grid = list(np.linspace(np.log(low), np.log(high), STEPS))
         sized = [at(length, a) for a in grid]
         for _ in range(HALVINGS):
             tops = np.array([(prior + one.views).max(axis=1) for one in sized])
             tops += log_half_cauchy(np.exp(grid), structure)[:, None]
-            best = np.maximum(best, tops.max(axis=0))
+            best = tops.max(axis=0)  # of this length: a peak may lie between two points
             # axis by axis only where they may differ
             views = (0, 1, 2) if best[1] + best[2] > best[0] + prior.max() + CHANGE else (0,)
             middles = set[float]()
             for k in views:
-                middles.update(_middles(grid, tops[:, k], best[k] - NEGLIGIBLE))
+                middles.update(_middles(grid, tops[:, k].tolist(), best[k] - NEGLIGIBLE))
             if not middles:
                 break
             sized += [at(length, a) for a in middles]
