@@ -281,7 +281,6 @@ class Session:
             rng=self.rng("assess"),
             priors=self.config.discrepancy.priors(),
             parameter_priors=self.priors,
-            sample=matches.sample(SAMPLE),
             stars=matches if isinstance(matches, MatchTable) else None,
         )
 
