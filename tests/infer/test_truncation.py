@@ -450,6 +450,6 @@ def test_coefficients_are_covered(cut, kind, full, capsys):
             f"\ncut at {cut} sigma, {kind}, {len(seeds)} truths: pulls rms {rms:.3f} with the "
             f"circle in the likelihood, {plain:.2f} without"
         )
-    assert inside and abs(rms - 1) < (0.08 if full else 0.25)
+    assert inside and abs(rms - 1) < (0.12 if full else 0.35)
     # so that this test can fail
     assert not covered and plain > 1.5
