@@ -1,10 +1,11 @@
 """Test of linear deviations of single exposures that their frames do not fit.
 
 Every exposure e has a statistic T_e of its own, of the shift, rotation, scale and shears that are
-no parameters of its frame.  Exposures deviate in ways of their own, and their sum is what is
-tested: it does not need the covariance of hundreds of scores.  Through the polynomials, which all
-fit together, the T_e are slightly dependent; mean and variance of the sum are those of a scaled
-chi-square (Satterthwaite 1946).
+no parameters of its frame: a chi-square of the same probability as Hotelling's statistic, with the
+covariance of the scores from its own stars.  Exposures deviate in ways of their own, and the sum of
+the T_e is what is tested: it does not need the covariance of hundreds of scores.  Through the
+polynomials, which all fit together, the T_e are slightly dependent; mean and variance of the sum
+are those of a scaled chi-square (Satterthwaite 1946).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ __all__ = ["exposure_test"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+LEAST_P = 1e-300
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
 MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
@@ -58,6 +60,8 @@ class _Deviations:
         Of the score, from those of single detections.
     square : ndarray, shape (n, n)
         Mean square of the deviations over the detector.
+    n_stars : float
+        Stars that the covariance is known from, those of other exposures by what they add to it.
     """
 
     score: Float
@@ -66,6 +70,14 @@ class _Deviations:
     cross: Float
     covariance: Float
     square: Float
+    n_stars: float
+
+    @property
+    def statistic(self) -> float:
+        """Chi-square of the same probability as Hotelling's statistic about zero."""
+        n, t = len(self.score), float(self.score @ np.linalg.solve(self.covariance, self.score))
+        p = stats.beta.sf(min(t / self.n_stars, 1.0), n / 2, (self.n_stars - n) / 2)
+        return float(stats.chi2.isf(max(p, LEAST_P), n))
 
     def along(self, N: Float) -> _Deviations:
         """Some directions of them."""
@@ -76,6 +88,7 @@ class _Deviations:
             N.T @ self.cross,
             N.T @ self.covariance @ N,
             N.T @ self.square @ N,
+            self.n_stars,
         )
 
 
@@ -109,8 +122,8 @@ class _Meat:
             total += gain.T @ (one.precision[:, None] * gain)
         return cls(by_star, total)
 
-    def covariance(self, nuisance: Float, star: Int, own: Float) -> Float:
-        """Covariance (n, n) of an exposure's scores.
+    def covariance(self, nuisance: Float, star: Int, own: Float) -> tuple[Float, Float]:
+        """Covariance (n, n) of an exposure's scores: of its own stars, and of all others.
 
         Parameters
         ----------
@@ -128,7 +141,7 @@ class _Meat:
         through = self.by_star[which] @ nuisance
         left = direct - through
         rest = nuisance.T @ self.total @ nuisance - through.T @ through
-        return np.asarray(left.T @ left + rest)
+        return left.T @ left, rest
 
 
 def exposure_test(projection: Projection) -> Outcome | None:
@@ -154,7 +167,7 @@ def exposure_test(projection: Projection) -> Outcome | None:
     T, n, size2, noise2 = 0.0, 0, 0.0, 0.0
     shared, apart = np.zeros((projection.n_global, projection.n_global)), 0.0
     for one in found:
-        T += float(one.score @ np.linalg.solve(one.covariance, one.score))
+        T += one.statistic
         n += len(one.score)
         shared += one.cross.T @ np.linalg.solve(one.information, one.cross)
         alone = np.linalg.solve(
@@ -271,16 +284,20 @@ def _of_exposure(
             direct += through
         psi.append(projection.star_scores(F, block, direct))
     own_scores = np.concatenate(psi)
+    n_own = sum(int(sample.used[block.rows].sum()) for block in blocks)
     if meat is None:
-        covariance = own_scores.T @ own_scores + projection.score_ratio * others
+        of_own, of_others = own_scores.T @ own_scores, projection.score_ratio * others
     else:
         star = np.concatenate([sample.star[block.rows] for block in blocks])
-        covariance = meat.covariance(nuisance, star, own_scores)
+        of_own, of_others = meat.covariance(nuisance, star, own_scores)
         if local is not None:
             before = local.gain[:, :G] @ nuisance
             after = own_gain - before
             P = local.precision[:, None]
-            covariance += after.T @ (P * after) - before.T @ (P * before)
+            of_others += after.T @ (P * after) - before.T @ (P * before)
+    covariance = of_own + of_others
+    share = float(np.trace(of_own) / np.trace(covariance))
+    n_others = max(int(sample.used.sum()) - n_own, 1)
     return whole, _Deviations(
         score - nuisance.T @ projection.score[:G],
         (information + information.T) / 2,
@@ -288,4 +305,5 @@ def _of_exposure(
         cross,
         (covariance + covariance.T) / 2,
         square,
+        1.0 / (share**2 / n_own + (1.0 - share) ** 2 / n_others),
     )

@@ -154,7 +154,7 @@ def test_curvature_in_time_is_what_the_lines_leave():
     square = t**2 - np.polyval(np.polyfit(t, t**2, 1), t)
     # shifts are those of the exposures
     z = np.stack([X * square, Y * square], 1)
-    T, q, dof = Dense(table, fit).statistic(added(table, fit.model, fit.mean, z))
+    T, q, _ = Dense(table, fit).statistic(added(table, fit.model, fit.mean, z))
     assert found["curvature in time"].dof == q == 4
     assert found["curvature in time"].statistic == pytest.approx(T, rel=1e-6)
     # u_1_0 and v_0_1 have their drift
@@ -217,7 +217,12 @@ def test_deviations_of_exposures_are_those_of_dense_matrices(case, shared):
     for e in range(len(model.exposures)):
         Z, _, U = dense.projected(fields * (table.exposure == e)[:, None, None])
         psi = dense.summed(np.einsum("naq,na->nq", Z, whole))
-        T += U @ np.linalg.solve(psi.T @ psi, U)
+        V, own = psi.T @ psi, psi[np.unique(dense.star[table.exposure == e])]
+        share = np.trace(own.T @ own) / np.trace(V)
+        here = int((table.exposure == e).sum())
+        N = 1 / (share**2 / here + (1 - share) ** 2 / (len(table) - here))
+        p = stats.beta.sf(U @ np.linalg.solve(V, U) / N, len(U) / 2, (N - len(U)) / 2)
+        T += stats.chi2.isf(p, len(U))
         S = dense.information(Z, Z)
         whitened.append(Z @ np.linalg.inv(np.linalg.cholesky(S)).T)
     every = np.concatenate(whitened, axis=2)
