@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.membership import star_averages
-from bayesdist.infer.robust.scores import scores_of
+from bayesdist.infer.scores import scores_of
 from bayesdist.infer.stars import Stars, prepare
 from bayesdist.infer.views import Solution
 from bayesdist.model import DistortionModel

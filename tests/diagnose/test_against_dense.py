@@ -12,7 +12,7 @@ from bayesdist.diagnose.regressors import functions_for
 from bayesdist.diagnose.sample import scored_sample
 from bayesdist.diagnose.score import regressor_tests
 from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.infer.robust.scores import scores_of
+from bayesdist.infer.scores import scores_of
 from bayesdist.infer.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel
 

@@ -18,7 +18,7 @@ from bayesdist.infer.coordinates import Split
 from bayesdist.infer.kernel import circle_terms
 from bayesdist.infer.laplace import conditional_mode, starting_point
 from bayesdist.infer.membership import memberships, star_log_likelihood
-from bayesdist.infer.robust.scores import Scores
+from bayesdist.infer.scores import Scores
 from bayesdist.infer.target import Target
 from tests.seeds import over
 

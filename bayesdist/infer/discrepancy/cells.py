@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.robust.scores import Scores
+from bayesdist.infer.scores import Scores
 from bayesdist.infer.stars import Stars
 from bayesdist.model import Groups, merge_groups
 

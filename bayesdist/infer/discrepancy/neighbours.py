@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.robust.scores import Scores
+from bayesdist.infer.scores import Scores
 from bayesdist.infer.stars import prepare
 from bayesdist.model import DistortionModel
 

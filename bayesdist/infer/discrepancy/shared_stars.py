@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
-from bayesdist.infer.robust.scores import Scores
+from bayesdist.infer.scores import Scores
 from bayesdist.infer.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 

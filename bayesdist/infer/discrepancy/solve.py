@@ -21,7 +21,7 @@ from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_stars
 from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.robust.scores import scores_of
+from bayesdist.infer.scores import scores_of
 from bayesdist.infer.settling import Settling
 from bayesdist.infer.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.views import Solution
