@@ -140,6 +140,11 @@ def functions_for(sample: ScoredSample) -> Functions:
     for values, make in ((sample.mag, _by_magnitude), (sample.colour, _by_colour)):
         if values is not None and np.ptp(values) > 0:
             add(Factor(_standing_out(values), LINEAR), make)
+    if sample.mag is not None and sample.epoch is not None and np.ptp(sample.mag) > 0:
+        if np.ptp(sample.epoch) > SHORTEST:
+            years = sample.epoch - (sample.epoch.min() + sample.epoch.max()) / 2
+            values = _standing_out(sample.mag) * years / (np.ptp(sample.epoch) / 2)
+            add(Factor(values, LINEAR), _magnitude_in_time)
     time = sample.model.time
     dates = np.unique(sample.epoch) if sample.epoch is not None else np.zeros(0)
     if sample.epoch is not None and time is None and len(dates) > 1:
@@ -190,6 +195,17 @@ def _by_magnitude(functions: Int) -> Regressors:
         "add a magnitude term, cut the faint stars, or correct the charge-transfer efficiency",
         "the residuals go with the magnitude of the stars",
         "the residuals do not go with the magnitude of the stars",
+    )
+
+
+def _magnitude_in_time(functions: Int) -> Regressors:
+    return Regressors(
+        "magnitude in time",
+        functions,
+        INDEPENDENT,
+        "cut the faint stars, correct the charge-transfer efficiency, or leave out the late years",
+        "how the residuals go with the magnitude of the stars changes with time",
+        "how the residuals go with the magnitude of the stars does not change with time",
     )
 
 
