@@ -12,6 +12,9 @@ from bayesdist.assess.verdict import Caveat
 
 __all__ = ["caveats_of", "rests_on"]
 
+LEAST_CHI2 = 0.8  # per degree of freedom
+WIDE = 5.0  # errors of a star, within which true matches are lost when nominal positions are off
+
 # tests whose findings the error model holds, by the part of it
 OF_STRUCTURE = ("order ",)
 OF_NOISE = ("noise by ",)
@@ -32,6 +35,7 @@ def _caveats(session: Session) -> Iterator[Caveat]:
     for test in session.score_tests:
         if test.significant and not _held(session, test.name):
             yield Caveat(f"{test.finding}: {test.remedy}")
+    yield from _of_matching(session)
     held = held_out_of(session)
     if held is not None and held.doubtful:
         yield Caveat(held.verdict)
@@ -55,6 +59,25 @@ def _held(session: Session, test: str) -> bool:
         or (bool(found.structure) and test.startswith(OF_STRUCTURE))
         or (linear and test.startswith(OF_DEVIATIONS))
     )
+
+
+def _of_matching(session: Session) -> Iterator[Caveat]:
+    """What the matching may have cut off, where the likelihood does not hold it."""
+    if session.in_circle:
+        return
+    radius, sigma = session.config.outliers.match_radius, session.posterior.reference_sigma
+    if radius is not None and radius < WIDE * sigma:
+        yield Caveat(
+            f"stars were matched within {radius / sigma:.1f} of their errors of nominal positions "
+            "that are not given, which cuts the scatter and draws the fit: match again with a "
+            "wider match radius, or give the columns u_nominal and v_nominal"
+        )
+    ratio = session.fit.chi2 / max(session.fit.dof, 1)
+    if ratio < LEAST_CHI2:
+        yield Caveat(
+            f"the residuals scatter less than the quoted errors say (chi-square {ratio:.2g} per "
+            "degree of freedom): the match radius has cut them, or the errors are too large"
+        )
 
 
 def _of_time(session: Session) -> Iterator[Caveat]:

@@ -24,6 +24,7 @@ __all__ = ["check"]
 # measured on two cores of a server at orders 4 and 5; other machines differ by factors
 STAR_S = 3e-9  # of the likelihood, for each star and pass
 EXPANSION_S = 1.5e-8  # of an expansion to second order, for each star
+IN_CIRCLE = 80.0  # times as much for a star that was matched in a circle about its nominal position
 EXPANSIONS = 40  # in the search for the proposal
 OVERHEAD_S = 6e-5  # of emcee and the proposal, for each walker and step
 FIXED_S = 1.0  # diagnostics and files
@@ -96,8 +97,9 @@ def _cost(session: Session) -> str:
         exact = has_second_stage(sampler.second_stage, passes, n)
         passes = PILOTS + (passes if exact else 0)
         how = "certified, with an exact second stage; " if exact else "certified, approximate; "
-    per_pass = STAR_S * n
-    total = EXPANSIONS * EXPANSION_S * n + passes * (per_pass + OVERHEAD_S) + FIXED_S
+    dear = IN_CIRCLE if session.in_circle else 1.0
+    per_pass = dear * STAR_S * n
+    total = dear * EXPANSIONS * EXPANSION_S * n + passes * (per_pass + OVERHEAD_S) + FIXED_S
     return (
         f"cost         {how}about {passes} passes over {n} stars, "
         f"{number(1e3 * per_pass, 2)} ms each: "

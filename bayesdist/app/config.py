@@ -485,6 +485,49 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _matched_in_a_circle(self) -> Config:
+        if self.selfcal is not None and _names_nominal(self.selfcal.columns):
+            raise ValueError(
+                "nominal positions are of matches in [data], and a [selfcal] finds its matches "
+                "itself; leave u_nominal and v_nominal out"
+            )
+        if self.data is not None and _names_nominal(self.data.columns):
+            if self.data.format not in ("auto", "table"):
+                raise ValueError(
+                    f"nominal positions are columns of tables, and data.format is "
+                    f"{self.data.format!r}; leave u_nominal and v_nominal out"
+                )
+            self.refuse_circle()
+        return self
+
+    def refuse_circle(self) -> None:
+        """Refuse what cannot go with matches in a circle about their nominal positions.
+
+        Raises
+        ------
+        ValueError
+            As validators raise it.
+        """
+        if self.outliers.match_radius is None:
+            return
+        head = "matches with nominal positions and outliers.match_radius are"
+        if self.data is not None and self.data.sigma == "by_magnitude":
+            raise ValueError(
+                f"{head} cut by the match circle, and so are residuals, from which data.sigma = "
+                "'by_magnitude' takes the errors; give columns of errors, or a number"
+            )
+        if self.holdout is not None:
+            raise ValueError(
+                f"{head} cut by the match circle, which the prediction of [holdout] does not "
+                "know; leave [holdout] out, or the nominal positions"
+            )
+        if self.periods is not None:
+            raise ValueError(
+                f"{head} cut by the match circle, which draws the least-squares fits of [periods] "
+                "to the nominal solution; leave [periods] out, or the nominal positions"
+            )
+
+    @model_validator(mode="after")
     def _periods_of_polynomials(self) -> Config:
         if self.periods is None:
             return self
@@ -615,6 +658,10 @@ class Config(Section):
     def requirements(self) -> tuple[Requirement, ...]:
         """The requirements."""
         return tuple(Requirement(**r.model_dump()) for r in self.requirement)
+
+
+def _names_nominal(columns: dict[str, str] | None) -> bool:
+    return any((columns or {}).get(key) for key in ("u_nominal", "v_nominal"))
 
 
 class _RequirementFile(Section):

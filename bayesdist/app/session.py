@@ -45,6 +45,7 @@ from bayesdist.assess.solution import Solution
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.data.holdout import Split
 from bayesdist.diagnose import ScoreTest, score_tests
+from bayesdist.errors import ConfigError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -115,9 +116,26 @@ class Session:
         held, errors = self._split.held, self.magnitude_errors
         return held if errors is None else held.with_errors_by_magnitude(errors)
 
+    @property
+    def in_circle(self) -> bool:
+        """Whether the likelihood is that of stars matched in circles about nominal positions."""
+        if self.config.data is None or self.config.outliers.match_radius is None:
+            return False
+        return self._all_matches.has_nominal
+
     @cached_property
     def _all_matches(self) -> Matches:
         """Matches as read."""
+        matches = self._read_matches()
+        if matches.has_nominal:
+            try:  # columns may be found by their names
+                self.config.refuse_circle()
+            except ValueError as error:
+                cause, _, do = str(error).partition("; ")
+                raise ConfigError(cause, where=", ".join(matches.sources), do=do) from None
+        return matches
+
+    def _read_matches(self) -> Matches:
         data = self.config.data
         assert data is not None
         if data.format == "rvb":
@@ -168,7 +186,10 @@ class Session:
     @cached_property
     def shards(self) -> Shards:
         """All stars as the passes go over them: they are read once."""
-        return load(self.model, self.matches, self.config.resources())
+        shards = load(self.model, self.matches, self.config.resources())
+        if self.in_circle:  # said before anything is fitted
+            shards.survey.check_circle(self.config.outliers.match_radius)
+        return shards
 
     def errors_changed(self) -> None:
         """Forget what rests on the errors of the stars."""

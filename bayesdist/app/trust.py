@@ -14,7 +14,7 @@ LEAST_CHI2, MOST_CHI2 = 0.67, 1.5
 
 def warnings_of(session: Session) -> list[str]:
     """What a reader of the numbers has to know, each as a sentence."""
-    fit, out = session.fit, [*session.doubts]
+    fit, out, circle = session.fit, [*session.doubts], session.in_circle
     out += [one.sentence for one in session.coverages if one.significant]
     if session.majority:
         out.append(session.majority)
@@ -25,11 +25,23 @@ def warnings_of(session: Session) -> list[str]:
             if held
             else session.misfit.sentence
         )
-    ratio = fit.chi2 / max(fit.dof, 1)
-    if ratio < LEAST_CHI2:
+    if session.config.data is not None and session.raw_matches.has_nominal and not circle:
         out.append(
-            f"chi-square per degree of freedom is {ratio:.2g}: the quoted errors are too large, "
-            "and with them all uncertainties"
+            "the matches have nominal positions, and outliers.match_radius is not given: the "
+            "likelihood does not know that they were selected"
+        )
+    ratio = fit.chi2 / max(fit.dof, 1)
+    if circle:
+        if ratio < LEAST_CHI2:
+            out.append(
+                f"chi-square per degree of freedom of least squares is {ratio:.2g}: the match "
+                "circle cuts the residuals, and draws this fit to the nominal solution; the "
+                "posterior knows of the circle"
+            )
+    elif ratio < LEAST_CHI2:
+        out.append(
+            f"chi-square per degree of freedom is {ratio:.2g}: the match radius has cut the "
+            "residuals, or the quoted errors are too large, and with them all uncertainties"
         )
     if ratio > MOST_CHI2:
         out.append(

@@ -133,13 +133,9 @@ def verdict_of(
     elif high < asked:
         verdict, reason = "missed", f"{interval}, below the {asked:g} asked for"
     else:
-        verdict, reason = (
-            "undecided",
-            (
-                f"{interval}, on both sides of the {asked:g} asked for: {n:.0f} effective draws are "
-                "too few"
-            ),
-        )
+        verdict = "undecided"
+        reason = f"{interval}, on both sides of the {asked:g} asked for: too few effective draws"
+        reason += f" ({n:.0f})"
     if not caveats or (verdict == "missed" and all(c.larger for c in caveats)):
         return verdict, reason
     texts = "; ".join(c.text for c in caveats)

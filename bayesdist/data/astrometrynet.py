@@ -28,6 +28,8 @@ COLUMNS = {
     "mag": "",
     "colour": "",
     "star": "",
+    "u_nominal": "",
+    "v_nominal": "",
 }
 
 

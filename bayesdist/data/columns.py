@@ -23,6 +23,7 @@ __all__ = [
     "match_columns",
     "matches_from_table",
     "needed_columns",
+    "nominal_columns",
     "plane_unit",
     "position_unit",
     "sky_columns",
@@ -48,6 +49,8 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "mag": ("mag", "magnitude"),
     "colour": ("colour", "color"),
     "star": ("star",),
+    "u_nominal": ("u_nominal",),
+    "v_nominal": ("v_nominal",),
 }
 
 
@@ -224,9 +227,9 @@ def matches_from_table(
     data : astropy Table or mapping of arrays
     columns : mapping of str to str, optional
         Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag
-        colour star.  What is not named is looked for under its usual names (`ALIASES`), in any case
-        of letters; an empty name leaves a quantity out.  With ra and dec, u and v are the tangent
-        plane in arcsec.
+        colour star u_nominal v_nominal.  What is not named is looked for under its usual names
+        (`ALIASES`), in any case of letters; an empty name leaves a quantity out.  With ra and dec,
+        u and v are the tangent plane in arcsec.
     source : str, optional
         File, for errors.
     unit : str, optional
@@ -359,6 +362,9 @@ def match_columns(
     for key in ("sigma_u", "sigma_v"):
         if key in found:
             out[key] = _sigma(column(key), out["unit"])
+    if nominal := nominal_columns(found, source=source, tangent_point=tangent_point):
+        for key in nominal:
+            out[key] = _in_unit(column(key), out["unit"])
     if "epoch" in found:
         out["epoch"] = column("epoch").years()
     for key in ("mag", "colour"):
@@ -413,10 +419,49 @@ def plane_unit(unit: str | None, *, source: str) -> str:
     return "arcsec"
 
 
+def nominal_columns(
+    found: Mapping[str, str], *, source: str, tangent_point: tuple[float, float] | None
+) -> tuple[str, ...]:
+    """'u_nominal' and 'v_nominal' where a table has them, else nothing.
+
+    Parameters
+    ----------
+    found, source, tangent_point
+        As of `match_columns`.
+
+    Raises
+    ------
+    InputError
+        For one without the other; beside sky positions, where no tangent point is given: the plane
+        on which they lie is not to depend on which stars were matched.
+    """
+    keys = tuple(key for key in ("u_nominal", "v_nominal") if key in found)
+    if len(keys) == 1:
+        missing = "v_nominal" if keys[0] == "u_nominal" else "u_nominal"
+        raise InputError(
+            f"column {missing!r} is missing beside its partner",
+            where=source,
+            do="give nominal positions in both axes or in none",
+        )
+    if keys and "ra" in found and tangent_point is None:
+        raise InputError(
+            "nominal positions stand beside ra and dec, and the tangent point of their plane is "
+            "not given",
+            where=source,
+            do="set data.tangent_point to that of the nominal positions",
+        )
+    return keys
+
+
+def _in_unit(column: SourceColumn, unit: str) -> Float:
+    """Numbers in the unit of u, v."""
+    own = column.unit
+    return column.numbers() * (1.0 if own is None else conversion(own, unit, where=column.where))
+
+
 def _sigma(column: SourceColumn, unit: str) -> Float:
     """Standard errors in the unit of u, v."""
-    own = column.unit
-    sigma = column.numbers() * (1.0 if own is None else conversion(own, unit, where=column.where))
+    sigma = _in_unit(column, unit)
     good = sigma > 0
     if not good.all():
         bad = int(np.argmin(good))

@@ -24,7 +24,8 @@ Int = NDArray[np.int64]
 
 _POSITIONS = ("x", "y", "u", "v")
 _SIGMAS = ("sigma_u", "sigma_v")
-_OPTIONAL = ("epoch", "mag", "colour")
+_NOMINAL = ("u_nominal", "v_nominal")
+_OPTIONAL = ("epoch", "mag", "colour", *_NOMINAL)
 _CODES = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
 _INTEGERS = ("row", "source", "star", *_CODES)
 
@@ -73,6 +74,9 @@ class MatchTable:
     tangent_point : tuple of float, optional
         RA and Dec in degrees of the plane that u, v lie on, where they were made from sky
         positions.
+    u_nominal, v_nominal : ndarray, optional
+        Where an earlier solution put the star, in `unit`: both or neither.  The match was looked
+        for within a circle about it.
 
     Raises
     ------
@@ -104,6 +108,8 @@ class MatchTable:
     n_rows: int = None  # type: ignore[assignment]
     rejected: Mapping[str, int] = field(default_factory=dict)
     tangent_point: tuple[float, float] | None = None
+    u_nominal: Float | None = None
+    v_nominal: Float | None = None
 
     def __post_init__(self) -> None:
         self._complete()
@@ -192,6 +198,13 @@ class MatchTable:
                 where=", ".join(self.sources),
                 do="give both errors or neither",
             )
+        if (self.u_nominal is None) != (self.v_nominal is None):
+            missing = "u_nominal" if self.u_nominal is None else "v_nominal"
+            raise InputError(
+                f"column {missing!r} is missing beside its partner",
+                where=", ".join(self.sources),
+                do="give nominal positions in both axes or in none",
+            )
         names_of = {**_CODES, "source": "sources"}
         for name, labels in names_of.items():
             codes = getattr(self, name)
@@ -254,6 +267,11 @@ class MatchTable:
     def has_mag(self) -> bool:
         """Whether the stars have magnitudes."""
         return self.mag is not None
+
+    @property
+    def has_nominal(self) -> bool:
+        """Whether the stars have nominal positions."""
+        return self.u_nominal is not None
 
     @property
     def exposures(self) -> tuple[str, ...]:

@@ -36,7 +36,10 @@ PathLike = str | os.PathLike[str]
 Errors = MagnitudeErrors | tuple[float, float]
 Segment = tuple[int, int, int]  # part, first row, row after the last
 
-_ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour", "star")
+_ARRAYS = (
+    *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour", "star"),
+    *("u_nominal", "v_nominal"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +137,7 @@ class PartitionedMatches:
     rejected : dict of str to int
         As `dropped`.
     tangent_point : tuple of float or None
-    has_epoch, has_mag, has_sigma : bool
+    has_epoch, has_mag, has_sigma, has_nominal : bool
     """
 
     whole: Whole
@@ -204,6 +207,11 @@ class PartitionedMatches:
     def has_sigma(self) -> bool:
         """Whether the stars have errors."""
         return self.errors is not None or "sigma_u" in self.parts[0].found
+
+    @property
+    def has_nominal(self) -> bool:
+        """Whether the stars have nominal positions."""
+        return "u_nominal" in self.parts[0].found
 
     def pieces(self) -> tuple[Piece, ...]:
         """The rows in consecutive pieces.

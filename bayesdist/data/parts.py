@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from bayesdist.data.columns import (
     match_columns,
     needed_columns,
+    nominal_columns,
     plane_unit,
     position_unit,
     sky_columns,
@@ -162,6 +163,7 @@ def match_part(
                     where=source,
                     do="give both errors or neither",
                 )
+    nominal_columns(found, source=source, tangent_point=tangent_point)
     if "ra" in found:
         own = plane_unit(unit, source=source)
     else:

@@ -126,4 +126,9 @@ def neutralise_aberration(
     }
     if table.sigma_u is not None and table.sigma_v is not None:
         changes |= {"sigma_u": table.sigma_u / factor, "sigma_v": table.sigma_v / factor}
+    if table.u_nominal is not None and table.v_nominal is not None:
+        changes |= {
+            "u_nominal": origin[0] + (table.u_nominal - origin[0]) / factor,
+            "v_nominal": origin[1] + (table.v_nominal - origin[1]) / factor,
+        }
     return replace(table, **changes)  # type: ignore[arg-type]

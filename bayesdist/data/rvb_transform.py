@@ -271,11 +271,18 @@ def _moved(
     matches: MatchTable, code: NDArray[np.int64], matrix: Float, shift: Float, centre: Float
 ) -> MatchTable:
     """Pairs moved by a linear map each: that of its code."""
-    points = np.column_stack([matches.u, matches.v])
-    offset = points - centre[code]
-    # the change is added: an identity leaves every digit
-    change = np.einsum("nij,nj->ni", (matrix - np.eye(2))[code], offset) + shift[code]
-    columns = {"u": points[:, 0] + change[:, 0], "v": points[:, 1] + change[:, 1]}
+
+    def moved(u: Float, v: Float) -> Float:
+        points = np.stack([u, v])
+        offset = points.T - centre[code]
+        # the change is added: an identity leaves every digit
+        change = np.einsum("nij,nj->ni", (matrix - np.eye(2))[code], offset) + shift[code]
+        return points + change.T
+
+    columns = dict(zip(("u", "v"), moved(matches.u, matches.v), strict=True))
+    if matches.u_nominal is not None and matches.v_nominal is not None:
+        nominal = moved(matches.u_nominal, matches.v_nominal)
+        columns |= dict(zip(("u_nominal", "v_nominal"), nominal, strict=True))
     if matches.sigma_u is not None and matches.sigma_v is not None:
         var = np.stack([matches.sigma_u, matches.sigma_v], axis=1) ** 2
         out = np.sqrt(np.einsum("nij,nj->ni", (matrix**2)[code], var))

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 __all__ = ["write_partitioned"]
 
-_NUMBERS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour")
+_NUMBERS = (
+    *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour"),
+    *("u_nominal", "v_nominal"),
+)
 _LABELS = {
     "exposure": ("exposure_names", ("1",)),
     "chip": ("chip_numbers", (1,)),
@@ -104,7 +107,7 @@ def _schema(table: MatchTable, *, like: pyarrow.Schema | None = None) -> pyarrow
     import pyarrow
 
     units = {"x": "pix", "y": "pix", "epoch": "yr"}
-    units |= dict.fromkeys(("u", "v", "sigma_u", "sigma_v"), table.unit)
+    units |= dict.fromkeys(("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal"), table.unit)
     out = []
     for name in _NUMBERS:
         if getattr(table, name) is not None:

@@ -19,16 +19,18 @@ from scipy import stats
 from scipy.linalg import cho_solve
 
 from bayesdist.diagnose.projection import Projection
-from bayesdist.diagnose.result import Outcome, noncentrality
+from bayesdist.diagnose.result import Outcome
 from bayesdist.diagnose.sample import Block
-from bayesdist.diagnose.score import independent_directions
+from bayesdist.diagnose.score import independent_directions, smallest_pattern
 from bayesdist.model.frames import frame_names
 
 __all__ = ["exposure_test"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
+MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
 
 _LINEAR = {
@@ -77,6 +79,58 @@ class _Deviations:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Meat:
+    """Scores of the global parameters, by stars.
+
+    Parameters
+    ----------
+    by_star : ndarray, shape (stars, G)
+        Sums over the detections of each.
+    total : ndarray, shape (G, G)
+        Sum of their squares, and what the priors add.
+    """
+
+    by_star: Float
+    total: Float
+
+    @classmethod
+    def of(cls, projection: Projection) -> _Meat:
+        """Those of all stars."""
+        sample, G = projection.sample, projection.n_global
+        by_star = np.zeros((int(sample.star.max()) + 1, G))
+        for block in sample.blocks:
+            F = projection.functions.polynomials(block.rows)
+            psi = projection.star_scores(F, block, projection.through(block, np.eye(G)))
+            np.add.at(by_star, sample.star[block.rows], psi)
+        total = by_star.T @ by_star + np.diag(projection.precision[:G])
+        for one in projection.exposures.values():
+            gain = one.gain[:, :G]
+            total += gain.T @ (one.precision[:, None] * gain)
+        return cls(by_star, total)
+
+    def covariance(self, nuisance: Float, star: Int, own: Float) -> Float:
+        """Covariance (n, n) of an exposure's scores.
+
+        Parameters
+        ----------
+        nuisance : ndarray, shape (G, n)
+            Parameters that the deviations are taken for.
+        star : ndarray of int, shape (N,)
+            Stars of the exposure's detections.
+        own : ndarray, shape (N, n)
+            Scores of the detections before the parameters are projected out.
+        """
+        which, of = np.unique(star, return_inverse=True)
+        direct = np.zeros((len(which), own.shape[1]))
+        np.add.at(direct, of, own)
+        # a star is one, in this exposure and in all others
+        through = self.by_star[which] @ nuisance
+        left = direct - through
+        rest = nuisance.T @ self.total @ nuisance - through.T @ through
+        return np.asarray(left.T @ left + rest)
+
+
 def exposure_test(projection: Projection) -> Outcome | None:
     """Test of the exposures' own deviations.
 
@@ -98,21 +152,23 @@ def exposure_test(projection: Projection) -> Outcome | None:
     if len(found) < 2:
         return None
     T, n, size2, noise2 = 0.0, 0, 0.0, 0.0
-    inverse = cho_solve(projection.root, np.eye(projection.n_global))
-    together, apart = np.zeros_like(inverse), 0.0
+    shared, apart = np.zeros((projection.n_global, projection.n_global)), 0.0
     for one in found:
         T += float(one.score @ np.linalg.solve(one.covariance, one.score))
         n += len(one.score)
-        shared = inverse @ one.cross.T @ np.linalg.solve(one.information, one.cross)
-        together += shared
-        apart += float(np.trace(shared @ shared))
+        shared += one.cross.T @ np.linalg.solve(one.information, one.cross)
+        alone = np.linalg.solve(
+            one.information, one.cross @ cho_solve(projection.root, one.cross.T)
+        )
+        apart += float(np.trace(alone @ alone))
         back = np.linalg.inv(one.own)
         step = back @ one.score
         noise = float(np.trace(one.square @ back @ one.covariance @ back))
         size2 += (float(step @ one.square @ step) - noise) / len(found)
         noise2 += noise / len(found)
+    together = cho_solve(projection.root, shared)
     # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
-    stretch = 1.0 + (float(np.trace(together @ together)) - apart) / n
+    stretch = 1.0 + (float((together * together.T).sum()) - apart) / n
     dof = n / stretch
     return Outcome(
         name="exposures",
@@ -121,7 +177,7 @@ def exposure_test(projection: Projection) -> Outcome | None:
         dof_residual=None,
         p_value=float(stats.chi2.sf(T / stretch, dof)),
         size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(_smallest, float(np.sqrt(noise2)), dof),
+        smallest=partial(smallest_pattern, float(np.sqrt(noise2)), dof, None),
         unit=model.unit,
         remedy=_remedy(model.frames),
         present="exposures deviate from each other in linear terms that their frames do not fit",
@@ -134,13 +190,11 @@ def _remedy(frames: str) -> str:
     return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
 
 
-def _smallest(noise: float, dof: float, level: float) -> float:
-    return float(noise * np.sqrt(noncentrality(level, dof) / dof))
-
-
 def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
     """Deviations of every exposure with stars enough, along the directions that it has left."""
-    meat = _global_meat(projection)
+    meat = None
+    if len(projection.sample) * projection.n_global**2 < MOST_PRODUCTS:
+        meat = _Meat.of(projection)
     by_exposure: dict[int, list[Block]] = {}
     for block in projection.sample.blocks:
         by_exposure.setdefault(block.exposure, []).append(block)
@@ -168,11 +222,15 @@ def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Floa
 
 
 def _of_exposure(
-    projection: Projection, blocks: list[Block], names: list[str], meat: Float
+    projection: Projection, blocks: list[Block], names: list[str], meat: _Meat | None
 ) -> tuple[Float, _Deviations]:
-    """Information before anything is projected out, and one exposure's deviations."""
+    """Information before anything is projected out, and one exposure's deviations.
+
+    Without the scores of the global parameters, the part of other exposures in the covariance is
+    taken to be as wrong as errors are on average.
+    """
     sample, model, G = projection.sample, projection.sample.model, projection.n_global
-    K, n = model.n_terms, len(names)
+    n = len(names)
     local = projection.exposures.get(blocks[0].frame_exposure)
     whole, cross, score = np.zeros((n, n)), np.zeros((n, G)), np.zeros(n)
     square = np.zeros((n, n))
@@ -181,7 +239,7 @@ def _of_exposure(
     fields = [_fields(block, names, model.origin) for block in blocks]
     parts = [projection.parts(block) for block in blocks]
     for block, Z, (by_global, by_local) in zip(blocks, fields, parts, strict=True):
-        F = projection.functions.at(sample, block.rows)[:K]
+        F = projection.functions.polynomials(block.rows)
         WZ = projection.weighted(F, block, Z)
         whole += np.einsum("akm,akn->mn", Z, WZ)
         columns = block.columns[: by_global.shape[2]]
@@ -198,24 +256,31 @@ def _of_exposure(
         cross = cross - to_local.T @ local.gain[:, :G]
         score = score - own_gain.T @ local.score
     nuisance = cho_solve(projection.root, cross.T)
-    # stars of the exposure itself, in place of what they say of the parameters alone
-    covariance = nuisance.T @ meat @ nuisance
+    information = own - cross @ nuisance
+    others, psi = information.copy(), []
     for block, Z, (_, by_local) in zip(blocks, fields, parts, strict=True):
-        F = projection.functions.at(sample, block.rows)[:K]
-        through = projection.reduced(block) @ nuisance
+        F = projection.functions.polynomials(block.rows)
+        through = projection.through(block, nuisance)
         direct = Z - through
         if local is not None:
             at = np.searchsorted(local.index, block.columns[block.columns >= G])
             direct -= by_local @ own_gain[at]
-        for sign, coefficients in ((1.0, direct), (-1.0, through)):
-            psi = projection.star_scores(F, block, coefficients)
-            covariance += sign * psi.T @ psi
-    if local is not None:
-        before = local.gain[:, :G] @ nuisance
-        after = own_gain - before
-        P = local.precision[:, None]
-        covariance += after.T @ (P * after) - before.T @ (P * before)
-    information = own - cross @ nuisance
+        if meat is None:
+            others -= np.einsum("akm,akn->mn", direct, projection.weighted(F, block, direct))
+        else:
+            direct += through
+        psi.append(projection.star_scores(F, block, direct))
+    own_scores = np.concatenate(psi)
+    if meat is None:
+        covariance = own_scores.T @ own_scores + projection.score_ratio * others
+    else:
+        star = np.concatenate([sample.star[block.rows] for block in blocks])
+        covariance = meat.covariance(nuisance, star, own_scores)
+        if local is not None:
+            before = local.gain[:, :G] @ nuisance
+            after = own_gain - before
+            P = local.precision[:, None]
+            covariance += after.T @ (P * after) - before.T @ (P * before)
     return whole, _Deviations(
         score - nuisance.T @ projection.score[:G],
         (information + information.T) / 2,
@@ -224,18 +289,3 @@ def _of_exposure(
         (covariance + covariance.T) / 2,
         square,
     )
-
-
-def _global_meat(projection: Projection) -> Float:
-    """Covariance (G, G) of the scores of the global parameters, from those of single detections."""
-    sample, G = projection.sample, projection.n_global
-    K = sample.model.n_terms
-    out = np.diag(projection.precision[:G])
-    for block in sample.blocks:
-        F = projection.functions.at(sample, block.rows)[:K]
-        psi = projection.star_scores(F, block, projection.reduced(block))
-        out += psi.T @ psi
-    for one in projection.exposures.values():
-        gain = one.gain[:, :G]
-        out += gain.T @ (one.precision[:, None] * gain)
-    return np.asarray(out)

@@ -16,15 +16,17 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.projection import Projection
-from bayesdist.diagnose.result import Outcome, noncentrality
+from bayesdist.diagnose.result import Outcome
+from bayesdist.diagnose.score import smallest_pattern
 
 __all__ = ["noise_tests"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-STARS_PER_PART = 100  # of a part of the data; smaller ones are joined
-STARS_PER_CELL = 250
+STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
+STARS_PER_CELL = 60
+STARS_PER_BIN = 150  # of magnitudes
 MOST_CELLS = 8  # along each side of a chip
 MOST_MAGNITUDES = 10
 
@@ -42,6 +44,9 @@ class _Squares:
     star : ndarray of int, shape (N,)
     sigma : float
         Typical standard deviation along an axis.
+    free : float
+        Degrees of freedom of the residuals, over their number: what the fit takes from all of them
+        together makes their squares scatter more than each by itself tells.
     unit : str
     """
 
@@ -50,6 +55,7 @@ class _Squares:
     expected: Float
     star: Int
     sigma: float
+    free: float
     unit: str
 
     @property
@@ -81,11 +87,13 @@ def noise_tests(projection: Projection) -> list[Outcome]:
         expected,
         np.unique(sample.star[rows], return_inverse=True)[1],
         float(np.sqrt(ratio * np.median(variance))),
+        1.0 - float(projection.leverage[:, rows].mean()),
         sample.model.unit,
     )
     parts = {"position": _cells(projection, rows)}
     if sample.mag is not None:
-        parts["magnitude"] = _magnitudes(sample.mag[rows])
+        n_stars = int(squares.star.max(initial=0)) + 1
+        parts["magnitude"] = _magnitudes(sample.mag[rows], n_stars)
     exposure = np.concatenate(
         [np.full(one.rows.stop - one.rows.start, one.exposure) for one in sample.blocks]
     )
@@ -102,9 +110,10 @@ def _cells(projection: Projection, rows: Int) -> Int:
         chip[block.rows] = block.chip
     chip = chip[rows]
     code = np.zeros(len(rows), np.int64)
-    for c, n in enumerate(np.bincount(chip)):
-        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MOST_CELLS))
+    for c in np.unique(chip):
         here = chip == c
+        n = len(np.unique(sample.star[rows[here]]))
+        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MOST_CELLS))
         ix, iy = (
             np.clip(((z[rows[here]] + 1) * side / 2).astype(np.int64), 0, side - 1)
             for z in (sample.X, sample.Y)
@@ -114,17 +123,18 @@ def _cells(projection: Projection, rows: Int) -> Int:
     return code
 
 
-def _magnitudes(mag: Float) -> Int:
-    """Bins with equal numbers of stars."""
-    n = int(np.clip(len(mag) // STARS_PER_CELL, 1, MOST_MAGNITUDES))
+def _magnitudes(mag: Float, n_stars: int) -> Int:
+    """Bins with equal numbers of detections."""
+    n = int(np.clip(n_stars // STARS_PER_BIN, 1, MOST_MAGNITUDES))
     edges = np.quantile(mag, np.linspace(0, 1, n + 1)[1:-1])
     return np.searchsorted(np.unique(edges), mag)
 
 
-def _joined(code: Int) -> Int:
+def _joined(code: Int, star: Int) -> Int:
     """Codes from 0 of parts that have stars enough: each takes its successors until it has."""
     values, index = np.unique(code, return_inverse=True)
-    count = np.bincount(index)
+    pairs = np.unique(index * (int(star.max()) + 1) + star)
+    count = np.bincount(pairs // (int(star.max()) + 1))
     out, total, part = np.zeros(len(values), np.int64), 0, 0
     for k, n in enumerate(count):
         out[k] = part
@@ -138,7 +148,7 @@ def _joined(code: Int) -> Int:
 
 def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
     """Test by parts of the data; None where there is but one."""
-    code = _joined(code)
+    code = _joined(code, squares.star)
     m = int(code.max(initial=0)) + 1
     if m < 2:
         return None
@@ -156,7 +166,7 @@ def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
     n = np.bincount(code)
     pooled = float(own @ n**2) / n.sum() / n
     # of the means of so many squares, the cube root is all but Gaussian (Wilson and Hilferty 1931)
-    shape = 1.0 / np.maximum(own, pooled)
+    shape = squares.free / np.maximum(own, pooled)
     root = np.cbrt(ratio / squares.ratio) - 1.0 + 1.0 / (9.0 * shape)
     weight = 9.0 * shape
     root = root - np.average(root, weights=weight)
@@ -175,7 +185,7 @@ def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
         dof_residual=None,
         p_value=float(stats.chi2.sf(T, m - 1)),
         size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(_smallest, float(np.sqrt(noise)), m - 1),
+        smallest=partial(smallest_pattern, float(np.sqrt(noise)), m - 1, None),
         unit=squares.unit,
         remedy=_REMEDIES[name],
         present=f"the noise differs from {over}, from {low * squares.sigma:.2g} to "
@@ -200,11 +210,15 @@ def _by_axis(squares: _Squares) -> Outcome | None:
     n = len(d)
     if n < STARS_PER_PART:
         return None
-    T = float(d.sum() ** 2 / (d**2).sum())
+    T = squares.free * float(d.sum() ** 2 / (d**2).sum())
     of_each = squares.square.sum(axis=1) / squares.expected.sum(axis=1)
     scale = np.sqrt(of_each / ratio)
     # standard deviations differ by half of what variances do, each from its mean by half of that
-    noise = squares.sigma * float(np.sqrt((d**2).sum())) / (2 * ratio * squares.expected.sum())
+    noise = (
+        squares.sigma
+        * float(np.sqrt((d**2).sum() / squares.free))
+        / (2 * ratio * squares.expected.sum())
+    )
     size2 = (squares.sigma * float(scale[0] - scale[1]) / 2) ** 2 - noise**2
     larger = "u" if scale[0] > scale[1] else "v"
     return Outcome(
@@ -214,13 +228,9 @@ def _by_axis(squares: _Squares) -> Outcome | None:
         dof_residual=float(n - 1),
         p_value=float(stats.beta.sf(min(T / n, 1.0), 0.5, (n - 1) / 2)),
         size=float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(_smallest, noise, 1),
+        smallest=partial(smallest_pattern, noise, 1, None),
         unit=squares.unit,
         remedy=_REMEDIES["axis"],
         present=f"the noise along {larger} is larger than along the other axis, beside its errors",
         absent="the noise is described equally well along u and v",
     )
-
-
-def _smallest(noise: float, dof: float, level: float) -> float:
-    return float(noise * np.sqrt(noncentrality(level, dof) / dof))

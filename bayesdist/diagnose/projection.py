@@ -3,13 +3,14 @@
 The regressors Z of a test are functions of the detections; the parameters of the model are
 nuisance.  With J the derivatives of positions by the parameters, H the curvature of each detection
 and P the precision of the priors, what is left of Z is Z - J C^-1 (Z^T H J)^T, C = J^T H J + P.
-Parameters of single exposures are eliminated exposure by exposure, so that nothing large is built.
+Parameters of single exposures are eliminated exposure by exposure, so that nothing large is ever
+built.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +21,7 @@ from bayesdist.diagnose.regressors import Functions
 from bayesdist.diagnose.sample import Block, ScoredSample
 from bayesdist.infer.prior import GaussianPriors
 
-__all__ = ["Eliminated", "Projection", "projection_of"]
+__all__ = ["LARGEST_LEVERAGE", "Eliminated", "Projection", "projection_of"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -53,11 +54,6 @@ class Eliminated:
     score: Float
     precision: Float
 
-    def rows(self, block: Block) -> Int:
-        """Which of them move the detections of a block: those of another chip do not."""
-        columns = block.columns[block.columns >= self.index[0]]
-        return np.searchsorted(self.index, columns)
-
 
 @dataclass(frozen=True, eq=False)
 class Projection:
@@ -68,23 +64,26 @@ class Projection:
 
     Parameters
     ----------
-    sample : ScoredSample
     functions : Functions
     exposures : dict of int to Eliminated
         By the code of the frame's exposure.
     information : ndarray, shape (G + q, G + q)
         Of global parameters and regressors, with the priors, the exposures' parameters eliminated.
     score : ndarray, shape (G + q,)
-    theta, centre, precision : ndarray, shape (D,)
-        Solution and priors.
+    precision : ndarray, shape (D,)
+        Of the priors.
     """
 
-    sample: ScoredSample
     functions: Functions
     exposures: dict[int, Eliminated]
     information: Float
     score: Float
     precision: Float
+
+    @property
+    def sample(self) -> ScoredSample:
+        """The detections."""
+        return self.functions.sample
 
     @property
     def n_global(self) -> int:
@@ -119,25 +118,31 @@ class Projection:
         G = self.n_global
         return np.asarray(self.score[G:] - self.nuisance.T @ self.score[:G])
 
-    @cached_property
-    def efficient_information(self) -> Float:
-        """Information of the regressors (q, q), the parameters projected out."""
+    def whole_information(self, which: Int) -> Float:
+        """Information (n, n) of some regressors beside the exposures' parameters alone."""
+        inside = self.n_global + which
+        return self.information[np.ix_(inside, inside)]
+
+    def efficient_information(self, which: Int) -> Float:
+        """Information (n, n) of some regressors, the parameters projected out."""
         G = self.n_global
-        out = self.information[G:, G:] - self.information[G:, :G] @ self.nuisance
+        out = self.information[np.ix_(G + which, G + which)]
+        out = out - self.information[G + which, :G] @ self.nuisance[:, which]
         return np.asarray((out + out.T) / 2)
 
-    def reduced(self, block: Block) -> Float:
-        """Derivative (2, K, G) of a block's polynomial by the global parameters.
+    def through(self, block: Block, by: Float) -> Float:
+        """Change (2, K, n) of a block's polynomial that global parameters (G, n) bring about.
 
-        The parameters of the exposure follow.
+        The parameters of the exposure follow them.
         """
         by_global, by_local = _parts(block, self.n_global)
-        out = np.zeros((*by_global.shape[:2], self.n_global))
-        out[..., block.columns[: by_global.shape[2]]] = by_global
+        n_own = by_global.shape[2]
+        out = by_global @ by[block.columns[:n_own]]
         if by_local.shape[2]:
             one = self.exposures[block.frame_exposure]
-            out -= by_local @ one.gain[one.rows(block), : self.n_global]
-        return out
+            at = np.searchsorted(one.index, block.columns[n_own:])
+            out -= by_local @ (one.gain[at, : self.n_global] @ by)
+        return np.asarray(out)
 
     def parts(self, block: Block) -> tuple[Float, Float]:
         """Derivatives (2, K, m) of a block's polynomial by global and by local parameters."""
@@ -155,20 +160,29 @@ class Projection:
     @cached_property
     def leverage(self) -> Float:
         """Fraction (2, N) of the noise of each detection that the fit follows, along u and v."""
-        sample, K, G = self.sample, self.sample.model.n_terms, self.n_global
+        sample, G = self.sample, self.n_global
         inverse = cho_solve(self.root, np.eye(G))
+        followed = {
+            e: (
+                back := -cho_solve(self.root, one.gain[:, :G].T),
+                one.inverse - one.gain[:, :G] @ back,
+            )
+            for e, one in self.exposures.items()
+        }
         out = np.zeros((2, len(sample)))
         for block in sample.blocks:
-            by_local = _parts(block, G)[1]
-            reduced = self.reduced(block)
-            phi = self.functions.at(sample, block.rows)[:K]
+            by_global, by_local = _parts(block, G)
+            columns = block.columns[: by_global.shape[2]]
+            phi = self.functions.polynomials(block.rows)
+            joint = inverse[np.ix_(columns, columns)]
+            if by_local.shape[2]:
+                one = self.exposures[block.frame_exposure]
+                at = np.searchsorted(one.index, block.columns[len(columns) :])
+                cross, own = followed[block.frame_exposure]
+                edge = cross[np.ix_(columns, at)]
+                joint = np.block([[joint, edge], [edge.T, own[np.ix_(at, at)]]])
             for axis in (0, 1):
-                covariance = reduced[axis] @ inverse @ reduced[axis].T
-                if by_local.shape[2]:
-                    one = self.exposures[block.frame_exposure]
-                    rows = one.rows(block)
-                    own = one.inverse[np.ix_(rows, rows)]
-                    covariance += by_local[axis] @ own @ by_local[axis].T
+                covariance = block.derivative[axis] @ joint @ block.derivative[axis].T
                 follows = np.einsum("kn,kn->n", phi, covariance @ phi)
                 out[axis, block.rows] = follows * sample.curvature[2 * axis, block.rows]
         return np.clip(out, 0.0, LARGEST_LEVERAGE)
@@ -178,42 +192,42 @@ class Projection:
         """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
         return np.asarray(self.sample.score / np.sqrt(1.0 - self.leverage))
 
-    def regressor_maps(self, which: Int) -> Iterator[tuple[Block, Float, Float]]:
-        """Coefficients (2, L, n) of the projected regressors, block by block.
+    def regressor_map(self, block: Block, which: Int) -> Float:
+        """Coefficients (2, L, n) of projected regressors in a block.
 
         Parameters
         ----------
+        block : Block
         which : ndarray of int, shape (n,)
             From 0 to q - 1.
 
-        Yields
-        ------
-        block : Block
-        coefficients : ndarray, shape (2, L, n)
+        Returns
+        -------
+        ndarray, shape (2, L, n)
             Of the functions.
-        follows : ndarray, shape (l, n)
-            How the exposure's parameters follow.
         """
-        sample, G = self.sample, self.n_global
-        K, nuisance = sample.model.n_terms, self.nuisance[:, which]
-        for block in sample.blocks:
-            by_global, by_local = _parts(block, G)
-            n_own = by_global.shape[2]
-            out = _added(block, self.n_added, K, len(sample.model.chips))[..., which]
-            out[:, :K] -= by_global @ nuisance[block.columns[:n_own]]
-            follows = np.zeros((0, len(which)))
-            if by_local.shape[2]:
-                gain = self.exposures[block.frame_exposure].gain
-                follows = gain[:, G + which] - gain[:, :G] @ nuisance
-                out[:, :K] -= by_local @ follows[self.exposures[block.frame_exposure].rows(block)]
-            yield block, out, follows
+        K, nuisance = self.sample.model.n_terms, self.nuisance[:, which]
+        by_global, by_local = _parts(block, self.n_global)
+        n_own = by_global.shape[2]
+        out = _added(block, self.n_added, K, which)
+        out[:, :K] -= by_global @ nuisance[block.columns[:n_own]]
+        if by_local.shape[2]:
+            one = self.exposures[block.frame_exposure]
+            at = np.searchsorted(one.index, block.columns[n_own:])
+            out[:, :K] -= by_local @ self._following(one, which)[at]
+        return out
+
+    def _following(self, one: Eliminated, which: Int) -> Float:
+        """Parameters (l, n) of an exposure that regressors are taken for."""
+        G = self.n_global
+        return np.asarray(one.gain[:, G + which] - one.gain[:, :G] @ self.nuisance[:, which])
 
     def prior_meat(self, which: Int) -> Float:
         """Covariance (n, n) that priors give to the scores of regressors, as data of their own."""
         G, nuisance = self.n_global, self.nuisance[:, which]
         out = nuisance.T @ (self.precision[:G, None] * nuisance)
         for one in self.exposures.values():
-            follows = one.gain[:, G + which] - one.gain[:, :G] @ nuisance
+            follows = self._following(one, which)
             out += follows.T @ (one.precision[:, None] * follows)
         return np.asarray(out)
 
@@ -224,15 +238,13 @@ class Projection:
         return float((self.whole_score**2).sum() / h.sum())
 
 
-def projection_of(
-    sample: ScoredSample, functions: Functions, theta: Float, priors: GaussianPriors
-) -> Projection:
-    """Sums over a sample.
+def projection_of(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
+    """Sums over the detections of a sample.
 
     Parameters
     ----------
-    sample : ScoredSample
     functions : Functions
+        With the sample.
     theta : ndarray, shape (D,)
         Where the scores were taken.
     priors : GaussianPriors
@@ -242,15 +254,14 @@ def projection_of(
     Projection
     """
     try:
-        return _summed(sample, functions, theta, priors)
+        return _summed(functions, theta, priors)
     except np.linalg.LinAlgError:
-        return _summed(sample.with_positive_curvature(), functions, theta, priors)
+        concave = functions.sample.with_positive_curvature()
+        return _summed(replace(functions, sample=concave), theta, priors)
 
 
-def _summed(
-    sample: ScoredSample, functions: Functions, theta: Float, priors: GaussianPriors
-) -> Projection:
-    model = sample.model
+def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
+    sample, model = functions.sample, functions.sample.model
     G, K, L = model.n_global, model.n_terms, len(functions.terms)
     chips = len(model.chips)
     m = G + 2 * (L - K) * chips
@@ -266,26 +277,24 @@ def _summed(
         inner = np.diag(priors.precision[index])
         cross, own = np.zeros((len(index), m)), pull[index].copy()
         for block in blocks:
-            F = functions.at(sample, block.rows)
+            F = functions.at(block.rows)
             by_global, by_local = _parts(block, G)
             n_own = by_global.shape[2]
-            start = G + 2 * (L - K) * block.chip
-            columns = np.r_[block.columns[:n_own], start : start + 2 * (L - K)]
+            added = 2 * (L - K) * block.chip + np.arange(2 * (L - K))
+            columns = np.r_[block.columns[:n_own], G + added]
             X = np.zeros((2, L, len(columns)))
             X[:, :K, :n_own] = by_global
-            X[..., n_own:] = _added(block, L - K, K, 1)
+            X[..., n_own:] = _added(block, L - K, K, added)
             WX = _weighted(F, sample.curvature[:, block.rows], X)
             R = F @ sample.score[:, block.rows].T  # (L, 2)
-            information[np.ix_(columns, columns)] += np.einsum("alm,aln->mn", X, WX, optimize=True)
-            score[columns] += np.einsum("alm,la->m", X, R)
+            information[np.ix_(columns, columns)] += _contracted(X, WX)
+            score[columns] += _contracted(X, R.T[..., None])[:, 0]
             if by_local.shape[2]:
                 at = np.searchsorted(index, block.columns[n_own:])
-                cross[np.ix_(at, columns)] += np.einsum(
-                    "akl,akm->lm", by_local, WX[:, :K], optimize=True
-                )
+                cross[np.ix_(at, columns)] += _contracted(by_local, WX[:, :K])
                 Wl = _weighted(F[:K], sample.curvature[:, block.rows], by_local)
-                inner[np.ix_(at, at)] += np.einsum("akl,akm->lm", by_local, Wl, optimize=True)
-                own[at] += np.einsum("akl,ka->l", by_local, R[:K])
+                inner[np.ix_(at, at)] += _contracted(by_local, Wl)
+                own[at] += _contracted(by_local, R[:K].T[..., None])[:, 0]
         if len(index):
             inverse = _inverse(inner)
             gain = inverse @ cross
@@ -294,7 +303,7 @@ def _summed(
             exposures[blocks[0].frame_exposure] = Eliminated(
                 index, inverse, gain, own, priors.precision[index]
             )
-    out = Projection(sample, functions, exposures, information, score, priors.precision)
+    out = Projection(functions, exposures, information, score, priors.precision)
     out.root  # noqa: B018 - raises here, where there is another way
     return out
 
@@ -313,18 +322,19 @@ def _parts(block: Block, n_global: int) -> tuple[Float, Float]:
     return block.derivative[..., :n], block.derivative[..., n:]
 
 
-def _added(block: Block, n_added: int, n_terms: int, chips: int) -> Float:
-    """Regressors (2, L, 2 n_added chips) of a block, along the axes of the polynomials.
-
-    With one chip, those of the block's own.
-    """
-    out = np.zeros((2, n_terms + n_added, 2 * n_added * chips))
-    start = 2 * n_added * (block.chip if chips > 1 else 0)
-    for axis in (0, 1):
-        for other in (0, 1):
-            columns = start + 2 * np.arange(n_added) + other
-            out[axis, n_terms + np.arange(n_added), columns] = block.frame[axis, other]
+def _added(block: Block, n_added: int, n_terms: int, which: Int) -> Float:
+    """Some regressors (2, L, n) in a block, along the axes of the polynomials."""
+    out = np.zeros((2, n_terms + n_added, len(which)))
+    chip, rest = np.divmod(which, 2 * n_added)
+    here = np.flatnonzero(chip == block.chip)
+    function, axis = np.divmod(rest[here], 2)
+    out[:, n_terms + function, here] = block.frame[:, axis]
     return out
+
+
+def _contracted(A: Float, B: Float) -> Float:
+    """Sums over axes and functions: (2, L, m) and (2, L, n) to (m, n)."""
+    return A.reshape(-1, A.shape[2]).T @ B.reshape(-1, B.shape[2])
 
 
 def _weighted(F: Float, curvature: Float, X: Float) -> Float:

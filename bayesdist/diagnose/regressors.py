@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -22,9 +23,12 @@ Int = NDArray[np.int64]
 LINEAR = 1  # order of the terms that go with magnitude, colour and time
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
+FEWEST_AT_EDGES = 200  # detections: some in each margin
+NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
 # information that a direction has kept beside the parameters, over what it had: below, it is theirs
 INDEPENDENT = 1e-6
+CONSTANT = 1e-9  # scatter of a factor, in magnitudes or of the time from -1 to 1
 OWN_OF_TIME = 0.02  # frames take up drifts but for what the curvature of the polynomial leaves
 
 
@@ -77,17 +81,19 @@ class Functions:
 
     Parameters
     ----------
+    sample : ScoredSample
     order : int
         Highest total order of the polynomials.
     factors : tuple of Factor
     regressors : tuple of Regressors
     """
 
+    sample: ScoredSample
     order: int
     factors: tuple[Factor, ...]
     regressors: tuple[Regressors, ...]
 
-    @property
+    @cached_property
     def terms(self) -> tuple[tuple[int, int], ...]:
         """Powers (i, j) of every function, by the polynomial and then by the factors."""
         out = list(polynomial_terms(self.order))
@@ -103,14 +109,31 @@ class Functions:
         sizes += [np.full(one.n_terms, np.mean(one.values**2)) for one in self.factors]
         return np.concatenate(sizes) / ((2 * i + 1) * (2 * j + 1))
 
-    def at(self, sample: ScoredSample, rows: slice) -> Float:
-        """Values (L, n) at some detections."""
-        top = max([self.order, *(one.order for one in self.factors)])
-        P = np.ascontiguousarray(legendre.legvander(sample.X[rows], top).T)
-        Q = np.ascontiguousarray(legendre.legvander(sample.Y[rows], top).T)
-        i, j = np.array(polynomial_terms(top)).T
-        products = P[i] * Q[j]
-        parts = [products[: len(polynomial_terms(self.order))]]
+    @cached_property
+    def _tables(self) -> tuple[Float, Float]:
+        """Legendre polynomials (order + 1, N) of both coordinates."""
+        X, Y = self.sample.X, self.sample.Y
+        P, Q = (np.asarray(legendre.legvander(z, self.order).T, float) for z in (X, Y))
+        return P, Q
+
+    @cached_property
+    def _powers(self) -> tuple[Int, Int]:
+        i, j = np.array(polynomial_terms(self.order), np.int64).T
+        return i, j
+
+    def polynomials(self, rows: slice) -> Float:
+        """Values (K, n) of the model's own functions at some detections."""
+        K = self.sample.model.n_terms
+        P, Q = self._tables
+        i, j = self._powers
+        return np.asarray(P[i[:K], rows] * Q[j[:K], rows])
+
+    def at(self, rows: slice) -> Float:
+        """Values (L, n) of all functions at some detections."""
+        P, Q = self._tables
+        i, j = self._powers
+        products = P[i, rows] * Q[j, rows]
+        parts = [products]
         parts += [products[: one.n_terms] * one.values[rows] for one in self.factors]
         return np.concatenate(parts)
 
@@ -133,28 +156,31 @@ def functions_for(sample: ScoredSample) -> Functions:
 
     def add(factor: Factor, make: Callable[[Int], Regressors]) -> None:
         nonlocal start
+        if np.std(factor.values) < CONSTANT:
+            return
         factors.append(factor)
         regressors.append(make(start + np.arange(factor.n_terms)))
         start += factor.n_terms
 
     for values, make in ((sample.mag, _by_magnitude), (sample.colour, _by_colour)):
-        if values is not None and np.ptp(values) > 0:
+        if values is not None:
             add(Factor(_standing_out(values), LINEAR), make)
-    if sample.mag is not None and sample.epoch is not None and np.ptp(sample.mag) > 0:
-        if np.ptp(sample.epoch) > SHORTEST:
-            years = sample.epoch - (sample.epoch.min() + sample.epoch.max()) / 2
-            values = _standing_out(sample.mag) * years / (np.ptp(sample.epoch) / 2)
-            add(Factor(values, LINEAR), _magnitude_in_time)
-    time = sample.model.time
-    dates = np.unique(sample.epoch) if sample.epoch is not None else np.zeros(0)
-    if sample.epoch is not None and time is None and len(dates) > 1:
-        if np.ptp(dates) > SHORTEST:
-            add(Factor(sample.epoch - sample.epoch.mean(), LINEAR), _drift)
-    elif sample.epoch is not None and time is not None and len(dates) > 2:
-        half = (sample.epoch - (dates[0] + dates[-1]) / 2) / (np.ptp(dates) / 2)
-        order = max([LINEAR, *(i + j for _, i, j in time.terms)])
-        add(Factor(_beyond_steps(half, time, sample.epoch), order), _curved)
-    return Functions(n + HIGHER, tuple(factors), tuple(regressors))
+    edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
+    if len(sample) >= FEWEST_AT_EDGES:
+        factors += [Factor(one - one.mean(), 0) for one in edges]
+        regressors.append(_at_edges(start + np.arange(len(edges))))
+        start += len(edges)
+    time, epoch = sample.model.time, sample.epoch
+    if epoch is not None and np.ptp(epoch) > SHORTEST:
+        # from -1 to 1
+        half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)
+        if sample.mag is not None:
+            add(Factor(_standing_out(sample.mag) * half, LINEAR), _magnitude_in_time)
+        add(Factor(half - half.mean(), LINEAR), _drift)
+        if time is not None and len(np.unique(epoch)) > 2:
+            order = max([LINEAR, *(i + j for _, i, j in time.terms)])
+            add(Factor(_beyond_lines(half, time, epoch), order), _curved)
+    return Functions(sample, n + HIGHER, tuple(factors), tuple(regressors))
 
 
 def _standing_out(values: Float) -> Float:
@@ -164,7 +190,7 @@ def _standing_out(values: Float) -> Float:
     return np.asarray(inside - inside.mean())
 
 
-def _beyond_steps(half: Float, time: TimeDependence, epoch: Float) -> Float:
+def _beyond_lines(half: Float, time: TimeDependence, epoch: Float) -> Float:
     """Square of time, without what a constant and the segments' own lines say of it."""
     design = np.column_stack([np.ones(len(half)), time.weights(epoch)])
     dates, of = np.unique(half, return_inverse=True)
@@ -184,6 +210,17 @@ def _higher(order: int, total: int) -> Regressors:
         f"raise model.order to {total}" if total <= MAX_ORDER else table,
         f"the residuals hold terms of order {total}, and the model ends at order {order}",
         f"no terms of order {total} are left in the residuals",
+    )
+
+
+def _at_edges(functions: Int) -> Regressors:
+    return Regressors(
+        "edges",
+        functions,
+        INDEPENDENT,
+        "leave out the margins of the detector, or fit a look-up table",
+        "the residuals rise towards the edges of the detector",
+        "the residuals do not rise towards the edges of the detector",
     )
 
 
@@ -225,8 +262,8 @@ def _drift(functions: Int) -> Regressors:
         "drift",
         functions,
         OWN_OF_TIME,
-        "add time-dependent terms (model.tdd)",
-        "the linear terms drift with time, and the model does not",
+        "add time-dependent terms to model.tdd",
+        "linear terms drift with time, and the model's do not",
         "no drift of the linear terms is left in the residuals",
     )
 

@@ -20,11 +20,12 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 SAMPLE = 200_000  # detections that are looked at
+LARGEST_BLOCK = 4096  # detections, whose functions stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Detections of one chip, exposure and epoch: one polynomial describes them.
+    """Detections of one chip, exposure and epoch, or some of them: one polynomial describes them.
 
     Parameters
     ----------
@@ -165,14 +166,17 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
 
 
 def _blocks(stars: Stars, exposure: Int, theta: Float) -> tuple[Block, ...]:
-    """Pieces of the groups that lie in one exposure each."""
+    """Pieces of the groups that lie in one exposure each and are not too large."""
     model, groups = stars.model, stars.groups
     effective = model.effective(theta, groups)
     jacobian = model.effective_jacobian(theta, groups)
     out = []
     for g, (columns, derivative) in enumerate(jacobian):
         a, b = int(stars.starts[g]), int(stars.starts[g + 1])
-        edges = a + 1 + np.flatnonzero(np.diff(exposure[a:b]))
+        edges = np.union1d(
+            a + 1 + np.flatnonzero(np.diff(exposure[a:b])),
+            np.arange(a + LARGEST_BLOCK, b, LARGEST_BLOCK),
+        )
         frame = model.frame(theta, int(groups.exposure[g]))[0]
         for first, last in zip([a, *edges], [*edges, b], strict=True):
             out.append(

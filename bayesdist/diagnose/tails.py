@@ -24,9 +24,9 @@ __all__ = ["truncation_test"]
 Float = NDArray[np.float64]
 
 FEWEST_STARS = 50
+FEW = 0.5  # expected matches whose absence says nothing
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
-TINY, LARGEST = 1e-300, 50.0
 ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
 
 
@@ -53,9 +53,9 @@ class _Deficit:
     @property
     def p_value(self) -> float:
         """Probability of so few, over what the scale may be."""
-        # far out nothing is expected, or anything; neither is a number that floats hold
-        exponent = np.log(max(self.expected, TINY)) + self.spread * NODES
-        at = np.exp(np.minimum(exponent, LARGEST))
+        if self.expected < FEW:
+            return 1.0
+        at = self.expected * np.exp(self.spread * NODES)
         chance = special.gammaincc(self.beyond + 1, at)
         return float(WEIGHTS @ chance / WEIGHTS.sum())
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.exposures import exposure_test
 from bayesdist.diagnose.noise import noise_tests
+from bayesdist.diagnose.patterns import pattern_test
 from bayesdist.diagnose.projection import projection_of
 from bayesdist.diagnose.regressors import functions_for
-from bayesdist.diagnose.result import ScoreTest, corrected
+from bayesdist.diagnose.result import FAMILY_LEVEL, Outcome, ScoreTest, corrected
 from bayesdist.diagnose.sample import scored_sample
 from bayesdist.diagnose.score import regressor_tests
 from bayesdist.diagnose.tails import truncation_test
@@ -17,6 +20,8 @@ from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.views import Solution
 
 __all__ = ["score_tests"]
+
+OF_TIME = ("drift", "curvature in time")
 
 
 def score_tests(
@@ -52,13 +57,23 @@ def score_tests(
         When the table does not go with the solution's model, or the solution does not say how it
         was fitted.
     """
-    sample = scored_sample(table, solution)
     projection = projection_of(
-        sample,
-        functions_for(sample),
+        functions_for(scored_sample(table, solution)),
         np.asarray(solution.mean, float),
         priors or GaussianPriors.none(solution.model),
     )
-    others = (exposure_test(projection), truncation_test(projection, match_radius))
-    found = [*regressor_tests(projection), *noise_tests(projection)]
+    exposures = exposure_test(projection)
+    found = regressor_tests(projection)
+    if exposures is not None and exposures.p_value < FAMILY_LEVEL:
+        found = [_doubtful(one) if one.name in OF_TIME else one for one in found]
+    truncation = truncation_test(projection, match_radius)
+    others = (exposures, pattern_test(projection), truncation)
+    found += noise_tests(projection)
     return corrected([*found, *(one for one in others if one is not None)])
+
+
+def _doubtful(outcome: Outcome) -> Outcome:
+    """A test of time where exposures deviate by themselves: so few dates may go with time too."""
+    return replace(
+        outcome, present=f"{outcome.present}, if it is not single exposures that deviate"
+    )

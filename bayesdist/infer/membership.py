@@ -157,9 +157,12 @@ def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
 
     A task for `Shards.sum` is made of it by what sums over the stars.
     """
-    return kernel.memberships(
-        stars.blocks, stars.columns, stars.powers(theta), stars.model.order, constants
-    )
+    powers, order = stars.powers(theta), stars.model.order
+    if circle := stars.circle(constants):
+        return kernel.truncated_memberships(
+            stars.blocks, stars.columns, circle, powers, order, constants
+        )
+    return kernel.memberships(stars.blocks, stars.columns, powers, order, constants)
 
 
 def _count(stars: Stars, theta: Float, constants: Constants) -> Float:

@@ -3,7 +3,9 @@
     p(r) = (1 - f) N(r_u; 0, s_u^2 + j^2) N(r_v; 0, s_v^2 + j^2) + f p_out(r)
 
 One membership for each star, shared by both axes.  p_out is a round Gaussian of scale s_out, or
-uniform on the match circle.  Sampled are log j, logit f and log s_out; the priors are proper:
+uniform on the match circle.  Where stars were matched within a circle about nominal positions that
+are known, both parts are normalised on it, and f is the fraction of false matches in it.  Sampled
+are log j, logit f and log s_out; the priors are proper:
 
     f      Beta(a, b)
     j      half-Student-t, four degrees of freedom, scale: the median quoted error
@@ -50,7 +52,8 @@ class OutlierMixture:
     model : str
         'gaussian', 'uniform' or 'none'.
     match_radius : float, optional
-        Radius of the match circle in the unit of u, v; needed by 'uniform'.
+        Radius of the match circle in the unit of u, v; needed by 'uniform'.  With matches that have
+        nominal positions, the likelihood is that of stars selected within it.
     jitter : float or None
         Extra error j in the unit of u, v; None samples it.
     fraction_prior : tuple of float
@@ -168,7 +171,8 @@ class Hyper:
                 log_f, log_1_f = log_expit(h[:, k]), log_expit(-h[:, k])
             else:
                 out = np.exp(2 * h[:, k])
-        return Constants(j2, log_f, log_1_f, out, KINDS[self.mixture.model], self.scale**2)
+        kind, radius = KINDS[self.mixture.model], self.mixture.match_radius or 0.0
+        return Constants(j2, log_f, log_1_f, out, kind, self.scale**2, radius)
 
     # -- priors -----------------------------------------------------------------------------------
 

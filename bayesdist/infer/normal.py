@@ -211,9 +211,15 @@ def mixture(stars: Stars, theta: Float, constants: Constants, em: bool = False) 
     NormalEquations
         `right` is the gradient by the effective coefficients.
     """
-    moments = kernel.mixture_moments(
-        stars.pieces, stars.columns, stars.powers(theta), stars.model.order, constants, em=em
-    )
+    powers, order = stars.powers(theta), stars.model.order
+    if circle := stars.circle(constants):
+        moments = kernel.truncated_moments(
+            stars.pieces, stars.columns, circle, powers, order, constants, em=em
+        )
+    else:
+        moments = kernel.mixture_moments(
+            stars.pieces, stars.columns, powers, order, constants, em=em
+        )
     E = stars.model.effective(theta, stars.groups)
     return NormalEquations(
         moments.weight, moments.right, E, 0.0, moments.cross, moments.scalars, stars.groups

@@ -195,7 +195,14 @@ def _fingerprint(target: Target, *settings: object) -> str:
 def _digest(stars: Stars) -> tuple[str]:
     digest = hashlib.sha256()
     groups = stars.groups
-    for column in (*stars.columns, stars.starts, groups.chip, groups.exposure, groups.epoch):
+    for column in (
+        *stars.columns,
+        *stars.offsets,
+        stars.starts,
+        groups.chip,
+        groups.exposure,
+        groups.epoch,
+    ):
         digest.update(np.ascontiguousarray(column).data)
     return (digest.hexdigest(),)
 

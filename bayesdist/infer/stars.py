@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
+from bayesdist.infer.kernel import Constants
 from bayesdist.model import DistortionModel, Groups
 
 __all__ = ["Stars", "errors_of", "groups_of", "in_table_order", "prepare"]
@@ -39,6 +40,9 @@ class Stars:
         Reference position.
     var_u, var_v : ndarray, shape (N,)
         Squared errors; one array where they are equal.
+    off_u, off_v : ndarray, shape (N,), or None
+        Nominal position, about which the star was matched, minus reference position; None where
+        it is not known.
     """
 
     model: DistortionModel
@@ -50,6 +54,8 @@ class Stars:
     v: Float
     var_u: Float
     var_v: Float
+    off_u: Float | None = None
+    off_v: Float | None = None
 
     def __len__(self) -> int:
         return len(self.X)
@@ -60,10 +66,19 @@ class Stars:
         return self.X, self.Y, self.u, self.v, self.var_u, self.var_v
 
     @property
+    def offsets(self) -> tuple[Float, ...]:
+        """off_u and off_v; empty where there are none."""
+        return () if self.off_u is None or self.off_v is None else (self.off_u, self.off_v)
+
+    def circle(self, constants: Constants) -> tuple[Float, ...]:
+        """Offsets of the circles in which stars were matched; empty where that plays no part."""
+        return self.offsets if constants.radius else ()
+
+    @property
     def nbytes(self) -> int:
         """Bytes of all columns."""
         shared = self.var_u is self.var_v
-        return 8 * len(self) * (5 if shared else 6)
+        return 8 * len(self) * ((5 if shared else 6) + len(self.offsets))
 
     @cached_property
     def blocks(self) -> Int:
@@ -143,6 +158,8 @@ def prepare(model: DistortionModel, matches: MatchTable) -> tuple[Stars, Int]:
         v=matches.v[order],
         var_u=var_u,
         var_v=var_u if equal else sigma_v[order] ** 2,
+        off_u=None if matches.u_nominal is None else (matches.u_nominal - matches.u)[order],
+        off_v=None if matches.v_nominal is None else (matches.v_nominal - matches.v)[order],
     )
     return stars, np.arange(len(x))[order]
 

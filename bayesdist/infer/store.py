@@ -6,7 +6,7 @@ import tempfile
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from bayesdist.infer.stars import Stars
 __all__ = ["Store"]
 
 EMPTY = np.zeros(0)
+COLUMNS, OFFSETS = ("X", "Y", "u", "v", "var_u", "var_v"), ("off_u", "off_v")
 
 
 class Store:
@@ -54,7 +55,7 @@ class Store:
                 self._file = tempfile.TemporaryFile(prefix="bayesdist-", buffering=0)
                 self._closed = weakref.finalize(self, self._file.close)
             place = self._file.seek(0, 2)
-            for column in stars.columns:
+            for column in (*stars.columns, *stars.offsets):
                 _write(self._file, np.ascontiguousarray(column).view(np.uint8).data)
         except OSError as error:
             raise InputError(
@@ -62,7 +63,8 @@ class Store:
                 where=_folder(),
                 do="set TMPDIR to a folder with more room, or raise compute.memory_mb",
             ) from error
-        frame = replace(stars, X=EMPTY, Y=EMPTY, u=EMPTY, v=EMPTY, var_u=EMPTY, var_v=EMPTY)
+        none: dict[str, Any] = {name: EMPTY for name in COLUMNS + OFFSETS[: len(stars.offsets)]}
+        frame = replace(stars, **none)
         frame.__dict__.update(blocks=stars.blocks, pieces=stars.pieces)
         self._kept.append((frame, place))
 
@@ -80,7 +82,8 @@ class Store:
     def _restored(self, frame: Stars, place: int) -> Stars:
         assert self._file is not None
         n = int(frame.starts[-1])
-        columns = np.empty((6, n))
+        names = COLUMNS + OFFSETS[: len(frame.offsets)]
+        columns = np.empty((len(names), n))
         self._file.seek(place)
         view, done = columns.ravel().view(np.uint8).data, 0
         while done < len(view):
@@ -88,8 +91,8 @@ class Store:
             if not got:
                 raise InputError("the scratch file has become shorter", do="start again")
             done += got
-        X, Y, u, v, var_u, var_v = columns
-        stars = replace(frame, X=X, Y=Y, u=u, v=v, var_u=var_u, var_v=var_v)
+        read: dict[str, Any] = dict(zip(names, columns, strict=True))
+        stars = replace(frame, **read)
         stars.__dict__.update(blocks=frame.blocks, pieces=frame.pieces)
         return stars
 

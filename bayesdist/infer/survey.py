@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
 from bayesdist.infer.stars import Stars
 from bayesdist.model import Groups, merge_groups
 
@@ -17,6 +18,8 @@ __all__ = ["ChipSurvey", "Survey", "survey"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+ROUNDING = 1e-6  # by how much, relative, a star at the edge of its circle may seem to lie outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,9 @@ class Survey:
     variance : tuple of ndarray
         Evenly spread samples of the squared errors of both axes.
     sources : tuple of str
+    farthest : tuple of float and str
+        Largest distance of a star from its nominal position, and which star that is; less than 0
+        where there are no nominal positions.
     """
 
     n: int
@@ -72,6 +78,7 @@ class Survey:
     chips: tuple[ChipSurvey, ...]
     variance: tuple[Float, ...]
     sources: tuple[str, ...]
+    farthest: tuple[float, str] = (-1.0, "")
 
     def __add__(self, other: Survey) -> Survey:
         return Survey(
@@ -81,12 +88,36 @@ class Survey:
             tuple(a + b for a, b in zip(self.chips, other.chips, strict=True)),
             self.variance + other.variance,
             self.sources,
+            max(self.farthest, other.farthest, key=lambda one: one[0]),
         )
 
     @property
     def reference_sigma(self) -> float:
         """Median quoted error of one axis: the scale of the priors."""
         return float(np.sqrt(np.median(np.concatenate(self.variance))))
+
+    def check_circle(self, radius: float | None) -> None:
+        """Refuse stars outside the circle in which they are said to have been matched.
+
+        Parameters
+        ----------
+        radius : float or None
+            In the unit of u, v; None where stars are not said to be matched in a circle.
+
+        Raises
+        ------
+        InputError
+            Naming the star that is farthest from its nominal position.
+        """
+        distance, where = self.farthest
+        if radius is not None and distance > radius * (1 + ROUNDING):
+            raise InputError(
+                f"lies {distance:.6g} from its nominal position, outside the match circle of "
+                f"radius {radius:g}",
+                where=where,
+                do="set outliers.match_radius to the radius with which the stars were matched, or "
+                "correct the row",
+            )
 
     @property
     def where(self) -> str:
@@ -133,7 +164,17 @@ def survey(stars: Stars, matches: MatchTable, every: int) -> Survey:
         chips=tuple(chips),
         variance=(stars.var_u[::every].copy(), stars.var_v[::every].copy()),
         sources=matches.sources,
+        farthest=_farthest(matches),
     )
+
+
+def _farthest(matches: MatchTable) -> tuple[float, str]:
+    """Largest distance of a star from its nominal position, and the star's file and row."""
+    if matches.u_nominal is None or matches.v_nominal is None:
+        return -1.0, ""
+    distance = np.hypot(matches.u - matches.u_nominal, matches.v - matches.v_nominal)
+    k = int(np.argmax(distance))
+    return float(distance[k]), f"{matches.sources[matches.source[k]]}, row {matches.row[k] + 1}"
 
 
 def _hull(points: Float) -> Float:

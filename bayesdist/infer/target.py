@@ -34,11 +34,19 @@ class Target:
     shards : Shards
     mixture : OutlierMixture
     priors : GaussianPriors
+
+    Raises
+    ------
+    InputError
+        For a star outside the circle in which it was matched.
     """
 
     shards: Shards
     mixture: OutlierMixture
     priors: GaussianPriors
+
+    def __post_init__(self) -> None:
+        self.shards.survey.check_circle(self.mixture.match_radius)
 
     @property
     def model(self) -> DistortionModel:
@@ -120,13 +128,15 @@ def log_likelihood(stars: Stars, theta: Float, constants: Constants) -> Float:
     step = max(1, SCRATCH // (16 * model.n_terms * len(stars.groups)))
     for a in range(0, len(theta), step):
         rows = slice(a, a + step)
-        out[rows] = kernel.log_likelihood(
-            stars.blocks,
-            stars.columns,
-            stars.powers(theta[rows]),
-            model.order,
-            constants.of(rows),
-        )
+        powers, some = stars.powers(theta[rows]), constants.of(rows)
+        if circle := stars.circle(constants):
+            out[rows] = kernel.truncated_log_likelihood(
+                stars.blocks, stars.columns, circle, powers, model.order, some
+            )
+        else:
+            out[rows] = kernel.log_likelihood(
+                stars.blocks, stars.columns, powers, model.order, some
+            )
     return out
 
 

@@ -9,7 +9,7 @@ from .truth import Truth, catalogue_row, kind, mapped, observed, order_config, p
 
 STRUCTURE = (
     *("structure", "unmodelled", "leaves out", "correlated", "err together", "misfit"),
-    *("discrepancy", "does not describe"),
+    *("discrepancy", "does not describe", "repeat", "edges"),
 )
 ORDER = (*STRUCTURE, "order")
 CATALOGUE_WORDS = ("catalogue", "catalog", "reference frame")

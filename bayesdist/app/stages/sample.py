@@ -57,7 +57,7 @@ def keep_posterior(session: Session, posterior: Posterior) -> None:
     write_star_files(matches, session.fit, posterior, run / FOLDER)
     c, i = posterior.convergence, posterior.sampler
     run.summarise(
-        outliers=_outliers(posterior),
+        outliers=_outliers(posterior, session.in_circle),
         sampler={
             "method": i.method,
             "exact": i.exact,
@@ -85,7 +85,7 @@ def keep_posterior(session: Session, posterior: Posterior) -> None:
         log.warning("sample: NOT CONVERGED after %d steps: %s", i.steps, "; ".join(c.reasons))
 
 
-def _outliers(posterior: Posterior) -> dict[str, object]:
+def _outliers(posterior: Posterior, in_circle: bool) -> dict[str, object]:
     out: dict[str, object] = {"model": posterior.mixture.model, "unit": posterior.unit}
     names = {"f": "fraction", "j": "jitter", "s_out": "scale"}
     for key, name in names.items():
@@ -97,6 +97,8 @@ def _outliers(posterior: Posterior) -> dict[str, object]:
         elif key == "f":
             out[name] = {"mean": 0.0, "sd": 0.0}
     out["n_flagged"] = posterior.n_flagged
+    if in_circle:
+        out["match_circle"] = posterior.mixture.match_radius
     return out
 
 

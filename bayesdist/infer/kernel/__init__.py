@@ -9,6 +9,7 @@ from bayesdist.infer.kernel.cache import kept_by_content
 
 with kept_by_content():
     from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
+    from bayesdist.infer.kernel.circle import circle_terms
     from bayesdist.infer.kernel.clusters import cluster_moments, products_of
     from bayesdist.infer.kernel.likelihood import log_likelihood
     from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
@@ -27,6 +28,12 @@ with kept_by_content():
         log_marginals,
         weighted_stars,
     )
+    from bayesdist.infer.kernel.truncated import (
+        truncated_log_likelihood,
+        truncated_memberships,
+        truncated_moments,
+        truncated_scores,
+    )
 
 __all__ = [
     "BLOCK",
@@ -40,6 +47,7 @@ __all__ = [
     "UNIFORM",
     "Constants",
     "Moments",
+    "circle_terms",
     "cluster_moments",
     "eliminate_stars",
     "least_squares_moments",
@@ -53,5 +61,9 @@ __all__ = [
     "products_of",
     "residuals",
     "set_threads",
+    "truncated_log_likelihood",
+    "truncated_memberships",
+    "truncated_moments",
+    "truncated_scores",
     "weighted_stars",
 ]

@@ -42,6 +42,8 @@ class Constants(NamedTuple):
         `NO_OUTLIERS`, `GAUSSIAN` or `UNIFORM`.
     unit2 : float
         A typical variance.
+    radius : float
+        Of the circle about nominal positions in which stars were matched; 0 where there is none.
     """
 
     j2: Float
@@ -50,11 +52,12 @@ class Constants(NamedTuple):
     out: Float
     kind: int
     unit2: float
+    radius: float = 0.0
 
     def of(self, rows: slice) -> Constants:
         """Those of some of the parameter vectors."""
         j2, log_f, log_1_f, out = (c[rows] for c in self[:4])
-        return Constants(j2, log_f, log_1_f, out, self.kind, self.unit2)
+        return Constants(j2, log_f, log_1_f, out, self.kind, self.unit2, self.radius)
 
 
 def packed(constants: Constants) -> Float:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.infer import kernel
 from bayesdist.infer.kernel import GAUSSIAN, Constants
 from bayesdist.infer.linear import Clip
 from bayesdist.infer.membership import sampled_points, star_averages
@@ -39,6 +40,15 @@ class Scores:
 
     def of(self, stars: Stars) -> Float:
         """Gradient by the model's u and v, and minus the second derivatives uu, uv, vv: (5, N)."""
+        if self.constants is not None and (circle := stars.circle(self.constants)):
+            return kernel.truncated_scores(
+                stars.blocks,
+                stars.columns,
+                circle,
+                stars.powers(self.theta),
+                stars.model.order,
+                self.constants,
+            )
         r = stars.residuals(self.theta).T
         if self.constants is None:
             assert self.clip is not None

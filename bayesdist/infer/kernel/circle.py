@@ -1,0 +1,242 @@
+"""The probability that a Gaussian falls in a circle, with the derivatives that Newton steps need.
+
+With a Gaussian of variances A, B about the origin and a circle of radius R about d, points on the
+circle are (x, y) = d + R (cos t, sin t), and q = (x^2/A + y^2/B) / 2.  The field that points away
+from the origin and has the Gaussian as its divergence turns the integral over the disc into one
+over its edge,
+
+    Z = R / (4 pi sqrt(A B))  integral of E(q) (R + d_u cos t + d_v sin t) dt,
+    E(q) = (1 - e^-q) / q,
+
+and derivatives by d are integrals over the edge of the Gaussian and its derivatives; those by the
+variances follow from dZ/dA = (1/2) d^2Z/dd_u^2.  Integrands are periodic and entire, so that equal
+steps in t converge faster than any power: some thirty nodes do for a circle of four sigma.
+
+Outside the circle the parts of E cancel, all but an exponentially small rest.  There 1/q, whose
+integral is zero then, is left out, and the largest e^-q is taken out of the sum.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.infer.kernel.polynomial import FAST
+
+__all__ = ["NODES", "circle_terms", "inside", "log_circle", "nodes_for", "slopes"]
+
+Float = NDArray[np.float64]
+
+SURE = 8.6**2  # squared errors from the edge within which the probability is 1 to the last digit
+# squared error over radius that is the least the edge can resolve; steeper ones are blurred to it,
+# which concerns stars within a few such errors of their edge
+STEEP = 512.0**-2
+CANCELLED = 1e3  # sum of moduli over the sum, from which on the rest is taken by itself
+EDGE = 0.02  # q below which E is a series
+
+COUNTS = (
+    *(12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 56, 64, 72, 80, 96, 112, 128, 160, 192, 224),
+    *(256, 320, 384, 448, 512, 640, 768, 1024, 1536, 2048, 3072, 4096, 6144, 8192),
+)
+MOST = COUNTS[-1]
+
+
+def _table() -> tuple[NDArray[np.int64], NDArray[np.int64], Float, Float]:
+    """Numbers of nodes, where each set of them begins, and their cosines and sines."""
+    angles = np.concatenate([2 * np.pi * np.arange(n) / n for n in COUNTS])
+    begin = np.concatenate([[0], np.cumsum(COUNTS)[:-1]]).astype(np.int64)
+    return np.array(COUNTS, np.int64), begin, np.cos(angles), np.sin(angles)
+
+
+NODES = _table()
+
+# All of it is inlined, for the reason given at `numeric.exp_negative`.
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def inside(du, dv, A, B, R):
+    """Whether the Gaussian lies in the circle but for less than the last digit."""
+    d2 = du * du + dv * dv
+    room = R - math.sqrt(d2)
+    return room > 0.0 and room * room > SURE * max(A, B)
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def nodes_for(du, dv, A, B, R, counts):
+    """Which set of nodes resolves the integrand."""
+    bend = R * math.sqrt(du * du / (A * A) + dv * dv / (B * B)) + R * R * abs(1.0 / A - 1.0 / B)
+    wanted = 9.0 + 7.2 * math.sqrt(bend)
+    if du * du + dv * dv > R * R:
+        wanted *= 1.8
+    k = 0
+    while k < len(counts) - 1 and counts[k] < wanted:
+        k += 1
+    return k
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _total(values, n):
+    """Sum of the first n, a multiple of four."""
+    total = 0.0
+    for s in range(0, n, 4):
+        total += (values[s] + values[s + 1]) + (values[s + 2] + values[s + 3])
+    return total
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _flux(e, away):
+    """What a node adds to the sum: E(e) times the way out."""
+    series = 1.0 - e * (1.0 / 2 - e * (1.0 / 6 - e * (1.0 / 24 - e * (1.0 / 120 - e / 720))))
+    safe = max(e, EDGE)
+    return away * (series if e < EDGE else (1.0 - exp_negative(-safe)) / safe)
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work):
+    """Logarithm of the probability, where the Gaussian's centre lies in the circle.
+
+    No term is negative.
+    """
+    half_a, half_b = 0.5 / A, 0.5 / B
+    for k in range(n):
+        c, s = cosine[first + k], sine[first + k]
+        x, y = du + R * c, dv + R * s
+        work[k] = _flux(x * x * half_a + y * y * half_b, R + du * c + dv * s)
+    return math.log(R / (2.0 * n * math.sqrt(A * B)) * _total(work, n))
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _exponents(du, dv, A, B, R, n, first, cosine, sine, q):
+    """q at the nodes, and the least of them."""
+    half_a, half_b = 0.5 / A, 0.5 / B
+    least = math.inf
+    for k in range(n):
+        x, y = du + R * cosine[first + k], dv + R * sine[first + k]
+        q[k] = x * x * half_a + y * y * half_b
+    for k in range(n):
+        least = min(least, q[k])
+    return least
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work):
+    """Logarithm of the probability, where it does not, from q at the nodes."""
+    scale = R / (2.0 * n * math.sqrt(A * B))
+    for k in range(n):
+        work[k] = _flux(q[k], R + du * cosine[first + k] + dv * sine[first + k])
+    total = _total(work, n)
+    for k in range(n):
+        work[k] = abs(work[k])
+    if _total(work, n) < CANCELLED * total:
+        return math.log(scale * total)
+    for k in range(n):
+        away = R + du * cosine[first + k] + dv * sine[first + k]
+        work[k] = -away * exp_negative(least - q[k]) / q[k]
+    return math.log(scale * _total(work, n)) - least
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def log_circle(du, dv, A, B, R, nodes, q, work):
+    """Logarithm of the probability that the Gaussian about the origin falls in the circle about d.
+
+    q and work have room for `MOST` numbers.
+    """
+    if inside(du, dv, A, B, R):
+        return 0.0
+    A, B = max(A, STEEP * R * R), max(B, STEEP * R * R)
+    counts, begin, cosine, sine = nodes
+    k = nodes_for(du, dv, A, B, R, counts)
+    n, first = counts[k], begin[k]
+    if du * du + dv * dv <= R * R:
+        return _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work)
+    least = _exponents(du, dv, A, B, R, n, first, cosine, sine, q)
+    return _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work)
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def slopes(du, dv, A, B, R, nodes, q, work, out):
+    """`log_circle` and its derivatives, into out (10,).
+
+    The logarithm; its derivatives by u, v; uu, uv, vv; by a variance that is added on both axes;
+    by that and u, by that and v; and twice by that.
+    """
+    for m in range(10):
+        out[m] = 0.0
+    if inside(du, dv, A, B, R):
+        return
+    free_a, free_b = 1.0, 1.0  # whether the variance is what it is said to be
+    if A < STEEP * R * R:
+        A, free_a = STEEP * R * R, 0.0
+    if B < STEEP * R * R:
+        B, free_b = STEEP * R * R, 0.0
+    counts, begin, cosine, sine = nodes
+    k = nodes_for(du, dv, A, B, R, counts)
+    n, first = counts[k], begin[k]
+    least = _exponents(du, dv, A, B, R, n, first, cosine, sine, q)
+    if du * du + dv * dv <= R * R:
+        log_z = _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work)
+    else:
+        log_z = _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work)
+    for k in range(n):
+        work[k] = exp_negative(least - q[k])
+    ia, ib = 1.0 / A, 1.0 / B
+    u = v = uu = uv = vv = t = tu = tv = tt = 0.0
+    for k in range(n):
+        c, s, g = cosine[first + k], sine[first + k], work[k]
+        x, y = (du + R * c) * ia, (dv + R * s) * ib
+        w = 0.5 * (free_a * (x * x - ia) + free_b * (y * y - ib))  # of g, by the variance
+        gc, gs = g * c, g * s
+        across = free_a * gc * x + free_b * gs * y
+        u += gc
+        v += gs
+        uu -= gc * x
+        uv -= gc * y
+        vv -= gs * y
+        t -= across
+        tu += w * gc
+        tv += w * gs
+        tt -= w * across - free_a * gc * x * ia - free_b * gs * y * ib
+    # of Z over Z; t and tt had their halves left out
+    scale = R / (n * math.sqrt(A * B)) * math.exp(-least - log_z)
+    u, v, uu, uv, vv = scale * u, scale * v, scale * uu, scale * uv, scale * vv
+    t, tu, tv, tt = 0.5 * scale * t, scale * tu, scale * tv, 0.5 * scale * tt
+    out[0], out[1], out[2] = log_z, u, v
+    out[3], out[4], out[5] = uu - u * u, uv - u * v, vv - v * v
+    out[6], out[7], out[8], out[9] = t, tu - t * u, tv - t * v, tt - t * t
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FAST)
+def _each(du, dv, A, B, R, nodes, out):
+    q, work = np.empty(MOST), np.empty(MOST)
+    for s in range(len(du)):
+        slopes(du[s], dv[s], A[s], B[s], R, nodes, q, work, out[s])
+
+
+def circle_terms(du: Float, dv: Float, A: Float, B: Float, radius: float) -> Float:
+    """Logarithm of the probability that Gaussians fall in circles, and its derivatives (N, 10).
+
+    Parameters
+    ----------
+    du, dv : ndarray, shape (N,)
+        Centres of the circles, seen from those of the Gaussians.
+    A, B : ndarray, shape (N,)
+        Variances in u and v.
+    radius : float
+        Of the circles.
+
+    Returns
+    -------
+    ndarray, shape (N, 10)
+        The logarithm; its derivatives by the centre's u, v; uu, uv, vv; by a variance that is added
+        on both axes; by that variance and u, by it and v; twice by it.
+    """
+    du, dv, A, B = (
+        np.ascontiguousarray(a, float) for a in np.broadcast_arrays(*np.atleast_1d(du, dv, A, B))
+    )
+    out = np.empty((len(du), 10))
+    _each(du, dv, A, B, float(radius), NODES, out)
+    return out

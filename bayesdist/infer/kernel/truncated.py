@@ -1,0 +1,538 @@
+"""The passes over stars that are matched only within a circle about a nominal position.
+
+    p(r | matched) = (1 - f) N(r) / Z + f p_out(r) / Z_out
+
+Z and Z_out are the probabilities of either part to fall in the circle, which depend on the model's
+position, on the jitter and on the scale of the outliers: see `circle`.  f is the fraction of false
+matches among those in the circle.  Uniform outliers fill the circle, and their Z_out is 1.
+
+These passes stand beside those without a circle, which stay as fast as they are: here a star costs
+an integral.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.kernel.blocks import BLOCK, threads_for
+from bayesdist.infer.kernel.circle import MOST, NODES, log_circle, slopes
+from bayesdist.infer.kernel.mixture import GAUSSIAN, Constants, packed
+from bayesdist.infer.kernel.moments import (
+    N_HYPER,
+    N_MIXTURE,
+    Moments,
+    _add,
+    _by_group,
+    _dot,
+    product_table,
+)
+from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.infer.kernel.polynomial import FAST, horner, legendre
+
+__all__ = [
+    "truncated_log_likelihood",
+    "truncated_memberships",
+    "truncated_moments",
+    "truncated_scores",
+]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+SCRATCH = 16_000_000  # bytes of partial sums held at a time
+INTEGRAL = 30  # what a star costs, in likelihood evaluations without a circle
+N_TERMS = 21  # columns and scalars of one star
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _parts(ru, rv, du, dv, au, av, row, gaussian, radius, nodes, q, work):
+    """Densities of both parts, and what was taken out of them: half a chi-square.
+
+    In the unit of `mixture`.
+    """
+    q_in = 0.5 * (ru * ru / au + rv * rv / av)
+    q_in += log_circle(du, dv, au, av, radius, nodes, q, work)
+    q_out = (ru * ru + rv * rv) * row[3] + row[4]
+    if gaussian:
+        out = 1.0 / row[6]
+        q_out += log_circle(du, dv, out, out, radius, nodes, q, work)
+    t = exp_negative(-abs(q_in - q_out))
+    is_core = q_in <= q_out
+    peak = row[1] / math.sqrt(au * av)
+    return (
+        peak if is_core else peak * t,
+        row[2] * t if is_core else row[2],
+        q_in if is_core else q_out,
+    )
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+def _sums(
+    blocks,
+    X,
+    Y,
+    u,
+    v,
+    var_u,
+    var_v,
+    off_u,
+    off_v,
+    coef,
+    order,
+    rows,
+    unit2,
+    gaussian,
+    radius,
+    nodes,
+):
+    n_blocks, n_draws = len(blocks), len(rows)
+    sums = np.empty((n_blocks, n_draws))
+    constant = math.log(2 * math.pi * unit2)
+    for b in nb.prange(n_blocks):
+        g, a, e = blocks[b]
+        n = e - a
+        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        q, work = np.empty(MOST), np.empty(MOST)
+        for d in range(n_draws):
+            horner(coef[d, g, 0], order, X[a:e], Y[a:e], n, pu, inner)
+            horner(coef[d, g, 1], order, X[a:e], Y[a:e], n, pv, inner)
+            total = 0.0
+            for s in range(n):
+                ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
+                d_in, d_out, least = _parts(
+                    ru,
+                    rv,
+                    ru + off_u[a + s],
+                    rv + off_v[a + s],
+                    var_u[a + s] + rows[d, 0],
+                    var_v[a + s] + rows[d, 0],
+                    rows[d],
+                    gaussian,
+                    radius,
+                    nodes,
+                    q,
+                    work,
+                )
+                total += math.log(d_in + d_out) - least
+            sums[b, d] = total - n * constant
+    return sums
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+def _memberships(
+    blocks,
+    X,
+    Y,
+    u,
+    v,
+    var_u,
+    var_v,
+    off_u,
+    off_v,
+    coef,
+    order,
+    rows,
+    unit2,
+    gaussian,
+    radius,
+    nodes,
+    out,
+):
+    share = 1.0 / len(rows)
+    constant = math.log(2 * math.pi * unit2)
+    for b in nb.prange(len(blocks)):
+        g, a, e = blocks[b]
+        n = e - a
+        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        q, work = np.empty(MOST), np.empty(MOST)
+        for s in range(a, e):
+            out[0, s] = out[1, s] = out[2, s] = 0.0
+        for d in range(len(rows)):
+            horner(coef[d, g, 0], order, X[a:e], Y[a:e], n, pu, inner)
+            horner(coef[d, g, 1], order, X[a:e], Y[a:e], n, pv, inner)
+            for s in range(n):
+                ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
+                d_in, d_out, least = _parts(
+                    ru,
+                    rv,
+                    ru + off_u[a + s],
+                    rv + off_v[a + s],
+                    var_u[a + s] + rows[d, 0],
+                    var_v[a + s] + rows[d, 0],
+                    rows[d],
+                    gaussian,
+                    radius,
+                    nodes,
+                    q,
+                    work,
+                )
+                loglik = math.log(d_in + d_out) - least - constant
+                out[0, a + s] += share * d_out / (d_in + d_out)
+                out[1, a + s] += share * loglik
+                out[2, a + s] += share * loglik * loglik
+
+
+@nb.njit(cache=True, forceinline=True, fastmath=FAST)
+def _star(ru, rv, du, dv, au, av, row, gaussian, wavering, radius, nodes, q, work, zc, zo, out):
+    """What one star gives: 11 columns of `mixture_moments`, then its 10 scalars.
+
+    Of `out` (21,).  `wavering` is 1, or 0 at fixed memberships.
+    """
+    nodes = nodes
+    j2, f, w = row[0], row[5], row[6]
+    slopes(du, dv, au, av, radius, nodes, q, work, zc)
+    iu, iv = 1.0 / au, 1.0 / av
+    eu, ev, r2 = ru * ru * iu, rv * rv * iv, ru * ru + rv * rv
+    q_in, q_out = 0.5 * (eu + ev) + zc[0], r2 * row[3] + row[4]
+    # of the logarithms of both parts: by residual, log j, log s_out, then second ones
+    k = 2.0 * j2
+    in_u, in_v = -ru * iu - zc[1], -rv * iv - zc[2]
+    in_uu, in_uv, in_vv = -iu - zc[3], -zc[4], -iv - zc[5]
+    in_j = j2 * ((eu - 1.0) * iu + (ev - 1.0) * iv) - k * zc[6]
+    in_ju, in_jv = k * (ru * iu * iu - zc[7]), k * (rv * iv * iv - zc[8])
+    in_jj = 2.0 * in_j + k * k * (
+        0.5 * ((1.0 - 2.0 * eu) * iu * iu + (1.0 - 2.0 * ev) * iv * iv) - zc[9]
+    )
+    out_u = out_v = out_uu = out_uv = out_vv = out_s = out_su = out_sv = out_ss = 0.0
+    if gaussian:
+        s2 = 1.0 / w
+        slopes(du, dv, s2, s2, radius, nodes, q, work, zo)
+        q_out += zo[0]
+        out_u, out_v = -ru * w - zo[1], -rv * w - zo[2]
+        out_uu, out_uv, out_vv = -w - zo[3], -zo[4], -w - zo[5]
+        k = 2.0 * s2
+        out_s = r2 * w - 2.0 - k * zo[6]
+        out_su, out_sv = 2.0 * ru * w - k * zo[7], 2.0 * rv * w - k * zo[8]
+        out_ss = -2.0 * r2 * w - 2.0 * k * zo[6] - k * k * zo[9]
+    t = exp_negative(-abs(q_in - q_out))
+    is_core = q_in <= q_out
+    peak = row[1] * math.sqrt(iu * iv)
+    d_in = peak if is_core else peak * t
+    d_out = row[2] * t if is_core else row[2]
+    whole = 1.0 / (d_in + d_out)
+    p, m = d_out * whole, d_in * whole
+    D_u, D_v = in_u - out_u, in_v - out_v
+    pq = p * m * wavering
+    out[0] = -(m * in_uu + p * out_uu) - pq * D_u * D_u
+    out[1] = -(m * in_uv + p * out_uv) - pq * D_u * D_v
+    out[2] = -(m * in_vv + p * out_vv) - pq * D_v * D_v
+    out[3] = -(m * in_u + p * out_u)
+    out[4] = -(m * in_v + p * out_v)
+    out[5] = m * in_ju + pq * in_j * D_u
+    out[6] = m * in_jv + pq * in_j * D_v
+    out[7] = -pq * D_u
+    out[8] = -pq * D_v
+    out[9] = p * out_su - pq * out_s * D_u
+    out[10] = p * out_sv - pq * out_s * D_v
+    pq = p * m
+    out[11] = math.log(d_in + d_out) - (q_in if is_core else q_out)
+    out[12], out[13], out[14] = m * in_j, p, p * out_s
+    out[15] = -m * in_jj - pq * in_j * in_j
+    out[16], out[17] = pq * in_j, pq * in_j * out_s
+    out[18], out[19] = f * (1.0 - f) - pq, -pq * out_s
+    out[20] = -p * out_ss - pq * out_s * out_s
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+def _moments(
+    pieces,
+    X,
+    Y,
+    u,
+    v,
+    var_u,
+    var_v,
+    off_u,
+    off_v,
+    coef,
+    order,
+    row,
+    unit2,
+    em,
+    gaussian,
+    radius,
+    nodes,
+):
+    n_pieces, top = len(pieces), 2 * order
+    sums = np.zeros((n_pieces, 11, (top + 1) * (top + 2) // 2))
+    scalars = np.zeros((n_pieces, N_MIXTURE))
+    wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
+    for b in nb.prange(n_pieces):
+        g, first, end = pieces[b]
+        P, Q = np.empty((top + 1, BLOCK)), np.empty((top + 1, BLOCK))
+        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
+        one, columns = np.empty(N_TERMS), np.empty((N_TERMS, BLOCK))
+        for a in range(first, end, BLOCK):
+            e = min(a + BLOCK, end)
+            n = e - a
+            horner(coef[g, 0], order, X[a:e], Y[a:e], n, pu, inner)
+            horner(coef[g, 1], order, X[a:e], Y[a:e], n, pv, inner)
+            legendre(X[a:e], n, top, P)
+            legendre(Y[a:e], n, top, Q)
+            columns[:] = 0.0
+            for s in range(n):
+                ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
+                _star(
+                    ru,
+                    rv,
+                    ru + off_u[a + s],
+                    rv + off_v[a + s],
+                    var_u[a + s] + row[0],
+                    var_v[a + s] + row[0],
+                    row,
+                    gaussian,
+                    wavering,
+                    radius,
+                    nodes,
+                    q,
+                    work,
+                    zc,
+                    zo,
+                    one,
+                )
+                columns[:, s] = one
+            for k in range(N_MIXTURE):
+                scalars[b, k] += _dot(columns[11 + k], P[0])
+            scalars[b, 0] -= n * log_unit
+            _add(columns, 0, 3, P, Q, top, inner, sums[b])
+            _add(columns, 3, 5, P, Q, order, inner, sums[b])
+            if not em:
+                _add(columns, 5, 11, P, Q, order, inner, sums[b])
+    return sums, scalars
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
+def _scores(
+    blocks,
+    X,
+    Y,
+    u,
+    v,
+    var_u,
+    var_v,
+    off_u,
+    off_v,
+    coef,
+    order,
+    row,
+    gaussian,
+    radius,
+    nodes,
+    out,
+):
+    for b in nb.prange(len(blocks)):
+        g, a, e = blocks[b]
+        n = e - a
+        pu, pv, inner = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+        q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
+        one = np.empty(N_TERMS)
+        horner(coef[g, 0], order, X[a:e], Y[a:e], n, pu, inner)
+        horner(coef[g, 1], order, X[a:e], Y[a:e], n, pv, inner)
+        for s in range(n):
+            ru, rv = u[a + s] - pu[s], v[a + s] - pv[s]
+            _star(
+                ru,
+                rv,
+                ru + off_u[a + s],
+                rv + off_v[a + s],
+                var_u[a + s] + row[0],
+                var_v[a + s] + row[0],
+                row,
+                gaussian,
+                1.0,
+                radius,
+                nodes,
+                q,
+                work,
+                zc,
+                zo,
+                one,
+            )
+            out[0, a + s], out[1, a + s] = one[3], one[4]
+            for k in range(3):
+                out[2 + k, a + s] = one[k]
+
+
+def truncated_log_likelihood(
+    blocks: Int,
+    columns: tuple[Float, ...],
+    offsets: tuple[Float, ...],
+    coef: Float,
+    order: int,
+    constants: Constants,
+) -> Float:
+    """Log-likelihood of all stars for many parameter vectors.
+
+    Parameters
+    ----------
+    blocks, columns, coef, order
+        As in `log_likelihood`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal position minus data, in u and v.
+    constants : Constants
+        Arrays of length D; the radius is that of the circle.
+
+    Returns
+    -------
+    ndarray, shape (D,)
+    """
+    rows, coef = packed(constants), np.ascontiguousarray(coef)
+    out = np.empty(len(coef))
+    step = max(1, SCRATCH // (8 * max(len(blocks), 1)))
+    with threads_for(INTEGRAL * len(columns[0]) * len(coef)):
+        for a in range(0, len(coef), step):
+            some = slice(a, a + step)
+            sums = _sums(
+                blocks,
+                *columns,
+                *offsets,
+                coef[some],
+                order,
+                rows[some],
+                constants.unit2,
+                constants.kind == GAUSSIAN,
+                constants.radius,
+                NODES,
+            )
+            # as in `log_likelihood`
+            out[some] = np.ascontiguousarray(sums.T).sum(axis=1)
+    return out
+
+
+def truncated_memberships(
+    blocks: Int,
+    columns: tuple[Float, ...],
+    offsets: tuple[Float, ...],
+    coef: Float,
+    order: int,
+    constants: Constants,
+) -> Float:
+    """Probability of being an outlier and log-likelihood of each star, averaged over draws.
+
+    Parameters
+    ----------
+    blocks, columns, coef, order, constants
+        As in `memberships`; the radius of the constants is that of the circle.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal position minus data, in u and v.
+
+    Returns
+    -------
+    ndarray, shape (3, N)
+        Probability; mean log-likelihood; mean of its square.
+    """
+    out = np.empty((3, len(columns[0])))
+    with threads_for(INTEGRAL * out.shape[1] * len(coef)):
+        _memberships(
+            blocks,
+            *columns,
+            *offsets,
+            np.ascontiguousarray(coef),
+            order,
+            packed(constants),
+            constants.unit2,
+            constants.kind == GAUSSIAN,
+            constants.radius,
+            NODES,
+            out,
+        )
+    return out
+
+
+def truncated_moments(
+    pieces: Int,
+    columns: tuple[Float, ...],
+    offsets: tuple[Float, ...],
+    coef: Float,
+    order: int,
+    constants: Constants,
+    *,
+    em: bool = False,
+) -> Moments:
+    """Gradient and Hessian of the mixture's log-likelihood.
+
+    Parameters
+    ----------
+    pieces, columns, coef, order, constants
+        As in `mixture_moments`; the radius of the constants is that of the circle.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal position minus data, in u and v.
+    em : bool
+        Curvature at fixed memberships, in place of the Hessian; `cross` is zero then.  It is the
+        covariance of a truncated Gaussian times two inverse variances, and never negative.
+
+    Returns
+    -------
+    Moments
+        With the scalars of `mixture_moments`.
+    """
+    K = (order + 1) * (order + 2) // 2
+    with threads_for(INTEGRAL * len(columns[0])):
+        sums, scalars = _moments(
+            pieces,
+            *columns,
+            *offsets,
+            np.ascontiguousarray(coef),
+            order,
+            packed(constants)[0],
+            constants.unit2,
+            em,
+            constants.kind == GAUSSIAN,
+            constants.radius,
+            NODES,
+        )
+    total = _by_group(sums, pieces)
+    weight = np.einsum("gcm,klm->gckl", total[:, :3], product_table(order), optimize=True)
+    return Moments(
+        weight,
+        total[:, 3:5, :K].copy(),
+        total[:, 5:, :K].reshape(len(coef), N_HYPER, 2, K).copy(),
+        scalars.sum(axis=0),
+    )
+
+
+def truncated_scores(
+    blocks: Int,
+    columns: tuple[Float, ...],
+    offsets: tuple[Float, ...],
+    coef: Float,
+    order: int,
+    constants: Constants,
+) -> Float:
+    """Gradient of each star's log-likelihood by the model's u and v, and its curvature.
+
+    Parameters
+    ----------
+    blocks, columns, order
+        As in `residuals`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal position minus data, in u and v.
+    coef : ndarray, shape (G, 2, K)
+    constants : Constants
+        Of one parameter vector.
+
+    Returns
+    -------
+    ndarray, shape (5, N)
+        The gradient; minus the second derivatives uu, uv, vv.
+    """
+    out = np.empty((5, len(columns[0])))
+    with threads_for(INTEGRAL * out.shape[1]):
+        _scores(
+            blocks,
+            *columns,
+            *offsets,
+            np.ascontiguousarray(coef),
+            order,
+            packed(constants)[0],
+            constants.kind == GAUSSIAN,
+            constants.radius,
+            NODES,
+            out,
+        )
+    return out

@@ -1,0 +1,148 @@
+"""Verdicts, sentences, and which tests there are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bayesdist.diagnose import sample as sample_module
+from bayesdist.diagnose import score_tests
+from bayesdist.diagnose.result import Outcome, corrected, noncentrality
+from bayesdist.diagnose.sample import SAMPLE, scored_sample
+from bayesdist.errors import InputError
+from bayesdist.infer.views import without_frames
+
+from ..infer.patterned import moved
+from .support import TIME, Scene, by_name, polynomial
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def outcome(p: float, name: str = "a test") -> Outcome:
+    return Outcome(name, 1.0, 2, None, p, 0.5, lambda level: level, "pix", "x", "something", "none")
+
+
+def test_holm_steps_down_and_stops_at_the_first_that_fails():
+    p = [2e-4, 0.9, 4.9e-4, 3e-4, 1e-9]
+    # sorted: 1e-9 <= 2e-4, 2e-4 <= 2.5e-4, 3e-4 <= 3.3e-4, 4.9e-4 <= 5e-4, 0.9 > 1e-3
+    assert [t.significant for t in corrected([outcome(x) for x in p])] == [
+        True, False, True, True, True
+    ]  # fmt: skip
+    p[3] = 3.4e-4  # fails, and all that are larger with it
+    assert [t.significant for t in corrected([outcome(x) for x in p])] == [
+        True, False, False, False, True
+    ]  # fmt: skip
+    # what alone is found has to pass the first step
+    assert {t.smallest for t in corrected([outcome(x) for x in p])} == {1e-3 / 5}
+    assert corrected([]) == ()
+
+
+def test_sentences_say_what_was_found_or_could_have_been():
+    found, absent = corrected([outcome(0.0), outcome(0.3)])
+    assert found.finding == "something (0.5 pix rms, p < 1e-300)"
+    assert absent.finding == "none (0.0005 pix rms would have been found)"
+
+
+@pytest.mark.parametrize("dof_residual", [None, 7.5, 40.0, 3e4, 1e7])
+@pytest.mark.parametrize("dof", [1, 6, 28.7])
+def test_noncentrality_has_the_power(dof, dof_residual):
+    level, size = 1e-4, 200_000
+    shift = noncentrality(level, dof, dof_residual)
+    rng = np.random.default_rng(1)
+    T = rng.noncentral_chisquare(dof, shift, size)
+    if dof_residual is None:
+        found = stats.chi2.sf(T, dof) < level
+    else:
+        T = T / dof / (rng.chisquare(dof_residual, size) / dof_residual)
+        found = stats.f.sf(T, dof, dof_residual) < level
+    assert found.mean() == pytest.approx(0.9, abs=0.005)
+
+
+def test_every_question_has_a_row_where_the_data_can_be_asked():
+    one = Scene(1500, 2)
+    always = {"order 3", "order 4", "magnitude", "colour", "truncation"}
+    always |= {"noise by position", "noise by magnitude", "noise by axis"}
+    assert set(one.tests(1)) == always
+    several = {"exposures", "noise by exposure"}
+    assert set(Scene(1500, 2, "shift", 5).tests(1)) == always | several | {"drift"}
+    timed = {"drift", "curvature in time"}
+    assert set(Scene(1500, 2, "shift", 5, time=TIME).tests(1)) == always | several | timed
+    # frames that fit all linear terms leave no deviations, and no drift
+    assert set(Scene(1500, 2, "affine", 5).tests(1)) == always | {"noise by exposure"}
+    model, table = one.data(1)
+    fit = one.solve(model, table)
+    bare = table._with(mag=None, colour=np.ones(len(table)))
+    assert set(by_name(score_tests(bare, fit))) == always - {
+        "magnitude", "colour", "noise by magnitude"
+    }  # fmt: skip
+
+
+def test_too_few_stars_are_not_asked():
+    assert "order 4" not in Scene(14, 2).tests(1)
+    assert set(Scene(9, 1).tests(3)) <= {"order 2", "magnitude", "colour"}
+
+
+def test_remedies_name_what_to_do():
+    found = Scene(600, 8, n_exposures=3).with_pattern(1, polynomial(9, 0.05, 1))
+    assert found["order 9"].significant and found["order 9"].remedy == "raise model.order to 9"
+    assert found["order 10"].remedy == "fit a look-up table"
+    assert "terms of order 9" in found["order 9"].finding
+    assert "hierarchy of deviations" in found["exposures"].remedy
+    assert found["order 9"].unit == "pix"
+
+
+def test_drift_of_exposures_that_deviate_is_doubtful():
+    scene = Scene(1200, 1, "shift_rotation", 6)
+    rng = np.random.default_rng(3)
+    scale = 1e-4 * rng.standard_normal(6)
+
+    def breathing(table):
+        return scale[table.exposure][:, None] * np.stack([table.x - 500, table.y - 400], 1)
+
+    found = scene.with_pattern(2, breathing)
+    assert found["exposures"].significant and found["drift"].significant
+    assert found["drift"].finding.startswith("linear terms drift with time")
+    assert "if it is not single exposures that deviate" in found["drift"].finding
+
+
+def test_large_tables_are_sampled_and_say_what_the_sample_sees(monkeypatch):
+    scene = Scene(4000, 2)
+    table, fit = scene.fitted(1)
+    assert SAMPLE == 200_000
+    whole = by_name(score_tests(table, fit))
+    monkeypatch.setattr(sample_module, "SAMPLE", 1000)
+    part = by_name(score_tests(table, fit))
+    assert len(scored_sample(table, fit)) == 1000
+    ratio = part["order 3"].smallest / whole["order 3"].smallest
+    assert ratio == pytest.approx(2.0, rel=0.1)
+    assert min(one.p_value for one in part.values()) > 1e-3
+
+
+def test_a_view_does_not_say_how_it_was_fitted():
+    table, fit = Scene(200, 1, "shift", 2).fitted(1)
+    with pytest.raises(InputError, match="how it was fitted"):
+        score_tests(table, without_frames(fit))
+
+
+def test_rows_may_stand_in_any_order():
+    scene = Scene(900, 2, "shift_rotation", 4)
+    model, table = scene.data(3)
+    table = moved(table, polynomial(3, 0.003, 1)(table))
+    fit = scene.solve(model, table)
+    mixed = table.select(np.random.default_rng(1).permutation(len(table)))
+    other = by_name(score_tests(mixed, fit))
+    for name, one in by_name(score_tests(table, fit)).items():
+        assert other[name].statistic == pytest.approx(one.statistic, rel=1e-8), name
+
+
+def test_magnitudes_that_stand_for_none_are_no_lever():
+    """A code of 99 among magnitudes neither hides a dependence nor makes one."""
+    scene = Scene(1500, 2)
+    model, table = scene.data(4)
+    table = moved(table, 0.005 * (table.mag - 14)[:, None] * [[0.0, 1.0]])
+    mag = table.mag.copy()
+    mag[::300] = 99.0
+    fit = scene.solve(model, table)
+    found = by_name(score_tests(table._with(mag=mag), fit))
+    assert found["magnitude"].p_value < 1e-20
