@@ -35,6 +35,8 @@ def _caveats(session: Session) -> Iterator[Caveat]:
     for test in session.score_tests:
         if test.significant and not _held(session, test.name):
             yield Caveat(f"{test.finding}: {test.remedy}")
+    for text in session.further_caveats:
+        yield Caveat(text)
     yield from _of_matching(session)
     held = held_out_of(session)
     if held is not None and held.doubtful:

@@ -359,6 +359,11 @@ class Session:
         return errors if found is None else found.of_centroids(errors)
 
     @property
+    def further_caveats(self) -> tuple[str, ...]:
+        """What else keeps verdicts from being given, in runs of one kind."""
+        return ()
+
+    @property
     def doubts(self) -> list[str]:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
         return [f"{t.finding}: {t.remedy}" for t in self.score_tests if t.significant]

@@ -174,6 +174,8 @@ def functions_for(sample: ScoredSample) -> Functions:
     if epoch is not None and np.ptp(epoch) > SHORTEST:
         # from -1 to 1
         half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)
+        if sample.mag is not None:
+            add(Factor(_standing_out(sample.mag) * half, LINEAR), _magnitude_in_time)
         add(Factor(half - half.mean(), LINEAR), _drift)
         if time is not None and len(np.unique(epoch)) > 2:
             order = max([LINEAR, *(i + j for _, i, j in time.terms)])
@@ -230,6 +232,17 @@ def _by_magnitude(functions: Int) -> Regressors:
         "add a magnitude term, cut the faint stars, or correct the charge-transfer efficiency",
         "the residuals go with the magnitude of the stars",
         "the residuals do not go with the magnitude of the stars",
+    )
+
+
+def _magnitude_in_time(functions: Int) -> Regressors:
+    return Regressors(
+        "magnitude in time",
+        functions,
+        INDEPENDENT,
+        "cut the faint stars, correct the charge-transfer efficiency, or leave out the late years",
+        "how the residuals go with the magnitude of the stars changes with time",
+        "how the residuals go with the magnitude of the stars does not change with time",
     )
 
 

@@ -49,7 +49,7 @@ def inside_chips(rng: np.random.Generator, n: int) -> CampaignTruth:
     return usual(rng, stars=n, chips=TWO, rate=chip_by_chip(drift(rng)))
 
 
-@kind("campaign_gap", "gap", "between exposures", *STRUCTURE, *OF_TIME, n=300)
+@kind("campaign_gap", "gap", "drifts with time", n=300)
 def gap(rng: np.random.Generator, n: int) -> CampaignTruth:
     """Two chips drift as one detector: the distance between them changes, which is not fitted."""
     return usual(rng, stars=n, chips=TWO)

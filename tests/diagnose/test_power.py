@@ -71,6 +71,29 @@ def test_trails_of_charge_transfer_are_found():
     assert rest <= {"magnitude", "noise by axis"}
 
 
+def test_trails_that_grow_with_time_are_found():
+    """Nothing at the first date, 0.015 pixels for each magnitude at the far edge at the last."""
+
+    def trails(table):
+        grown = (table.epoch - table.epoch.min()) / np.ptp(table.epoch)
+        return (0.015 * (table.mag - 14) * grown * table.y / 800.0)[:, None] * [[0.0, 1.0]]
+
+    scene = Scene(2000, 2, "shift_rotation", 10)
+    found = [scene.with_pattern(k, trails) for k in FEW]
+    assert median_p(found, "magnitude in time") < 1e-6
+    assert median_p(found, "magnitude") < 1e-6  # there is some on the mean, too
+
+
+def test_trails_that_stay_do_not_grow():
+    scene = Scene(2000, 2, "shift_rotation", 10)
+
+    def trails(table):
+        return (0.005 * (table.mag - 14) * table.y / 800.0)[:, None] * [[0.0, 1.0]]
+
+    found = [scene.with_pattern(k, trails) for k in FEW]
+    assert not any(one["magnitude in time"].significant for one in found)
+
+
 def test_refraction_by_colour_is_found():
     def refraction(table):
         return (0.01 * (table.colour - 1))[:, None] * [[1.0, 0.5]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from bayesdist.app.stages.fit import summarise_fit
 from bayesdist.data import MatchTable, centroid_errors
 from bayesdist.infer import load, save_fit
 from bayesdist.infer.checkpoints import write_arrays
+from bayesdist.infer.deviation_trends import trend_p_values
 from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.series import Series
@@ -29,6 +31,7 @@ Float = NDArray[np.float64]
 
 log = logging.getLogger("bayesdist")
 
+TREND = 1e-3  # probability of a trend by chance, over all kinds of deviation
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 
@@ -76,6 +79,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
     session.run.summarise(
         tables=tables_summary(session, tables),
         scatter={name: _scatter(joint, name) for name in joint.tau},
+        deviations={"warnings": _trends(joint, matches)},
         exposures_skipped=dict(alone.skipped),
         exposures_outlying=list(joint.outlying),
     )
@@ -102,6 +106,38 @@ def _series(alone: ExposureSolutions, reference: Chip) -> Series:
     labels = [s for s in alone.labels if s.split(".")[-1] in SERIES and s not in fixed]
     epoch, values, cov = alone.series(*labels)
     return Series(epoch, values, cov, tuple(labels), alone.names, source="exposures")
+
+
+def _trends(joint: HierarchicalFit, matches: MatchTable) -> list[str]:
+    """Deviations that go with time although they are taken to scatter, each as a clause."""
+    model = joint.model
+    assert matches.epoch is not None
+    names = np.array(model.exposures)
+    code = {name: k for k, name in enumerate(matches.exposure_names)}
+    first = {int(k): float(matches.epoch[row]) for k, row in _first_rows(matches)}
+    kept = [k for k, name in enumerate(names) if name not in joint.outlying]
+    epoch = np.array([first[code[str(names[k])]] for k in kept])
+    values = joint.fit.mean[joint.index].reshape(len(joint.scatter.kinds), -1).T[kept]
+    breaks = () if model.time is None else model.time.breaks
+    p = trend_p_values(values, epoch, breaks)
+    out = []
+    for kind, one in zip(joint.scatter.kinds, p, strict=True):
+        if one * len(p) < TREND:
+            term = f'["{kind[-1]}", 0, 0]'
+            do = f"add {term} to model.tdd.terms" if "shift" in kind else "extend model.tdd.terms"
+            out.append(
+                f"the {kind} of the exposures drifts with time (p = {one:.1g}), and is taken to "
+                f"scatter between exposures: {do}"
+            )
+    for text in out:
+        log.warning("fit: WARNING: %s", text)
+    return out
+
+
+def _first_rows(matches: MatchTable) -> Iterator[tuple[int, int]]:
+    """Code of each exposure, and a row of it."""
+    codes, rows = np.unique(matches.exposure, return_index=True)
+    yield from zip(codes.tolist(), rows.tolist(), strict=True)
 
 
 # -- summary.json ---------------------------------------------------------------------------------

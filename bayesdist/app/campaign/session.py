@@ -279,10 +279,15 @@ class CampaignSession(Session):
         return self.inputs.catalog.sigma_pm_u is not None or bool(super().motions_stated)
 
     @property
+    def further_caveats(self) -> tuple[str, ...]:
+        """Deviations that go with time: no draw of the errors of a later exposure has that."""
+        return tuple(self.run.summary.get("deviations", {}).get("warnings", ()))
+
+    @property
     def doubts(self) -> list[str]:
         """What the stages found odd, and what the campaign cannot tell."""
         found = self.run.summary
-        parts = ("matching", "tables", "time_dependence")
+        parts = ("matching", "deviations", "tables", "time_dependence")
         own = [text for part in parts for text in found.get(part, {}).get("warnings", [])]
         return [*own, *super().doubts]
 

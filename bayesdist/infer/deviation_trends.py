@@ -1,0 +1,51 @@
+"""Do the deviations of exposures go with time, where they are taken to scatter at random?"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+__all__ = ["trend_p_values"]
+
+Float = NDArray[np.float64]
+
+FEWEST_FREE = 3  # degrees of freedom beside the lines
+
+
+def trend_p_values(values: Float, epoch: Float, breaks: ArrayLike = ()) -> Float:
+    """Probability (k,) of lines in time that are as steep by chance, for each kind of deviation.
+
+    An F test of a line in each segment against a constant, with the scatter of the exposures about
+    the lines for its noise: that is all noise that deviations have.
+
+    Parameters
+    ----------
+    values : ndarray, shape (E, k)
+        Deviations of exposures.
+    epoch : ndarray, shape (E,)
+        Decimal years.
+    breaks : array_like
+        Dates at which segments begin.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        1 where there are too few exposures.
+    """
+    segment = np.searchsorted(np.asarray(breaks, float), epoch, side="right")
+    constant = (segment[:, None] == np.unique(segment)).astype(float)
+    middle = constant.T @ epoch / constant.sum(axis=0)
+    lines = constant * (epoch[:, None] - middle)
+    lines = lines[:, np.ptp(lines, axis=0) > 0]
+    free = len(epoch) - constant.shape[1] - lines.shape[1]
+    if free < FEWEST_FREE or not lines.shape[1]:
+        return np.ones(values.shape[1])
+    flat, bent = (
+        values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+        for design in (constant, np.column_stack([constant, lines]))
+    )
+    left = (bent**2).sum(axis=0)
+    gain = np.maximum((flat**2).sum(axis=0) - left, 0.0)
+    ratio = np.divide(gain / lines.shape[1], left / free, out=np.zeros_like(gain), where=left > 0)
+    return np.asarray(stats.f.sf(ratio, lines.shape[1], free))
