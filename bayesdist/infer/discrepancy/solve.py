@@ -14,11 +14,12 @@ from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_sid
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.information import Information
 from bayesdist.infer.discrepancy.linear import linear_deviations
-from bayesdist.infer.discrepancy.noise import score_excess
+from bayesdist.infer.discrepancy.noise import not_narrower, score_excess
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_star_errors
-from bayesdist.infer.discrepancy.structure import AxisStructure, axis_structure
+from bayesdist.infer.discrepancy.structure import structure_posterior
+from bayesdist.infer.discrepancy.summary import chip_structure
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.robust.scores import scores_of
 from bayesdist.infer.settling import Settling
@@ -30,7 +31,6 @@ __all__ = ["estimate_discrepancy"]
 Float = NDArray[np.float64]
 
 DRAWS = 2000
-POINTS = 12  # on each axis
 
 
 # a second BLAS thread gains little here and loses much on a machine that has other work
@@ -96,7 +96,7 @@ def estimate_discrepancy(
         extra, rms = shared_star_errors(stars, scores, formal, model, priors.star * pixel)
         noise = noise + extra
         facts["star_rms"] = rms
-    noise, ratio = _not_narrower(noise, formal)
+    noise, ratio = not_narrower(noise, formal)
     if settling is not None:
         formal, noise = (settling.mean(settling.mean(c).T).T for c in (formal, noise))
         theta = settling.mean(theta)
@@ -109,24 +109,6 @@ def estimate_discrepancy(
     return Discrepancy(model, np.asarray(scores.theta), formal, noise, found, theta, linear, facts)
 
 
-def _not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
-    """The covariance by the stars' scatter, on the whole not below the formal one, and its ratio.
-
-    Quoted errors that are too large are the user's statement: residuals cannot tell them from
-    matches that were cut.
-    """
-    D = len(formal)
-    # a little of the formal one, so that no direction is without variance
-    share = min(0.5, D / (100 * D + 1))
-    noise = (1 - share) * noise + share * formal
-    scale = np.sqrt(np.diag(formal))
-    ratio = float(
-        np.trace(np.linalg.solve(formal / np.outer(scale, scale), noise / np.outer(scale, scale)))
-    )
-    ratio /= D
-    return noise * max(1.0, 1 / ratio), ratio
-
-
 def _structures(
     information: Information,
     working: Information,
@@ -136,51 +118,36 @@ def _structures(
     n: int,
     rng: np.random.Generator,
 ) -> tuple[dict[int, ChipStructure], Float, dict[str, object]]:
-    """Structure of chips (by code), and what it does to the parameters."""
+    """Structure of chips (by code), what it does to the parameters, and its sizes."""
     model, sums = working.model, working.sums
     stars = sums.position[:, :, 0].sum(axis=1)
     shift = information.covariance @ information.score
-    theta, out, rows = np.zeros((n, model.n_params)), {}, []
+    theta, out = np.zeros((n, model.n_params)), {}
+    rows: list[dict[str, object]] = []
     for code in chips:
         chip = model.chips[code]
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
         S, crossed, taken, score = _along_axes(information, working, functions, code)
         waves = functions.finer_waves(rng)
-        here = ChipStructure(functions, waves, np.empty(0)).evaluate(*_even_points())
-        coefficients = []
+        coefficients, posteriors = [], []
         for a in (0, 1):
             through = information.covariance @ crossed[a]
-            posterior: AxisStructure = axis_structure(
-                functions,
+            posterior = structure_posterior(
+                (functions,),
                 S[a] - crossed[a].T @ through,
                 score[a] - crossed[a].T @ shift,
                 noise=_star_error(information, code, a),
                 higher_order=priors.higher_order * pixel,
                 structure=priors.structure * pixel,
             )
-            drawn = posterior.draws(n, rng)
+            (drawn,) = posterior.draws(n, rng)
             coefficients.append(drawn)
+            posteriors.append(posterior)
             # the fit takes structure for polynomials; the truth lies on the other side
             theta -= drawn[:, : functions.n_known] @ (working.covariance @ taken[a]).T
-            rows.append(
-                {
-                    "chip": chip.number,
-                    "axis": "uv"[a],
-                    "field_rms": posterior.field_rms,
-                    "length_pix": posterior.length * max(chip.size) / 2,
-                    "rms": float(np.sqrt(np.mean((drawn @ here.T) ** 2))),
-                    "seen": float(np.sqrt(np.mean((here @ drawn.mean(axis=0)) ** 2))),
-                }
-            )
-        out[chip.number] = ChipStructure(functions, waves, np.stack(coefficients, axis=1))
+        out[chip.number], sizes = chip_structure(chip, functions, waves, coefficients, posteriors)
+        rows += sizes
     return out, theta, {"structure": rows}
-
-
-def _even_points() -> tuple[Float, Float]:
-    """Scaled positions over which sizes are averaged."""
-    line = (np.arange(POINTS) + 0.5) * 2 / POINTS - 1
-    X, Y = np.meshgrid(line, line)
-    return X.ravel(), Y.ravel()
 
 
 def _star_error(information: Information, chip: int, axis: int) -> float:
