@@ -81,11 +81,18 @@ class RunDiscrepancy:
             terms.append(DeviationsTerm(self.found))
         return tuple(terms)
 
+    def structure(self, grid: tuple[int, int], epoch: float | None) -> LocalTerm | None:
+        """What is left out at a position; None where nothing is."""
+        return structure_term(self.found, grid, epoch) if self.found.structure else None
+
     def local(self, grid: tuple[int, int], epoch: float | None) -> tuple[LocalTerm, ...]:
-        """What is left out at a position, as a term of the budget."""
-        if not self.found.structure:
-            return ()
-        return (structure_term(self.found, grid, epoch),)
+        """The same, as terms of the budget."""
+        term = self.structure(grid, epoch)
+        return () if term is None else (term,)
+
+    def moved(self, matrix: Float) -> RunDiscrepancy:
+        """The same in another gauge: errors of parameters times a matrix (D, D)."""
+        return RunDiscrepancy(self.found.moved(matrix))
 
     def of_centroids(self, errors: MagnitudeErrors | None) -> MagnitudeErrors | None:
         """Scatter by magnitude less the structure that residuals show, which has its own term."""

@@ -44,7 +44,7 @@ def score_excess(information: Information) -> Float:
         block = ((index[:, None] * b // side) * b + index * b // side).ravel()
         for a in (0, 1):
             top, bottom, n = (
-                np.bincount(block, w, minlength=b * b)
+                np.asarray(np.bincount(block, w, minlength=b * b), float)
                 for w in (squares[chip, :, a], curvature[chip, :, a], count[chip])
             )
             out[chip, :, a] = shrunk_ratios(top, bottom, n)[block]
