@@ -5,7 +5,8 @@ run, as far as its assessment, and makes a table: do the stated errors cover, is
 called met that the truth misses, and is a refusal given for the right reason?
 """
 
-from . import exposure_kinds, star_kinds, static_kinds  # noqa: F401  (each enters its kinds)
+# each enters its kinds
+from . import exposure_kinds, selfcal_kinds, star_kinds, static_kinds  # noqa: F401
 from .truth import KINDS
 
 __all__ = ["KINDS"]
