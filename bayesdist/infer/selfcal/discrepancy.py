@@ -18,7 +18,7 @@ from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.structure import structure_posterior
 from bayesdist.infer.discrepancy.summary import chip_structure
-from bayesdist.infer.selfcal.eliminated import Columns, eliminated
+from bayesdist.infer.selfcal.eliminated import Columns, eliminated, even_stars, without_parameters
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.sandwich import sandwich
 from bayesdist.infer.selfcal.scores import DetectionScores, score_excess, scores_of_detections
@@ -30,9 +30,8 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 DRAWS = 2000
-MOST_DETECTIONS = 40_000  # that are asked for structure
+MOST_DETECTIONS = 60_000  # that are asked for structure
 MOST_SINES = 700  # of all axes and chips: their information is decomposed
-KNOWN = 1e-10  # relative information below which a combination of parameters is not known
 
 
 # a second BLAS thread gains little here and loses much on a machine that has other work
@@ -72,12 +71,10 @@ def selfcal_discrepancy(
     noise, ratio = _noise(solution, working)
     facts: dict[str, object] = {"structure": [], "unit": model.unit, "noise_ratio": ratio}
 
-    some = _even_stars(solution)
+    some = even_stars(solution.problem, MOST_DETECTIONS)
     problem, stars = solution.problem.of_stars(some), solution.stars[some]
     chosen = np.isin(solution.problem.star, some)
-    flat, working = (
-        DetectionScores(s.gradient[chosen], s.curvature[chosen]) for s in (flat, working)
-    )
+    flat, working = flat.at(chosen), working.at(chosen)
     functions = _functions(problem) if structure else {}
     counts = np.bincount(problem.groups.index, minlength=len(problem.groups))
     deviations = deviation_columns(
@@ -85,7 +82,8 @@ def selfcal_discrepancy(
     )
     columns = Columns(problem, solution.theta, functions, deviations)
     N, score, taken = eliminated(columns, flat, stars, working=working)
-    S, score = _without_parameters(solution, N, score)
+    left = without_parameters(solution, N, score)
+    S, score = left.information, left.score
     # what the fit of all detections makes of a unit of each function
     D, all_of_them = model.n_params, len(solution.problem) / len(problem)
     taken = cov @ taken[:, D:] * all_of_them
@@ -115,15 +113,6 @@ def _noise(solution: Solution, scores: DetectionScores) -> tuple[Float, float]:
     return out, ratio
 
 
-def _even_stars(solution: Solution) -> Int:
-    """Stars that are asked: all, or every k-th.
-
-    A part of the stars says less than all of them, and nothing wrong.
-    """
-    step = int(np.ceil(len(solution.problem) / MOST_DETECTIONS))
-    return np.arange(0, solution.problem.n_stars, step)
-
-
 def _functions(problem: Problem) -> dict[int, StructureFunctions]:
     """Functions on each chip (by code) that has detections."""
     model = problem.model
@@ -139,20 +128,6 @@ def _functions(problem: Problem) -> dict[int, StructureFunctions]:
             model.order, size, int(max(min(wanted.n_side, side), LEAST_SIDE))
         )
     return out
-
-
-def _without_parameters(solution: Solution, N: Float, score: Float) -> tuple[Float, Float]:
-    """Information and score of all other columns, with the free parameters eliminated."""
-    D, free, known = len(solution.theta), solution.free, solution.information
-    A = N[np.ix_(free, free)] + known.precision[np.ix_(free, free)]
-    pull = (score[:D] + known.pull(solution.theta))[free]
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    values, vectors = np.linalg.eigh(A / np.outer(scale, scale))
-    good = values > KNOWN
-    root = vectors[:, good] / np.sqrt(values[good]) / scale[:, None]
-    through = root.T @ N[free, D:]
-    S = N[D:, D:] - through.T @ through
-    return (S + S.T) / 2, score[D:] - through.T @ (root.T @ pull)
 
 
 def _structure(

@@ -27,14 +27,25 @@ from bayesdist.infer.selfcal.following import places_by_star
 from bayesdist.infer.selfcal.normal import Structure
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.scores import DetectionScores
+from bayesdist.infer.selfcal.solve import Solution
 
-__all__ = ["Columns", "Piece", "StarSums", "eliminated", "pieces", "star_sums"]
+__all__ = [
+    "Columns",
+    "Piece",
+    "Remainder",
+    "StarSums",
+    "eliminated",
+    "even_stars",
+    "pieces",
+    "star_sums",
+    "without_parameters",
+]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 DETECTIONS = 8192  # gone through at a time
-UNKNOWN = 1e-10  # relative curvature below which a combination of a star's numbers is not known
+UNKNOWN = 1e-10  # relative curvature below which a combination of numbers is not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +79,21 @@ class Columns:
         """Number of parameters."""
         return self.problem.model.n_params
 
+    def n_functions(self, chip: int) -> int:
+        """Number of functions over a chip (by code), along one axis."""
+        return self.functions[chip].n_known if chip in self.functions else 0
+
+    def values(self, chip: int, rows: Int) -> Float:
+        """Values (n, n_functions) of these at some detections on the chip."""
+        if chip not in self.functions:
+            return np.zeros((len(rows), 0))
+        return self.functions[chip].evaluate(self.problem.X[rows], self.problem.Y[rows])
+
     @cached_property
     def widths(self) -> tuple[int, ...]:
         """Dense columns of each chip along one axis."""
         K, chips = self.problem.model.n_terms, range(len(self.problem.model.chips))
-        return tuple(K + (self.functions[c].n_known if c in self.functions else 0) for c in chips)
+        return tuple(K + self.n_functions(c) for c in chips)
 
     @cached_property
     def n_sparse(self) -> int:
@@ -111,6 +132,14 @@ class Columns:
         for chip, epoch in zip(p.groups.chip, p.groups.epoch, strict=True):
             out.append(self.deviations.positions(int(chip), float(epoch), phi)[0])
         return np.mean(out, axis=0)
+
+
+def even_stars(problem: Problem, most: int) -> Int:
+    """Stars that are asked: all, or every k-th, so that there are no more detections than `most`.
+
+    A part of the stars says less than all of them, and nothing wrong.
+    """
+    return np.arange(0, problem.n_stars, int(np.ceil(len(problem) / most)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,18 +192,15 @@ def pieces(columns: Columns) -> Iterator[Piece]:
         last = int(np.searchsorted(p.starts, p.starts[first] + DETECTIONS, side="right")) - 1
         last = min(max(last, first + 1), p.n_stars)
         rows = slice(int(p.starts[first]), int(p.starts[last]))
-        X, Y, group = p.X[rows], p.Y[rows], p.groups.index[rows]
+        group = p.groups.index[rows]
         chip, n = p.groups.chip[group], rows.stop - rows.start
         phi = np.empty((n, p.model.n_terms))
         dense = []
         for code, basis in enumerate(bases):
             here = np.flatnonzero(chip == code)
-            phi[here] = basis.evaluate_scaled(X[here], Y[here])
-            values = phi[here]
-            if code in columns.functions:
-                more = columns.functions[code].evaluate(X[here], Y[here])
-                values = np.concatenate([values, more], axis=1)
-            dense.append((here, values))
+            phi[here] = basis.evaluate_scaled(p.X[rows][here], p.Y[rows][here])
+            more = columns.values(code, rows.start + here)
+            dense.append((here, np.concatenate([phi[here], more], axis=1)))
         # parameters of exposures and drifts
         m = structure.extra.shape[1]
         values, index = np.zeros((n, 2, m)), np.zeros((n, m), np.int64)
@@ -226,6 +252,47 @@ class StarSums:
 
     rows: Float
     right: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """What is left of further columns when the free parameters are eliminated as well.
+
+    Parameters
+    ----------
+    information : ndarray, shape (n, n)
+    score : ndarray, shape (n,)
+    gain : ndarray, shape (D, n)
+        How the parameters follow the columns; zero for held ones.
+    """
+
+    information: Float
+    score: Float
+    gain: Float
+
+
+def without_parameters(solution: Solution, N: Float, score: Float) -> Remainder:
+    """Columns beside the parameters, these eliminated as the solution has them.
+
+    Parameters
+    ----------
+    solution : Solution
+        Which parameters are free, and what is known of them beside the detections.
+    N, score : ndarray
+        As of `eliminated`.
+    """
+    D, free, known = len(solution.theta), solution.free, solution.information
+    A = N[np.ix_(free, free)] + known.precision[np.ix_(free, free)]
+    pull = (score[:D] + known.pull(solution.theta))[free]
+    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    values, vectors = np.linalg.eigh(A / np.outer(scale, scale))
+    good = values > UNKNOWN
+    root = vectors[:, good] / np.sqrt(values[good]) / scale[:, None]
+    through = root.T @ N[free, D:]
+    S = N[D:, D:] - through.T @ through
+    gain = np.zeros((D, len(N) - D))
+    gain[free] = root @ through
+    return Remainder((S + S.T) / 2, score[D:] - through.T @ (root.T @ pull), gain)
 
 
 def star_sums(
@@ -307,13 +374,13 @@ def eliminated(
     for piece in pieces(columns):
         rows, s = piece.rows, piece.stars
         known = pull[s], prior.precision[s]
-        here = DetectionScores(scores.gradient[rows], scores.curvature[rows])
+        here = scores.at(rows)
         sums = star_sums(columns, piece, here, *known)
         _add_products(total, columns, columns, piece, here.curvature)
         total -= sums.rows.T @ sums.rows
         score += _pulled(columns, piece, here.gradient) - sums.rows.T @ sums.right
         if working is not None:
-            here = DetectionScores(working.gradient[rows], working.curvature[rows])
+            here = working.at(rows)
             sums = star_sums(columns, piece, here, *known)
             _add_products(other, narrow, columns, piece, here.curvature)
             other -= sums.rows[:, inside].T @ sums.rows

@@ -40,7 +40,7 @@ def sandwich(solution: Solution, scores: DetectionScores) -> Float:
     meat = np.array(solution.information.precision)
     pull = np.einsum("skq,sq->sk", p.priors.precision, p.priors.centre - solution.stars)
     for piece in pieces(columns):
-        here = DetectionScores(scores.gradient[piece.rows], scores.curvature[piece.rows])
+        here = scores.at(piece.rows)
         known = pull[piece.stars], p.priors.precision[piece.stars]
         sums = star_sums(columns, piece, here, *known)
         S, q = known[0].shape

@@ -33,6 +33,10 @@ class DetectionScores:
     gradient: Float
     curvature: Float
 
+    def at(self, rows: slice | NDArray[np.bool_]) -> DetectionScores:
+        """Those of some detections."""
+        return DetectionScores(self.gradient[rows], self.curvature[rows])
+
     def flattened(self, excess: Float) -> DetectionScores:
         """Those of a likelihood whose variances are larger by factors (N,)."""
         return DetectionScores(

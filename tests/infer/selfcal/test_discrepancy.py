@@ -10,8 +10,7 @@ import pytest
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.linear import deviation_columns
 from bayesdist.infer.selfcal.calibrate import gauge_of
-from bayesdist.infer.selfcal.discrepancy import _without_parameters
-from bayesdist.infer.selfcal.eliminated import Columns, eliminated
+from bayesdist.infer.selfcal.eliminated import Columns, eliminated, without_parameters
 from bayesdist.infer.selfcal.information import Information
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem
@@ -20,7 +19,6 @@ from bayesdist.infer.selfcal.scores import DetectionScores, scores_of_detections
 from bayesdist.infer.selfcal.solve import Solution, solve
 from bayesdist.model import TimeDependence
 from tests.infer.selfcal.fields import field, problem_of
-
 
 NO_FALSE = Mixture(0.0, 1e-300)
 
@@ -138,7 +136,8 @@ def test_sums_are_those_with_all_stars_explicit(kind, motion, rng):
         taken / unit / unit[:D, None], other[:D] / unit / unit[:D, None], atol=1e-8
     )
     # parameters eliminated, as held by the gauge
-    S_left, score_left = _without_parameters(solution, N, score)
+    found = without_parameters(solution, N, score)
+    S_left, score_left = found.information, found.score
     free, rest = solution.free, np.arange(D, n)
     through = dense[np.ix_(rest, free)] @ np.linalg.inv(dense[np.ix_(free, free)])
     left = dense[np.ix_(rest, rest)] - through @ dense[np.ix_(free, rest)]
@@ -180,7 +179,7 @@ def test_sandwich_is_a_jackknife_over_stars():
         rest = np.isin(p.star, others)
         N, score, _ = eliminated(
             Columns(p.of_stars(others), solution.theta),
-            DetectionScores(scores.gradient[rest], scores.curvature[rest]),
+            scores.at(rest),
             solution.stars[others],
         )
         moved[s] = np.linalg.solve(N[np.ix_(free, free)], score[free])
