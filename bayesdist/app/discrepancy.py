@@ -42,9 +42,12 @@ class RunDiscrepancy:
     Parameters
     ----------
     found : Discrepancy
+    frames : bool
+        Whether what is left out has made errors of the exposures' frames that count.
     """
 
     found: Discrepancy
+    frames: bool = False
 
     def with_noise(self, posterior: Posterior, before: Float | None = None) -> Posterior:
         """The posterior with its draws spread by the errors of the stars as they scatter.
@@ -76,14 +79,16 @@ class RunDiscrepancy:
         """Errors of parameters, as terms of the budget."""
         terms: list[FieldTerm] = []
         if self.found.structure:
-            terms.append(StructureInFit(self.found))
+            terms.append(StructureInFit(self.found, self.frames))
         if self.found.linear is not None:
-            terms.append(DeviationsTerm(self.found))
+            terms.append(DeviationsTerm(self.found, self.frames))
         return tuple(terms)
 
     def structure(self, grid: tuple[int, int], epoch: float | None) -> LocalTerm | None:
         """What is left out at a position; None where nothing is."""
-        return structure_term(self.found, grid, epoch) if self.found.structure else None
+        if not self.found.structure:
+            return None
+        return structure_term(self.found, grid, epoch, frames=self.frames)
 
     def local(self, grid: tuple[int, int], epoch: float | None) -> tuple[LocalTerm, ...]:
         """The same, as terms of the budget."""
@@ -92,7 +97,7 @@ class RunDiscrepancy:
 
     def moved(self, matrix: Float) -> RunDiscrepancy:
         """The same in another gauge: errors of parameters times a matrix (D, D)."""
-        return RunDiscrepancy(self.found.moved(matrix))
+        return replace(self, found=self.found.moved(matrix))
 
     def of_centroids(self, errors: MagnitudeErrors | None) -> MagnitudeErrors | None:
         """Scatter by magnitude less the structure that residuals show, which has its own term."""

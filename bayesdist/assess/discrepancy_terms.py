@@ -37,17 +37,21 @@ class StructureInFit:
     Parameters
     ----------
     discrepancy : Discrepancy
+    frames : bool
+        Whether errors of the exposures' frames count, of each draw those of an exposure chosen at
+        random.
     name, source : str
     """
 
     discrepancy: Discrepancy
+    frames: bool = False
     name: str = STRUCTURE_IN_FIT
     source: str = SOURCE
     without: None = None
 
     def draws(self, n: int, rng: np.random.Generator) -> FieldDraws:
         """The first n draws, over and over: they belong to those of the structure itself."""
-        return _theta(self.discrepancy, self.discrepancy.structure_theta, n)
+        return _theta(self.discrepancy, self.discrepancy.structure_theta, n, self.frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +62,13 @@ class DeviationsTerm:
     ----------
     discrepancy : Discrepancy
         With `linear`.
+    frames : bool
+        As of `StructureInFit`.
     name, source : str
     """
 
     discrepancy: Discrepancy
+    frames: bool = False
     name: str = DEVIATIONS
     source: str = SOURCE
     without: None = None
@@ -71,8 +78,10 @@ class DeviationsTerm:
         linear = self.discrepancy.linear
         assert linear is not None
         rows = rng.integers(len(linear.theta), size=n)
-        found = _theta(self.discrepancy, linear.theta[rows], n)
-        return _Bending(found.model, found.mean, found.theta, linear=linear, rows=rows)
+        found = _theta(self.discrepancy, linear.theta[rows], n, self.frames)
+        return _Bending(
+            found.model, found.mean, found.theta, found.exposure, linear=linear, rows=rows
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,17 +97,26 @@ class _Bending(FieldDraws):
         return super().polynomials(epoch=epoch, chip=chip) + bent
 
 
-def _theta(discrepancy: Discrepancy, shift: Float, n: int) -> FieldDraws:
-    """Polynomials and drift moved by shifts of the parameters."""
+def _theta(discrepancy: Discrepancy, shift: Float, n: int, frames: bool) -> FieldDraws:
+    """Polynomials and drift moved by shifts of the parameters, with or without frames."""
     model, mean = discrepancy.model, discrepancy.mean
-    theta = np.tile(mean, (n, 1))
+    moved, theta = shift[np.arange(n) % len(shift)], np.tile(mean, (n, 1))
+    fitted = [e for e in range(len(model.exposures)) if model.free_frame_names(e)]
+    if frames and fitted:
+        # draws are in random order: their number chooses the exposure
+        exposure = np.array(fitted)[(np.arange(n) % len(shift)) % len(fitted)]
+        return FieldDraws(model, mean, theta + moved, exposure)
     D = model.n_distortion
-    theta[:, :D] += shift[np.arange(n) % len(shift), :D]
+    theta[:, :D] += moved[:, :D]
     return FieldDraws(model, mean, theta)
 
 
 def structure_term(
-    discrepancy: Discrepancy, grid: tuple[int, int], epoch: float | None
+    discrepancy: Discrepancy,
+    grid: tuple[int, int],
+    epoch: float | None,
+    *,
+    frames: bool = False,
 ) -> LocalTerm:
     """What the model leaves out at a position, on a grid.
 
@@ -112,13 +130,17 @@ def structure_term(
         Points on x and y.
     epoch : float or None
         Decimal years; needed by a model with time dependence.
+    frames : bool
+        As of `StructureInFit`.
 
     Returns
     -------
     LocalTerm
     """
     model = discrepancy.model
-    followed = StructureInFit(discrepancy).draws(discrepancy.n_draws, np.random.default_rng(0))
+    followed = StructureInFit(discrepancy, frames).draws(
+        discrepancy.n_draws, np.random.default_rng(0)
+    )
     sigma, drawn = {}, {}
     for chip in model.chips:
         if chip.number not in discrepancy.structure:

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from bayesdist.diagnose.projection import Projection
 from bayesdist.diagnose.result import Outcome, noncentrality
+from bayesdist.diagnose.sample import ScoredSample
 
-__all__ = ["noise_tests"]
+__all__ = ["Scored", "noise_tests"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -27,6 +28,16 @@ STARS_PER_PART = 100  # of a part of the data; smaller ones are joined
 STARS_PER_CELL = 250
 MOST_CELLS = 8  # along each side of a chip
 MOST_MAGNITUDES = 10
+
+
+class Scored(Protocol):
+    """Detections with scores to which has been given back what the fit has taken of them."""
+
+    @property
+    def sample(self) -> ScoredSample: ...
+
+    @property
+    def whole_score(self) -> Float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +69,12 @@ class _Squares:
         return float(self.square.sum() / self.expected.sum())
 
 
-def noise_tests(projection: Projection) -> list[Outcome]:
+def noise_tests(projection: Scored) -> list[Outcome]:
     """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go.
 
     Parameters
     ----------
-    projection : Projection
+    projection : Projection, or what else has sample and scores
 
     Returns
     -------
@@ -94,7 +105,7 @@ def noise_tests(projection: Projection) -> list[Outcome]:
     return [one for one in (*out, _by_axis(squares)) if one is not None]
 
 
-def _cells(projection: Projection, rows: Int) -> Int:
+def _cells(projection: Scored, rows: Int) -> Int:
     """Coarse cells of each chip."""
     sample = projection.sample
     chip = np.empty(len(sample), np.int64)

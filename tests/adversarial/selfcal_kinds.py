@@ -13,10 +13,11 @@ from .star_kinds import BRIGHT, OF_MAGNITUDE, magnitudes
 from .static_kinds import ORDER, STRUCTURE
 from .truth import SIGMA, Frame, Map, Truth, kind, mapped
 
-FALSE = 0.03  # fraction of detections that are displaced
-FALSE_SIGMA = 0.3  # px: by which
+FALSE = 0.02  # fraction of detections that are displaced
+FALSE_SIGMA = 0.6  # px: by which, on each axis
 SPURIOUS = 0.02  # detections of nothing, as a fraction of the others
 DENSITY = 600 / fields.SIDE**2  # stars on a square pixel of the sky
+MOST_STEPS = 500  # of the sampler
 STEPS = (200.0, 600.0)  # px: of the dithers
 ROLLS = ((0.0, 60.0), (0.0, 90.0), (0.0, 60.0, 130.0))  # degrees
 OF_MOTIONS = ("motion", "drift", "date", "epoch")
@@ -109,6 +110,8 @@ def dithered(
     config: dict[str, Any] = {
         "selfcal": selfcal,
         "model": {"order": 3, "reference_pixel": [fields.MIDDLE, fields.MIDDLE]},
+        # where many detections are doubtful the sampler takes long
+        "sampler": {"max_steps": MOST_STEPS},
     }
     dates = dict(zip(frames, 2010.0 + when, strict=True)) if years else {}
     if dates:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.discrepancy import RunDiscrepancy, kept_discrepancy
 from bayesdist.app.selfcal.config import SelfcalBlock
 from bayesdist.app.selfcal.gauge import Known, fixed_by, gauge_words
 from bayesdist.app.selfcal.inputs import (
@@ -34,6 +35,7 @@ from bayesdist.data import MagnitudeErrors, MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.parallax import parallax_factors
 from bayesdist.diagnose import ScoreTest
+from bayesdist.diagnose.dithered import selfcal_score_tests
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer import GaussianPriors, Matches
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
@@ -347,9 +349,16 @@ class SelfcalSession(Session):
             self.solved, rng=self.rng("assess"), priors=self.config.discrepancy.priors()
         )
 
+    @cached_property
+    def discrepancy(self) -> RunDiscrepancy | None:
+        """What the model may leave out; exposures overlap in part, and their frames follow it."""
+        found = kept_discrepancy(self)
+        return found and replace(found, frames=True)
+
     def made_score_tests(self) -> tuple[ScoreTest, ...]:
-        """None yet."""
-        return ()
+        """Targeted tests of the residuals for what the model lacks, with the stars eliminated."""
+        matches = self.raw_matches
+        return selfcal_score_tests(self.solved, mag=matches.mag, epoch=matches.epoch)
 
     catalogue_stated = None
     motions_stated = None
@@ -364,7 +373,8 @@ class SelfcalSession(Session):
         found, local = self.discrepancy, None
         if found is not None:
             S = gauge_free_matrix(self.model, self.solution.mean, self.gauge.null)
-            local = found.moved(S).structure(where["grid"], where.get("epoch"))
+            relative = replace(found.moved(S), frames=False)  # of the detector alone
+            local = relative.structure(where["grid"], where.get("epoch"))
         return with_local(uncertainty_map(self.relative, **where), local)
 
     @property
@@ -383,7 +393,7 @@ class SelfcalSession(Session):
             for one in self.misfits
             if one.hidden
         ]
-        return [*self.gauge.sentences, *known, *warnings, *hidden]
+        return [*self.gauge.sentences, *known, *warnings, *hidden, *super().doubts]
 
     def fit_changed(self) -> None:
         """Forget what rests on the solution."""

@@ -34,6 +34,7 @@ __all__ = [
     "Piece",
     "Remainder",
     "StarSums",
+    "add_products",
     "eliminated",
     "even_stars",
     "pieces",
@@ -376,13 +377,13 @@ def eliminated(
         known = pull[s], prior.precision[s]
         here = scores.at(rows)
         sums = star_sums(columns, piece, here, *known)
-        _add_products(total, columns, columns, piece, here.curvature)
+        add_products(total, columns, columns, piece, here.curvature)
         total -= sums.rows.T @ sums.rows
         score += _pulled(columns, piece, here.gradient) - sums.rows.T @ sums.right
         if working is not None:
             here = working.at(rows)
             sums = star_sums(columns, piece, here, *known)
-            _add_products(other, narrow, columns, piece, here.curvature)
+            add_products(other, narrow, columns, piece, here.curvature)
             other -= sums.rows[:, inside].T @ sums.rows
     if working is None:
         other = total[inside]
@@ -390,7 +391,7 @@ def eliminated(
     return (total + total.T) / 2, score[columns.order], other[narrow.order][:, columns.order]
 
 
-def _add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float) -> None:
+def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float) -> None:
     """Add Z^T H Z of a piece to N, by columns inside; `left` may lack the dense functions."""
     H_M = H @ piece.frame
     weight = np.swapaxes(piece.frame, 1, 2) @ H_M
