@@ -22,6 +22,7 @@ from bayesdist.diagnose.sample import Block, ScoredSample
 from bayesdist.diagnose.score import STARS_PER_DIRECTION, independent_directions
 from bayesdist.infer.discrepancy.functions import legendre_products
 from bayesdist.infer.discrepancy.linear import deviation_columns
+from bayesdist.infer.selfcal.discrepancy import MOST_EXPOSURES
 from bayesdist.infer.selfcal.eliminated import (
     Columns,
     add_products,
@@ -149,7 +150,9 @@ def selfcal_score_tests(
         inside = np.clip(mag, low, high)[rows]
         varied = inside - inside.mean()
     counts = np.bincount(problem.groups.index, minlength=len(problem.groups)).astype(float)
-    deviations = deviation_columns(model, solution.theta, problem.groups, counts)
+    deviations = deviation_columns(
+        model, solution.theta, problem.groups, counts, most=MOST_EXPOSURES
+    )
     columns = _Added(problem, solution.theta, {}, deviations, varied)
     sums = _summed(solution, columns, rows, solution.stars[some])
     found = [_tested(sums, name, which, model.order) for name, which in columns.families()]

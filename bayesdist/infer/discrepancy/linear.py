@@ -159,6 +159,7 @@ def deviation_columns(
     counts: Float,
     *,
     exposures: bool = True,
+    most: int = MOST_EXPOSURES,
 ) -> DeviationColumns | None:
     """Deviations that the frames of a model do not fit, and curvatures of its drift.
 
@@ -171,18 +172,20 @@ def deviation_columns(
         Stars of each group.
     exposures : bool
         Whether single exposures deviate; not where a hierarchy of them has been fitted.
+    most : int
+        Exposures of which single deviations are told: the scatter of more averages out.
 
     Returns
     -------
     DeviationColumns or None
-        None where nothing can deviate: for a single exposure, and without a drift for more than
-        forty, whose scatter averages out.
+        None where nothing can deviate: without a drift for a single exposure, and for more than so
+        many.
     """
     keys = np.column_stack([groups.exposure, groups.epoch])
     distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
     n_exposures = len(distinct)
     kinds = tuple(k for k, fitted in KINDS.items() if model.frames not in fitted)
-    if n_exposures < 2 or n_exposures > MOST_EXPOSURES or not exposures:
+    if n_exposures < 2 or n_exposures > most or not exposures:
         kinds = ()
     per_exposure = [SCATTERS[k] for k in kinds for _ in range({"shift": 2, "shear": 2}.get(k, 1))]
     terms = _bending(model)

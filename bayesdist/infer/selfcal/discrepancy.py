@@ -24,13 +24,14 @@ from bayesdist.infer.selfcal.sandwich import sandwich
 from bayesdist.infer.selfcal.scores import DetectionScores, score_excess, scores_of_detections
 from bayesdist.infer.selfcal.solve import Solution
 
-__all__ = ["selfcal_discrepancy"]
+__all__ = ["MOST_EXPOSURES", "selfcal_discrepancy"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 DRAWS = 2000
 MOST_DETECTIONS = 60_000  # that are asked for structure
+MOST_EXPOSURES = 150  # whose deviations are told apart
 MOST_SINES = 700  # of all axes and chips: their information is decomposed
 
 
@@ -78,7 +79,12 @@ def selfcal_discrepancy(
     functions = _functions(problem) if structure else {}
     counts = np.bincount(problem.groups.index, minlength=len(problem.groups))
     deviations = deviation_columns(
-        model, solution.theta, problem.groups, counts.astype(float), exposures=exposures
+        model,
+        solution.theta,
+        problem.groups,
+        counts.astype(float),
+        exposures=exposures,
+        most=MOST_EXPOSURES,
     )
     columns = Columns(problem, solution.theta, functions, deviations)
     N, score, taken = eliminated(columns, flat, stars, working=working)
@@ -101,6 +107,8 @@ def selfcal_discrepancy(
         )
         facts["exposures"] = linear.n_exposures
         facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
+    if exposures and model.frames != "affine" and not (linear and linear.scatter):
+        facts["exposures_measured"] = False
     return Discrepancy(model, solution.theta, cov, noise, found, theta, linear, facts)
 
 
