@@ -135,6 +135,8 @@ def rests_on(session: Session, epoch: float | None) -> tuple[str, ...]:
     out.append(f"errors given by the user: {', '.join(given) or 'none'}")
     n = len(session.fit.model.exposures)
     out.append(_exposures(session, n))
+    if found is not None and found.found.facts.get("exposures_measured") is False:
+        out.append("no variation between exposures, which is not measured")
     dates = session.dates
     if epoch is not None and dates.size:
         first, last = float(dates.min()), float(dates.max())

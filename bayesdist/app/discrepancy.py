@@ -42,9 +42,12 @@ class RunDiscrepancy:
     Parameters
     ----------
     found : Discrepancy
+    frames : bool
+        Whether what is left out has made errors of the exposures' frames that count.
     """
 
     found: Discrepancy
+    frames: bool = False
 
     def with_noise(self, posterior: Posterior, before: Float | None = None) -> Posterior:
         """The posterior with its draws spread by the errors of the stars as they scatter.
@@ -75,16 +78,25 @@ class RunDiscrepancy:
         """Errors of parameters, as terms of the budget; with the deviation of single exposures."""
         terms: list[FieldTerm] = []
         if self.found.structure:
-            terms.append(StructureInFit(self.found))
+            terms.append(StructureInFit(self.found, self.frames))
         if self.found.linear is not None:
-            terms.append(DeviationsTerm(self.found, single))
+            terms.append(DeviationsTerm(self.found, single, self.frames))
         return tuple(terms)
 
-    def local(self, grid: tuple[int, int], epoch: float | None) -> tuple[LocalTerm, ...]:
-        """What is left out at a position, as a term of the budget."""
+    def structure(self, grid: tuple[int, int], epoch: float | None) -> LocalTerm | None:
+        """What is left out at a position; None where nothing is."""
         if not self.found.structure:
-            return ()
-        return (structure_term(self.found, grid, epoch),)
+            return None
+        return structure_term(self.found, grid, epoch, frames=self.frames)
+
+    def local(self, grid: tuple[int, int], epoch: float | None) -> tuple[LocalTerm, ...]:
+        """The same, as terms of the budget."""
+        term = self.structure(grid, epoch)
+        return () if term is None else (term,)
+
+    def moved(self, matrix: Float) -> RunDiscrepancy:
+        """The same in another gauge: errors of parameters times a matrix (D, D)."""
+        return replace(self, found=self.found.moved(matrix))
 
     def of_centroids(self, errors: MagnitudeErrors | None) -> MagnitudeErrors | None:
         """Scatter by magnitude less the structure that is among the residuals, as it has a term.

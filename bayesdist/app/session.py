@@ -378,6 +378,10 @@ class Session:
         """The solution of relative positions, where the gauge is no part of it."""
         return None
 
+    def relative_map(self, **where: Any) -> UncertaintyMap | None:
+        """Uncertainty of relative positions, as `position_map`; None without a gauge."""
+        return None
+
     @cached_property
     def local_terms(self) -> tuple[LocalTerm, ...]:
         """Errors that were measured beside the solution, on the grid of the assessment."""

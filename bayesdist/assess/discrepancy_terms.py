@@ -37,17 +37,21 @@ class StructureInFit:
     Parameters
     ----------
     discrepancy : Discrepancy
+    frames : bool
+        Whether errors of the exposures' frames count, of each draw those of an exposure chosen at
+        random.
     name, source : str
     """
 
     discrepancy: Discrepancy
+    frames: bool = False
     name: str = STRUCTURE_IN_FIT
     source: str = SOURCE
     without: None = None
 
     def draws(self, n: int, rng: np.random.Generator) -> FieldDraws:
         """The first n draws, over and over: they belong to those of the structure itself."""
-        return _theta(self.discrepancy, self.discrepancy.structure_theta, n)
+        return _theta(self.discrepancy, self.discrepancy.structure_theta, n, self.frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +65,14 @@ class DeviationsTerm:
     single : bool
         Whether the position is one in a single exposure that is yet to come, whose own deviation
         is in the error; else one in the mean of the exposures.
+    frames : bool
+        As of `StructureInFit`.
     name, source : str
     """
 
     discrepancy: Discrepancy
     single: bool = False
+    frames: bool = False
     name: str = DEVIATIONS
     source: str = SOURCE
     without: None = None
@@ -75,9 +82,17 @@ class DeviationsTerm:
         linear = self.discrepancy.linear
         assert linear is not None
         rows = rng.integers(len(linear.theta), size=n)
-        found = _theta(self.discrepancy, linear.theta[rows], n)
+        found = _theta(self.discrepancy, linear.theta[rows], n, self.frames)
         seed = int(rng.integers(2**63)) if self.single else None
-        return _Bending(found.model, found.mean, found.theta, linear=linear, rows=rows, seed=seed)
+        return _Bending(
+            found.model,
+            found.mean,
+            found.theta,
+            found.exposure,
+            linear=linear,
+            rows=rows,
+            seed=seed,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,17 +114,26 @@ class _Bending(FieldDraws):
         return out
 
 
-def _theta(discrepancy: Discrepancy, shift: Float, n: int) -> FieldDraws:
-    """Polynomials and drift moved by shifts of the parameters."""
+def _theta(discrepancy: Discrepancy, shift: Float, n: int, frames: bool) -> FieldDraws:
+    """Polynomials and drift moved by shifts of the parameters, with or without frames."""
     model, mean = discrepancy.model, discrepancy.mean
-    theta = np.tile(mean, (n, 1))
+    moved, theta = shift[np.arange(n) % len(shift)], np.tile(mean, (n, 1))
+    fitted = [e for e in range(len(model.exposures)) if model.free_frame_names(e)]
+    if frames and fitted:
+        # draws are in random order: their number chooses the exposure
+        exposure = np.array(fitted)[(np.arange(n) % len(shift)) % len(fitted)]
+        return FieldDraws(model, mean, theta + moved, exposure)
     D = model.n_distortion
-    theta[:, :D] += shift[np.arange(n) % len(shift), :D]
+    theta[:, :D] += moved[:, :D]
     return FieldDraws(model, mean, theta)
 
 
 def structure_term(
-    discrepancy: Discrepancy, grid: tuple[int, int], epoch: float | None
+    discrepancy: Discrepancy,
+    grid: tuple[int, int],
+    epoch: float | None,
+    *,
+    frames: bool = False,
 ) -> LocalTerm:
     """What the model leaves out at a position, on a grid.
 
@@ -123,13 +147,17 @@ def structure_term(
         Points on x and y.
     epoch : float or None
         Decimal years; needed by a model with time dependence.
+    frames : bool
+        As of `StructureInFit`.
 
     Returns
     -------
     LocalTerm
     """
     model = discrepancy.model
-    followed = StructureInFit(discrepancy).draws(discrepancy.n_draws, np.random.default_rng(0))
+    followed = StructureInFit(discrepancy, frames).draws(
+        discrepancy.n_draws, np.random.default_rng(0)
+    )
     sigma, drawn = {}, {}
     for chip in model.chips:
         if chip.number not in discrepancy.structure:

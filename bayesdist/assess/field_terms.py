@@ -45,15 +45,15 @@ class FieldDraws:
     mean : ndarray, shape (D,)
         Where there is no error.
     theta : ndarray, shape (n, D)
-    exposure : int, optional
-        Code of the exposure whose frame is among the parameters that err; None for errors of the
-        polynomials and their drift alone.
+    exposure : int or ndarray of int, shape (n,), optional
+        Code of the exposure, of all draws or of each, whose frame is among the parameters that err;
+        None for errors of the polynomials and their drift alone.
     """
 
     model: DistortionModel
     mean: Float
     theta: Float
-    exposure: int | None = None
+    exposure: int | NDArray[np.int64] | None = None
 
     def polynomials(self, *, epoch: float | None, chip: int) -> Float:
         """Legendre coefficients (n, 2, K) of the error, along the axes of the gauge.
@@ -65,6 +65,13 @@ class FieldDraws:
         chip : int
             Chip number.
         """
+        if isinstance(self.exposure, np.ndarray):
+            out = np.empty((len(self.theta), 2, self.model.n_terms))
+            for e in np.unique(self.exposure):
+                rows = self.exposure == e
+                here = FieldDraws(self.model, self.mean, self.theta[rows], int(e))
+                out[rows] = here.polynomials(epoch=epoch, chip=chip)
+            return out
         place = place_of(self.model, epoch=epoch, exposure=self.exposure, chip=chip)
         error = place.polynomial(self.theta) - place.polynomial(self.mean)
         if self.exposure is None:

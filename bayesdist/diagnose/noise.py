@@ -10,16 +10,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from bayesdist.diagnose.projection import Projection
 from bayesdist.diagnose.result import Outcome
+from bayesdist.diagnose.sample import ScoredSample
 from bayesdist.diagnose.score import smallest_pattern
 
-__all__ = ["noise_tests"]
+__all__ = ["Scored", "noise_tests"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -29,6 +30,19 @@ STARS_PER_CELL = 60
 STARS_PER_BIN = 150  # of magnitudes
 MOST_CELLS = 8  # along each side of a chip
 MOST_MAGNITUDES = 10
+
+
+class Scored(Protocol):
+    """Detections with scores to which has been given back what the fit has taken of them."""
+
+    @property
+    def sample(self) -> ScoredSample: ...
+
+    @property
+    def whole_score(self) -> Float: ...
+
+    @property
+    def leverage(self) -> Float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +78,12 @@ class _Squares:
         return float(self.square.sum() / self.expected.sum())
 
 
-def noise_tests(projection: Projection) -> list[Outcome]:
+def noise_tests(projection: Scored) -> list[Outcome]:
     """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go.
 
     Parameters
     ----------
-    projection : Projection
+    projection : Projection, or what else has sample and scores
 
     Returns
     -------
@@ -102,7 +116,7 @@ def noise_tests(projection: Projection) -> list[Outcome]:
     return [one for one in (*out, _by_axis(squares)) if one is not None]
 
 
-def _cells(projection: Projection, rows: Int) -> Int:
+def _cells(projection: Scored, rows: Int) -> Int:
     """Coarse cells of each chip."""
     sample = projection.sample
     chip = np.empty(len(sample), np.int64)

@@ -38,7 +38,7 @@ def pattern_test(projection: Projection) -> Outcome | None:
     if len(sample) < FEWEST_STARS:
         return None
     model = sample.model
-    power, trials, at = 0.0, 0.0, (0.0, 0.0, 0, 0)
+    power, trials, at = 0.0, 0.0, (0, 0, 0, 0)
     for chip, (scores, squares) in _binned(projection).items():
         allowed = _frequencies(model.order)
         for axis in (0, 1):
@@ -50,10 +50,10 @@ def pattern_test(projection: Projection) -> Outcome | None:
             if found[j, i] > power:
                 power, at = float(found[j, i]), (int(i), int(j), chip, axis)
     p_value = float(-np.expm1(trials * np.log1p(-np.exp(-power)))) if power > 0 else 1.0
-    i, j, chip, axis = at
+    column, row, chip, axis = at
     size = model.chips[chip].size
-    signed = j if j <= PADDED * BINS // 2 else j - PADDED * BINS
-    period = PADDED / max(np.hypot(i / size[0], signed / size[1]), 1e-12)
+    signed = row if row <= PADDED * BINS // 2 else row - PADDED * BINS
+    period = PADDED / max(np.hypot(column / size[0], signed / size[1]), 1e-12)
     h = float(np.mean(sample.curvature[[0, 2]]))
     n = len(sample) / len(model.chips)
     unit = np.sqrt(2 / (n * h))  # rms of a wave whose power is one, on one axis

@@ -72,7 +72,7 @@ def with_spread(posterior: Posterior, before: Float, after: Float) -> Posterior:
     ----------
     posterior : Posterior
     before, after : ndarray, shape (D, D)
-        Positive definite.
+        As `recolouring`.
 
     Returns
     -------
@@ -89,14 +89,17 @@ def recolouring(before: Float, after: Float) -> Float:
     Parameters
     ----------
     before, after : ndarray, shape (D, D)
-        Positive definite.
+        Positive definite, but for parameters without variance, which are held.
 
     Returns
     -------
     ndarray, shape (D, D)
-        A with A before A^T = after; the identity where the two are equal.
+        A with A before A^T = after; the identity where the two are equal, and for what is held.
     """
-    scale = np.sqrt(np.diag(before))
-    unit = np.outer(scale, scale)
-    roots = [np.linalg.cholesky(c / unit) * scale[:, None] for c in (before, after)]
-    return np.asarray(np.linalg.solve(roots[0].T, roots[1].T).T)
+    free = np.flatnonzero(np.diag(before) > 0)
+    scale = np.sqrt(np.diag(before)[free])
+    unit, inner = np.outer(scale, scale), np.ix_(free, free)
+    roots = [np.linalg.cholesky(c[inner] / unit) * scale[:, None] for c in (before, after)]
+    out = np.eye(len(before))
+    out[inner] = np.linalg.solve(roots[0].T, roots[1].T).T
+    return out

@@ -15,9 +15,10 @@ from astropy.table import Table
 from bayesdist.app.config import load_config
 from bayesdist.app.judging import budget_of, margins_of
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.selfcal.session import SelfcalSession
 from bayesdist.app.session import Session
-from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import rehearse, run_stage
+from bayesdist.app.sessions import own_stages, rehearse_run, session_of
+from bayesdist.app.stages import run_stage
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.assess.statistics import field_statistic
@@ -26,6 +27,7 @@ from bayesdist.assess.verdict import clopper_pearson
 from . import campaign_measure
 from .campaign_truth import CampaignTruth
 from .fields import SIDE
+from .selfcal_errors import lists_of, selfcal_error
 from .truth import KINDS, Truth
 from .written import toml_text
 
@@ -48,6 +50,8 @@ def configuration(truth: Truth, seed: int) -> dict[str, Any]:
     config["sampler"]["seed"] = seed + 1
     if truth.epoch is not None:
         config["assess"]["epoch"] = truth.epoch
+    if truth.self_calibrated:
+        del config["data"]
     for name, block in truth.config.items():
         config[name] = config.get(name, {}) | block if isinstance(block, dict) else block
     return config
@@ -55,16 +59,23 @@ def configuration(truth: Truth, seed: int) -> dict[str, Any]:
 
 def assessed(truth: Truth, folder: Path, seed: int) -> Session:
     """A session of a run of these stars, its assessment made."""
-    Table(truth.stars).write(folder / "stars.parquet")
+    if truth.self_calibrated:
+        lists_of(truth).write(folder / "stars.ecsv")
+    else:
+        Table(truth.stars).write(folder / "stars.parquet")
+    if truth.dates:
+        names, epochs = zip(*truth.dates.items(), strict=True)
+        Table({"exposure": names, "epoch": epochs}).write(folder / "exposures.ecsv")
     (folder / "config.toml").write_text(toml_text(configuration(truth, seed)))
     settings, text = load_config(folder / "config.toml")
     directory = RunDirectory.plan(folder / "run", settings, text, folder)
     session = session_of(directory)
-    rehearse(session)
+    rehearse_run(session)
     directory.begin()
     session.begun()
-    for stage in STAGES:
-        run_stage(session, stage)
+    own = own_stages(session)
+    for stage in ("match", *STAGES) if truth.self_calibrated else STAGES:
+        run_stage(session, stage, own.get(stage))
     return session
 
 
@@ -75,6 +86,8 @@ def actual_error(session: Session, truth: Truth, rng: np.random.Generator) -> np
     frames were fitted, along the axes of the polynomials, as the budget has it.  It is compared
     with the map that all exposures have in common, seen as that exposure points.
     """
+    if isinstance(session, SelfcalSession):
+        return selfcal_error(session, truth, rng)
     solution = session.solution
     model, mean = solution.model, np.asarray(solution.mean)
     x, y = mesh(*grid_pixels(model.chips[0].size, session.config.assess.grid))

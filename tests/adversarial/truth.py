@@ -66,6 +66,8 @@ class Truth:
         At which positions are assessed.
     frames : dict of str to Frame
         Of the exposures, by name; empty where the model has none.
+    dates : dict of str to float
+        Of the exposures of a self-calibration, where it is given any.
     """
 
     stars: dict[str, np.ndarray]
@@ -73,6 +75,12 @@ class Truth:
     config: dict[str, Any]
     epoch: float | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
+    dates: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def self_calibrated(self) -> bool:
+        """Whether there is no catalogue to be matched with."""
+        return "selfcal" in self.config
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.discrepancy import RunDiscrepancy, kept_discrepancy
 from bayesdist.app.selfcal.config import SelfcalBlock
 from bayesdist.app.selfcal.gauge import Known, fixed_by, gauge_words
 from bayesdist.app.selfcal.inputs import (
@@ -24,21 +26,27 @@ from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.app.selfcal.matching import TURN_BACK, half_turned
 from bayesdist.app.selfcal.start import started
 from bayesdist.app.session import Session
-from bayesdist.assess import StarSample
+from bayesdist.assess import StarSample, UncertaintyMap, uncertainty_map
 from bayesdist.assess.dithered_misfit import dithered_misfit
+from bayesdist.assess.maps import with_local
 from bayesdist.assess.misfit import Misfit
 from bayesdist.assess.solution import Solution as Assessed
 from bayesdist.data import MagnitudeErrors, MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.parallax import parallax_factors
+from bayesdist.diagnose import ScoreTest
+from bayesdist.diagnose.dithered import selfcal_score_tests
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer import GaussianPriors, Matches
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.selfcal import Gauge, ReferenceStars, SelfCalibration, Solution, gauge_free
 from bayesdist.infer.selfcal.calibrate import gauge_of, self_calibrate
+from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
 from bayesdist.infer.selfcal.following import taken_by_stars
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem, prepared
+from bayesdist.infer.selfcal.relative import gauge_free_matrix
 from bayesdist.model import DistortionModel
 
 __all__ = ["DETECTIONS", "SOLUTION", "SelfcalSession"]
@@ -320,8 +328,9 @@ class SelfcalSession(Session):
 
     @property
     def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
-        """The same."""
-        return self.magnitude_errors
+        """The same, less the structure that residuals show."""
+        errors, found = self.magnitude_errors, self.discrepancy
+        return errors if found is None else found.of_centroids(errors)
 
     def _sampled(self) -> StarSample:
         sample, solution = super()._sampled(), self.solved
@@ -334,17 +343,39 @@ class SelfcalSession(Session):
         """Structure that the solution leaves, of all chips together: they share stars."""
         return (dithered_misfit(self.solved),)
 
-    def measure(self) -> None:
-        """Nothing beside the posterior: stars that are free take up what detections share."""
-        self.run.summarise(discrepancy=None, score_tests=None)
+    def estimate_discrepancy(self) -> Discrepancy:
+        """What the model may leave out, from the residuals with the stars eliminated."""
+        return selfcal_discrepancy(
+            self.solved, rng=self.rng("assess"), priors=self.config.discrepancy.priors()
+        )
+
+    @cached_property
+    def discrepancy(self) -> RunDiscrepancy | None:
+        """What the model may leave out; exposures overlap in part, and their frames follow it."""
+        found = kept_discrepancy(self)
+        return found and replace(found, frames=True)
+
+    def made_score_tests(self) -> tuple[ScoreTest, ...]:
+        """Targeted tests of the residuals for what the model lacks, with the stars eliminated."""
+        matches = self.raw_matches
+        return selfcal_score_tests(self.solved, mag=matches.mag, epoch=matches.epoch)
 
     catalogue_stated = None
     motions_stated = None
 
     @property
     def relative(self) -> Assessed:
-        """The posterior of relative positions, whatever the gauge."""
-        return gauge_free(self.posterior, self.gauge.null)
+        """The solution of relative positions, whatever the gauge."""
+        return gauge_free(self.solution, self.gauge.null)
+
+    def relative_map(self, **where: Any) -> UncertaintyMap:
+        """Uncertainty of relative positions over a chip, with what the model leaves out."""
+        found, local = self.discrepancy, None
+        if found is not None:
+            S = gauge_free_matrix(self.model, self.solution.mean, self.gauge.null)
+            relative = replace(found.moved(S), frames=False)  # of the detector alone
+            local = relative.structure(where["grid"], where.get("epoch"))
+        return with_local(uncertainty_map(self.relative, **where), local)
 
     @property
     def gauge_words(self) -> str:
@@ -362,12 +393,13 @@ class SelfcalSession(Session):
             for one in self.misfits
             if one.hidden
         ]
-        return [*self.gauge.sentences, *known, *warnings, *hidden]
+        return [*self.gauge.sentences, *known, *warnings, *hidden, *super().doubts]
 
     def fit_changed(self) -> None:
         """Forget what rests on the solution."""
         self.errors_changed()
-        names = ("fit", "model", "priors", "solved", "gauge", "fixed", "raw_matches", "systematics")
+        names = ("fit", "model", "priors", "solved", "gauge", "fixed", "raw_matches")
+        names += ("systematics", "solution", "discrepancy", "local_terms", "score_tests")
         for name in names:
             self.__dict__.pop(name, None)
 

@@ -37,7 +37,9 @@ def write_stars(session: SelfcalSession) -> dict[str, Any]:
         For summary.json.
     """
     solution = session.solved
-    found = star_catalogue(solution)
+    left_out = session.discrepancy
+    cov = None if left_out is None else left_out.found.covariance
+    found = star_catalogue(solution, cov)
     table = star_table(session, found)
     table.meta |= trust(session) | labelled(session)
     write_table(table, session.run / "stars.ecsv")

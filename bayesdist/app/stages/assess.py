@@ -100,10 +100,8 @@ def _assess_periods(session: Session) -> None:
 
 def relative_maps(session: Session, places: Sequence[dict[str, Any]]) -> list[UncertaintyMap]:
     """Maps of relative positions, where the gauge is a question; else none."""
-    relative = session.relative
-    if relative is None:
-        return []
-    return [replace(uncertainty_map(relative, **place), kind=RELATIVE) for place in places]
+    found = [session.relative_map(**place) for place in places]
+    return [replace(one, kind=RELATIVE) for one in found if one is not None]
 
 
 def _map_summary(

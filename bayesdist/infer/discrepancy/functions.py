@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bayesdist.model.basis import polynomial_terms
 
-__all__ = ["StructureFunctions"]
+__all__ = ["StructureFunctions", "legendre_products"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -121,14 +121,14 @@ class StructureFunctions:
 
     def evaluate(self, X: Float, Y: Float) -> Float:
         """Terms and sines (N, n_known) at scaled positions, -1 to 1 along each side."""
-        return np.concatenate([_legendre(X, Y, self.terms), self._sines(X, Y)], axis=1)
+        return np.concatenate([legendre_products(X, Y, self.terms), self._sines(X, Y)], axis=1)
 
     def _sines(self, X: Float, Y: Float) -> Float:
         i, j = self._waves.T - 1
         by_x, by_y = self._along(0, X), self._along(1, Y)
         low = polynomial_terms(self.order)
         out = by_x[:, i] * by_y[:, j]
-        out -= _legendre(X, Y, low) @ self._in_polynomials
+        out -= legendre_products(X, Y, low) @ self._in_polynomials
         return out
 
     def _along(self, axis: int, Z: Float) -> Float:
@@ -167,7 +167,8 @@ def _orthonormal(Z: Float, order: int) -> Float:
     return np.asarray(legendre.legvander(Z, order) * np.sqrt(2 * np.arange(order + 1) + 1))
 
 
-def _legendre(X: Float, Y: Float, terms: tuple[tuple[int, int], ...]) -> Float:
+def legendre_products(X: Float, Y: Float, terms: tuple[tuple[int, int], ...]) -> Float:
+    """Products (N, n) of Legendre polynomials of unit mean square, by their powers (i, j)."""
     order = max(max(t) for t in terms)
     by_x, by_y = _orthonormal(X, order), _orthonormal(Y, order)
     i, j = np.array(terms).T

@@ -7,6 +7,7 @@ prior decides, as it must where one extrapolates.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -16,11 +17,18 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.information import GroupCells, Information
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors, log_half_cauchy
-from bayesdist.model import DistortionModel
+from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["LinearDeviations", "linear_deviations"]
+__all__ = [
+    "DeviationColumns",
+    "LinearDeviations",
+    "deviation_columns",
+    "deviation_draws",
+    "linear_deviations",
+]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 # deviations of an exposure by what scatters together, and the frames that fit them already
 KINDS = {
@@ -99,6 +107,129 @@ class LinearDeviations:
         return out
 
 
+@dataclass(frozen=True, eq=False)
+class DeviationColumns:
+    """Functions whose coefficients scatter: displacements of the stars of some groups.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+    kinds : tuple of str
+        Deviations of each exposure.
+    terms : tuple of (int, int, int)
+        Chip (by code), axis and basis function that bends in time.
+    scatter : ndarray of str, shape (n,)
+        Of which scatter each coefficient is.
+    of_group : ndarray of int, shape (G,)
+        Exposure of each group of stars, from 0.
+    n_exposures : int
+    middle : float
+        Date about which time is counted; NaN without terms.
+    size : float
+        Half the longer side of a chip, in the unit of u, v.
+    """
+
+    model: DistortionModel
+    theta: Float
+    kinds: tuple[str, ...]
+    terms: tuple[tuple[int, int, int], ...]
+    scatter: NDArray[np.str_]
+    of_group: Int
+    n_exposures: int
+    middle: float
+    size: float
+
+    def __len__(self) -> int:
+        return len(self.scatter)
+
+    @property
+    def n_of_exposures(self) -> int:
+        """Number of the coefficients that are deviations of exposures; they come first."""
+        return len(self) - len(self.terms)
+
+    def positions(self, chip: int, epoch: float, phi: Float) -> Float:
+        """Positions (C, 2) along the axes of the polynomials, given the basis (C, K)."""
+        poly = self.model.polynomials(self.theta, np.array([chip]), np.array([epoch]))
+        return np.asarray(phi @ poly[..., 0, :, :].T)
+
+    def at(self, g: int, chip: int, epoch: float, phi: Float, centre: Float) -> tuple[Int, Float]:
+        """Which functions (q,) displace stars of a group, and by what (C, 2, q).
+
+        Parameters
+        ----------
+        g, chip : int
+            Number of the group, and code of its chip.
+        epoch : float
+        phi : ndarray, shape (C, K)
+            The model's basis at the stars.
+        centre : ndarray, shape (2,)
+            About which exposures deviate.
+        """
+        own = _deviations(self.positions(chip, epoch, phi) - centre, self.kinds, self.size)
+        columns = int(self.of_group[g]) * own.shape[2] + np.arange(own.shape[2])
+        here = [k for k, term in enumerate(self.terms) if term[0] == chip]
+        out = np.zeros((len(phi), 2, len(here)))
+        for k, number in enumerate(here):
+            _, axis, term = self.terms[number]
+            out[:, axis, k] = 0.5 * (epoch - self.middle) ** 2 * self.size * phi[:, term]
+        columns = np.concatenate([columns, self.n_of_exposures + np.array(here, np.int64)])
+        return columns, np.concatenate([own, out], axis=2)
+
+
+def deviation_columns(
+    model: DistortionModel,
+    theta: Float,
+    groups: Groups,
+    counts: Float,
+    *,
+    exposures: bool = True,
+    most: int = MOST_EXPOSURES,
+) -> DeviationColumns | None:
+    """Deviations that the frames of a model do not fit, and curvatures of its drift.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+    groups : Groups
+    counts : ndarray, shape (G,)
+        Stars of each group.
+    exposures : bool
+        Whether single exposures deviate; not where a hierarchy of them has been fitted.
+    most : int
+        Exposures of which single deviations are told: the scatter of more averages out.
+
+    Returns
+    -------
+    DeviationColumns or None
+        None where nothing can deviate: without a drift for a single exposure, and for more than so
+        many.
+    """
+    keys = np.column_stack([groups.exposure, groups.epoch])
+    distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
+    n_exposures = len(distinct)
+    kinds = tuple(k for k, fitted in KINDS.items() if model.frames not in fitted)
+    if n_exposures < 2 or n_exposures > most or not exposures:
+        kinds = ()
+    per_exposure = [SCATTERS[k] for k in kinds for _ in range({"shift": 2, "shear": 2}.get(k, 1))]
+    terms = _bending(model)
+    scatter = np.array([*per_exposure * n_exposures, *[CURVATURE] * len(terms)])
+    if not len(scatter):
+        return None
+    return DeviationColumns(
+        model=model,
+        theta=theta,
+        kinds=kinds,
+        terms=terms,
+        scatter=scatter,
+        of_group=of_group.ravel(),
+        n_exposures=n_exposures,
+        middle=float(np.average(groups.epoch, weights=counts)) if terms else np.nan,
+        size=model.pixel_size(theta) * max(max(c.size) for c in model.chips) / 2,
+    )
+
+
 def linear_deviations(
     information: Information,
     working: Information,
@@ -121,49 +252,35 @@ def linear_deviations(
         Draws.
     rng : numpy.random.Generator
     exposures : bool
-        Whether single exposures deviate; not where a hierarchy of them has been fitted.
+        As `deviation_columns`.
 
     Returns
     -------
     LinearDeviations or None
-        None where nothing can deviate: for a single exposure, and without a drift for more than
-        forty, whose scatter averages out.
+        None where nothing can deviate.
     """
-    model, groups = working.model, working.sums.groups
-    keys = np.column_stack([groups.exposure, groups.epoch])
-    distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
-    of_group, n_exposures = of_group.ravel(), len(distinct)
-    kinds = [k for k, fitted in KINDS.items() if model.frames not in fitted]
-    if n_exposures < 2 or n_exposures > MOST_EXPOSURES or not exposures:
-        kinds = []
-    per_exposure = [SCATTERS[k] for k in kinds for _ in range({"shift": 2, "shear": 2}.get(k, 1))]
-    terms = _bending(model)
-    dates = np.array([c.count.sum() for c in working.groups()])
-    middle = float(np.average(groups.epoch, weights=dates)) if terms else np.nan
-    Q = n_exposures * len(per_exposure)
-    total = Q + len(terms)
-    if not total:
+    model = working.model
+    counts = np.array([c.count.sum() for c in working.groups()])
+    groups = working.sums.groups
+    columns = deviation_columns(model, working.theta, groups, counts, exposures=exposures)
+    if columns is None:
         return None
-    scatter = np.array([*per_exposure * n_exposures, *[CURVATURE] * len(terms)])
-    size = model.pixel_size(working.theta) * max(max(c.size) for c in model.chips) / 2
+    total = len(columns)
+    centre = np.mean(
+        [columns.positions(c.chip, c.epoch, c.phi).mean(axis=0) for c in working.groups()], axis=0
+    )
 
-    def displacement(cells: GroupCells, g: int, centre: Float) -> Float:
+    def displacement(cells: GroupCells, g: int) -> Float:
         out = np.zeros((len(cells.X), 2, total))
-        first = int(of_group[g]) * len(per_exposure)
-        own = _deviations(_positions(working, cells) - centre, kinds, size)
-        out[:, :, first : first + own.shape[2]] = own
-        for k, (chip, axis, term) in enumerate(terms):
-            if chip == cells.chip:
-                bent = 0.5 * (cells.epoch - middle) ** 2 * size
-                out[:, axis, Q + k] = bent * cells.phi[:, term]
+        which, values = columns.at(g, cells.chip, cells.epoch, cells.phi, centre)
+        out[:, :, which] = values
         return np.asarray(np.einsum("ab,cbq->caq", cells.frame, out))
 
-    centre = np.mean([_positions(working, c).mean(axis=0) for c in working.groups()], axis=0)
     S, score = np.zeros((total, total)), np.zeros(total)
     crossed = [np.zeros((model.n_params, total)) for _ in range(2)]
     for which, source in enumerate((information, working)):
         for g, cells in enumerate(source.groups()):
-            moved = displacement(cells, g, centre)
+            moved = displacement(cells, g)
             pulled = np.einsum("cab,cbq->caq", cells.curvature, moved, optimize=True)
             crossed[which][cells.columns] += cells.onto_parameters(pulled)
             if which == 0:
@@ -172,6 +289,32 @@ def linear_deviations(
     through = information.covariance @ crossed[0]
     S = S - crossed[0].T @ through
     score = score - through.T @ information.score
+    return deviation_draws(columns, S, score, working.covariance @ crossed[1], priors, n, rng)
+
+
+def deviation_draws(
+    columns: DeviationColumns,
+    S: Float,
+    score: Float,
+    taken: Float,
+    priors: DiscrepancyPriors,
+    n: int,
+    rng: np.random.Generator,
+) -> LinearDeviations:
+    """Posterior draws of deviations, the sizes of their scatters marginalised.
+
+    Parameters
+    ----------
+    columns : DeviationColumns
+    S, score : ndarray, shape (q, q), (q,)
+        Information and score of their coefficients, with what the fit takes eliminated.
+    taken : ndarray, shape (D, q)
+        What a fit makes of a unit of each.
+    priors : DiscrepancyPriors
+    n : int
+    rng : numpy.random.Generator
+    """
+    total, scatter = len(columns), columns.scatter
     S = (S + S.T) / 2
     medians = {
         "shift": priors.exposure,
@@ -218,14 +361,14 @@ def linear_deviations(
     order = rng.permutation(n)
     coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
     return LinearDeviations(
-        model=model,
+        model=columns.model,
         # the fit takes a deviation for its own; the truth lies on the other side
-        theta=-coefficients @ (working.covariance @ crossed[1]).T,
-        terms=terms,
-        curvature=coefficients[:, Q:] * size,
-        epoch=middle,
+        theta=-coefficients @ taken.T,
+        terms=columns.terms,
+        curvature=coefficients[:, columns.n_of_exposures :] * columns.size,
+        epoch=columns.middle,
         scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
-        n_exposures=n_exposures,
+        n_exposures=columns.n_exposures,
     )
 
 
@@ -241,15 +384,7 @@ def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:
     return tuple(out)
 
 
-def _positions(information: Information, cells: GroupCells) -> Float:
-    """Positions (C, 2) along the axes of the polynomials."""
-    poly = information.model.polynomials(
-        information.theta, np.array([cells.chip]), np.array([cells.epoch])
-    )[..., 0, :, :]
-    return np.asarray(cells.phi @ poly.T)
-
-
-def _deviations(position: Float, kinds: list[str], size: float) -> Float:
+def _deviations(position: Float, kinds: Sequence[str], size: float) -> Float:
     """Displacements (C, 2, q) by unit deviations of each kind; shifts in half sizes."""
     p, q = position.T
     zero, one = np.zeros_like(p), np.full_like(p, size)

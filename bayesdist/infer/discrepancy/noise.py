@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.information import Information
 
-__all__ = ["score_excess"]
+__all__ = ["not_narrower", "score_excess", "shrunk_ratios"]
 
 Float = NDArray[np.float64]
 
@@ -44,11 +44,29 @@ def score_excess(information: Information) -> Float:
         block = ((index[:, None] * b // side) * b + index * b // side).ravel()
         for a in (0, 1):
             top, bottom, n = (
-                np.bincount(block, w, minlength=b * b)
+                np.asarray(np.bincount(block, w, minlength=b * b), float)
                 for w in (squares[chip, :, a], curvature[chip, :, a], count[chip])
             )
-            out[chip, :, a] = _shrunk(top, bottom, n)[block]
+            out[chip, :, a] = shrunk_ratios(top, bottom, n)[block]
     return out
+
+
+def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
+    """The covariance by the stars' scatter, on the whole not below the formal one, and its ratio.
+
+    Quoted errors that are too large are the user's statement: residuals cannot tell them from
+    matches that were cut.
+    """
+    D = len(formal)
+    # a little of the formal one, so that no direction is without variance
+    share = min(0.5, D / (100 * D + 1))
+    noise = (1 - share) * noise + share * formal
+    scale = np.sqrt(np.diag(formal))
+    ratio = float(
+        np.trace(np.linalg.solve(formal / np.outer(scale, scale), noise / np.outer(scale, scale)))
+    )
+    ratio /= D
+    return noise * max(1.0, 1 / ratio), ratio
 
 
 def _cell_of(X: Float, Y: Float, side: int) -> NDArray[np.int64]:
@@ -56,7 +74,7 @@ def _cell_of(X: Float, Y: Float, side: int) -> NDArray[np.int64]:
     return np.asarray(iy * side + ix)
 
 
-def _shrunk(top: Float, bottom: Float, n: Float) -> Float:
+def shrunk_ratios(top: Float, bottom: Float, n: Float) -> Float:
     """Ratios of sums over blocks, drawn towards their mean."""
     mean = top.sum() / bottom.sum()
     good = (n >= STARS_PER_BLOCK / 6) & (bottom > 0) & (top > 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -79,6 +79,17 @@ class Discrepancy:
     def n_draws(self) -> int:
         """Number of draws."""
         return len(self.structure_theta)
+
+    def moved(self, matrix: Float) -> Discrepancy:
+        """The same with all errors of the parameters times a matrix (D, D)."""
+        linear = self.linear
+        return replace(
+            self,
+            formal=matrix @ self.formal @ matrix.T,
+            noise=matrix @ self.noise @ matrix.T,
+            structure_theta=self.structure_theta @ matrix.T,
+            linear=linear and replace(linear, theta=linear.theta @ matrix.T),
+        )
 
     @cached_property
     def covariance(self) -> Float:

@@ -15,7 +15,7 @@ from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.information import Information
 from bayesdist.infer.discrepancy.linear import linear_deviations
 from bayesdist.infer.discrepancy.neighbours import SharedVariance, shared_variances
-from bayesdist.infer.discrepancy.noise import score_excess
+from bayesdist.infer.discrepancy.noise import not_narrower, score_excess
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_stars
@@ -106,7 +106,7 @@ def estimate_discrepancy(
     if repeated is not None:
         noise = noise + repeated.covariance(model, scores.theta, formal)
         facts["star_rms"] = repeated.rms
-    noise, ratio = _not_narrower(noise, formal)
+    noise, ratio = not_narrower(noise, formal)
     if settling is not None:
         formal, noise = (settling.mean(settling.mean(c).T).T for c in (formal, noise))
         theta = settling.mean(theta)
@@ -117,24 +117,6 @@ def estimate_discrepancy(
         facts["exposures"] = linear.n_exposures
         facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
     return Discrepancy(model, np.asarray(scores.theta), formal, noise, found, theta, linear, facts)
-
-
-def _not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
-    """The covariance by the stars' scatter, on the whole not below the formal one, and its ratio.
-
-    Quoted errors that are too large are the user's statement: residuals cannot tell them from
-    matches that were cut.
-    """
-    D = len(formal)
-    # a little of the formal one, so that no direction is without variance
-    share = min(0.5, D / (100 * D + 1))
-    noise = (1 - share) * noise + share * formal
-    scale = np.sqrt(np.diag(formal))
-    ratio = float(
-        np.trace(np.linalg.solve(formal / np.outer(scale, scale), noise / np.outer(scale, scale)))
-    )
-    ratio /= D
-    return noise * max(1.0, 1 / ratio), ratio
 
 
 def _structures(

@@ -72,5 +72,5 @@ def discrepancy_from_arrays(
             },
             n_exposures=int(arrays["linear_exposures"]),
         )
-    parts = (arrays[k] for k in ("mean", "formal", "noise"))
-    return Discrepancy(model, *parts, structure, arrays["structure_theta"], linear)
+    mean, formal, noise = (arrays[k] for k in ("mean", "formal", "noise"))
+    return Discrepancy(model, mean, formal, noise, structure, arrays["structure_theta"], linear)

@@ -48,17 +48,28 @@ class StarCatalogue:
         return len(self.values)
 
 
-def star_catalogue(solution: Solution) -> StarCatalogue:
+def star_catalogue(solution: Solution, cov: Float | None = None) -> StarCatalogue:
     """Stars at their modes, with Laplace covariances.
 
     The covariance of a star is that of its own detections for a known distortion, and what the
     error of the distortion adds: A^-1 + A^-1 B Sigma B^T A^-1.
+
+    Parameters
+    ----------
+    solution : Solution
+    cov : ndarray, shape (D, D), optional
+        Sigma; that of the solution by default.
     """
     problem = solution.problem
     S, q = problem.n_stars, problem.n_star
-    cov, own = np.empty((S, q, q)), np.empty((S, q, q))
+    total, own = np.empty((S, q, q)), np.empty((S, q, q))
     root = np.zeros((len(solution.theta), len(solution.free)))
-    root[solution.free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
+    if cov is None:
+        root[solution.free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
+    else:
+        scale = np.sqrt(np.diag(cov)[solution.free])
+        inner = cov[np.ix_(solution.free, solution.free)] / np.outer(scale, scale)
+        root[solution.free] = scale[:, None] * np.linalg.cholesky(inner)
     for some, rows, factors in eliminated_rows(
         problem, solution.theta, solution.mixture, solution.stars
     ):
@@ -66,18 +77,18 @@ def star_catalogue(solution: Solution) -> StarCatalogue:
         own[some] = np.swapaxes(back, 1, 2) @ back
         # A^-1 B = L^-T (L^-1 B)
         spread = np.swapaxes(back, 1, 2) @ (rows @ root)
-        cov[some] = own[some] + spread @ np.swapaxes(spread, 1, 2)
+        total[some] = own[some] + spread @ np.swapaxes(spread, 1, 2)
     w = memberships(problem, solution.theta, solution.mixture, solution.stars)
     members = np.asarray(np.bincount(problem.star, w, minlength=S), float)
     # a star without members is somewhere in the match circle
     widest = problem.least_root**-2
     lost = (members < 0.5) & (np.trace(own[:, :2, :2], axis1=1, axis2=2) > 2 * widest)
-    for matrices in (own, cov):
+    for matrices in (own, total):
         matrices[lost, :2] = matrices[lost, :, :2] = 0.0
         matrices[lost, :2, :2] = widest * np.eye(2)
     return StarCatalogue(
         solution.stars,
-        cov,
+        total,
         own,
         problem.counts,
         members,

@@ -12,7 +12,7 @@ from bayesdist.infer.selfcal.normal import STARS, memberships
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.solve import Solution
 
-__all__ = ["MOST_TAKEN", "Following", "following", "taken_by_stars"]
+__all__ = ["MOST_TAKEN", "Following", "following", "places_by_star", "taken_by_stars"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -61,7 +61,7 @@ def following(solution: Solution) -> Iterator[Following]:
         rows = slice(int(p.starts[first]), int(p.starts[last]))
         to_pixels = np.linalg.inv(p.jacobians(theta, rows))
         w, star = weights[rows], p.star[rows] - first
-        by_star = np.swapaxes(to_pixels @ _by_star(p, rows), 1, 2)
+        by_star = np.swapaxes(to_pixels @ places_by_star(p, rows), 1, 2)
         own = np.array(p.priors.precision[first:last])
         np.add.at(own, star, w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2))
         roots = _inverse_roots(own)
@@ -90,7 +90,7 @@ def _inverse_roots(matrices: Float) -> Float:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)) / scale[:, None, :])
 
 
-def _by_star(problem: Problem, rows: slice) -> Float:
+def places_by_star(problem: Problem, rows: slice) -> Float:
     """Places of detections by the parameters of their stars, (n, 2, q)."""
     n, q, unit = rows.stop - rows.start, problem.n_star, np.eye(2)
     out = np.broadcast_to(unit, (n, 2, 2))

@@ -287,6 +287,27 @@ class Problem:
         )
         return replace(self, X=X, Y=Y, offset=offset, W=W)
 
+    def of_stars(self, which: Int) -> Problem:
+        """The same with some of the stars only, by their numbers in ascending order."""
+        counts = self.counts[which]
+        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        rows = np.repeat(self.starts[which] - starts[:-1], counts) + np.arange(starts[-1])
+        return replace(
+            self,
+            groups=replace(self.groups, index=self.groups.index[rows]),
+            starts=starts,
+            seen=self.seen[:, rows],
+            X=self.X[rows],
+            Y=self.Y[rows],
+            offset=self.offset[rows],
+            W=self.W[rows],
+            var=self.var[rows],
+            time=self.time[rows] if len(self.time) else self.time,
+            factor=self.factor[rows] if len(self.factor) else self.factor,
+            priors=StarPriors(self.priors.centre[which], self.priors.precision[which]),
+            rows=self.rows[rows],
+        )
+
     def with_sigma(self, sigma: Float) -> Problem:
         """The same with other errors (N,), in the order of this object."""
         return replace(self, var=sigma**2)

@@ -1,0 +1,379 @@
+"""Score tests of self-calibrations: what a model lacks, with the stars eliminated.
+
+As for matched stars (`bayesdist.diagnose.score`), with the places of stars among the parameters
+that are projected out, and with the scores of a star's detections added up.  What stars take up
+cannot be tested: directions in which known stars would say much more are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesdist.diagnose.noise import noise_tests
+from bayesdist.diagnose.result import Outcome, ScoreTest, corrected, noncentrality
+from bayesdist.diagnose.sample import Block, ScoredSample
+from bayesdist.diagnose.score import independent_directions
+from bayesdist.infer.discrepancy.functions import legendre_products
+from bayesdist.infer.discrepancy.linear import deviation_columns
+from bayesdist.infer.selfcal.discrepancy import MOST_EXPOSURES
+from bayesdist.infer.selfcal.eliminated import (
+    Columns,
+    add_products,
+    even_stars,
+    pieces,
+    star_sums,
+    without_parameters,
+)
+from bayesdist.infer.selfcal.following import taken_by_stars
+from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.sandwich import star_scores
+from bayesdist.infer.selfcal.scores import scores_of_detections
+from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+
+__all__ = ["selfcal_score_tests"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+MOST_DETECTIONS = 60_000  # that are looked at
+STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
+HIGHER = 2  # orders above the model's that are tested
+TOLD = 0.02  # of what known stars would say of a direction: less is not told from their places
+OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the others
+SHORTEST = 0.1  # years in which motions are looked for
+LINEAR = polynomial_terms(1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Added(Columns):
+    """Terms of higher order, and linear terms times the magnitude, on both axes of every chip.
+
+    Parameters
+    ----------
+    mag : ndarray, shape (N,), or None
+        Of each detection, about the mean.
+    """
+
+    mag: Float | None = field(default=None)
+
+    @cached_property
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """Powers of the terms of higher order."""
+        order = self.problem.model.order
+        return polynomial_terms(order + HIGHER)[len(polynomial_terms(order)) :]
+
+    def n_functions(self, chip: int) -> int:
+        """Number of functions along one axis."""
+        return len(self.terms) + (0 if self.mag is None else len(LINEAR))
+
+    def values(self, chip: int, rows: Int) -> Float:
+        """Values (n, n_functions) of these."""
+        X, Y = self.problem.X[rows], self.problem.Y[rows]
+        out = legendre_products(X, Y, self.terms)
+        if self.mag is None:
+            return out
+        more = self.mag[rows, None] * legendre_products(X, Y, LINEAR)
+        return np.concatenate([out, more], axis=1)
+
+    def families(self) -> Iterator[tuple[str, Int]]:
+        """Name of each test, and which of the further columns it has."""
+        n, order = self.n_functions(0), self.problem.model.order
+        start = n * np.arange(2 * len(self.problem.model.chips))[:, None]
+        degree = np.array([sum(term) for term in self.terms])
+        for step in range(1, HIGHER + 1):
+            yield f"order {order + step}", np.ravel(start + np.flatnonzero(degree == order + step))
+        if self.mag is not None:
+            yield "magnitude", np.ravel(start + np.arange(len(self.terms), n))
+        if self.deviations is not None:
+            first = n * len(start)
+            yield "exposures", first + np.arange(self.deviations.n_of_exposures)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """What the detections say of the further columns of a problem.
+
+    Parameters
+    ----------
+    known : ndarray, shape (n, n)
+        Information if stars and parameters were known.
+    information, score : ndarray, shape (n, n), (n,)
+        With both eliminated.
+    covariance : ndarray, shape (n, n)
+        Of the score, by the scores of single stars.
+    square : ndarray, shape (n, n)
+        Mean products of displacements over the detections.
+    n_stars : int
+    unit : str
+    """
+
+    known: Float
+    information: Float
+    score: Float
+    covariance: Float
+    square: Float
+    n_stars: int
+    unit: str
+
+
+def selfcal_score_tests(
+    solution: Solution, *, mag: Float | None = None, epoch: Float | None = None
+) -> tuple[ScoreTest, ...]:
+    """Targeted tests of a self-calibration for what its model lacks, and for its noise.
+
+    A test is left out where the data cannot be asked.
+
+    Parameters
+    ----------
+    solution : Solution
+    mag, epoch : ndarray, shape (N,), optional
+        Of each detection of its problem; decimal years.
+
+    Returns
+    -------
+    tuple of ScoreTest
+    """
+    whole = solution.problem
+    some = even_stars(whole, MOST_DETECTIONS)
+    rows = np.isin(whole.star, some)
+    problem, model = whole.of_stars(some), whole.model
+    varied = None
+    if mag is not None and np.ptp(mag) > 0:
+        low, high = np.percentile(mag, [OUTSIDE, 100 - OUTSIDE])
+        inside = np.clip(mag, low, high)[rows]
+        varied = inside - inside.mean()
+    counts = np.bincount(problem.groups.index, minlength=len(problem.groups)).astype(float)
+    deviations = deviation_columns(
+        model, solution.theta, problem.groups, counts, most=MOST_EXPOSURES
+    )
+    columns = _Added(problem, solution.theta, {}, deviations, varied)
+    sums = _summed(solution, columns, rows, solution.stars[some])
+    found = [_tested(sums, name, which, model.order) for name, which in columns.families()]
+    if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
+        found.append(_motions(solution, epoch))
+    found += noise_tests(_noise_sample(solution, some, rows, mag))
+    return corrected([one for one in found if one is not None])
+
+
+def _summed(solution: Solution, columns: _Added, rows: NDArray[np.bool_], stars: Float) -> _Sums:
+    """Sums over some of the detections of a solution."""
+    p, scores = columns.problem, scores_of_detections(solution).at(rows)
+    n, D = columns.sparse.stop, columns.n_params
+    known, taken, square = (np.zeros((n, n)) for _ in range(3))
+    prior, score, psi = p.priors, np.zeros(n), []
+    pull = np.einsum("skq,sq->sk", prior.precision, prior.centre - stars)
+    unit = np.broadcast_to(np.eye(2), (len(p), 2, 2))
+    for piece in pieces(columns):
+        here, s = scores.at(piece.rows), piece.stars
+        sums = star_sums(columns, piece, here, pull[s], prior.precision[s])
+        taken += sums.rows.T @ sums.rows
+        score -= sums.rows.T @ sums.right
+        add_products(known, columns, columns, piece, here.curvature)
+        add_products(square, columns, columns, piece, unit[piece.rows])
+        psi.append(star_scores(columns, piece, here.gradient))
+    inside = np.ix_(columns.order, columns.order)
+    own = np.concatenate(psi)
+    N = (known - taken)[inside]
+    left = without_parameters(solution, N, score[columns.order] + own.sum(axis=0))
+    own = own[:, D:] - own[:, :D] @ left.gain
+    # given back what the parameters have taken: a little, and much the same everywhere
+    numbers = 2 * float((scores.curvature[:, 0, 0] > 0).sum()) - p.n_star * p.n_stars
+    free = max(1 - len(solution.free) / max(numbers, 1.0), 0.1)
+    covariance = own.T @ own / free + left.gain.T @ solution.information.precision @ left.gain
+    further = np.ix_(columns.order[D:], columns.order[D:])
+    return _Sums(
+        known[further],
+        left.information,
+        left.score,
+        covariance,
+        square[further] / len(p),
+        p.n_stars,
+        p.model.unit,
+    )
+
+
+def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
+    """Outcome of one test; None where the data cannot be asked."""
+    at = np.ix_(which, which)
+    N = independent_directions(sums.known[at], sums.information[at], TOLD)
+    q, n = N.shape[1], sums.n_stars
+    if q == 0 or n < STARS_PER_DIRECTION * q + 2:
+        return None
+    U, S, V = N.T @ sums.score[which], N.T @ sums.information[at] @ N, N.T @ sums.covariance[at] @ N
+    T = float(U @ np.linalg.solve(V, U))
+    inverse, Q = np.linalg.inv(S), N.T @ sums.square[at] @ N
+    step, noise = inverse @ U, float(np.trace(Q @ inverse @ V @ inverse))
+    remedy, present, absent = _words(name, order)
+    return Outcome(
+        name=name,
+        statistic=T,
+        dof=q,
+        dof_residual=float(n - q),
+        p_value=float(stats.beta.sf(min(T / n, 1.0), q / 2, (n - q) / 2)),
+        size=float(np.sqrt(max(float(step @ Q @ step) - noise, 0.0))),
+        smallest=partial(_smallest, float(np.sqrt(max(noise, 0.0))), q, float(n - q)),
+        unit=sums.unit,
+        remedy=remedy,
+        present=present,
+        absent=absent,
+    )
+
+
+def _smallest(noise: float, dof: float, dof_residual: float, level: float) -> float:
+    return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))
+
+
+def _words(name: str, order: int) -> tuple[str, str, str]:
+    """Remedy, and the finding where there is something and where there is not."""
+    if name.startswith("order "):
+        total = int(name.removeprefix("order "))
+        raised = f"raise model.order to {total}" if total <= MAX_ORDER else "fit a look-up table"
+        return (
+            raised,
+            f"the residuals hold terms of {name}, and the model ends at order {order}",
+            f"no terms of {name} are left in the residuals",
+        )
+    if name == "magnitude":
+        return (
+            "cut the faint stars, or correct the charge-transfer efficiency",
+            "the residuals go with the magnitude of the stars",
+            "the residuals do not go with the magnitude of the stars",
+        )
+    return (
+        "give selfcal.frames a scale where it has none, or leave out exposures",
+        "exposures deviate from each other in linear terms that their frames do not fit",
+        "no deviations of single exposures are left in the residuals",
+    )
+
+
+def _motions(solution: Solution, epoch: Float) -> Outcome | None:
+    """Test for stars that move: do the residuals of single stars go with time?
+
+    Of each star the square of the slope's score is compared with the squares of all that is left of
+    its residuals, so that nothing is assumed of the size of the errors.
+    """
+    p, scores = solution.problem, scores_of_detections(solution)
+    S = p.n_stars
+    g, H = scores.gradient, scores.curvature
+
+    def summed(values: Float) -> Float:
+        out = np.zeros((S, *values.shape[1:]))
+        np.add.at(out, p.star, values)
+        return out
+
+    members = summed((H[:, 0, 0] > 0).astype(float))
+    A = summed(H) + p.priors.precision
+    many = np.flatnonzero(members >= 4)  # of fewer nothing is left
+    if len(many) < 100:
+        return None
+    mean = summed(epoch[:, None]) / p.counts[:, None]
+    t = epoch - mean[p.star, 0]
+    cross, square = summed(t[:, None, None] * H)[many], summed(t[:, None, None] ** 2 * H)[many]
+    slope = summed(t[:, None] * g)[many]
+    left = square - cross @ np.linalg.solve(A[many], cross)
+    moving = np.linalg.det(left) > 1e-6 * np.linalg.det(square)
+    many, left, slope = many[moving], left[moving], slope[moving]
+    if len(many) < 100:
+        return None
+    step = np.linalg.solve(left, slope[..., None])[..., 0]
+    explained = np.einsum("na,na->n", slope, step)
+    inverse = np.zeros_like(H)
+    good = H[:, 0, 0] > 0
+    inverse[good] = np.linalg.inv(H[good])
+    chi2 = summed(np.einsum("na,nab,nb->n", g, inverse, g))[many]
+    rest = (chi2 - explained) / (2 * members[many] - 4)
+    difference = explained / 2 - rest
+    n = len(many)
+    spread = float(np.std(difference) / np.sqrt(n))
+    T = float(difference.mean() / spread)
+    # of a motion in a year, rms over the stars and both axes together
+    noise2 = float(np.mean(np.trace(np.linalg.inv(left), axis1=1, axis2=2) * rest))
+    size2 = float(np.mean((step**2).sum(axis=1))) - noise2
+    years = float(np.std(epoch))
+    return Outcome(
+        name="motions",
+        statistic=T**2,
+        dof=1,
+        dof_residual=None,
+        p_value=float(stats.norm.sf(T)),
+        size=years * float(np.sqrt(max(size2, 0.0))),
+        smallest=partial(_smallest_motion, years * np.sqrt(noise2) / n**0.25),
+        unit=p.model.unit,
+        remedy="set selfcal.motion to 'proper_motion'",
+        present="stars move between the dates of the exposures, and are taken to stand still",
+        absent="no motions of the stars are left in the residuals",
+    )
+
+
+def _smallest_motion(noise: float, level: float) -> float:
+    return float(noise * np.sqrt(np.sqrt(noncentrality(2 * level, 1))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """As of `Scored`."""
+
+    sample: ScoredSample
+    whole_score: Float
+    leverage: Float
+
+
+def _noise_sample(
+    solution: Solution, some: Int, rows: NDArray[np.bool_], mag: Float | None
+) -> _Scored:
+    """Some detections along the axes of the detector, in the unit of u and v.
+
+    Rolls turn the axes of the sky from exposure to exposure, and errors are those of pixels.
+    """
+    whole, theta, model = solution.problem, solution.theta, solution.problem.model
+    p, pixel = whole.of_stars(some), model.pixel_size(theta)
+    order = np.argsort(p.groups.index, kind="stable")
+    group = p.groups.index[order]
+    scores = scores_of_detections(solution).at(rows)
+    J = p.jacobians(theta, slice(0, len(p)))
+    g = np.einsum("nab,na->nb", J, scores.gradient)[order] / pixel
+    H = (np.swapaxes(J, 1, 2) @ scores.curvature @ J)[order] / pixel**2
+    r = (p.places(theta) - p.star_places(solution.stars[some]))[..., None]
+    residual = np.linalg.solve(J, r)[order, :, 0] * pixel
+    variance = (p.var[order] + solution.mixture.jitter**2) * pixel**2
+    member = memberships(whole, theta, solution.mixture, solution.stars)[rows][order]
+    starts = np.searchsorted(group, np.arange(len(p.groups) + 1))
+    jacobian, effective = p.effective_jacobian(theta), p.effective(theta)
+    blocks = tuple(
+        Block(
+            slice(int(a), int(b)),
+            int(p.groups.chip[k]),
+            int(p.groups.exposure[k]),
+            int(p.groups.exposure[k]),
+            model.frame(theta, int(p.groups.exposure[k]))[0],
+            effective[k],
+            *jacobian[k],
+        )
+        for k, (a, b) in enumerate(pairwise(starts))
+        if b > a
+    )
+    sample = ScoredSample(
+        model=model,
+        X=p.X[order],
+        Y=p.Y[order],
+        score=g.T,
+        curvature=np.stack([H[:, 0, 0], H[:, 0, 1], H[:, 1, 1]]),
+        residual=np.asarray(residual.T, float),
+        variance=np.stack([variance, variance]),
+        inlier=member,
+        mag=None if mag is None else mag[rows][order],
+        colour=None,
+        epoch=None,
+        star=p.star[order],
+        blocks=blocks,
+    )
+    taken = taken_by_stars(solution)[rows][order]
+    return _Scored(sample, sample.score / np.sqrt(1.0 - taken), np.stack([taken, taken]))

@@ -1,0 +1,85 @@
+"""Covariance of a self-calibration by how its detections scatter, star by star."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.selfcal.eliminated import Columns, Piece, pieces, star_sums
+from bayesdist.infer.selfcal.scores import DetectionScores
+from bayesdist.infer.selfcal.solve import Solution
+
+__all__ = ["sandwich", "star_scores"]
+
+Float = NDArray[np.float64]
+
+# A star that determines a parameter alone has no residual; its squared score says nothing.
+LEAST_FREE = 0.1
+
+
+def sandwich(solution: Solution, scores: DetectionScores) -> Float:
+    """Covariance (D, D) of the parameters whatever the errors of single stars are; 0 for held ones.
+
+    The detections of a star share its position, so that their scores are added up.  Each sum is
+    divided by one minus the leverage of the star's detections (HC3 of MacKinnon and White 1985,
+    Journal of Econometrics 29, 305, with stars for observations): a jackknife over stars, to first
+    order.
+
+    Parameters
+    ----------
+    solution : Solution
+    scores : DetectionScores
+        Of its detections.
+    """
+    p, free = solution.problem, solution.free
+    columns = Columns(p, solution.theta)
+    root = np.zeros((columns.n_params, len(free)))
+    root[free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
+    inside = np.empty_like(root)
+    inside[columns.order] = root
+    meat = np.array(solution.information.precision)
+    pull = np.einsum("skq,sq->sk", p.priors.precision, p.priors.centre - solution.stars)
+    for piece in pieces(columns):
+        here = scores.at(piece.rows)
+        known = pull[piece.stars], p.priors.precision[piece.stars]
+        sums = star_sums(columns, piece, here, *known)
+        S, q = known[0].shape
+        moved = _displacements(columns, piece, inside)
+        whole = np.einsum("nab,naf,nbf->n", here.curvature, moved, moved, optimize=True)
+        leverage = np.bincount(piece.star, whole, S)
+        leverage -= np.sum((sums.rows @ inside) ** 2, axis=1).reshape(S, q).sum(axis=1)
+        # of as many numbers as its detections have beside its own
+        number = 2 * np.bincount(piece.star, here.curvature[:, 0, 0] > 0, S) - q
+        mean = np.clip(leverage / np.maximum(number, 1), 0.0, 1 - LEAST_FREE)
+        psi = star_scores(columns, piece, here.gradient) / (1 - mean)[:, None]
+        meat += psi.T @ psi
+    cov = root @ root.T
+    return np.asarray(cov @ meat @ cov)
+
+
+def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:
+    """Scores (S, n) of each star of a piece, by all columns.
+
+    At the stars' modes: their own parameters have no gradient, and nothing is to be eliminated.
+    """
+    S = piece.stars.stop - piece.stars.start
+    out = np.zeros((S, columns.sparse.stop))
+    turned = np.einsum("nab,na->nb", piece.frame, gradient)
+    # of one number for each star
+    for code, (here, values) in enumerate(piece.dense):
+        for axis in (0, 1):
+            summed = piece.of_stars(turned[:, None, axis, None])[:, here] @ values
+            out[:, columns.dense(code, axis)] = summed
+    out[:, columns.sparse] = (piece.of_stars(gradient[:, None, :]) @ piece.sparse).toarray()
+    return out[:, columns.order]
+
+
+def _displacements(columns: Columns, piece: Piece, root: Float) -> Float:
+    """Displacements (n, 2, f) of detections by some changes (columns inside, f)."""
+    out = np.zeros((len(piece), 2, root.shape[1]))
+    for code, (here, values) in enumerate(piece.dense):
+        for axis in (0, 1):
+            out[here, axis] = values @ root[columns.dense(code, axis)]
+    out = piece.frame @ out
+    out += (piece.sparse @ root[columns.sparse]).reshape(out.shape)
+    return np.asarray(out)

@@ -1,0 +1,68 @@
+"""Draws of the structure on a chip as a result, with its sizes for summaries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.discrepancy.functions import StructureFunctions
+from bayesdist.infer.discrepancy.result import ChipStructure
+from bayesdist.infer.selfcal.structure import StructurePosterior
+from bayesdist.model import Chip
+
+__all__ = ["chip_structure"]
+
+Float = NDArray[np.float64]
+
+POINTS = 12  # on each axis
+
+
+def chip_structure(
+    chip: Chip,
+    functions: StructureFunctions,
+    waves: Float,
+    coefficients: Sequence[Float],
+    posteriors: Sequence[StructurePosterior],
+) -> tuple[ChipStructure, list[dict[str, object]]]:
+    """Structure on a chip, and its sizes on each axis.
+
+    Parameters
+    ----------
+    chip : Chip
+    functions : StructureFunctions
+    waves : ndarray, shape (FINE, 2)
+        Of what is finer than the functions.
+    coefficients : sequence of ndarray, shape (n, m)
+        Draws along u, and along v.
+    posteriors : sequence of StructurePosterior
+        From which they are.
+
+    Returns
+    -------
+    ChipStructure, list of dict
+        For each axis: the chip, the axis, the amplitude and length of the field, the rms over the
+        chip of the draws, on the mean of their squares and their median.
+    """
+    found = ChipStructure(functions, waves, np.stack(coefficients, axis=1))
+    here = found.evaluate(*_even_points())
+    rows: list[dict[str, object]] = [
+        {
+            "chip": chip.number,
+            "axis": axis,
+            "field_rms": posterior.field_rms,
+            "length_pix": posterior.length * max(chip.size) / 2,
+            "rms": float(np.sqrt(np.mean((drawn @ here.T) ** 2))),
+            "median": float(np.median(np.sqrt(np.mean((drawn @ here.T) ** 2, axis=1)))),
+        }
+        for axis, drawn, posterior in zip("uv", coefficients, posteriors, strict=True)
+    ]
+    return found, rows
+
+
+def _even_points() -> tuple[Float, Float]:
+    """Scaled positions over which sizes are averaged."""
+    line = (np.arange(POINTS) + 0.5) * 2 / POINTS - 1
+    X, Y = np.meshgrid(line, line)
+    return X.ravel(), Y.ravel()
