@@ -25,6 +25,7 @@ __all__ = ["Scored", "noise_tests"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+LARGEST_LEVERAGE = 0.5
 STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
 STARS_PER_CELL = 60
 STARS_PER_BIN = 150  # of magnitudes
@@ -90,7 +91,10 @@ def noise_tests(projection: Scored) -> list[Outcome]:
     list of Outcome
     """
     sample = projection.sample
-    rows = np.flatnonzero(sample.used)
+    # what the fit has taken of a residual says nothing of its noise
+    rows = np.flatnonzero(sample.used & (projection.leverage.max(axis=0) < LARGEST_LEVERAGE))
+    if len(rows) < STARS_PER_PART:
+        return []
     variance = sample.variance[:, rows]
     square = projection.whole_score[:, rows] ** 2 * variance
     expected = sample.curvature[0::2, rows] * variance

@@ -32,6 +32,7 @@ __all__ = ["independent_directions", "regressor_tests", "smallest_pattern"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+MOST_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
 LEAST_DOF = 3  # of the noise: below, its covariance says nothing
 LEAST_P = 1e-300
 MOST_CHIPS = 4  # that are tested together, with the covariance of all their scores
@@ -121,8 +122,10 @@ def _parts_of(projection: Projection, chips: list[int], meat: str) -> Iterator[t
     if meat == "robust":
         sums = _star_sums(projection, chips, tried)
     else:
-        sums = [(np.eye(one.q), 0.0) for one in tried]
-    for one, (V, spread) in zip(tried, sums, strict=True):
+        sums = [(np.eye(one.q), 0.0, 0.0) for one in tried]
+    for one, (V, spread, taken) in zip(tried, sums, strict=True):
+        if taken > MOST_TAKEN:
+            continue
         if meat == "robust":
             # as a Wishart matrix that scatters as much
             dof = one.q * (one.q + 1) / spread
@@ -177,8 +180,12 @@ class _Directions:
 
 def _star_sums(
     projection: Projection, chips: list[int], tried: Sequence[_Directions]
-) -> list[tuple[Float, float]]:
-    """Covariance of the scores of each family, from those of single stars, and how it scatters."""
+) -> list[tuple[Float, float, float]]:
+    """Covariance of the scores of each family, from those of single stars.
+
+    Also how it scatters, and the fraction of the noise that fit and step have taken from the stars
+    that it is made of.
+    """
     if not tried:
         return []
     sample = projection.sample
@@ -190,13 +197,15 @@ def _star_sums(
     seen = [np.zeros((one.q, one.q)) for one in tried]
     by_star = np.zeros((0 if single else n_stars, len(together.step)))
     trace, norm = np.zeros((2, n_stars, len(tried)))
+    taken = np.zeros(len(tried))
     blocks = [block for block in sample.blocks if block.chip in chips]
     all_chips = len(blocks) == len(sample.blocks)
     for block in blocks:
         coefficients = projection.regressor_map(block, together.columns) @ together.basis
         F = projection.functions.at(block.rows)
         x = np.stack([F.T @ coefficients[axis] for axis in (0, 1)])
-        psi, both = together.left_scores(projection, block, x)
+        psi, both, lost = together.left_scores(projection, block, x)
+        taken += lost
         star = sample.star[block.rows]
         if single:
             trace[star], norm[star] = both
@@ -220,7 +229,8 @@ def _star_sums(
         else:  # what other chips and priors say, through the frames: little
             V[k] += projection.score_ratio * (np.eye(one.q) - seen[k])
     spread = (trace**2 + norm**2).sum(axis=0)
-    return [(one, float(many)) for one, many in zip(V, spread, strict=True)]
+    taken /= trace.sum(axis=0)
+    return [(one, float(a), float(b)) for one, a, b in zip(V, spread, taken, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,11 +261,13 @@ class _Together:
             np.cumsum([0, *(one.q for one in tried[:-1])]),
         )
 
-    def left_scores(self, projection: Projection, block: Block, x: Float) -> tuple[Float, Float]:
+    def left_scores(
+        self, projection: Projection, block: Block, x: Float
+    ) -> tuple[Float, Float, Float]:
         """Scores (n, q) of detections when each family by itself is fitted too.
 
         Also trace and norm (2, n, families) of the information that each detection has of the
-        directions x (2, n, q).
+        directions x (2, n, q), and the sum (families,) of what fit and step take, times the trace.
         """
 
         def of_families(values: Float) -> Float:
@@ -272,10 +284,12 @@ class _Together:
         leverage = projection.leverage[:, block.rows, None] + np.stack(
             [np.where(uu > 0, G_uu, 0.0), np.where(vv > 0, G_vv, 0.0)]
         )
-        g = g / np.sqrt(1.0 - np.minimum(leverage, LARGEST_LEVERAGE))
+        leverage = np.minimum(leverage, LARGEST_LEVERAGE)
+        g = g / np.sqrt(1.0 - leverage)
         family = np.repeat(np.arange(len(self.starts)), np.diff([*self.starts, len(self.step)]))
         psi = g[0][:, family] * x[0] + g[1][:, family] * x[1]
-        return psi, np.stack([G_uu + G_vv, np.sqrt(G_uu**2 + 2 * G_uv**2 + G_vv**2)])
+        lost = (leverage[0] * G_uu + leverage[1] * G_vv).sum(axis=0)
+        return psi, np.stack([G_uu + G_vv, np.sqrt(G_uu**2 + 2 * G_uv**2 + G_vv**2)]), lost
 
 
 def independent_directions(whole: Float, left: Float, least: float) -> Float:

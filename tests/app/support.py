@@ -160,6 +160,16 @@ def toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
+# what verdicts ask for: the catalogue of a simulation is exact
+EXACT = {
+    "name": "reference catalogue",
+    "kind": "random",
+    "sigma_u": 0.0,
+    "sigma_v": 0.0,
+    "source": "exact in the simulation",
+}
+
+
 def config_text(**sections: Any) -> str:
     """A configuration; sections change these defaults, a section that is None is left out."""
     defaults: dict[str, Any] = {
@@ -189,7 +199,7 @@ def write_job(folder: Path, table: Table | None = None, **sections: Any) -> Path
     folder.mkdir(parents=True, exist_ok=True)
     table = as_table(simulated()[0]) if table is None else table
     table.write(folder / "stars.ecsv")
-    return write_config(folder / "config.toml", **sections)
+    return write_config(folder / "config.toml", **({"budget": [EXACT]} | sections))
 
 
 def begin_stagewise(folder: Path, config: Path, *stages: str) -> Path:

@@ -42,6 +42,12 @@ sigma_v = 0.004
 in_residuals = true
 source = "a paper"
 [[budget]]
+name = "proper motions"
+kind = "random"
+sigma_u = 0.0
+sigma_v = 0.0
+source = "stars at rest in the simulation"
+[[budget]]
 name = "aberration"
 kind = "scale"
 sigma = 4e-6
@@ -94,8 +100,10 @@ def test_the_budget_of_a_position_names_every_term_and_its_source(run):
     text = good("budget", run, "--at", 512, 128, "--magnitude", 16).out
     rows = rows_of(text)
     assert set(rows) == {
-        "coefficients", "time dependence", "aberration", "catalogue", "centroid", "total"
-    }  # fmt: skip
+        *("coefficients", "time dependence", "aberration", "catalogue", "proper motions"),
+        *("unmodelled structure in coefficients", "unmodelled structure", "centroid", "total"),
+        "exposure-to-exposure variation",
+    }
     assert rows["aberration"][0] == pytest.approx(4e-6 * 256, rel=5 / np.sqrt(2 * 2000))
     # the scatter holds the catalogue: what is left is the centroid's, to some 5 % in bins of 60
     assert rows["centroid"][0] == pytest.approx(np.sqrt(SIGMA**2 - 0.004**2), rel=0.2)

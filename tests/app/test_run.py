@@ -25,6 +25,7 @@ from bayesdist.app import stages
 from bayesdist.app.config import parse_config
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages.report import title_of
+from bayesdist.assess.discrepancy_terms import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior, outlier_probability, residuals
@@ -246,13 +247,15 @@ def test_the_budget_adds_up(finished):
     # what files differ by is shown, and adds to no total
     files = [r["name"] for r in table if r["kind"] == "product"]
     assert files[:2] == ["sip.hdr, forward", "sip.hdr, inverse"]
-    assert list(rows) == ["coefficients", "catalogue", "centroid", *files, "total"]
+    own = ["coefficients", STRUCTURE_IN_FIT, STRUCTURE]
+    assert list(rows) == [*own, "catalogue", "centroid", *files, "total"]
     assert rows["catalogue"]["u"] == pytest.approx(0.003)
     assert rows["centroid"]["v"] == pytest.approx(0.2 / 50.0)  # 50 mas in a pixel
     for axis in ("u", "v", "radial"):
         assert table[axis].unit == "pix"
-        parts = np.array([rows[n][axis] for n in list(rows)[:3]])
-        assert rows["total"][axis] == pytest.approx(np.sqrt((parts**2).sum()), rel=1e-9)
+        parts = np.array([rows[n][axis] for n in list(rows)[:5]])
+        # draws of the parts of the model are correlated by chance
+        assert rows["total"][axis] == pytest.approx(np.sqrt((parts**2).sum()), rel=0.02)
     for row, stated in zip(table, summary_of(finished.path)["budget"], strict=True):
         assert row["radial"] == pytest.approx(stated["radial"])
 
@@ -263,11 +266,14 @@ def test_the_coefficient_term_is_the_spread_of_the_draws(finished, posterior):
     drawn = posterior.model.predict(posterior.flat, x.ravel(), y.ravel())
     rms = np.sqrt(drawn.var(axis=0).mean(axis=0))
     (row,) = [r for r in summary_of(finished.path)["budget"] if r["name"] == "coefficients"]
-    assert [row["u"], row["v"]] == pytest.approx(rms, rel=0.05)
+    # the stars' scatter stands for the quoted errors: of 400 it is known to some percent
+    assert [row["u"], row["v"]] == pytest.approx(rms, rel=0.2)
     with fits.open(finished.path / "maps.fits") as hdus:
         field = drawn.std(axis=0).reshape(7, 9, 2)
-        np.testing.assert_allclose(hdus["MIX_SIGMA_U"].data, field[..., 0], rtol=0.05)
-        np.testing.assert_allclose(hdus["MIX_SIGMA_V"].data, field[..., 1], rtol=0.05)
+        for a, axis in enumerate("UV"):
+            # with what the model may leave out
+            ratio = hdus[f"MIX_SIGMA_{axis}"].data / field[..., a]
+            assert 0.9 < np.median(ratio) < 1.7
 
 
 def test_margins_agree_in_all_places(finished):

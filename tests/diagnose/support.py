@@ -49,6 +49,7 @@ class Scene:
     noise: Callable[[np.random.Generator, int], np.ndarray] = gaussian
     fraction: float = 0.0  # of false matches
     mixture: bool = False
+    misquoted: float = 0.0  # scatter of the logarithm of quoted errors, whatever the noise is
 
     def data(self, seed: int) -> tuple[DistortionModel, MatchTable]:
         rng = np.random.default_rng([seed, self.n, self.order])
@@ -77,7 +78,11 @@ class Scene:
         uv += SIGMA * self.noise(rng, self.n)
         false = rng.uniform(size=self.n) < self.fraction
         uv[false] += 0.5 * gaussian(rng, int(false.sum()))
-        return model, table._with(u=uv[:, 0], v=uv[:, 1], colour=rng.normal(1, 0.3, self.n))
+        table = table._with(u=uv[:, 0], v=uv[:, 1], colour=rng.normal(1, 0.3, self.n))
+        if self.misquoted:
+            factors = np.exp(self.misquoted * rng.standard_normal((2, self.n)))
+            table = table.with_sigma(*(SIGMA * factors))
+        return model, table
 
     def solve(self, model: DistortionModel, table: MatchTable) -> LinearFit | Posterior:
         if self.mixture:
@@ -140,4 +145,7 @@ def scenes_of_null() -> Iterator[tuple[str, Scene]]:
     yield "frames", Scene(600, 2, "shift_rotation", 5)
     yield "chips", Scene(800, 2, "shift_rotation_scale", 4, TWO_CHIPS)
     yield "time", Scene(600, 2, "shift", 6, time=TIME)
+    yield "misquoted", Scene(500, 2, misquoted=1.0)
+    yield "nothing left", Scene(60, 1, "shift", 20)
+    yield "mostly false", Scene(600, 2, fraction=0.4, mixture=True)
     yield "many chips", Scene(1500, 1, "shift", 3, MANY_CHIPS)

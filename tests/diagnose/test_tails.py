@@ -75,10 +75,18 @@ def test_errors_quoted_too_large_are_not_taken_for_a_cut():
     assert not found.significant and found.p_value > 0.05
 
 
-@pytest.mark.parametrize("noise", [student, unequal])
-def test_long_tails_are_no_cut(noise):
-    for seed in range(5):
-        assert truncation(*Scene(1500, 2, noise=noise).fitted(seed)).p_value > 0.05
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene(1500, 2, noise=student), Scene(1500, 2, noise=unequal),
+        Scene(1500, 2, misquoted=1.0), Scene(1500, 2, fraction=0.3),
+    ],
+)  # fmt: skip
+def test_long_tails_and_wrong_errors_are_no_cut(scene):
+    """Also where a radius lies in their midst: many are beyond it."""
+    for seed in range(4):
+        for radius in (None, 2.5 * SIGMA):
+            assert truncation(*scene.fitted(seed), match_radius=radius).p_value > 0.05
 
 
 def test_a_radius_far_beyond_the_true_matches_cuts_false_ones_only():
