@@ -16,7 +16,9 @@ from .truth import SIGMA, Frame, Map, Truth, kind, mapped
 FALSE = 0.02  # fraction of detections that are displaced
 FALSE_SIGMA = 0.6  # px: by which, on each axis
 SPURIOUS = 0.02  # detections of nothing, as a fraction of the others
-DENSITY = 600 / fields.SIDE**2  # stars on a square pixel of the sky
+IN_EXPOSURE = 600  # stars
+DETECTIONS = 14 * IN_EXPOSURE
+LEAST_EXPOSURES = 4
 MOST_STEPS = 500  # of the sampler
 STEPS = (200.0, 600.0)  # px: of the dithers
 ROLLS = ((0.0, 60.0), (0.0, 90.0), (0.0, 60.0, 130.0))  # degrees
@@ -59,7 +61,7 @@ def dithered(
     ----------
     rng : numpy.random.Generator
     n : int
-        Exposures.
+        Detections, about so many.
     true_map : callable
     deviations : callable, optional
         Of scale and shears of the exposures.
@@ -70,8 +72,9 @@ def dithered(
     years : float
         From the first exposure to the last; without them exposures have no dates.
     """
+    n = max(LEAST_EXPOSURES, round(n / IN_EXPOSURE))
     frames, reach = dithers(rng, n), 2600.0
-    sky = rng.uniform(-reach, reach, (int(DENSITY * (2 * reach) ** 2), 2))
+    sky = rng.uniform(-reach, reach, (int(IN_EXPOSURE * (2 * reach / fields.SIDE) ** 2), 2))
     mag = magnitudes(rng, len(sky))
     moving = motions * rng.standard_normal(sky.shape)
     own = None if deviations is None else deviations(rng, n)
@@ -119,41 +122,41 @@ def dithered(
     return Truth(stars, true_map, config, None, frames, dates)
 
 
-@kind("selfcal_inside", n=14, inside=True)
+@kind("selfcal_inside", n=DETECTIONS, inside=True)
 def inside(rng: np.random.Generator, n: int) -> Truth:
     """What is fitted is what is true."""
     return dithered(rng, n, mapped(small_distortion(rng)))
 
 
-@kind("selfcal_one_order_more_3", *ORDER, n=14, rms=0.003)
-@kind("selfcal_one_order_more_10", *ORDER, n=14, rms=0.010)
+@kind("selfcal_one_order_more_3", *ORDER, n=DETECTIONS, rms=0.003)
+@kind("selfcal_one_order_more_10", *ORDER, n=DETECTIONS, rms=0.010)
 def one_order_more(rng: np.random.Generator, n: int, rms: float) -> Truth:
     """The truth has order 4 as well."""
     more = fields.of_rms(fields.random_polynomial(rng, {4: 1.0}), rms)
     return dithered(rng, n, mapped(small_distortion(rng), more))
 
 
-@kind("selfcal_smooth_270", *STRUCTURE, n=14)
+@kind("selfcal_smooth_270", *STRUCTURE, n=DETECTIONS)
 def smooth(rng: np.random.Generator, n: int) -> Truth:
     """A Gaussian random field beside the polynomial."""
     more = fields.smooth(rng, 270, 0.004)
     return dithered(rng, n, mapped(small_distortion(rng), more))
 
 
-@kind("selfcal_lithography_300", *STRUCTURE, n=14)
+@kind("selfcal_lithography_300", *STRUCTURE, n=DETECTIONS)
 def lithography(rng: np.random.Generator, n: int) -> Truth:
     """Columns and rows are displaced periodically."""
     more = fields.ridges(rng, 300.0, 0.004)
     return dithered(rng, n, mapped(small_distortion(rng), more))
 
 
-@kind("selfcal_breathing_t", *OF_EXPOSURES, n=14)
+@kind("selfcal_breathing_t", *OF_EXPOSURES, n=DETECTIONS)
 def breathing(rng: np.random.Generator, n: int) -> Truth:
     """Scale and shears vary from exposure to exposure."""
     return dithered(rng, n, mapped(small_distortion(rng)), deviations=heavy_deviations)
 
 
-@kind("selfcal_charge_trails", *OF_MAGNITUDE, "charge transfer", "cte", n=14)
+@kind("selfcal_charge_trails", *OF_MAGNITUDE, "charge transfer", "cte", n=DETECTIONS)
 def charge_trails(rng: np.random.Generator, n: int) -> Truth:
     """Trails draw stars along y, 0.005 px per magnitude fainter than the brightest at full
     distance from the amplifier; the true map is that of stars without trails."""
@@ -165,7 +168,7 @@ def charge_trails(rng: np.random.Generator, n: int) -> Truth:
     return dithered(rng, n, mapped(small_distortion(rng)), displaced=trail)
 
 
-@kind("selfcal_motions", *OF_MOTIONS, *OF_EXPOSURES, n=14)
+@kind("selfcal_motions", *OF_MOTIONS, *OF_EXPOSURES, n=DETECTIONS)
 def motions(rng: np.random.Generator, n: int) -> Truth:
     """Stars move by 0.004 px a year over six years, and are taken to stand still."""
     return dithered(rng, n, mapped(small_distortion(rng)), motions=0.004, years=6.0)
