@@ -42,6 +42,13 @@ clip_abs = 3.0               # pixels: the match circle in the corners
 [assess]
 grid = [33, 33]
 
+[[budget]]
+name = "reference catalogue"
+kind = "random"
+sigma_u = 0.0                # the simulation's is exact; of 2MASS state yours
+sigma_v = 0.0
+source = "simulation"
+
 [[requirement]]
 name = "worst corner"
 statistic = "max"
