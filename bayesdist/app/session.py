@@ -196,7 +196,15 @@ class Session:
         shards = self.__dict__.get("shards")
         if shards is not None:
             shards.close()
-        for name in ("matches", "magnitude_errors", "shards", "sums", "stars", "misfits"):
+        for name in (
+            "matches",
+            "magnitude_errors",
+            "shards",
+            "sums",
+            "stars",
+            "misfits",
+            "_sample",
+        ):
             self.__dict__.pop(name, None)
 
     def close(self) -> None:
@@ -295,7 +303,7 @@ class Session:
     def made_score_tests(self) -> tuple[ScoreTest, ...]:
         """Targeted tests of the residuals for what the model lacks."""
         return score_tests(
-            self.matches.sample(SAMPLE),
+            self._sample,
             self.posterior,
             priors=self.priors,
             match_radius=self.config.outliers.match_radius,
@@ -462,7 +470,12 @@ class Session:
 
     def _sampled(self) -> StarSample:
         matches = self.matches
-        return star_sample(matches.sample(SAMPLE), len(matches), self.fit, self.posterior)
+        return star_sample(self._sample, len(matches), self.fit, self.posterior)
+
+    @cached_property
+    def _sample(self) -> MatchTable:
+        """Some of the matches, or all."""
+        return self.matches.sample(SAMPLE)
 
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""

@@ -65,7 +65,7 @@ def open_rvb(
     found = files[0].found
     named = {key: found.get(key, "") for key in ALIASES}
     # frames and bands may share their names with other quantities of a table of matches
-    named |= {"ra": "", "dec": "", "chip": "", "filter": found.get("band", "")}
+    named |= {"ra": "", "dec": "", "chip": "", "colour": "", "filter": found.get("band", "")}
     return open_matches(path, columns=named, unit=unit, sigma=sigma, pixel_origin=pixel_origin)
 
 

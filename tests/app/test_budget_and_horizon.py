@@ -154,7 +154,7 @@ def test_the_horizon_is_said_written_and_drawn(run):
 def test_exposures_after_the_data_are_worth_more_than_early_ones(run):
     req = run.parent / "late.toml"
     req.write_text(
-        '[[requirement]]\nname = "late"\nstatistic = "max"\nlimit = 0.02\nepoch = 2025.0\n'
+        '[[requirement]]\nname = "late"\nstatistic = "max"\nlimit = 0.04\nepoch = 2025.0\n'
     )
     cli("validate", run, "--requirements", req, "-q")
     text = good("plan", run, "--epochs", 2009.0, 2013.0, 2020.0).out

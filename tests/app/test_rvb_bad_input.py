@@ -11,7 +11,7 @@ import pytest
 from astropy.table import Table, vstack
 
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs
-from tests.app.support import cli, good, refused, summary_of
+from tests.app.support import EXACT, cli, good, refused, summary_of
 
 W1 = {"detector": DETECTORS["W1"]}
 
@@ -165,7 +165,12 @@ REQUIREMENTS = [
 def believed(tmp_path, table: Table, **sections: Any) -> dict[str, Any]:
     """The summary of a run, whose screen and file of margins say the same."""
     config = rvb_job(
-        tmp_path / "job", table, model={"order": 4}, requirement=REQUIREMENTS, **sections
+        tmp_path / "job",
+        table,
+        model={"order": 4},
+        requirement=REQUIREMENTS,
+        budget=[EXACT],
+        **sections,
     )
     result = good("run", config, "-o", tmp_path / "run")
     summary = summary_of(tmp_path / "run")

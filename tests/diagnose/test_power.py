@@ -42,8 +42,8 @@ def test_terms_of_the_next_order_are_found(scene):
     name = f"order {scene.order + 1}"
     assert median_p(found, name) < 1e-6
     assert sizes(found, name) == pytest.approx(rms, rel=0.25)
-    # and no other test speaks for it
-    others = [t for one in found for t in one.values() if t.name != name]
+    # and no other test speaks for it, but that of the edges, where such terms are largest
+    others = [t for one in found for t in one.values() if t.name not in (name, "edges")]
     assert not any(one.significant for one in others)
 
 

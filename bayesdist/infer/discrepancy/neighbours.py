@@ -131,7 +131,8 @@ def _shared(
         np.bincount(bins, w, minlength=len(EDGES) - 1).astype(float)
         for w in (None, weight, product, separation)
     )
-    if count[-1] < FEWEST_PAIRS:
+    # without pairs that say anything nothing is compared
+    if count[-1] < FEWEST_PAIRS or not (total > 0).all():
         return None
     mean = together / np.maximum(total, 1e-300)
     scatter = np.bincount(bins, (product - mean[bins] * weight) ** 2, minlength=len(count))
