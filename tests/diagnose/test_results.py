@@ -66,11 +66,17 @@ def test_every_question_has_a_row_where_the_data_can_be_asked():
     always |= {"noise by position", "noise by magnitude", "noise by axis"}
     assert set(one.tests(1)) == always
     several = {"exposures", "noise by exposure"}
-    assert set(Scene(1500, 2, "shift", 5).tests(1)) == always | several | {"drift", "magnitude in time"}
+    assert set(Scene(1500, 2, "shift", 5).tests(1)) == always | several | {
+        "drift",
+        "magnitude in time",
+    }
     timed = {"drift", "curvature in time", "magnitude in time"}
     assert set(Scene(1500, 2, "shift", 5, time=TIME).tests(1)) == always | several | timed
     # frames that fit all linear terms leave no deviations, and no drift
-    assert set(Scene(1500, 2, "affine", 5).tests(1)) == always | {"noise by exposure"}
+    assert set(Scene(1500, 2, "affine", 5).tests(1)) == always | {
+        "noise by exposure",
+        "magnitude in time",
+    }
     model, table = one.data(1)
     fit = one.solve(model, table)
     bare = table._with(mag=None, colour=np.ones(len(table)))
