@@ -187,6 +187,8 @@ class Outliers(Section):
     match_radius: PositiveFloat | None = None
     jitter: Literal["fit"] | Annotated[float, Field(ge=0)] = "fit"
     fraction_prior: Pair = (1.0, 9.0)
+    jitter_scale: PositiveFloat | None = None
+    outlier_scale: PositiveFloat | None = None
 
 
 class Sampler(Section):
@@ -435,6 +437,7 @@ class Config(Section):
                 None,
                 "set selfcal.match_radius",
             ),
+            "outliers.outlier_scale": (self.outliers.outlier_scale, None, "leave it out"),
             "sampler.method": (self.sampler.method, "exact", "leave it out"),
             "sampler.walkers": (self.sampler.walkers, None, "leave it out"),
             "sampler.second_stage": (self.sampler.second_stage, "auto", "leave it out"),
@@ -595,6 +598,8 @@ class Config(Section):
             match_radius=o.match_radius if self.selfcal is None else self.selfcal.match_radius,
             jitter=None if o.jitter == "fit" else o.jitter,
             fraction_prior=o.fraction_prior,
+            jitter_scale=o.jitter_scale,
+            outlier_scale=o.outlier_scale,
         )
 
     def spans(self) -> dict[str, tuple[float, float]]:

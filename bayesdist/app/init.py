@@ -60,7 +60,9 @@ target_rhat = 1.01
 grid = [33, {grid_y}]                 # points on x and y
 # epoch = 2006.5
 
-# [[budget]]                    # errors that the data cannot show: random | systematic
+# Errors that the data cannot show: random | systematic.  No requirement is called met before one
+# of them is the reference catalogue's, of size 0 with its source where it has none.
+# [[budget]]
 # name = "reference catalogue"
 # kind = "systematic"
 # sigma_u = 0.02

@@ -8,8 +8,9 @@ are known, both parts are normalised on it, and f is the fraction of false match
 are log j, logit f and log s_out; the priors are proper:
 
     f      Beta(a, b)
-    j      half-Student-t, four degrees of freedom, scale: the median quoted error
-    s_out  inverse gamma on s_out^2, shape 1; log s_out is most probable at five such errors
+    j      half-Student-t, four degrees of freedom, scale: the median quoted error by default
+    s_out  inverse gamma on s_out^2, shape 1; log s_out is most probable at five such errors by
+           default
 
 All three leave tails in the sampled coordinates that fall at least exponentially, so that the
 posterior stays proper where the data say nothing: j when the quoted errors are right, s_out when
@@ -58,17 +59,25 @@ class OutlierMixture:
         Extra error j in the unit of u, v; None samples it.
     fraction_prior : tuple of float
         Parameters (a, b) of the Beta prior of f.
+    jitter_scale : float, optional
+        Scale of the prior of j in the unit of u, v; by default the median quoted error.
+    outlier_scale : float, optional
+        Most probable s_out of 'gaussian' outliers beforehand, in the unit of u, v; by default five
+        median quoted errors.
 
     Raises
     ------
     InputError
-        For an unknown model, a missing radius, a negative jitter, or an improper prior.
+        For an unknown model, a missing radius, a negative jitter, an improper prior, or the prior
+        of what is not sampled.
     """
 
     model: str = "gaussian"
     match_radius: float | None = None
     jitter: float | None = None
     fraction_prior: tuple[float, float] = (1.0, 9.0)
+    jitter_scale: float | None = None
+    outlier_scale: float | None = None
 
     def __post_init__(self) -> None:
         if self.model not in ("gaussian", "uniform", "none"):
@@ -100,6 +109,21 @@ class OutlierMixture:
                 where="outliers.fraction_prior",
                 do="give two positive numbers",
             )
+        sampled = {"jitter_scale": "j", "outlier_scale": "s_out"}
+        for key, name in sampled.items():
+            value = getattr(self, key)
+            if value is None:
+                continue
+            if not 0 < value < np.inf:
+                raise InputError(
+                    f"{key} is {value}", where=f"outliers.{key}", do="give a positive number"
+                )
+            if name not in self.hyper:
+                raise InputError(
+                    f"{key} is the prior of {name}, which is not fitted",
+                    where=f"outliers.{key}",
+                    do="leave it out",
+                )
 
     @property
     def hyper(self) -> tuple[str, ...]:
@@ -132,7 +156,7 @@ class Hyper:
     ----------
     mixture : OutlierMixture
     scale : float
-        Median quoted error: the scale of the priors.
+        Median quoted error: the scale of the priors, where the mixture gives none.
     """
 
     mixture: OutlierMixture
@@ -186,9 +210,9 @@ class Hyper:
                 norm = gammaln(a + b) - gammaln(a) - gammaln(b)
                 out = out + a * log_expit(t) + b * log_expit(-t) + norm
             elif name == "j":
-                z2 = np.exp(2 * (t - np.log(self.scale)))
+                z2 = np.exp(2 * (t - np.log(self._jitter_scale)))
                 norm = gammaln((T_DOF + 1) / 2) - gammaln(T_DOF / 2)
-                norm += np.log(2 / self.scale) - 0.5 * np.log(np.pi * T_DOF)
+                norm += np.log(2 / self._jitter_scale) - 0.5 * np.log(np.pi * T_DOF)
                 out = out + t + norm - (T_DOF + 1) / 2 * np.log1p(z2 / T_DOF)
             else:
                 a, b = OUTLIER_SHAPE, self._outlier_rate
@@ -197,8 +221,12 @@ class Hyper:
         return out
 
     @property
+    def _jitter_scale(self) -> float:
+        return self.mixture.jitter_scale or self.scale
+
+    @property
     def _outlier_rate(self) -> float:
-        return OUTLIER_SHAPE * (OUTLIER_MODE * self.scale) ** 2
+        return OUTLIER_SHAPE * (self.mixture.outlier_scale or OUTLIER_MODE * self.scale) ** 2
 
     def prior_terms(self, h: Float) -> tuple[Float, Float]:
         """Gradient and minus the (diagonal) Hessian of the log prior at one point."""
@@ -210,7 +238,7 @@ class Hyper:
                 gradient[k] = a * (1 - f) - b * f
                 curvature[k] = (a + b) * f * (1 - f)
             elif name == "j":
-                z2 = np.exp(2 * (h[k] - np.log(self.scale)))
+                z2 = np.exp(2 * (h[k] - np.log(self._jitter_scale)))
                 gradient[k] = 1 - (T_DOF + 1) * z2 / (T_DOF + z2)
                 curvature[k] = (T_DOF + 1) * 2 * T_DOF * z2 / (T_DOF + z2) ** 2
             else:
@@ -227,7 +255,7 @@ class Hyper:
                 f = rng.beta(*self.mixture.fraction_prior, size=n)
                 columns.append(logit(np.clip(f, 1e-300, 1 - 1e-16)))
             elif name == "j":
-                columns.append(np.log(self.scale * np.abs(rng.standard_t(T_DOF, size=n))))
+                columns.append(np.log(self._jitter_scale * np.abs(rng.standard_t(T_DOF, size=n))))
             else:
                 precision = rng.gamma(OUTLIER_SHAPE, 1 / self._outlier_rate, size=n)
                 columns.append(-0.5 * np.log(precision))

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from bayesdist.assess.misfit import Misfit
     from bayesdist.assess.periods import TimeVariation
     from bayesdist.data import MagnitudeErrors
+    from bayesdist.diagnose import ScoreTest
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.model import Chip
     from bayesdist.report.campaign.context import CampaignResults
@@ -161,6 +162,8 @@ class ReportInput:
     misfits : tuple of Misfit
         Structure that the fit leaves in the residuals of each chip; a campaign's are among its own
         results.
+    score_tests : tuple of ScoreTest
+        What the residuals were asked, and what they say.
     magnitude_errors : MagnitudeErrors or None
         Errors by magnitude, where the stars carried none.
     flagged : ndarray of int, shape (E,), or None
@@ -192,6 +195,7 @@ class ReportInput:
     products: tuple[Product, ...] = ()
     warnings: tuple[str, ...] = ()
     misfits: tuple[Misfit, ...] = ()
+    score_tests: tuple[ScoreTest, ...] = ()
     magnitude_errors: MagnitudeErrors | None = None
     flagged: NDArray[np.int64] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -192,13 +192,16 @@ def _contents(inputs: ReportInput, images: Mapping[str, bytes]) -> dict[str, Any
             "holdout": holdout_tables(inputs.held_out),
             "data": tables.data_tables(inputs),
             "selfcal": selfcal_tables(inputs),
-            "fit": tables.fit_tables(inputs),
+            "fit": (*tables.fit_tables(inputs), *_present(tables.score_test_table(inputs))),
             "outliers": _present(tables.outlier_table(inputs)),
             "coefficients": tables.coefficient_tables(inputs),
             "maps": (tables.map_table(inputs),),
             "periods": period_tables(inputs),
             "budget": _present(tables.budget_table(inputs)),
-            "margins": _present(tables.margin_table(inputs)),
+            "margins": (
+                *_present(tables.margin_table(inputs)),
+                *_present(tables.rests_on_table(inputs)),
+            ),
             "provenance": (
                 *tables.provenance_tables(inputs),
                 *_present(tables.config_table(inputs)),

@@ -1,4 +1,4 @@
-"""Reliability: how often requirements are met, against how often it is said."""
+"""Reliability: how often requirements are met, against how often it is said; ranks of truths."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from bayesdist.report.style import CYCLE, WIDTH, figure_style, new_figure
 
-from .summary import reliability
+from .summary import WITHIN, reliability, simultaneous_band
 
 TITLES = {
     "drift": "Drift, extrapolated by five years",
@@ -52,4 +52,40 @@ def reliability_figure(found: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Fi
         axes[0].plot([], [], "o", color=CYCLE[1], ms=5, label="share (number: calibrations)")
         axes[0].plot([], [], color=CYCLE[0], lw=5, alpha=0.22, label="99 % binomial band")
         axes[0].legend(loc="lower right")
+    return fig
+
+
+BINS = 10
+
+
+def ranks_figure(found: Mapping[str, np.ndarray]) -> Figure:
+    """Histograms of ranks of three kinds of quantities, and all distributions less an even one."""
+    kinds = {
+        "coefficients": [r for name, r in found.items() if "_" in name],
+        "positions": [r for name, r in found.items() if " at " in name],
+        "rms, 95th percentile, maximum": [found[s] for s in ("rms", "p95", "max")],
+    }
+    n = len(found["rms"])
+    with figure_style():
+        fig = new_figure(WIDTH, 4.6)
+        upper, lower = fig.subplots(2, 3, sharey="row")
+        z = np.linspace(*WITHIN, 97)
+        band = simultaneous_band(n, 0.95) * np.sqrt(z * (1 - z) / n)
+        for top, below, (kind, ranks) in zip(upper, lower, kinds.items(), strict=True):
+            counts, edges = np.histogram(np.concatenate(ranks), np.linspace(0, 1, BINS + 1))
+            total = counts.sum()
+            top.bar(edges[:-1], counts / total, 1 / BINS, align="edge", color=CYCLE[0], alpha=0.5)
+            top.axhline(1 / BINS, color="#9AA5B1", lw=0.8)
+            top.set_title(f"{len(ranks)} {kind}" if len(ranks) > 3 else kind)
+            top.set_xlabel("rank of the truth")
+            below.fill_between(z, -band, band, color=CYCLE[0], alpha=0.22, lw=0)
+            for one in ranks:
+                shares = np.mean(one[:, None] <= z, axis=0)
+                below.plot(z, shares - z, color=CYCLE[1], lw=0.7, alpha=0.7)
+            below.axhline(0, color="#9AA5B1", lw=0.8)
+            below.set_xlabel("rank z")
+        upper[0].set_ylabel("share of truths")
+        lower[0].set_ylabel("share of ranks below z, less z")
+        lower[0].plot([], [], color=CYCLE[0], lw=5, alpha=0.22, label="95 %, all z at once")
+        lower[0].legend(loc="lower right")
     return fig

@@ -13,9 +13,11 @@ import numpy as np
 
 from .limits import limits_from, pilot, said_and_true
 from .places import covered
+from .ranks import ranks
 
 CAMPAIGNS = {True: 24, False: 3}  # of each kind, in full and reduced
 CALIBRATIONS = {True: 200, False: 12}
+TRUTHS = {True: 200, False: 12}  # from the priors
 JUDGED = ("drift", "pattern")
 PILOTS = {True: 8, False: 2}
 
@@ -41,3 +43,9 @@ def probabilities(kind: str, *, full: bool) -> tuple[np.ndarray, np.ndarray]:
     found = over(partial(said_and_true, kind), list(zip(limits, seeds, strict=True)), full=full)
     said, met = np.array(found, float).T
     return said, met
+
+
+def all_ranks(*, full: bool) -> dict[str, np.ndarray]:
+    """Ranks of each quantity among the draws, one for each truth from the priors."""
+    found = over(ranks, [(k,) for k in range(TRUTHS[full])], full=full)
+    return {name: np.array([one[name] for one in found]) for name in found[0]}

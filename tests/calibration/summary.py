@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.stats import binom
@@ -117,3 +118,22 @@ def reliability(said: np.ndarray, met: np.ndarray) -> list[Bin]:
 def excess(said: np.ndarray, met: np.ndarray) -> float:
     """How many more meet their limits than is said, in standard deviations of chance."""
     return float((met - said).sum() / np.sqrt((said * (1 - said)).sum()))
+
+
+WITHIN = (0.02, 0.98)  # ranks over which evenness is looked at
+
+
+def farthest(ranks: np.ndarray) -> float:
+    """Largest distance of the ranks' distribution (..., n) from an even one, in its own errors."""
+    n = ranks.shape[-1]
+    z = np.linspace(*WITHIN, 97)
+    shares = np.mean(ranks[..., None] <= z, axis=-2)
+    distance = np.abs(shares - z) / np.sqrt(z * (1 - z) / n)
+    return distance.max(axis=-1)
+
+
+@cache
+def simultaneous_band(n: int, probability: float) -> float:
+    """What `farthest` of n even ranks stays below with this probability."""
+    rng = np.random.default_rng(n)
+    return float(np.quantile(farthest(rng.uniform(size=(20_000, n))), probability))

@@ -263,6 +263,23 @@ def test_prior_of_the_outlier_scale():
     np.testing.assert_allclose(s_out_prior(t), expected, atol=1e-9)
 
 
+def test_scales_of_priors_are_those_that_are_given():
+    hyper = OutlierMixture("gaussian", jitter_scale=0.3, outlier_scale=4.0).bind(SCALE)
+    h = np.random.default_rng(2).uniform(-4, 3, (30, 3))
+    log_j, f, log_s = h.T
+    expected = np.log(2) + stats.t(4, scale=0.3).logpdf(np.exp(log_j)) + log_j
+    expected += stats.beta(1, 9).logpdf(expit(f)) + np.log(expit(f) * expit(-f))
+    expected += stats.invgamma(1, scale=16.0).logpdf(np.exp(2 * log_s)) + np.log(2) + 2 * log_s
+    np.testing.assert_allclose(hyper.log_prior(h), expected, rtol=1e-9, atol=1e-9)
+    gradient, _ = hyper.prior_terms(h[0])
+    np.testing.assert_allclose(
+        gradient, numerical_gradient(hyper.log_prior, h[0], 1e-3), rtol=1e-6, atol=1e-8
+    )
+    drawn = hyper.values(hyper.draw_prior(20_000, np.random.default_rng(3)))
+    assert stats.kstest(drawn["j"], lambda x: 2 * stats.t(4, scale=0.3).cdf(x) - 1).pvalue > 1e-3
+    assert np.median(drawn["s_out"]) == pytest.approx(4 / np.sqrt(np.log(2)), rel=0.05)
+
+
 def test_draws_follow_the_priors():
     hyper = OutlierMixture("gaussian", fraction_prior=(2.0, 30.0)).bind(SCALE)
     draws = hyper.values(hyper.draw_prior(20_000, np.random.default_rng(3)))
@@ -306,6 +323,10 @@ def test_prior_derivatives_by_differences(hyper):
         ({"fraction_prior": (0.0, 9.0)}, r"outliers\.fraction_prior"),
         ({"fraction_prior": (0.3, 9.0)}, r"outliers\.fraction_prior"),
         ({"fraction_prior": (1.0, np.nan)}, r"outliers\.fraction_prior"),
+        ({"jitter_scale": 0.0}, r"outliers\.jitter_scale"),
+        ({"jitter_scale": 0.1, "jitter": 0.0}, r"outliers\.jitter_scale.*not fitted"),
+        ({"outlier_scale": np.inf}, r"outliers\.outlier_scale"),
+        ({"outlier_scale": 1.0, "model": "none"}, r"outliers\.outlier_scale.*not fitted"),
     ],
     ids=str,
 )

@@ -21,7 +21,6 @@ from bayesdist.app.stages.assess import run_assess
 from bayesdist.app.stages.fit import summarise_fit
 from bayesdist.app.stages.sample import keep_posterior
 from bayesdist.infer import Posterior, save_fit
-from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.selfcal import sample_selfcal
 from bayesdist.infer.selfcal.calibrate import gauge_of
 from bayesdist.infer.selfcal.solve import solve
@@ -95,6 +94,7 @@ def _sample(session: SelfcalSession) -> None:
         session.solved,
         jitter=session.jitter,
         fraction_prior=config.outliers.fraction_prior,
+        jitter_scale=config.outliers.jitter_scale,
         seed=s.seed,
         ensembles=s.ensembles,
         target_ess=s.target_ess,
@@ -112,11 +112,13 @@ def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
     m, hyper = posterior.mixture, dict(posterior.hyper)
     if "j" in hyper:
         hyper["j"] = pixel * hyper["j"]
-    assert m.match_radius is not None
-    jitter = None if m.jitter is None else pixel * m.jitter
+    lengths = {
+        key: None if (value := getattr(m, key)) is None else pixel * value
+        for key in ("match_radius", "jitter", "jitter_scale")
+    }
     return replace(
         posterior,
-        mixture=OutlierMixture("uniform", pixel * m.match_radius, jitter, m.fraction_prior),
+        mixture=replace(m, **lengths),
         hyper=hyper,
         reference_sigma=pixel * posterior.reference_sigma,
     )

@@ -98,6 +98,7 @@ def _inputs(session: Session, hand: Hand | None) -> ReportInput:
         products=products,
         warnings=tuple(posterior_warnings(session)),
         misfits=() if isinstance(session, CampaignSession) else session.misfits,
+        score_tests=session.score_tests,
         periods=periods_of(session),
         held_out=held_out_of(session),
         magnitude_errors=session.magnitude_errors,

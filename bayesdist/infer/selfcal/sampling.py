@@ -34,6 +34,7 @@ def sample_selfcal(
     *,
     jitter: float | None = None,
     fraction_prior: tuple[float, float] = (1.0, 9.0),
+    jitter_scale: float | None = None,
     seed: int = 1,
     ensembles: int = 4,
     target_ess: float = 400.0,
@@ -52,6 +53,8 @@ def sample_selfcal(
         Held at this, in pixels; sampled by default.
     fraction_prior : tuple of float
         As `OutlierMixture`.
+    jitter_scale : float, optional
+        As `OutlierMixture`, in pixels.
     seed, ensembles, target_ess, target_rhat, max_steps, checkpoint_every, folder, progress
         As `sample`.
 
@@ -71,7 +74,7 @@ def sample_selfcal(
             f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
         )
     started = time.monotonic()
-    target = SelfTarget(solution, jitter, fraction_prior)
+    target = SelfTarget(solution, jitter, fraction_prior, jitter_scale)
     proposal = propose(target)
     seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
     settings = Settings(
@@ -82,7 +85,13 @@ def sample_selfcal(
         checkpoint_every=checkpoint_every,
         folder=None if folder is None else Path(folder),
         fingerprint=_fingerprint(
-            solution, jitter, fraction_prior, seed, ensembles, checkpoint_every
+            solution,
+            jitter,
+            fraction_prior,
+            jitter_scale,
+            seed,
+            ensembles,
+            checkpoint_every,
         ),
         progress=progress,
     )

@@ -32,11 +32,14 @@ class SelfTarget:
         Held at this; sampled by default.
     fraction_prior : tuple of float
         Parameters (a, b) of the Beta prior of the share of false detections.
+    jitter_scale : float, optional
+        Of the prior of the jitter, in pixels; by default the typical error of a detection.
     """
 
     solution: Solution
     jitter: float | None = None
     fraction_prior: tuple[float, float] = (1.0, 9.0)
+    jitter_scale: float | None = None
 
     @property
     def problem(self) -> Problem:
@@ -52,7 +55,9 @@ class SelfTarget:
     def mixture(self) -> OutlierMixture:
         """Uniform false detections, in pixels."""
         radius = self.problem.match_radius
-        return OutlierMixture("uniform", radius, self.jitter, self.fraction_prior)
+        return OutlierMixture(
+            "uniform", radius, self.jitter, self.fraction_prior, self.jitter_scale
+        )
 
     @cached_property
     def hyper(self) -> Hyper:

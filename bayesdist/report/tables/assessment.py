@@ -17,7 +17,7 @@ from bayesdist.report.tables.text import TextTable, marked
 
 AS_ABOVE = "as above"  # of the rows of single chips
 
-__all__ = ["budget_table", "map_table", "margin_table"]
+__all__ = ["budget_table", "map_table", "margin_table", "rests_on_table"]
 
 
 def map_table(inputs: ReportInput) -> TextTable:
@@ -143,6 +143,21 @@ def margin_table(inputs: ReportInput) -> TextTable | None:
         note="Margin: the limit minus the value that the statistic stays under with the probability"
         f" asked for. {gauge_of_new_exposure(inputs)}".rstrip(),
     )
+
+
+def rests_on_table(inputs: ReportInput) -> TextTable | None:
+    """What the verdicts take for granted or have measured."""
+    clauses: dict[str, list[str]] = {}
+    for m in inputs.margins:
+        for clause in m.rests_on:
+            clauses.setdefault(clause, []).append(m.requirement.name)
+    if not clauses:
+        return None
+    every = len(inputs.margins)
+    rows = tuple(
+        (clause, "all" if len(of) == every else ", ".join(of)) for clause, of in clauses.items()
+    )
+    return TextTable("What the verdicts rest on", ("", "Requirements"), rows, words=(0, 1))
 
 
 def _judgement(m: Margin, several: bool) -> str:

@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess import residual_statistics
+from bayesdist.diagnose.result import FAMILY_LEVEL, POWER
 from bayesdist.infer.skew import skew_of
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numerals import MISSING, count, interval, number, rounded
 from bayesdist.report.scales import Scale, display_scale, with_mas
 from bayesdist.report.tables.text import TextTable, listing, marked
 
-__all__ = ["fit_tables", "outlier_table"]
+__all__ = ["fit_tables", "outlier_table", "score_test_table"]
 
 
 def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
@@ -53,6 +54,43 @@ def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
             tuple(rows),
             note=_residual_note(inputs),
         ),
+    )
+
+
+def score_test_table(inputs: ReportInput) -> TextTable | None:
+    """What the residuals were asked, and what they say; None where they were not."""
+    if not inputs.score_tests:
+        return None
+    scale = display_scale(
+        inputs.unit, [t.smallest for t in inputs.score_tests if np.isfinite(t.smallest)] or [1.0]
+    )
+    rows = tuple(
+        (
+            t.name,
+            f"{number(t.statistic, 3)} of {number(t.dof, 3)}",
+            "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
+            number(t.size * scale.factor, 2),
+            number(t.smallest * scale.factor, 2) if np.isfinite(t.smallest) else MISSING,
+            f"found: {t.remedy}" if t.significant else "nothing found",
+        )
+        for t in inputs.score_tests
+    )
+    return TextTable(
+        "Score tests of the residuals",
+        (
+            "Test",
+            "Statistic, expected",
+            "p",
+            f"Size [{scale.unit}]",
+            f"Would have seen [{scale.unit}]",
+            "Result",
+        ),
+        rows,
+        words=(0, 5),
+        stacked=(5,),
+        note=f"Found: more than chance at {FAMILY_LEVEL:g} over all these tests together (Holm)."
+        " Size: rms over the detector, of the noise rms difference of its standard deviations;"
+        f" beside it the smallest that would have been seen with probability {POWER:g}.",
     )
 
 
@@ -174,6 +212,10 @@ def outlier_table(inputs: ReportInput) -> TextTable | None:
     if mixture.jitter is not None:
         note += f"; jitter fixed at {number(mixture.jitter)} {inputs.unit}"
     a, b = mixture.fraction_prior
+    if mixture.jitter_scale is not None:
+        note += f"; prior of j: scale {number(mixture.jitter_scale)} {inputs.unit}"
+    if mixture.outlier_scale is not None:
+        note += f"; prior of s_out: about {number(mixture.outlier_scale)} {inputs.unit}"
     note += "." if mixture.model == "none" else f"; prior of f: Beta({a:g}, {b:g})."
     return TextTable(
         "Outlier mixture",
