@@ -40,8 +40,11 @@ KINDS = {
 SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
 CURVATURE = "curvature"
 MOST_EXPOSURES = 40
-STEPS = {"shape": 12, "shift": 5, "rotation": 5, CURVATURE: 6}
+# amplitudes of each scatter that are gone through, by how many scatters there are: first to see
+# where the density is, then there alone
+COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
 RANGE = 10.0  # of amplitudes about the prior's median and what the data resolve
+NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,31 +332,37 @@ def deviation_draws(
         known = np.diag(S)[index == k]
         known = known[known > 1e-8 * max(float(known.max()), 1e-300)]
         resolved = 1 / np.sqrt(np.median(known)) if known.size else medians[name]
-        low = min(medians[name], resolved) / 5
+        low = min(medians[name], resolved) / RANGE
         high = RANGE * max(medians[name], resolved if resolved < 1e-2 else 0.0)
-        grids.append(np.geomspace(low, high, STEPS[name]))
+        grids.append(np.geomspace(low, high, COARSE[len(names) - 1]))
     values, vectors = np.linalg.eigh(S)
     S = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    combinations = [np.array(c) for c in product(*grids)]
-    density = np.empty(len(combinations))
-    for k, amplitude in enumerate(combinations):
+
+    def conditional(amplitude: Float) -> tuple[Float, Float, Float]:
+        """Scales, factor of the precision, and the score in its terms, of scaled coefficients."""
         spread = amplitude[index]
         scaled = S * np.outer(spread, spread) + np.eye(total)
         factor = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
-        z = scipy.linalg.solve_triangular(factor, spread * score, lower=True)
-        density[k] = 0.5 * z @ z - np.log(np.diag(factor)).sum()
-        density[k] += sum(
-            log_half_cauchy(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
-        )
-    weight = np.exp(density - density.max())
-    counts = rng.multinomial(n, weight / weight.sum())
+        return spread, factor, scipy.linalg.solve_triangular(factor, spread * score, lower=True)
+
+    def weights(grids: Sequence[Float]) -> Float:
+        """Posterior density of all combinations, the largest 1."""
+        density = np.empty([len(g) for g in grids])
+        for at, amplitude in zip(np.ndindex(density.shape), product(*grids), strict=True):
+            _, factor, z = conditional(np.array(amplitude))
+            density[at] = 0.5 * z @ z - np.log(np.diag(factor)).sum()
+            density[at] += sum(
+                log_half_cauchy(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
+            )
+        return np.exp(density - density.max())
+
+    grids = _where_it_counts(grids, weights(grids))
+    weight = weights(grids)
+    counts = rng.multinomial(n, (weight / weight.sum()).ravel())
     drawn, sizes = [], []
-    for amplitude, m in zip(combinations, counts, strict=True):
+    for amplitude, m in zip(product(*grids), counts, strict=True):
         if m:
-            spread = amplitude[index]
-            scaled = S * np.outer(spread, spread) + np.eye(total)
-            factor = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
-            z = scipy.linalg.solve_triangular(factor, spread * score, lower=True)
+            spread, factor, z = conditional(np.array(amplitude))
             z = z[:, None] + rng.standard_normal((total, m))
             z = scipy.linalg.solve_triangular(factor, z, trans=1, lower=True)
             drawn.append(spread * z.T)
@@ -370,6 +379,17 @@ def deviation_draws(
         scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
         n_exposures=columns.n_exposures,
     )
+
+
+def _where_it_counts(grids: Sequence[Float], weight: Float) -> list[Float]:
+    """Finer grids over the amplitudes that are not negligible, and the next ones on both sides."""
+    out = []
+    for k, grid in enumerate(grids):
+        best = weight.max(axis=tuple(a for a in range(weight.ndim) if a != k))
+        kept = np.flatnonzero(best > NEGLIGIBLE)
+        low, high = max(kept[0] - 1, 0), min(kept[-1] + 1, len(grid) - 1)
+        out.append(np.geomspace(grid[low], grid[high], REFINED[len(grids) - 1]))
+    return out
 
 
 def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:

@@ -32,8 +32,10 @@ Float = NDArray[np.float64]
 LENGTHS = np.geomspace(0.02, 0.6, 7)  # of the field, in longer half sides; all alike beforehand
 STEPS = 8  # of the amplitude, before the grid is refined
 HALVINGS = 6  # at most: neighbouring stars may tell an amplitude to some percent
-CHANGE = 0.7  # of the log density between two points, below which none is put between them
+CHANGE = 0.7  # of the log density between two points, below which none is put between them,
+WIDEST = 0.4  # or width of their interval in the logarithm, where most of the density is
 NEGLIGIBLE = 10.0  # in log density, below the largest
+MOST_OF_IT = 2.0  # in the same way
 UNLIKE = 0.2  # prior probability that the field differs on the two axes, by a factor e or so
 TERM_STEPS = 24  # of the amplitude of the higher orders
 
@@ -211,7 +213,7 @@ def chip_structure(
             views = (0, 1, 2) if best[1] + best[2] > best[0] + prior.max() + CHANGE else (0,)
             middles = set[float]()
             for k in views:
-                middles.update(_middles(grid, tops[:, k].tolist(), best[k] - NEGLIGIBLE))
+                middles.update(_middles(grid, tops[:, k].tolist(), float(best[k])))
             if not middles:
                 break
             sized += [at(length, a) for a in middles]
@@ -259,13 +261,16 @@ def _combined(
             yield point, density + u.evidence[0] + v.evidence[1]
 
 
-def _middles(grid: Sequence[float], tops: Sequence[float], least: float) -> list[float]:
+def _middles(grid: Sequence[float], tops: Sequence[float], best: float) -> list[float]:
     """Middles of the intervals that have some of the density, and over which it changes."""
-    return [
-        0.5 * (a + b)
-        for (a, top_a), (b, top_b) in pairwise(zip(grid, tops, strict=True))
-        if max(top_a, top_b) > least and abs(top_a - top_b) > CHANGE
-    ]
+    out = []
+    for (a, top_a), (b, top_b) in pairwise(zip(grid, tops, strict=True)):
+        top = max(top_a, top_b)
+        changes = top > best - NEGLIGIBLE and abs(top_a - top_b) > CHANGE
+        # a peak may lie between two points of the same height
+        if changes or (top > best - MOST_OF_IT and b - a > WIDEST):
+            out.append(0.5 * (a + b))
+    return out
 
 
 def _solve(factor: Float, right: Float, trans: int = 0) -> Float:
