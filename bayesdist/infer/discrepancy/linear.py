@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import product
 
 import numpy as np
@@ -16,7 +17,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.information import GroupCells, Information
-from bayesdist.infer.discrepancy.priors import DiscrepancyPriors, log_half_cauchy
+from bayesdist.infer.discrepancy.priors import DiscrepancyPriors, log_half_cauchy, log_widths
 from bayesdist.model import DistortionModel, Groups
 
 __all__ = [
@@ -346,7 +347,8 @@ def deviation_draws(
         return spread, factor, scipy.linalg.solve_triangular(factor, spread * score, lower=True)
 
     def weights(grids: Sequence[Float]) -> Float:
-        """Posterior density of all combinations, the largest 1."""
+        """Posterior weights of all combinations, the largest 1."""
+        widths = np.ix_(*(np.exp(log_widths(g)) for g in grids))
         density = np.empty([len(g) for g in grids])
         for at, amplitude in zip(np.ndindex(density.shape), product(*grids), strict=True):
             _, factor, z = conditional(np.array(amplitude))
@@ -354,7 +356,8 @@ def deviation_draws(
             density[at] += sum(
                 log_half_cauchy(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
             )
-        return np.exp(density - density.max())
+        weight = np.exp(density - density.max()) * reduce(np.multiply, widths)
+        return np.asarray(weight / weight.max())
 
     grids = _where_it_counts(grids, weights(grids))
     weight = weights(grids)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["DiscrepancyPriors", "log_half_cauchy"]
+__all__ = ["DiscrepancyPriors", "log_half_cauchy", "log_widths"]
 
 Float = NDArray[np.float64]
 
@@ -66,6 +66,19 @@ class DiscrepancyPriors:
                     where=f"discrepancy.{field.name}",
                     do="give a positive number",
                 )
+
+
+def log_widths(grid: Float) -> Float:
+    """Logarithms of the weights of amplitudes, in rising order, in an integral over their logarithm.
+
+    Those of the trapezoidal rule, and at both ends what a half-Cauchy density has beyond them: it
+    falls in proportion to the amplitude, or its inverse.
+    """
+    x = np.log(grid)
+    width = np.empty(len(x))
+    width[1:-1] = (x[2:] - x[:-2]) / 2
+    width[0], width[-1] = (x[1] - x[0]) / 2 + 1, (x[-1] - x[-2]) / 2 + 1
+    return np.asarray(np.log(width))
 
 
 def log_half_cauchy(value: Float, median: float) -> Float:

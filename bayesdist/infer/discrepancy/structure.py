@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.functions import FINE, StructureFunctions
 from bayesdist.infer.discrepancy.neighbours import SharedVariance
-from bayesdist.infer.discrepancy.priors import log_half_cauchy
+from bayesdist.infer.discrepancy.priors import log_half_cauchy, log_widths
 
 __all__ = ["Structure", "chip_structure"]
 
@@ -177,7 +177,7 @@ def chip_structure(
     low = 0.2 * min(higher_order, structure, resolved)
     high = max(3 * noise, 10 * structure)
     amplitudes = np.geomspace(low, 3 * high, TERM_STEPS)
-    prior = log_half_cauchy(amplitudes, higher_order)
+    prior = log_half_cauchy(amplitudes, higher_order) + log_widths(amplitudes)
 
     def axis_at(S: Float, s: Float, variance: Float) -> _Axis:
         matrix = S[T:, T:] + np.diag(1 / variance)
@@ -248,7 +248,7 @@ def _combined(
     length: float, grid: Sequence[float], sized: Sequence[_Sized], median: float
 ) -> Iterator[tuple[_Point, Float]]:
     """Amplitudes of the field on both axes, and the density of each for all of the terms."""
-    width = np.log(np.gradient(grid))
+    width = log_widths(np.exp(grid))
     for i, u in enumerate(sized):
         for j, v in enumerate(sized):
             both = (u.amplitude, v.amplitude)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.functions import FINE, StructureFunctions
-from bayesdist.infer.discrepancy.priors import log_half_cauchy
+from bayesdist.infer.discrepancy.priors import log_half_cauchy, log_widths
 
 __all__ = ["StructurePosterior", "structure_posterior"]
 
@@ -183,7 +183,7 @@ def structure_posterior(
     low = 0.2 * min(higher_order, structure, resolved)
     high = max(3 * noise, 10 * structure)
     amplitudes = np.geomspace(low, 3 * high, TERM_STEPS)
-    prior = log_half_cauchy(amplitudes, higher_order)
+    prior = log_half_cauchy(amplitudes, higher_order) + log_widths(amplitudes)
 
     def at_length(length: float) -> _Field:
         scale = np.sqrt(np.concatenate([one.spectrum(length) for one in blocks]))
@@ -221,13 +221,13 @@ def structure_posterior(
             tops = [p.log_density.max() for p in points]
             best = max([*tops, *(p.log_density.max() for p, _ in found)])
             grid, points = _refined(grid, points, tops, best - NEGLIGIBLE, field, at_point)
-        widths = np.gradient(grid)
+        widths = log_widths(np.exp(grid))
         found += [
             (p, w)
             for p, w in zip(points, widths, strict=True)
             if p.log_density.max() > best - NEGLIGIBLE
         ]
-    log_weight = np.array([p.log_density + np.log(w) for p, w in found])
+    log_weight = np.array([p.log_density + w for p, w in found])
     weight = np.exp(log_weight - log_weight.max())
     points_of = tuple(p for p, _ in found)
     return StructurePosterior(tuple(blocks), amplitudes, points_of, weight / weight.sum())
