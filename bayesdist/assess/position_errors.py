@@ -106,17 +106,20 @@ class PositionErrors:
         )
 
     def _smooth(self, term: UserTerm, sigma: tuple[float, float]) -> LocalTerm:
-        """A term as a smooth field over each chip, of the same size at every position."""
+        """A term as a smooth field of its size over each chip, larger at the edges than inside.
+
+        As the distortion of a catalogue, or of another camera, would be.
+        """
         rng = np.random.default_rng(self.seed)
         n, drawn = min(self.n_draws, SMOOTH_DRAWS), {}
         for chip in self.fields.whole.solution.model.chips:
             basis = PolynomialBasis(SMOOTH_ORDER, chip.size, chip.reference_pixel)
             phi = basis.evaluate(*mesh(*grid_pixels(chip.size, self.grid)))
-            phi = phi / np.linalg.norm(phi, axis=1, keepdims=True)
+            phi = phi * np.sqrt(len(phi) / np.square(phi).sum())
             field = rng.standard_normal((n, 2, phi.shape[1])) @ phi.T
             field = np.swapaxes(field, 1, 2) * sigma
             drawn[chip.number] = field.reshape(n, *self.grid[::-1], 2)
-        one = {c: np.broadcast_to(np.array(sigma), d.shape[1:]) for c, d in drawn.items()}
+        one = {c: np.sqrt(np.mean(np.square(d), axis=0)) for c, d in drawn.items()}
         return LocalTerm(term.name, one, term.source, drawn=drawn)
 
     @property
