@@ -12,6 +12,7 @@ import pytest
 from lxml import html as lxml_html
 
 from bayesdist.assess.misfit import Misfit
+from bayesdist.diagnose import ScoreTest
 from bayesdist.errors import InputError
 from bayesdist.report import Check, Product, write_report
 from bayesdist.report.captions import SECTIONS
@@ -353,3 +354,29 @@ def test_the_residuals_of_a_table_are_those_of_its_chip():
 
 
 NUMBERS = {"all": (1, 2), "WFC2": (1,), "WFC1": (2,)}
+
+
+def test_what_residuals_were_asked_and_verdicts_rest_on_stands_on_the_page(converged):
+    common = {"dof": 10.0, "dof_residual": 900.0, "unit": "pix"}
+    asked = (
+        ScoreTest("order 5", 61.0, p_value=2e-9, size=0.0042, smallest=0.003, significant=True,
+                  remedy="raise model.order to 5", finding="The residuals hold it", **common),
+        ScoreTest("edges", 9.1, p_value=0.52, size=0.0, smallest=np.inf, significant=False,
+                  remedy="leave out the margins", finding="Nothing rises", **common),
+    )  # fmt: skip
+    first, *rest = converged.margins
+    margins = (
+        replace(first, rests_on=("a polynomial of order 4", "no held-out stars")),
+        *(replace(m, rests_on=("a polynomial of order 4",)) for m in rest),
+    )
+    tree = lxml_html.fromstring(
+        render_report(replace(converged, score_tests=asked, margins=margins), {})
+    )
+    found = tree.xpath("//section[@id='fit']//tr[th='order 5']")[0].text_content()
+    assert "2.0 × 10⁻⁹" in found.replace("\u202f", " ") and "found: raise model.order to 5" in found
+    assert "nothing found" in tree.xpath("//section[@id='fit']//tr[th='edges']")[0].text_content()
+    of_all, of_one = (
+        tree.xpath(f"//section[@id='margins']//tr[th='{clause}']/td")[0].text_content()
+        for clause in margins[0].rests_on
+    )
+    assert (of_all, of_one) == ("all", first.requirement.name)

@@ -60,8 +60,9 @@ def agree(ours: np.ndarray, theirs: np.ndarray, what: str, capsys) -> None:
     ratio = ours.std(axis=0) / sd
     with capsys.disabled():
         print(
-            f"\n{what}: {sd.size} quantities, at least {sizes.min():.0f} independent draws; means "
-            f"differ by at most {shift.max():.3f} sd, sd ratio {ratio.min():.4f} to {ratio.max():.4f}"
+            f"\n{what}: {sd.size} quantities, at least {sizes.min():.0f} independent draws; "
+            f"means differ by at most {shift.max():.3f} sd, sd ratio {ratio.min():.4f} to "
+            f"{ratio.max():.4f}"
         )
     assert sizes.min() > 400
     assert (shift < 4 / np.sqrt(sizes)).all()
