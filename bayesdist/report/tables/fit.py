@@ -67,7 +67,7 @@ def score_test_table(inputs: ReportInput) -> TextTable | None:
     rows = tuple(
         (
             t.name,
-            f"{number(t.statistic, 3)} of {number(t.dof, 3)}",
+            f"{number(t.statistic, 3)} ({number(t.dof, 3)})",
             "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
             number(t.size * scale.factor, 2),
             number(t.smallest * scale.factor, 2) if np.isfinite(t.smallest) else MISSING,
@@ -79,7 +79,7 @@ def score_test_table(inputs: ReportInput) -> TextTable | None:
         "Score tests of the residuals",
         (
             "Test",
-            "Statistic, expected",
+            "Statistic (dof)",
             "p",
             f"Size [{scale.unit}]",
             f"Would have seen [{scale.unit}]",
