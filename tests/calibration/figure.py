@@ -87,5 +87,6 @@ def ranks_figure(found: Mapping[str, np.ndarray]) -> Figure:
         upper[0].set_ylabel("share of truths")
         lower[0].set_ylabel("share of ranks below z, less z")
         lower[0].plot([], [], color=CYCLE[0], lw=5, alpha=0.22, label="95 %, all z at once")
-        lower[0].legend(loc="lower right")
+        lower[0].set_ylim(-0.13, 0.17)
+        lower[0].legend(loc="upper right")
     return fig
