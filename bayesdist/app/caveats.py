@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.session import Session
-from bayesdist.assess.verdict import Caveat
+from bayesdist.assess.verdict import Caveat, scatter_too_small
+from bayesdist.infer.discrepancy.linear import CURVATURE
 
-__all__ = ["caveats_of", "rests_on"]
+__all__ = ["caveats_of", "rests_on", "visits_of"]
 
-LEAST_CHI2 = 0.8  # per degree of freedom
+Float = NDArray[np.float64]
+
+LEAST_HELD = 0.5  # of the structure that is found in residuals, for the budget to hold it
 WIDE = 5.0  # errors of a star, within which true matches are lost when nominal positions are off
 
 # tests whose findings the error model holds, by the part of it
 OF_STRUCTURE = ("order ",)
 OF_NOISE = ("noise by ",)
-OF_DEVIATIONS = ("exposures", "curvature in time")
+OF_EXPOSURES, OF_CURVATURE = "exposures", "curvature in time"
 
 
 def caveats_of(session: Session) -> tuple[Caveat, ...]:
@@ -30,8 +34,10 @@ def _caveats(session: Session) -> Iterator[Caveat]:
     if session.majority:
         yield Caveat(session.majority, larger=False)
     found = session.discrepancy
-    if found is None and session.misfit.significant:
-        yield Caveat(session.misfit.sentence)
+    held = None if found is None else found.structure_rms
+    if session.misfit.significant and (held or 0.0) < LEAST_HELD * session.misfit.structure:
+        what = "nothing" if held is None else f"{held:.2g} {session.misfit.unit} rms"
+        yield Caveat(f"{session.misfit.finding}, and the budget holds {what} of it")
     for test in session.score_tests:
         if test.significant and not _held(session, test.name):
             yield Caveat(f"{test.finding}: {test.remedy}")
@@ -55,11 +61,12 @@ def _held(session: Session, test: str) -> bool:
     if session.discrepancy is None:
         return False
     found = session.discrepancy.found
-    linear = found.linear is not None and bool(found.linear.scatter)
+    scatter = set() if found.linear is None else set(found.linear.scatter)
     return (
         test.startswith(OF_NOISE)
         or (bool(found.structure) and test.startswith(OF_STRUCTURE))
-        or (linear and test.startswith(OF_DEVIATIONS))
+        or (test.startswith(OF_EXPOSURES) and bool(scatter - {CURVATURE}))
+        or (test.startswith(OF_CURVATURE) and CURVATURE in scatter)
     )
 
 
@@ -74,16 +81,18 @@ def _of_matching(session: Session) -> Iterator[Caveat]:
             "that are not given, which cuts the scatter and draws the fit: match again with a "
             "wider match radius, or give the columns u_nominal and v_nominal"
         )
-    ratio = session.fit.chi2 / max(session.fit.dof, 1)
-    if ratio < LEAST_CHI2:
+    fit = session.fit
+    if scatter_too_small(fit.chi2, fit.dof):
         yield Caveat(
-            f"the residuals scatter less than the quoted errors say (chi-square {ratio:.2g} per "
-            "degree of freedom): the match radius has cut them, or the errors are too large"
+            f"the residuals scatter less than the quoted errors say (chi-square "
+            f"{fit.chi2 / fit.dof:.2g} per degree of freedom): the match radius has cut them, or "
+            "the errors are too large",
+            larger=False,
         )
 
 
 def _of_time(session: Session) -> Iterator[Caveat]:
-    time, dates = session.posterior.model.time, session.dates
+    time, dates = session.posterior.model.time, visits_of(session.dates)
     assert time is not None
     edges = [-np.inf, *time.breaks, np.inf]
     counts, _ = np.histogram(dates, edges)
@@ -101,6 +110,18 @@ def _of_time(session: Session) -> Iterator[Caveat]:
         )
 
 
+def visits_of(dates: Float) -> Float:
+    """Dates of which none are next to the same, in rising order: exposures of a visit are one.
+
+    Those within a day, or a fiftieth of the whole time.
+    """
+    if not dates.size:
+        return dates
+    apart = max(1 / 365.25, (dates.max() - dates.min()) / 50)
+    ordered = np.sort(dates)
+    return np.asarray(ordered[np.append(True, np.diff(ordered) > apart)])
+
+
 def _exposures(session: Session, n: int) -> str:
     """Of which exposures the position is one."""
     if session.systematics.aligned:
@@ -110,7 +131,8 @@ def _exposures(session: Session, n: int) -> str:
     if linear is None or "shape" not in linear.scatter:
         return f"{n} exposures" if n > 1 else "one exposure, or the mean of several"
     size = float(np.median(linear.scatter["shape"]))
-    what = f"whose scale and shears scatter by {size:.1g}"
+    what = f"whose {'scale and shears' if 'scale' in linear.kinds else 'shears'}"
+    what += f" scatter by {size:.1g}"
     if session.config.assess.exposure == "single":
         return f"a position in a single exposure, as {linear.n_exposures} exposures, {what}"
     return f"a position in the mean of {linear.n_exposures} exposures, {what}"
@@ -124,10 +146,13 @@ def rests_on(session: Session, epoch: float | None) -> tuple[str, ...]:
     if found is not None:
         rows = found.found.facts.get("structure", [])
         if rows:
-            rms = float(np.sqrt(np.mean([row["rms"] ** 2 for row in rows])))
+            median, most = (
+                float(np.sqrt(np.mean([row[key] ** 2 for row in rows])))
+                for key in ("median", "most")
+            )
             out.append(
-                f"structure beyond it of {rms:.2g} {model.unit} rms on an axis, from residuals and "
-                "prior"
+                f"structure beyond it of {median:.2g} {model.unit} rms on an axis, at most "
+                f"{most:.2g} with 95 % probability, from residuals and prior"
             )
         else:
             out.append("look-up tables, with their errors")
@@ -137,7 +162,7 @@ def rests_on(session: Session, epoch: float | None) -> tuple[str, ...]:
     out.append(_exposures(session, n))
     if found is not None and found.found.facts.get("exposures_measured") is False:
         out.append("no variation between exposures, which is not measured")
-    dates = session.dates
+    dates = visits_of(session.dates)
     if epoch is not None and dates.size:
         first, last = float(dates.min()), float(dates.max())
         beyond = max(first - epoch, epoch - last)

@@ -263,9 +263,14 @@ class BudgetBlock(Section):
     in_residuals: bool = False
 
     def names(self, *words: str) -> bool:
-        """Whether one of some words is in the row's name or source."""
-        text = f"{self.name} {self.source}".lower()
-        return any(word in text for word in words)
+        """Whether one of some words is in the row's name."""
+        return any(word in self.name.lower() for word in words)
+
+    @property
+    def stated(self) -> bool:
+        """Whether the row states an error: one of size 0 does so with its source only."""
+        sizes = (self.sigma_u, self.sigma_v, self.sigma)
+        return any(sizes) or self.source != GIVEN
 
     @model_validator(mode="after")
     def _sigma_of_its_kind(self) -> BudgetBlock:
@@ -623,8 +628,8 @@ class Config(Section):
         return Compute(**self.compute.model_dump())
 
     def states(self, *words: str) -> bool:
-        """Whether a [[budget]] row names one of some words in its name or its source."""
-        return any(row.names(*words) for row in self.budget)
+        """Whether a [[budget]] row with one of some words in its name states an error."""
+        return any(row.stated and row.names(*words) for row in self.budget)
 
     def user_terms(self) -> tuple[UserTerm, ...]:
         """The user's terms of the error budget that are the same at every place."""

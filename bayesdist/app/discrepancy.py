@@ -94,6 +94,15 @@ class RunDiscrepancy:
         term = self.structure(grid, epoch)
         return () if term is None else (term,)
 
+    @property
+    def structure_rms(self) -> float | None:
+        """Rms over the detector of the structure that the budget holds, both axes together."""
+        rows = self.found.facts.get("structure")
+        if not rows:
+            return None
+        by_axis = {a: np.mean([r["rms"] ** 2 for r in rows if r["axis"] == a]) for a in "uv"}
+        return float(np.sqrt(by_axis["u"] + by_axis["v"]))
+
     def moved(self, matrix: Float) -> RunDiscrepancy:
         """The same in another gauge: errors of parameters times a matrix (D, D)."""
         return replace(self, found=self.found.moved(matrix))
@@ -136,9 +145,9 @@ def keep_discrepancy(session: Session, estimate: Callable[[], Discrepancy]) -> N
     session.run.summarise(discrepancy=facts)
     for row in facts.get("structure", []):
         log.info(
-            "assess: structure beyond the model on chip %s, %s: %.2g %s rms, correlated over "
-            "%.0f pixels",
-            *(row["chip"], row["axis"], row["rms"], facts["unit"], row["length_pix"]),
+            "assess: structure beyond the model on chip %s, %s: %.2g %s rms, at most %.2g with "
+            "95 %% probability",
+            *(row["chip"], row["axis"], row["median"], facts["unit"], row["most"]),
         )
 
 

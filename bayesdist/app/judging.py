@@ -75,7 +75,7 @@ def products_of(session: Session) -> tuple[ProductTerm, ...]:
         try:
             kept = solution, product_terms(session)
         except BayesdistError as error:  # the export says so, and stops
-            log.info("assess: the files were not compared with the solution: %s", error)
+            log.warning("assess: WARNING: the files were not compared with the solution: %s", error)
             kept = solution, ()
         session.__dict__["_products"] = kept
     return kept[1]
@@ -153,10 +153,8 @@ def _of_any_star(session: Session, requirement: Requirement) -> Requirement:
 
 
 def _where_stars_are(session: Session, margin: Margin) -> Margin:
-    """A margin without verdict where it is judged on pixels that no stars cover."""
+    """A margin that is not met where it is judged on pixels that no stars cover."""
     for one in session.coverages:
-        if margin.verdict != "undecided" and one.misses(
-            margin.requirement, session.config.assess.grid
-        ):
+        if margin.verdict == "met" and one.misses(margin.requirement, session.config.assess.grid):
             return replace(margin, verdict="undecided", reason=one.sentence)
     return margin

@@ -331,6 +331,12 @@ class Session:
         """Whether an error of the catalogue's proper motions is; None without a catalogue."""
         return self.config.states("motion")
 
+    @property
+    def single_exposures(self) -> bool:
+        """Whether it is known by how much single exposures deviate."""
+        linear = None if self.discrepancy is None else self.discrepancy.found.linear
+        return self.systematics.aligned or (linear is not None and bool(linear.kinds))
+
     @cached_property
     def solution(self) -> Posterior:
         """What is exported and shown: all errors of the parameters are in its draws."""

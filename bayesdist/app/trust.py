@@ -5,11 +5,12 @@ from __future__ import annotations
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.periods import periods_of
 from bayesdist.app.session import Session
+from bayesdist.assess.verdict import scatter_too_small
 from bayesdist.errors import InputError
 
 __all__ = ["labelled", "posterior_warnings", "trust", "warnings_of"]
 
-LEAST_CHI2, MOST_CHI2 = 0.67, 1.5
+MOST_CHI2 = 1.5
 
 
 def warnings_of(session: Session) -> list[str]:
@@ -19,26 +20,34 @@ def warnings_of(session: Session) -> list[str]:
     if session.majority:
         out.append(session.majority)
     if session.misfit.significant:
-        held = session.discrepancy is not None
+        found = session.discrepancy
+        held = None if found is None else found.structure_rms
         out.append(
-            f"{session.misfit.finding}; the budget holds what was estimated of it"
-            if held
-            else session.misfit.sentence
+            session.misfit.sentence
+            if held is None
+            else f"{session.misfit.finding}; the budget holds {held:.2g} {session.misfit.unit} rms "
+            "of such structure"
         )
     if session.config.data is not None and session.raw_matches.has_nominal and not circle:
         out.append(
             "the matches have nominal positions, and outliers.match_radius is not given: the "
             "likelihood does not know that they were selected"
         )
+    if session.config.assess.exposure == "single" and not session.single_exposures:
+        out.append(
+            "assess.exposure is 'single', and how single exposures deviate is not known here, so "
+            "that errors are those in their mean"
+        )
     ratio = fit.chi2 / max(fit.dof, 1)
+    small = scatter_too_small(fit.chi2, fit.dof)
     if circle:
-        if ratio < LEAST_CHI2:
+        if small:
             out.append(
                 f"chi-square per degree of freedom of least squares is {ratio:.2g}: the match "
                 "circle cuts the residuals, and draws this fit to the nominal solution; the "
                 "posterior knows of the circle"
             )
-    elif ratio < LEAST_CHI2:
+    elif small:
         out.append(
             f"chi-square per degree of freedom is {ratio:.2g}: the match radius has cut the "
             "residuals, or the quoted errors are too large, and with them all uncertainties"

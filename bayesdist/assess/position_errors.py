@@ -80,7 +80,7 @@ class PositionErrors:
     def varied(self) -> tuple[PositionErrors, ...]:
         """The same draws with what may vary over the field varying: smoothly, and everywhere.
 
-        None where no term may vary.
+        Nothing where no term may vary.
         """
         moving = [t.varies and t.kind == "systematic" and any(s) for t, s in self._sized]
         if not any(moving):
@@ -91,7 +91,9 @@ class PositionErrors:
         ]
         still = [pair for pair, moves in zip(self._sized, moving, strict=True) if not moves]
         smooth = [
-            self._smooth(*pair) for pair, moves in zip(self._sized, moving, strict=True) if moves
+            self._smooth(*pair, np.random.default_rng([self.seed, k]))
+            for k, (pair, moves) in enumerate(zip(self._sized, moving, strict=True))
+            if moves
         ]
         shape = (self.n_draws, len(smooth), *self.squares.shape[2:])
         return (
@@ -105,12 +107,13 @@ class PositionErrors:
             replace(self, terms=tuple(everywhere)),
         )
 
-    def _smooth(self, term: UserTerm, sigma: tuple[float, float]) -> LocalTerm:
+    def _smooth(
+        self, term: UserTerm, sigma: tuple[float, float], rng: np.random.Generator
+    ) -> LocalTerm:
         """A term as a smooth field of its size over each chip, larger at the edges than inside.
 
         As the distortion of a catalogue, or of another camera, would be.
         """
-        rng = np.random.default_rng(self.seed)
         n, drawn = min(self.n_draws, SMOOTH_DRAWS), {}
         for chip in self.fields.whole.solution.model.chips:
             basis = PolynomialBasis(SMOOTH_ORDER, chip.size, chip.reference_pixel)

@@ -207,13 +207,14 @@ def check_requirements(
     for r, case in zip(requirements, cases, strict=True):
         factor = convert(1.0, unit, r.unit, pixel_scale)
         extremes = [
-            _margin(r, case, draws, errors, factor, n_effective, caveats)
-            for draws in zip(
+            _margin(r, case, draws, way, factor, n_effective, caveats)
+            for way, *draws in zip(
+                ways,
                 *([factor * one[r.statistic] for one in found[judged]] for judged in case),
                 strict=True,
             )
         ]
-        margins.append(_of_extremes(extremes, [t.name for t in terms if t.varies]))
+        margins.append(_of_extremes(extremes, [t.name for t in terms if t.varies], caveats))
     return tuple(margins)
 
 
@@ -290,18 +291,22 @@ def _chips_of(
     return (place_of(model, epoch=epoch, chip=number).chip,)
 
 
-def _of_extremes(margins: Sequence[Margin], names: Sequence[str]) -> Margin:
+def _of_extremes(
+    margins: Sequence[Margin], names: Sequence[str], caveats: Sequence[Caveat]
+) -> Margin:
     """The less favourable margin, with a verdict that holds for all of them."""
     worse = min(margins, key=lambda m: m.probability_met)
     if worse.verdict != "missed" or all(m.verdict == "missed" for m in margins):
         return worse
     better = max(margins, key=lambda m: m.probability_met)
+    vary = "varies" if len(names) == 1 else "vary"
     reason = (
-        f"it depends on how {' and '.join(names)} varies over the field: as one offset, a smooth "
+        f"it depends on how {' and '.join(names)} {vary} over the field: as one offset, a smooth "
         f"field, or independent errors, P(met) is {worse.probability_met:.3g} to "
         f"{better.probability_met:.3g}"
     )
-    return replace(worse, verdict="undecided", reason=reason)
+    texts = [*(one.text for one in caveats), reason]
+    return replace(worse, verdict="undecided", reason="; ".join(texts))
 
 
 def _not_converged(solution: Solution, converged: bool | None) -> tuple[Caveat, ...]:
@@ -336,7 +341,7 @@ def _margin(
     axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""
     place = errors.worst(worst_epoch, axis)
     remedy = None
-    if verdict != "met" and not caveats:
+    if verdict == "missed" and not caveats:
         remedy = find_remedy(errors, requirement, worst_epoch, factor)
     return Margin(
         requirement=requirement,

@@ -6,22 +6,38 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scipy.stats import beta
+from scipy.stats import beta, chi2
 
 from bayesdist.assess.solution import Solution
 
 __all__ = [
+    "LEAST_CHI2",
     "VERDICTS",
     "Caveat",
     "clopper_pearson",
     "counting_error",
     "effective_draws",
+    "scatter_too_small",
     "verdict_of",
 ]
 
 VERDICTS = ("met", "missed", "undecided")
 
 CONFIDENCE = 0.99
+LEAST_CHI2, CHANCE = 0.8, 1e-3  # per degree of freedom, and probability of as little
+
+
+def scatter_too_small(total: float, dof: float) -> bool:
+    """Whether residuals scatter less than their quoted errors say.
+
+    Parameters
+    ----------
+    total : float
+        Chi-square.
+    dof : float
+        Its degrees of freedom.
+    """
+    return total < LEAST_CHI2 * dof and float(chi2.cdf(total, max(dof, 1))) < CHANCE
 
 
 def effective_draws(solution: Solution, n_draws: int) -> float:

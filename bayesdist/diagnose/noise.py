@@ -214,7 +214,7 @@ def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
 
 _REMEDIES = {
     "position": "give errors that go with position",
-    "magnitude": "give errors that go with magnitude (data.sigma = 'by_magnitude', where it is not)",
+    "magnitude": "give errors that go with magnitude, or finer ones if they do",
     "exposure": "give each exposure errors of its own, or leave out exposures",
     "axis": "give errors sigma_u and sigma_v of their own",
 }

@@ -61,7 +61,7 @@ def pattern_test(projection: Projection) -> Outcome | None:
     def smallest(level: float) -> float:
         needed = np.log(trials / level)
         # a noncentral exponential exceeds it with probability 0.9
-        return float(unit * (np.sqrt(needed) + 1.0) / np.sqrt(2))
+        return float(unit * (np.sqrt(needed) + 1.0))
 
     return Outcome(
         name="repeating pattern",
@@ -69,7 +69,7 @@ def pattern_test(projection: Projection) -> Outcome | None:
         dof=2,
         dof_residual=None,
         p_value=p_value,
-        size=float(unit * np.sqrt(max(power - 1, 0.0)) / np.sqrt(2)),
+        size=float(unit * np.sqrt(max(power - 1, 0.0))),
         smallest=smallest,
         unit=model.unit,
         remedy="fit a look-up table with nodes closer than half the period",

@@ -4,7 +4,7 @@ magnitude, colour and time."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -65,6 +65,8 @@ class Regressors:
         Fraction of the information that a direction must have kept beside the model's parameters.
     remedy, present, absent : str
         As of `Outcome`.
+    beside : ndarray of int
+        Functions that the fit is given as well, so that they do not pass for these.
     """
 
     name: str
@@ -73,6 +75,17 @@ class Regressors:
     remedy: str
     present: str
     absent: str
+    beside: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    @property
+    def every(self) -> Int:
+        """All of these functions, the tested ones first."""
+        return np.concatenate([self.functions, self.beside])
+
+    @property
+    def own(self) -> NDArray[np.bool_]:
+        """Which of them are tested."""
+        return np.arange(len(self.functions) + len(self.beside)) < len(self.functions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +181,8 @@ def functions_for(sample: ScoredSample) -> Functions:
     edges = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
     if len(sample) >= FEWEST_AT_EDGES:
         factors += [Factor(one - one.mean(), 0) for one in edges]
-        regressors.append(_at_edges(start + np.arange(len(edges))))
+        orders = np.concatenate([one.functions for one in regressors[:HIGHER]])
+        regressors.append(_at_edges(start + np.arange(len(edges)), orders))
         start += len(edges)
     time, epoch = sample.model.time, sample.epoch
     if epoch is not None and np.ptp(epoch) > SHORTEST:
@@ -213,7 +227,7 @@ def _higher(order: int, total: int) -> Regressors:
     )
 
 
-def _at_edges(functions: Int) -> Regressors:
+def _at_edges(functions: Int, orders: Int) -> Regressors:
     return Regressors(
         "edges",
         functions,
@@ -221,6 +235,7 @@ def _at_edges(functions: Int) -> Regressors:
         "leave out the margins of the detector, or fit a look-up table",
         "the residuals rise towards the edges of the detector",
         "the residuals do not rise towards the edges of the detector",
+        orders,
     )
 
 

@@ -115,8 +115,9 @@ def _parts_of(projection: Projection, chips: list[int], meat: str) -> Iterator[t
     """Tests of all families on some chips, with the names of the families."""
     tried = []
     for family in projection.functions.regressors:
-        columns = np.concatenate([projection.columns(family.functions, chip) for chip in chips])
-        one = _Directions.of(projection, family, columns)
+        columns = np.concatenate([projection.columns(family.every, chip) for chip in chips])
+        own = np.tile(np.repeat(family.own, 2), len(chips))
+        one = _Directions.of(projection, family, columns, own)
         if one.q:
             tried.append(one)
     if meat == "robust":
@@ -138,7 +139,7 @@ def _parts_of(projection: Projection, chips: list[int], meat: str) -> Iterator[t
             continue
         T = shrink * float(one.score @ np.linalg.solve(V, one.score))
         p = float(stats.f.sf(T / one.q, one.q, dof_residual))
-        square = np.repeat(projection.functions.mean_square[one.family.functions], 2)
+        square = np.repeat(projection.functions.mean_square[one.family.every], 2)
         Q = (one.basis.T * np.tile(square, len(chips)) / len(chips)) @ one.basis
         size2, noise2 = float(one.score @ Q @ one.score), float(np.trace(Q @ V))
         yield one.family.name, _Part(T, p, one.q, dof_residual, size2, noise2)
@@ -169,12 +170,19 @@ class _Directions:
         return self.basis.shape[1]
 
     @classmethod
-    def of(cls, projection: Projection, family: Regressors, columns: Int) -> _Directions:
-        """Those of a family."""
+    def of(
+        cls, projection: Projection, family: Regressors, columns: Int, own: NDArray[np.bool_]
+    ) -> _Directions:
+        """Those of a family, of which some columns are tested beside the others."""
         S = projection.efficient_information(columns)
-        N = independent_directions(projection.whole_information(columns), S, family.least)
+        # each of the tested ones without what the others say of it
+        A = np.zeros((len(columns), own.sum()))
+        A[own] = np.eye(own.sum())
+        A[~own] = -np.linalg.lstsq(S[np.ix_(~own, ~own)], S[np.ix_(~own, own)])[0]
+        S = A.T @ S @ A
+        N = independent_directions(projection.whole_information(columns[own]), S, family.least)
         # eigenvectors: their information is diagonal
-        basis = N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True))
+        basis = A @ (N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True)))
         return cls(family, columns, basis, basis.T @ projection.efficient_score[columns])
 
 

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special
+from scipy import optimize, special, stats
 
 from bayesdist.diagnose.projection import Projection
 from bayesdist.diagnose.result import Outcome
@@ -25,6 +25,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 FEWEST_STARS = 50
+LEAST_P = 1e-300
 LARGEST_LEVERAGE = 0.5
 ENDS = 0.25  # of the expected number: with more, nothing ends at the match radius
 STARS_PER_PART = 150  # with errors alike, from which their scatter is measured
@@ -180,12 +181,13 @@ def truncation_test(projection: Projection, match_radius: float | None = None) -
         end = worst.radius**2 / both
     sigma = float(np.sqrt(np.median(both[radii.part]) / 2))
     chi2 = sample.residual**2 / (sample.variance * (1.0 - projection.leverage))
+    p_value = min(1.0, len(found) * worst.p_value)
     return Outcome(
         name="truncation",
-        statistic=worst.expected,
+        statistic=float(stats.chi2.isf(max(p_value, LEAST_P), 1)),  # of the same probability
         dof=1,
         dof_residual=None,
-        p_value=min(1.0, len(found) * worst.p_value),
+        p_value=p_value,
         size=radii.lost(end),
         smallest=partial(_smallest, sigma, n, len(found)),
         unit=sample.model.unit,

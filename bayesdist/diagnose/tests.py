@@ -22,6 +22,7 @@ from bayesdist.infer.views import Solution
 __all__ = ["score_tests"]
 
 OF_TIME = ("drift", "curvature in time")
+ORDERS, OF_PLACE = "order ", ("noise by position",)
 
 
 def score_tests(
@@ -66,10 +67,18 @@ def score_tests(
     found = regressor_tests(projection)
     if exposures is not None and exposures.p_value < FAMILY_LEVEL:
         found = [_doubtful(one) if one.name in OF_TIME else one for one in found]
+    orders = [one.p_value for one in found if one.name.startswith(ORDERS)]
     truncation = truncation_test(projection, match_radius)
     others = (exposures, pattern_test(projection), truncation)
     found += noise_tests(projection)
+    if min(orders, default=1.0) < FAMILY_LEVEL:
+        found = [_after_orders(one) if one.name in OF_PLACE else one for one in found]
     return corrected([*found, *(one for one in others if one is not None)])
+
+
+def _after_orders(outcome: Outcome) -> Outcome:
+    """A test by place where orders are missing, which look the same."""
+    return replace(outcome, present=f"{outcome.present}, if it is not the missing order")
 
 
 def _doubtful(outcome: Outcome) -> Outcome:

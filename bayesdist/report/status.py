@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesdist.assess.verdict import LEAST_CHI2, scatter_too_small
 from bayesdist.report.campaign.status import campaign_checks
 from bayesdist.report.context import Check, ReportInput
 from bayesdist.report.holdout import holdout_checks
@@ -19,7 +20,7 @@ __all__ = ["Verdict", "status_checks", "verdict"]
 _PARETO_K = 0.7  # above it importance weights cannot be trusted (Vehtari et al. 2024)
 _EFFICIENCY = 0.1
 _MCSE = 0.1  # of a posterior sd: adds half a percent to the error of a mean
-_CHI2 = (0.67, 1.5)  # per degree of freedom: quoted errors right within some twenty percent
+_MOST_CHI2 = 1.5  # per degree of freedom: quoted errors right within some twenty percent
 _LEFT_OUT = 0.2  # of the stars: rejection that takes more has shaped what it was to protect
 _CONDITION = 1e8  # leaves half the digits of a double
 
@@ -128,14 +129,14 @@ def _fit_checks(inputs: ReportInput) -> tuple[Check, ...]:
     fit = inputs.fit
     ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
     left_out = fit.n_rejected / fit.n_rows
-    low, high = _CHI2
+    small = scatter_too_small(fit.chi2, fit.dof)
     structure = (structure_check(inputs.misfits, fit="the fit"),) if inputs.misfits else ()
     return (
         Check(
             "Chi-square per degree of freedom, quoted errors",
             number(ratio),
-            f"{low:g} to {high:g}",
-            _level(low <= ratio <= high, "warn"),
+            f"{LEAST_CHI2:g} to {_MOST_CHI2:g}",
+            _level(not small and ratio <= _MOST_CHI2, "warn"),
         ),
         Check(
             f"{inputs.words.things.capitalize()} left out by the {inputs.words.chooser}",

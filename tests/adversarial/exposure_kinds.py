@@ -140,6 +140,17 @@ def breathing(rng: np.random.Generator, n: int, deviations: Scatter) -> Truth:
     return campaign(rng, n, true_map, exposures=16, deviations=deviations)
 
 
+@kind("breathing_unframed", *OF_EXPOSURES, n=3000)
+def breathing_unframed(rng: np.random.Generator, n: int) -> Truth:
+    """Four aligned exposures whose scale and shears vary, fitted without frames."""
+    true_map = mapped(fields.distortion(rng))
+    x, y = pixels(rng, n)
+    code = np.arange(n) % 4
+    w = deviating(true_map(x, y, None), normal_deviations(rng, 4)[code])
+    stars = observed(rng, x, y, w, exposure=np.array([f"e{k}" for k in code]))
+    return Truth(stars, true_map, order_config(3))
+
+
 @kind("breathing_new_exposure", *OF_EXPOSURES, n=3000)
 def breathing_new(rng: np.random.Generator, n: int) -> Truth:
     """Scale and shears vary, and the positions are those in an exposure that is yet to come."""

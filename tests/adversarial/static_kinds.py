@@ -76,6 +76,18 @@ def lithography(rng: np.random.Generator, n: int, period: float) -> Truth:
     return of_map(rng, n, fields.ridges(rng, period, 0.004))
 
 
+@kind("columns", *STRUCTURE, n=3000)
+def columns(rng: np.random.Generator, n: int) -> Truth:
+    """Each 40 columns have an offset of their own along u, 0.006 px rms."""
+    offset = 0.006 * rng.standard_normal(fields.SIDE // 40 + 1)
+
+    def steps(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        own = offset[np.clip((np.asarray(x) - 0.5) // 40, 0, len(offset) - 1).astype(int)]
+        return np.stack([own, np.zeros_like(own)], axis=-1)
+
+    return of_map(rng, n, steps)
+
+
 @kind("dead_amplifier", *STRUCTURE, n=3000)
 def dead_amplifier(rng: np.random.Generator, n: int) -> Truth:
     """One quadrant is displaced by 0.005 px."""

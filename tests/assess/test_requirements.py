@@ -1,4 +1,5 @@
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from bayesdist.assess import (
     check_requirements,
     position_errors,
 )
-from bayesdist.assess.verdict import Caveat, clopper_pearson
+from bayesdist.assess.verdict import Caveat, clopper_pearson, scatter_too_small
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 
@@ -303,3 +304,35 @@ def test_memory_does_not_grow_with_draws_times_points(shifting):
     finally:
         tracemalloc.stop()
     assert peak < 60e6
+
+
+def catalogue(name: str, sigma: float) -> UserTerm:
+    return UserTerm(name, "systematic", sigma, sigma, "pix", varies=True)
+
+
+def test_two_terms_that_vary_are_two_fields(exact):
+    """In quadrature, as one of their common size: limits between the two decide alike."""
+    limits = [Requirement(f"{limit}", "rms", limit) for limit in (0.012, 0.016, 0.02, 0.024)]
+    one = margins_of(exact, limits, terms=[catalogue("a", 0.01 * np.sqrt(2))])
+    two = margins_of(exact, limits, terms=[catalogue("a", 0.01), catalogue("b", 0.01)])
+    for x, y in zip(one, two, strict=True):
+        assert x.value == pytest.approx(y.value, rel=0.06)
+
+
+def test_a_catalogue_that_varies_is_judged_by_its_worst_form(exact):
+    """The maximum of independent errors and of a field that grows outwards exceeds an offset."""
+    limit = [Requirement("a", "max", 0.03)]
+    still = margins_of(exact, limit, terms=[replace(catalogue("a", 0.01), varies=False)])
+    (moving,) = margins_of(exact, limit, terms=[catalogue("a", 0.01)])
+    assert still[0].verdict == "met"
+    assert moving.probability_met < still[0].probability_met and moving.verdict != "met"
+    doubt = Caveat("the residuals go with magnitude")
+    (doubted,) = margins_of(exact, limit, terms=[catalogue("a", 0.01)], caveats=[doubt])
+    assert doubt.text in doubted.reason and "varies over the field" in doubted.reason
+
+
+@pytest.mark.parametrize(("stars", "small"), [(1500, True), (20, False)])
+def test_few_stars_may_scatter_little_by_chance(stars, small):
+    dof = 2 * stars - 20
+    assert scatter_too_small(0.75 * dof, dof) == small
+    assert not scatter_too_small(0.85 * dof, dof)

@@ -66,6 +66,10 @@ class LinearDeviations:
     scatter : dict of str to ndarray, shape (n,)
         Draws of each scatter.
     n_exposures : int
+    kinds : tuple of str
+        Deviations of each exposure: of 'shift', 'rotation', 'scale' and 'shear'.
+    size : float
+        Half the longer side of a chip, in the unit of u, v: that of a shift of 1.
     """
 
     model: DistortionModel
@@ -75,6 +79,8 @@ class LinearDeviations:
     epoch: float
     scatter: dict[str, Float]
     n_exposures: int
+    kinds: tuple[str, ...] = ()
+    size: float = 1.0
 
     def polynomials(self, epoch: float | None, chip: int) -> Float:
         """Coefficients (n, 2, K) on a chip of the curvature alone, at an epoch."""
@@ -100,13 +106,18 @@ class LinearDeviations:
         at = np.array([self.model.time.epoch0[0] if self.model.time else 0.0])
         P = self.model.polynomials(mean, np.array([code]), at)[0].copy()
         P[:, 0] = 0.0
-        turned = {
+        along = np.zeros((2, *P.shape))
+        along[0, 0, 0] = along[1, 1, 0] = self.size
+        fields = {
+            "shift": [*along],
             "rotation": [np.stack([-P[1], P[0]])],
-            "shape": [P, np.stack([P[0], -P[1]]), P[::-1]],
+            "scale": [P],
+            "shear": [np.stack([P[0], -P[1]]), P[::-1]],
         }
         out = np.zeros((n, *P.shape))
-        for name, scatter in self.scatter.items():
-            for field in turned.get(name, []):
+        for kind in self.kinds:
+            scatter = self.scatter[SCATTERS[kind]]
+            for field in fields[kind]:
                 out += (scatter * rng.standard_normal(n))[:, None, None] * field
         return out
 
@@ -381,6 +392,8 @@ def deviation_draws(
         epoch=columns.middle,
         scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
         n_exposures=columns.n_exposures,
+        kinds=columns.kinds,
+        size=columns.size,
     )
 
 

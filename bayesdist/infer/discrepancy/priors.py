@@ -69,7 +69,7 @@ class DiscrepancyPriors:
 
 
 def log_widths(grid: Float) -> Float:
-    """Logarithms of the weights of amplitudes, in rising order, in an integral over their logarithm.
+    """Logarithms of the weights of rising amplitudes in an integral over their logarithm.
 
     Those of the trapezoidal rule, and at both ends what a half-Cauchy density has beyond them: it
     falls in proportion to the amplitude, or its inverse.

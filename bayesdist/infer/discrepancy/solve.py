@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_side
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.information import Information
-from bayesdist.infer.discrepancy.linear import linear_deviations
+from bayesdist.infer.discrepancy.linear import MOST_EXPOSURES, linear_deviations
 from bayesdist.infer.discrepancy.neighbours import SharedVariance, shared_variances
 from bayesdist.infer.discrepancy.noise import not_narrower, score_excess
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
@@ -21,10 +23,12 @@ from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_stars
 from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.scores import scores_of
+from bayesdist.infer.scores import Scores, scores_of
 from bayesdist.infer.settling import Settling
 from bayesdist.infer.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars import prepare
 from bayesdist.infer.views import Solution
+from bayesdist.model import DistortionModel
 
 __all__ = ["estimate_discrepancy"]
 
@@ -66,7 +70,8 @@ def estimate_discrepancy(
     sample : MatchTable, optional
         Some of the matches, or all: what is finer than the functions is seen in neighbouring stars.
     stars : MatchTable, optional
-        The same matches with codes of the catalogue's stars, which then have errors in common.
+        The same matches in memory: those of a star of the catalogue, by its code, have errors in
+        common, and exposures without frames of their own are told apart.
     structure : bool
         Whether there is structure beyond the model; not where look-up tables were fitted to it.
     exposures : bool
@@ -87,8 +92,11 @@ def estimate_discrepancy(
     """
     model, scores = solution.model, scores_of(solution)
     priors = priors or DiscrepancyPriors()
-    with opened(model, matches, compute) as shards:
-        sums: CellSums = shards.sum(cell_sums, scores, cells_per_side(len(shards.groups)))
+    if exposures and stars is not None and model.frames == "none" and _several(stars):
+        sums = _by_exposure(stars, scores, model)
+    else:
+        with opened(model, matches, compute) as shards:
+            sums = shards.sum(cell_sums, scores, cells_per_side(len(shards.groups)))
     working = Information(model, scores.theta, sums, parameter_priors or GaussianPriors.none(model))
     pixel = model.pixel_size(scores.theta)
     repeated = None
@@ -117,6 +125,24 @@ def estimate_discrepancy(
         facts["exposures"] = linear.n_exposures
         facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
     return Discrepancy(model, np.asarray(scores.theta), formal, noise, found, theta, linear, facts)
+
+
+def _several(stars: MatchTable) -> bool:
+    """Whether the matches are of several exposures, few enough that each may deviate."""
+    return 1 < len(stars.exposure_names) <= MOST_EXPOSURES
+
+
+def _by_exposure(stars: MatchTable, scores: Scores, model: DistortionModel) -> CellSums:
+    """Sums with groups of their own for exposures that have no frames of their own."""
+    side = cells_per_side(len(stars.exposure_names) * len(model.chips))
+    parts = []
+    for code in range(len(stars.exposure_names)):
+        rows = np.flatnonzero(stars.exposure == code)
+        if rows.size:
+            part = cell_sums(prepare(model, stars.select(rows))[0], scores, side)
+            of = np.full(len(part.groups), code)
+            parts.append(replace(part, groups=replace(part.groups, exposure=of)))
+    return reduce(add, parts)
 
 
 def _structures(
@@ -162,6 +188,7 @@ def _structures(
                     "axis": "uv"[a],
                     "rms": float(np.sqrt(np.mean(by_draw**2))),
                     "median": float(np.median(by_draw)),
+                    "most": float(np.quantile(by_draw, 0.95)),
                     "length_pix": posterior.length * max(chip.size) / 2,
                 }
             )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.linear import LinearDeviations
+from bayesdist.infer.discrepancy.linear import KINDS, LinearDeviations
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.model import DistortionModel
 
@@ -38,6 +38,8 @@ def discrepancy_to_arrays(
             "linear_curvature": linear.curvature,
             "linear_epoch": np.array(linear.epoch),
             "linear_exposures": np.array(linear.n_exposures),
+            "linear_kinds": np.array([k in linear.kinds for k in KINDS]),
+            "linear_size": np.array(linear.size),
         }
         arrays |= {f"scatter_{name}": values for name, values in linear.scatter.items()}
     return arrays, dict(found.facts)
@@ -71,6 +73,8 @@ def discrepancy_from_arrays(
                 if name.startswith("scatter_")
             },
             n_exposures=int(arrays["linear_exposures"]),
+            kinds=tuple(k for k, has in zip(KINDS, arrays["linear_kinds"], strict=True) if has),
+            size=float(arrays["linear_size"]),
         )
     mean, formal, noise = (arrays[k] for k in ("mean", "formal", "noise"))
     return Discrepancy(model, mean, formal, noise, structure, arrays["structure_theta"], linear)

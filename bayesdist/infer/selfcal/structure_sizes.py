@@ -47,16 +47,18 @@ def chip_structure(
     """
     found = ChipStructure(functions, waves, np.stack(coefficients, axis=1))
     here = found.evaluate(*_even_points())
+    sizes = [np.sqrt(np.mean((drawn @ here.T) ** 2, axis=1)) for drawn in coefficients]
     rows: list[dict[str, object]] = [
         {
             "chip": chip.number,
             "axis": axis,
             "field_rms": posterior.field_rms,
             "length_pix": posterior.length * max(chip.size) / 2,
-            "rms": float(np.sqrt(np.mean((drawn @ here.T) ** 2))),
-            "median": float(np.median(np.sqrt(np.mean((drawn @ here.T) ** 2, axis=1)))),
+            "rms": float(np.sqrt(np.mean(by_draw**2))),
+            "median": float(np.median(by_draw)),
+            "most": float(np.quantile(by_draw, 0.95)),
         }
-        for axis, drawn, posterior in zip("uv", coefficients, posteriors, strict=True)
+        for axis, by_draw, posterior in zip("uv", sizes, posteriors, strict=True)
     ]
     return found, rows
 
