@@ -10,7 +10,7 @@ import pytest
 from bayesdist.app.campaign.overlap import _aligned, _at_first_epoch, chosen_exposures
 from bayesdist.app.campaign.report import _residuals
 from bayesdist.data import MatchTable
-from bayesdist.infer.nodes.alternation import with_columns
+from bayesdist.infer.nodes.alternation import inside_chips, with_columns
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 
 SIZE = (1024.0, 512.0)
@@ -22,11 +22,11 @@ def turned(xy, degrees):
     return xy @ np.array([[c, -s], [s, c]]).T
 
 
-def rolled_pairs(tables, n=4000, rolls=(0.0, 100.0, 190.0, 275.0), seed=3):
+def rolled_pairs(tables, n=4000, rolls=(0.0, 100.0, 190.0, 275.0), seed=3, margin=0.5):
     """One detector with a pattern, seen at several rolls."""
     rng = np.random.default_rng(seed)
     exposure = np.repeat(np.arange(len(rolls)), n)
-    x, y = (rng.uniform(1.0, s, exposure.size) for s in SIZE)
+    x, y = (rng.uniform(0.5 + margin, s + 0.5 - margin, exposure.size) for s in SIZE)
     flat = np.column_stack(corrected(tables, x, y, chip=1))
     uv = np.concatenate([turned(flat[exposure == k], roll) for k, roll in enumerate(rolls)])
     uv += SIGMA * rng.standard_normal(uv.shape)
@@ -37,7 +37,8 @@ def rolled_pairs(tables, n=4000, rolls=(0.0, 100.0, 190.0, 275.0), seed=3):
     )  # fmt: skip
 
 
-def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll():
+@pytest.mark.parametrize("margin", [0.5, 0.0], ids=["inside", "up to the edges"])
+def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll(margin):
     rng = np.random.default_rng(1)
     values = 0.08 * rng.standard_normal((2, 8, 16))
     gx, gy = np.meshgrid(np.linspace(-1, 1, 16), np.linspace(-1, 1, 8))
@@ -46,18 +47,24 @@ def test_residuals_show_the_pattern_of_the_detector_whatever_the_roll():
     # without what a polynomial of order 2 could follow
     values = (flat - (A @ np.linalg.lstsq(A, flat.T)[0]).T).reshape(values.shape)
     table = LookupTable(1, values)
-    pairs = rolled_pairs([table])
+    pairs = rolled_pairs([table], margin=margin)
     x, y = corrected([table], pairs.x, pairs.y, chip=1)
     chip = Chip(1, "CCD", SIZE, (512.0, 256.0))
+    model = DistortionModel(2, (chip,), frames="affine", exposures=pairs.exposure_names)
+    moved = with_columns(pairs, x=x, y=y)
+    kept = inside_chips(moved, model)
+    assert kept.all() == (margin > 0)
     session = SimpleNamespace(
         pairs=pairs,
-        matches=with_columns(pairs, x=x, y=y),
-        plain_model=DistortionModel(2, (chip,), frames="affine", exposures=pairs.exposure_names),
+        matches=moved.select(kept),
+        inside_with_tables=kept,
+        plain_model=model,
         magnitude_errors=None,
         config=SimpleNamespace(fit=SimpleNamespace(clip_abs=2.0)),
         tables=(table,),
     )
     (found,) = _residuals(session)
+    pairs = pairs.select(kept)
     without, after = found.binned_without, found.binned_with
     shift = table.evaluate(pairs.x, pairs.y)
     column, row = (np.floor((a - 0.5) / 64).astype(int) for a in (pairs.x, pairs.y))

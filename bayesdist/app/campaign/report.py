@@ -19,7 +19,7 @@ from bayesdist.data import MatchTable, read_catalog, with_centroid_errors
 from bayesdist.data.motions import motion_error_line
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.infer.nodes import pixel_shifts
-from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
+from bayesdist.infer.nodes.alternation import inside_chips, with_columns
 from bayesdist.model import corrected
 
 if TYPE_CHECKING:
@@ -188,13 +188,19 @@ def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
     pairs, moved, model = session.pairs, session.matches, session.plain_model
     assert isinstance(moved, MatchTable)
     errors, farthest = session.magnitude_errors, session.config.fit.clip_abs
-    numbers = pairs.chip_number
     plain = pairs if errors is None else with_centroid_errors(pairs, errors)
     if any(table.filter for table in session.tables):  # those of the detector are not of this run
         detector = [table for table in session.tables if not table.filter]
-        x, y = corrected(detector, pairs.x, pairs.y, chip=numbers)
-        plain = on_the_chips(with_columns(plain, x=x, y=y), model)
-    left = []
+        x, y = corrected(detector, pairs.x, pairs.y, chip=pairs.chip_number)
+        plain = with_columns(plain, x=x, y=y)
+    # the stars that neither has moved off their chip
+    kept = session.inside_with_tables
+    both = kept & inside_chips(plain, model)
+    pairs, plain, moved = (
+        one if rows.all() else one.select(rows, reason="moved off the chip")
+        for one, rows in ((pairs, both), (plain, both), (moved, both[kept]))
+    )
+    numbers, left = pairs.chip_number, []
     for table in (plain, moved) if session.tables else (plain,):
         # errors are those of the centroids: beside what the tables take out, chi-square is no guide
         fit = fit_linear(table, model, clip_chi2=np.inf, clip_abs=farthest)

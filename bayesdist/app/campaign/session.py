@@ -34,7 +34,7 @@ from bayesdist.errors import NotSettledError
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, fit_by_magnitude
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
-from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
+from bayesdist.infer.nodes.alternation import inside_chips, on_the_chips, with_columns
 from bayesdist.infer.series import Series
 from bayesdist.infer.settling import Settling
 from bayesdist.model import DistortionModel, LookupTable, corrected
@@ -175,12 +175,21 @@ class CampaignSession(Session):
         return predictive_of_campaign(self)
 
     def _corrected(self, pairs: MatchTable) -> MatchTable:
-        if not self.tables:
-            return pairs
+        return on_the_chips(self._moved(pairs), self.plain_model) if self.tables else pairs
+
+    def _moved(self, pairs: MatchTable) -> MatchTable:
+        """Pairs at the pixels that the tables move them to."""
         x, y = corrected(
             self.tables, pairs.x, pairs.y, chip=pairs.chip_number, filter=self.inputs.filter
         )
-        return on_the_chips(with_columns(pairs, x=x, y=y), self.plain_model)
+        return with_columns(pairs, x=x, y=y)
+
+    @property
+    def inside_with_tables(self) -> NDArray[np.bool_]:
+        """Boolean mask of the pairs that the tables do not move off their chip."""
+        if not self.tables:
+            return np.ones(len(self.pairs), bool)
+        return inside_chips(self._moved(self.pairs), self.plain_model)
 
     def errors_by_magnitude(self, pairs: Matches) -> tuple[LinearFit, Matches, MagnitudeErrors]:
         """Fit of every exposure by itself and errors by magnitude, as `fit_by_magnitude`.

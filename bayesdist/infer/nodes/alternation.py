@@ -28,7 +28,15 @@ from bayesdist.infer.nodes.trust import Trust, fitted_trust
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
 
-__all__ = ["Alternated", "Fit", "Round", "alternate", "on_the_chips", "with_columns"]
+__all__ = [
+    "Alternated",
+    "Fit",
+    "Round",
+    "alternate",
+    "inside_chips",
+    "on_the_chips",
+    "with_columns",
+]
 
 Float = NDArray[np.float64]
 
@@ -249,11 +257,16 @@ def on_the_chips(matches: MatchTable, model: DistortionModel) -> MatchTable:
 
     There the polynomial is not defined.  They count in the tables all the same.
     """
+    inside = inside_chips(matches, model)
+    return matches if inside.all() else matches.select(inside, reason="moved off the chip")
+
+
+def inside_chips(matches: MatchTable, model: DistortionModel) -> NDArray[np.bool_]:
+    """Boolean mask (N,) of the matches whose pixels lie on their chip."""
     size = np.array([model.chips[model.chip_code(c)].size for c in matches.chip_numbers])
     nx, ny = size[matches.chip].T
     x, y = matches.x, matches.y
-    inside = (x >= 0.5) & (x <= nx + 0.5) & (y >= 0.5) & (y <= ny + 0.5)
-    return matches if inside.all() else matches.select(inside, reason="moved off the chip")
+    return np.asarray((x >= 0.5) & (x <= nx + 0.5) & (y >= 0.5) & (y <= ny + 0.5))
 
 
 def _trusted(matches: MatchTable, trust: Trust, jitter: Float) -> MatchTable:
