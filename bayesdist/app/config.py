@@ -334,7 +334,7 @@ class Sip(Section):
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
-    crval: tuple[float, float] = (0.0, 0.0)
+    crval: tuple[float, float] | None = None
 
 
 class Idctab(Section):
