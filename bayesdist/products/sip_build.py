@@ -73,10 +73,10 @@ def sip_from_solution(
         With ``linear="sip"`` also for angular u, v; without it their mean scale at the reference
         pixel.
     origin : tuple of float, optional
-        (u, v) from which ``linear="sip"`` counts, without `tangent_point`.  By default (0, 0) where u, v are offsets from
-        the reference pixel, and the reference pixel where they are positions on the detector: of
-        the two, the one that leaves the smaller constant terms.  The header states it in BDU0,
-        BDV0.
+        (u, v) from which ``linear="sip"`` counts, without `tangent_point`.  By default (0, 0)
+        where u, v are offsets from the reference pixel, and the reference pixel where they are
+        positions on the detector: of the two, the one that leaves the smaller constant terms.  The
+        header states it in BDU0, BDV0.
     notes : sequence of str
         Sentences for COMMENT.
 

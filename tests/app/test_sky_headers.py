@@ -7,6 +7,7 @@ is compared with it there.
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ import pytest
 from astropy import units as apu
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import Table, vstack
 from astropy.wcs import WCS, FITSFixedWarning, Sip
+from astropy.wcs.utils import fit_wcs_from_points
 
 from tests.app.support import EXACT, begin_stagewise, summary_of, write_config, write_job
 
@@ -93,9 +95,118 @@ def test_positions_are_those_of_the_truth(crval, parity, tmp_path, rng) -> None:
     assert sky["rms_arcsec"] == pytest.approx(np.sqrt(2) * NOISE, rel=0.1)
     # the mean of 600 stars, on each axis
     assert np.hypot(sky["mean_east_arcsec"], sky["mean_north_arcsec"]) < 5 * NOISE / np.sqrt(N)
-    assert f"{sky['rms_arcsec']:.4g} arcsec rms from RA, Dec of " in (
-        run / "bayesdist.log"
-    ).read_text()
+    assert (
+        f"{sky['rms_arcsec']:.4g} arcsec rms from RA, Dec of "
+        in (run / "bayesdist.log").read_text()
+    )
     assert not [f for f in product["findings"] if not f.startswith("note")]
     # as the budget has it, the file is the solution
     assert product["forward_rms"] < 1e-4 * PIXEL
+
+
+def test_a_given_crval_keeps_the_sky_right(tmp_path, rng) -> None:
+    """That of the tangent point, as once had to be given: the constants are folded in."""
+    truth = camera((83.8, -5.4), -1)
+    given = (83.81, -5.39)
+    run = made(tmp_path, truth, rng, products={"sip": {"crval": given}})
+    np.testing.assert_array_equal(header_of(run).wcs.crval, given)
+    assert np.sqrt(np.mean(separations(run, truth, rng) ** 2)) < 2 * NOISE * np.sqrt(20 / N)
+    assert summary_of(run)["products"][0]["sky"]["solution_arcsec"] < 1e-5 * PIXEL
+
+
+def test_of_several_exposures_it_is_the_first_one(tmp_path, rng) -> None:
+    """Dithered and rotated exposures: the header says whose sky it is, and has it."""
+    first, second = camera((83.8, -5.4), -1), camera((83.83, -5.38), -1, angle=0.8)
+    tables = []
+    for name, truth in (("a", first), ("b", second)):
+        tables.append(stars_of(truth, rng))
+        tables[-1]["exposure"] = name
+    both = vstack(tables)
+    config = write_job(
+        tmp_path / "job",
+        both,
+        data={"matches": "stars.ecsv", "sigma": NOISE},
+        detector={"size": SIZE},
+        model={"order": 3, "frames": "shift_rotation_scale"},
+        products={"sip": {}},
+    )
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "export")
+    assert np.sqrt(np.mean(separations(run, first, rng) ** 2)) < 2 * NOISE * np.sqrt(20 / N)
+    sky = summary_of(run)["products"][0]["sky"]
+    assert sky["n"] <= N and sky["solution_arcsec"] < 1e-5 * PIXEL
+    assert "On the sky it is exposure a" in (run / "sip.hdr").read_text()
+
+
+def test_two_chips_have_a_header_each(tmp_path, rng) -> None:
+    """One plane, two chips: each header has its own CRVAL, and both are right."""
+    chips = {1: camera((83.8, -5.4), -1), 2: camera((83.8, -5.145), -1, angle=0.71)}
+    tables = []
+    for number, truth in chips.items():
+        tables.append(stars_of(truth, rng))
+        tables[-1]["chip"] = number
+    config = write_job(
+        tmp_path / "job",
+        vstack(tables),
+        data={"matches": "stars.ecsv", "sigma": NOISE},
+        detector=None,
+        chip=[
+            {"number": n, "name": f"c{n}", "size": SIZE, "reference_pixel": (1000.5, 750.5)}
+            for n in chips
+        ],
+        model={"order": 3},
+        products={"sip": {}},
+    )
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "export")
+    x, y = rng.uniform(0.5, np.array(SIZE) + 0.5, (1000, 2)).T
+    for product, (number, truth) in zip(summary_of(run)["products"], chips.items(), strict=True):
+        found = SkyCoord(*header_of(run, product["path"]).all_pix2world(x, y, 1), unit="deg")
+        true = SkyCoord(*truth.all_pix2world(x, y, 1), unit="deg")
+        apart = found.separation(true).arcsec
+        assert np.sqrt(np.mean(apart**2)) < 2 * NOISE * np.sqrt(20 / N), number
+        assert product["sky"]["n"] <= N and product["sky"]["solution_arcsec"] < 1e-5 * PIXEL
+
+
+def test_a_header_that_is_off_is_called_wrong(tmp_path, rng, monkeypatch) -> None:
+    """CRVAL moved by ten pixels on its way to the file."""
+    from bayesdist.app.stages import export
+    from bayesdist.products import write_sip
+
+    def moved(sip, path):
+        write_sip(replace(sip, crval=(sip.crval[0], sip.crval[1] + 10 * PIXEL / 3600)), path)
+
+    monkeypatch.setattr(export, "write_sip", moved)
+    run = made(tmp_path, camera((83.8, -5.4), -1), rng)
+    [product] = summary_of(run)["products"]
+    assert any(f.startswith("error: sky: astropy.wcs puts pixels up to 4 arcsec") for f in
+               product["findings"])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("file", "order", "terms"), [("AstroTomii_corr.fits", 3, 10), ("Harry695_corr.fits", 2, 6)]
+)
+def test_fields_of_astrometry_net(file, order, terms, data_dir, tmp_path) -> None:
+    """Real stars: as astropy's own fit of a TAN-SIP header to the same ones has them."""
+    path = data_dir / "anet_pairs" / file
+    table = fits.getdata(path)
+    x, y = np.array(table["field_x"]), np.array(table["field_y"])
+    stars = SkyCoord(table["index_ra"], table["index_dec"], unit="deg")
+    config = write_config(
+        tmp_path / "config.toml",
+        data={"matches": str(path), "sigma": 0.5},
+        detector={"size": tuple(2 * int(np.ceil(v.max() / 2)) for v in (x, y))},
+        model={"order": order},
+        budget=[EXACT],
+        products={"sip": {}},
+    )
+    run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess", "export")
+    ours = SkyCoord(*header_of(run).all_pix2world(x, y, 1), unit="deg")
+    # this fit counts pixels from 0
+    fitted = fit_wcs_from_points((x - 1, y - 1), stars, projection="TAN", sip_degree=order)
+    theirs = SkyCoord(*fitted.all_pix2world(x, y, 1), unit="deg")
+    sky = summary_of(run)["products"][0]["sky"]
+    # they keep the false matches, so that the two differ by a part of the error of a fit
+    error = sky["rms_arcsec"] * np.sqrt(terms / len(x))
+    assert np.median(ours.separation(theirs).arcsec) < error
+    assert np.median(ours.separation(stars)) < 1.1 * np.median(theirs.separation(stars))
+    assert np.hypot(sky["mean_east_arcsec"], sky["mean_north_arcsec"]) < 3 * error
+    assert sky["solution_arcsec"] < 1e-6

@@ -107,9 +107,7 @@ def test_sigmas_are_those_of_draws_on_the_sky() -> None:
     point = {"tangent_point": (150.0, 30.0)}
     sip = sip_from_solution(solution, **point)
     drawn = [
-        sip_from_solution(
-            StandIn(solution.model, theta, solution.cov), inverse_order=2, **point
-        )
+        sip_from_solution(StandIn(solution.model, theta, solution.cov), inverse_order=2, **point)
         for theta in solution.draws(200, np.random.default_rng(11))
     ]
     assert set(sip.sigma_a) == set(sip.a)
