@@ -275,7 +275,9 @@ def _sky_cards(
     if tangent_point is None:
         if crval is not None:
             return ()
-        return (text_card("COMMENT", "CRVAL is nominal: where u, v lie on the sky is not known."),)
+        return (
+            text_card("COMMENT", "Where u, v lie on the sky is not known: CRVAL is a placeholder."),
+        )
     return (
         text_card("COMMENT", "CRVAL and CRPIX are those of the solution, on the sky of its stars."),
         number_card("LONPOLE", 180.0, "[deg] north is up also at a pole"),

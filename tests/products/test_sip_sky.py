@@ -35,9 +35,11 @@ def worst(solution, sip, point) -> float:
     return float(header.separation(on_the_sky(u, v, point)).arcsec.max())
 
 
-@pytest.mark.parametrize("place", POINTS)
-@pytest.mark.parametrize("flip", [False, True])
-@pytest.mark.parametrize("order", [1, 3, 5, 9])
+@pytest.mark.parametrize(
+    ("order", "flip", "place"),
+    [(3, flip, place) for flip in (False, True) for place in POINTS]
+    + [(order, order == 5, "near a pole") for order in (1, 5, 9)],
+)
 def test_the_header_is_right_by_itself(order: int, flip: bool, place: str) -> None:
     solution = some_solution(
         order, unit="arcsec", pixel=PIXEL, angle=2.2, flip=flip, offset=(-1.4, 1.3), strength=20.0
