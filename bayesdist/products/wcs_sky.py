@@ -146,7 +146,8 @@ def _distortion(
     pixels = np.column_stack([x.ravel(), y.ravel()])
     if wcs.has_distortion:
         moved = np.hypot(*(wcs.pix2foc(pixels, 1) - pixels).T).max()
-        words.lines.append(f"  moves     pixels by up to {moved:.4g} px, tables included")
+        tables = ", tables included" if any(_tables(wcs)) else ""
+        words.lines.append(f"  moves     pixels by up to {moved:.4g} px{tables}")
     lon, lat = _world(wcs, pixels)
     if (plain := _withoutpv_keywords(header, wcs)) is not None:
         flat = plain.wcs_world2pix(np.column_stack([lon, lat]), 1)
