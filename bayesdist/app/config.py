@@ -13,6 +13,7 @@ from pydantic import (
     PositiveFloat,
     PositiveInt,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
@@ -28,6 +29,7 @@ from bayesdist.assess.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENC
 from bayesdist.assess.linear_term import LINEAR_KINDS, LinearTerm
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms import GIVEN, said_by_user
+from bayesdist.data.units import length_advice
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.discrepancy import DiscrepancyPriors
@@ -68,6 +70,16 @@ class Data(Section):
     pixel_origin: Literal[0, 1] = 1
     tangent_point: tuple[float, float] | None = None
     rvb: RvbBlock | None = None
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _no_length(cls, unit: Any) -> Any:
+        advice = length_advice(unit) if isinstance(unit, str) else ""
+        if advice:
+            raise ValueError(
+                f"data.unit is {unit!r}, and positions are in pixels or angles; {advice}"
+            )
+        return unit
 
     @model_validator(mode="after")
     def _only_of_rvb(self) -> Data:
@@ -339,7 +351,7 @@ class Sip(Section):
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
-    crval: tuple[float, float] = (0.0, 0.0)
+    crval: tuple[float, float] | None = None
 
 
 class Idctab(Section):

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS, FITSFixedWarning
 from numpy.typing import NDArray
 
+from bayesdist.data.tangent import tangent_plane
 from bayesdist.model import LookupTable, corrected
-from bayesdist.products import IdcTab, SipHeader
+from bayesdist.products import IdcTab, SipHeader, sip_header
 from bayesdist.products.parity import parity_of
 from bayesdist.products.sip_build import ARCSEC
 
-__all__ = ["ReleasedSet", "sip_positions"]
+__all__ = ["ReleasedSet", "sip_positions", "sky_of_header"]
 
 Float = NDArray[np.float64]
 
@@ -26,6 +30,7 @@ def sip_positions(
     unit: str,
     scale_arcsec: float | None,
     like: SipHeader | None = None,
+    tangent_point: tuple[float, float] | None = None,
 ) -> Float:
     """(u, v) of pixels (N,) by the forward terms of a header, shape (N, 2).
 
@@ -40,11 +45,24 @@ def sip_positions(
         Arcseconds in a pixel, as the header was made with, for u and v in pixels.
     like : SipHeader, optional
         Whose CD and zero point hold, for a file that states neither.
+    tangent_point : tuple of float, optional
+        Sky position of u, v = 0: the way is then over the sky, as astropy.wcs has it.
     """
+    if tangent_point is not None:
+        plane = tangent_plane(*sky_of_header(sip_header(sip), x, y), tangent_point)
+        return np.stack(plane, axis=-1) / ARCSEC[unit]
     stated = like or sip
     in_unit = 3600.0 / (ARCSEC[unit] if unit != "pix" else scale_arcsec or 1.0)
     offset = stated.offset or (0.0, 0.0)
     return np.stack(sip.forward(x, y), axis=-1) @ (in_unit * stated.cd).T + offset
+
+
+def sky_of_header(header: fits.Header, x: Float, y: Float) -> tuple[Float, Float]:
+    """RA and Dec (N,) in degrees of pixels by a header, as astropy.wcs has them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        ra, dec = WCS(header).all_pix2world(x, y, 1)
+    return np.asarray(ra), np.asarray(dec)
 
 
 @dataclass(frozen=True, eq=False)

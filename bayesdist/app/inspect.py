@@ -12,7 +12,7 @@ __all__ = ["inspect"]
 
 
 def inspect(path: str | Path) -> str:
-    """Describe an IDCTAB, a D2IMFILE or NPOLFILE, a SIP header or a posterior.
+    """Describe an IDCTAB, a D2IMFILE or NPOLFILE, the WCS of a FITS file or header, or a posterior.
 
     Parameters
     ----------

@@ -20,8 +20,9 @@ def sip_of(session: Session, solution: Solution, chip: int) -> SipHeader:
         inverse_order=sip.inverse_order,
         linear=sip.linear,
         crval=sip.crval,
+        tangent_point=session.tangent_point,
         scale_arcsec=session.scale_arcsec,
-        notes=_notes(session),
+        notes=[*_notes(session), *_sky_notes(session)],
     )
 
 
@@ -50,3 +51,11 @@ def idctab_of(session: Session, solution: Solution) -> IdcTab:
 def _notes(session: Session) -> list[str]:
     """What a file has to say of the run it is from."""
     return [session.gauge_words] if session.gauge_words else []
+
+
+def _sky_notes(session: Session) -> list[str]:
+    """For which exposure a header is right on the sky, where they differ."""
+    model = session.model
+    if session.tangent_point is None or model.frames == "none" or len(model.exposures) < 2:
+        return []
+    return [f"On the sky it is exposure {model.exposures[0]}: others have frames of their own."]

@@ -36,6 +36,7 @@ from bayesdist.products import (
     write_sip,
     write_wise_meta,
 )
+from bayesdist.products.sip_build import ARCSEC
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
@@ -48,6 +49,7 @@ Positions = Callable[[Float, Float, int, float | None], Float]
 FORWARD, INVERSE = "forward", "inverse"
 GRID = (33, 33)  # points over which files are laid on the solution
 ROUNDING = 1e-9  # of a pixel
+SKY_ROUNDING = 2e-9  # arcsec: what double precision leaves of an RA of 360 degrees, and back
 
 
 def product_terms(session: Session) -> tuple[ProductTerm, ...]:
@@ -98,9 +100,12 @@ def _sip_terms(
 ) -> list[ProductTerm]:
     """Forward and inverse of one header for each chip."""
     unit, scale = session.solution.model.unit, session.scale_arcsec
+    point = session.tangent_point if like is None else None  # WISE's entries have no CRVAL
 
     def place(x: Float, y: Float, chip: int, _: float | None) -> Float:
-        return sip_positions(headers[chip], x, y, unit=unit, scale_arcsec=scale, like=like)
+        return sip_positions(
+            headers[chip], x, y, unit=unit, scale_arcsec=scale, like=like, tangent_point=point
+        )
 
     def missed(x: Float, y: Float, chip: int, _: float | None) -> Float:
         sip = headers[chip]
@@ -161,6 +166,8 @@ def _released(session: CampaignSession, folder: Path) -> list[ReleasedSet]:
 def _term(session: Session, file: str, direction: str, shift: Positions) -> ProductTerm:
     solution = session.solution
     least = ROUNDING * solution.model.pixel_size(solution.mean)
+    if session.tangent_point is not None:
+        least = max(least, SKY_ROUNDING / ARCSEC[solution.model.unit])
     against = "the solution" if direction == FORWARD else "its forward terms"
     source = f"{MEASURED}: as written, against {against}"
     return ProductTerm(f"{file}, {direction}", file, direction, shift, source, least)

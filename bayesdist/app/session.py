@@ -314,6 +314,14 @@ class Session:
         """Those that `assess` has made."""
         return kept_score_tests(self.run)
 
+    @property
+    def tangent_point(self) -> tuple[float, float] | None:
+        """Sky position of (u, v) = (0, 0), degrees; None where u, v are not said to be on the sky.
+
+        Only of matches: in other runs u, v lie along the detector.
+        """
+        return None if self.config.data is None else self.raw_matches.tangent_point
+
     @cached_property
     def dates(self) -> Float:
         """Distinct dates of the matches, in decimal years; none where they have none."""

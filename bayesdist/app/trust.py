@@ -5,6 +5,7 @@ from __future__ import annotations
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.periods import periods_of
 from bayesdist.app.session import Session
+from bayesdist.assess.units import pixel_doubt
 from bayesdist.assess.verdict import scatter_too_small
 from bayesdist.errors import InputError
 
@@ -17,6 +18,8 @@ def warnings_of(session: Session) -> list[str]:
     """What a reader of the numbers has to know, each as a sentence."""
     fit, out, circle = session.fit, [*session.doubts], session.in_circle
     out += [one.sentence for one in session.coverages if one.significant]
+    if doubt := pixel_doubt(fit):
+        out.append(doubt)
     if session.majority:
         out.append(session.majority)
     if session.misfit.significant:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
 from bayesdist.assess.grid import grid_pixels, mesh
@@ -60,14 +61,23 @@ class Coverage:
     def sentence(self) -> str:
         """What it means, as a clause."""
         part = f"chip {self.chip.name}" if self.several else "the detector"
-        x, y = mesh(*grid_pixels(self.chip.size, _FINE))
-        inside = self.beyond(x, y) <= 0
-        x, y = x[inside], y[inside]
+        (left, right), (bottom, top) = self.extent
         return (
             f"{100 * self.gap:.0f} % of {part} lies beyond the area that its stars cover (within "
-            f"x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to {y.max():.0f}): there the "
+            f"x {left:.0f} to {right:.0f}, y {bottom:.0f} to {top:.0f}): there the "
             "polynomial is extrapolated, and its errors are not known"
         )
+
+    @property
+    def extent(self) -> Float:
+        """Smallest and largest x, then y, of the area, shape (2, 2)."""
+        on_chip = [(0.5, n + 0.5) for n in self.chip.size]
+        reach = np.eye(2)[:, None] * [[1.0], [-1.0]]  # the least x, the least -x, ...
+        found = [
+            [linprog(way, self.sides[:, :2], -self.sides[:, 2], bounds=on_chip).x for way in axis]
+            for axis in reach
+        ]
+        return np.einsum("aca->ac", np.array(found))
 
     def beyond(self, x: Float, y: Float) -> Float:
         """Distance (N,) of pixels beyond the area; negative inside."""

@@ -9,7 +9,9 @@ from bayesdist.assess.solution import Solution
 from bayesdist.data.units import UNITS
 from bayesdist.errors import InputError
 
-__all__ = ["UNITS", "convert", "pixel_scale_of", "require_scale"]
+__all__ = ["UNITS", "convert", "pixel_doubt", "pixel_scale_of", "require_scale"]
+
+PIXELS_OF_ONE_KIND = 3.0  # factor by which two kinds of pixels differ at most
 
 _MAS = {"mas": 1.0, "arcsec": 1e3, "deg": 3.6e6}
 
@@ -101,3 +103,27 @@ def pixel_scale_of(
     if model.unit == "pix":
         return None
     return convert(model.pixel_size(solution.mean, chip), model.unit, "mas")
+
+
+def pixel_doubt(solution: Solution) -> str:
+    """Doubt about u and v that are called pixels and are not, as a clause; empty without one.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+
+    Returns
+    -------
+    str
+    """
+    model = solution.model
+    if model.unit != "pix":
+        return ""
+    size = model.linear_scale(solution.mean)
+    if 1 / PIXELS_OF_ONE_KIND <= size <= PIXELS_OF_ONE_KIND:
+        return ""
+    return (
+        f"u and v are called pixels, and one pixel of x, y is {size:.4g} of theirs: if they are "
+        f"millimetres, divide them and their errors by {size:.4g}; if they are angles, give their "
+        "unit; as they are, every error in 'pix' is in the unit of u and v"
+    )

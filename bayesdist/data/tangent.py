@@ -20,6 +20,8 @@ __all__ = [
     "direction_of",
     "direction_sum",
     "mean_direction",
+    "plane_axes",
+    "sky_of_plane",
     "tangent_jacobian",
     "tangent_plane",
 ]
@@ -154,3 +156,46 @@ def tangent_jacobian(
     out[..., 1, 0] = np.sin(d) * np.sin(delta) / D**2
     out[..., 1, 1] = np.cos(delta) / D**2
     return out
+
+
+def plane_axes(point: tuple[float, float]) -> Float:
+    """Unit vectors to the east, to the north and to the tangent point, as the rows of a matrix.
+
+    Parameters
+    ----------
+    point : tuple of float
+        Tangent point (ra0, dec0), degrees.
+
+    Returns
+    -------
+    ndarray, shape (3, 3)
+        A position of the plane lies in the direction (xi, eta, 1) @ rows, xi and eta in radians.
+    """
+    a, d = np.radians(point)
+    return np.array(
+        [
+            [-np.sin(a), np.cos(a), 0.0],
+            [-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)],
+            [np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)],
+        ]
+    )
+
+
+def sky_of_plane(xi: ArrayLike, eta: ArrayLike, point: tuple[float, float]) -> tuple[Float, Float]:
+    """Sky positions of points of a tangent plane: the inverse of `tangent_plane`.
+
+    Parameters
+    ----------
+    xi, eta : array_like
+        Seconds of arc.
+    point : tuple of float
+        Tangent point (ra0, dec0), degrees.
+
+    Returns
+    -------
+    ra, dec : ndarray
+        Degrees, ra in [0, 360).
+    """
+    xi, eta = np.asarray(xi, float) / ARCSEC, np.asarray(eta, float) / ARCSEC
+    x, y, z = np.moveaxis(np.stack([xi, eta, np.ones_like(xi)], axis=-1) @ plane_axes(point), -1, 0)
+    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))

@@ -8,7 +8,7 @@ import astropy.units as apu
 
 from bayesdist.errors import InputError
 
-__all__ = ["UNITS", "check_unit", "conversion", "unit_of"]
+__all__ = ["UNITS", "check_unit", "conversion", "length_advice", "unit_of"]
 
 UNITS = ("pix", "arcsec", "mas", "deg")
 
@@ -35,8 +35,20 @@ def check_unit(unit: str, *, where: str = "unit") -> str:
         For any other.
     """
     if unit not in UNITS:
-        raise InputError(f"unit is {unit!r}", where=where, do=f"choose one of {', '.join(UNITS)}")
+        do = length_advice(unit) or f"choose one of {', '.join(UNITS)}"
+        raise InputError(f"unit is {unit!r}", where=where, do=do)
     return unit
+
+
+def length_advice(unit: str) -> str:
+    """What to do with positions in a length, as millimetres of a focal plane; empty for others."""
+    parsed = apu.Unit(unit.strip(), parse_strict="silent")
+    if parsed.physical_type != "length":
+        return ""
+    return (
+        f"divide u, v and their errors by the size of a pixel in {unit} and call them 'pix', or "
+        "multiply them by the plate scale and call them 'arcsec'"
+    )
 
 
 def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
@@ -81,5 +93,5 @@ def conversion(unit: apu.UnitBase, to: str, *, where: str) -> float:
         raise InputError(
             f"unit {unit} cannot be brought to {to}",
             where=where,
-            do="correct the unit in the file or in the configuration",
+            do=length_advice(str(unit)) or "correct the unit in the file or in the configuration",
         ) from None

@@ -109,6 +109,13 @@ class LinearFit:
     dof: int
     condition: float
 
+    def __repr__(self) -> str:
+        return (
+            f"LinearFit({self.model.summary}, {self.n_used} of {self.n_rows} stars, "
+            f"rms {self.rms_u:.4g} and {self.rms_v:.4g} {self.unit}, "
+            f"chi2/dof {self.chi2:.5g}/{self.dof}, condition {self.condition:.3g})"
+        )
+
     @property
     def unit(self) -> str:
         """Unit of u and v."""

@@ -96,6 +96,15 @@ class Posterior:
     certificate: Certificate | None = None
     own_places: bool = False
 
+    def __repr__(self) -> str:
+        c = self.convergence
+        state = "converged" if c.converged else f"NOT CONVERGED ({'; '.join(c.reasons)})"
+        return (
+            f"Posterior({self.model.summary}, {self.n_stars} stars, {self.n_flagged} of them "
+            f"flagged, {len(self.flat)} draws, {state}, R-hat {c.rhat_max:.4g}, "
+            f"ESS {c.ess_bulk_min:.4g})"
+        )
+
     @property
     def approximation(self) -> str:
         """What every output has to say of draws that are not exact; empty where they are."""

@@ -229,6 +229,19 @@ class DistortionModel:
         return self._bases[0].n_terms
 
     @property
+    def summary(self) -> str:
+        """What it is, in a few words."""
+        names = ", ".join(chip.name or str(chip.number) for chip in self.chips[:4])
+        chips = f"{len(self.chips)} chip{'s' if len(self.chips) > 1 else ''}"
+        more = ", ..." if len(self.chips) > 4 else ""
+        frames = f", frames '{self.frames}'" if self.n_frame else ""
+        drift = f", {len(self.time.terms)} terms of time" if self.time is not None else ""
+        return (
+            f"order {self.order}, {chips} ({names}{more}){frames}{drift}, "
+            f"{self.n_params} parameters"
+        )
+
+    @property
     def n_frame(self) -> int:
         """Parameters of one exposure: of its frame, and of the chips' own deviations."""
         return len(frame_names(self.frames)) + len(self._own_names)
@@ -719,8 +732,21 @@ class DistortionModel:
             1 where u and v are pixels, else the square root of the pixel's area, without drift and
             frames.
         """
-        if self.unit == "pix":
-            return 1.0
+        return 1.0 if self.unit == "pix" else self.linear_scale(theta, chip)
+
+    def linear_scale(self, theta: ArrayLike, chip: int | None = None) -> float:
+        """Size of a pixel in what u and v are counted in, also where that is called pixels.
+
+        Parameters
+        ----------
+        theta, chip
+            As of `pixel_size`.
+
+        Returns
+        -------
+        float
+            Square root of the pixel's area at the reference pixel, without drift and frames.
+        """
         theta, basis = np.asarray(theta, float), self.basis(chip)
         linear = [
             basis.to_monomials(theta[self.coefficient_slice(chip, axis)])[1:3] for axis in (0, 1)

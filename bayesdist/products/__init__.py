@@ -12,7 +12,7 @@ from bayesdist.products.d2im import read_d2im, write_d2im
 from bayesdist.products.idctab import IdcTab, read_idctab, write_idctab
 from bayesdist.products.idctab_build import idctab_from_solution
 from bayesdist.products.idctab_lint import lint_idctab
-from bayesdist.products.inspect import describe, describe_idctab, describe_lookup_file, describe_sip
+from bayesdist.products.inspect import describe, describe_idctab, describe_lookup_file
 from bayesdist.products.lint import Finding
 from bayesdist.products.lookup_file import LookupFile, read_lookup_file, write_lookup_file
 from bayesdist.products.lookup_lint import lint_lookup_file
@@ -36,6 +36,7 @@ from bayesdist.products.sip_rotate import (
     rotated_sip,
     rotated_solution,
 )
+from bayesdist.products.sip_text import describe_sip
 from bayesdist.products.sip_write import sip_header, write_sip
 from bayesdist.products.storable import Lost, Stored, storable
 from bayesdist.products.subarray import Subarray

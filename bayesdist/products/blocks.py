@@ -138,7 +138,8 @@ def parse_blocks(raw: bytes, where: str) -> tuple[Block, ...]:
                 io.BytesIO(raw), memmap=False, lazy_load_hdus=False, disable_image_compression=True
             ) as hdus:
                 places = [hdu.fileinfo() for hdu in hdus]
-        except (OSError, ValueError, fits.VerifyError) as error:
+        except (OSError, ValueError, AttributeError, fits.VerifyError) as error:
+            # the AttributeError is of an HDU that does not conform to the standard
             raise FormatError(
                 f"is no FITS file ({error})", where=where, do="check the file"
             ) from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,28 +13,24 @@ from bayesdist.products.bivariate import largest_magnitude
 from bayesdist.products.blocks import read_blocks
 from bayesdist.products.idctab import FILTER_COLUMNS, IdcTab
 from bayesdist.products.idctab_lint import lint_idctab
-from bayesdist.products.indices import idctab_column, sip_keyword
-from bayesdist.products.lint import LEVELS, Finding
+from bayesdist.products.indices import idctab_column
+from bayesdist.products.lint import finding_lines
 from bayesdist.products.lookup_file import AXES, LookupFile
 from bayesdist.products.lookup_lint import lint_lookup_file
-from bayesdist.products.sip import SipHeader
-from bayesdist.products.sip_inverse import worst_closure
-from bayesdist.products.sip_lint import lint_sip
-from bayesdist.products.sip_read import holds_sip, read_sip
-from bayesdist.products.wise_lint import lint_wise_band
-from bayesdist.products.wise_meta import WiseBand, holds_wise_meta, read_wise_meta
+from bayesdist.products.sip_text import describe_wise_meta
+from bayesdist.products.wcs_file import header_file, holds_wcs
+from bayesdist.products.wcs_text import describe_wcs
+from bayesdist.products.wise_meta import holds_wise_meta, read_wise_meta
 
 __all__ = [
     "UNDERSTOOD",
     "describe",
     "describe_idctab",
     "describe_lookup_file",
-    "describe_sip",
-    "describe_wise_meta",
 ]
 
 UNDERSTOOD = (
-    "an IDCTAB, a D2IMFILE or NPOLFILE, or a FITS file or text file of cards with SIP keywords, "
+    "an IDCTAB, a D2IMFILE or NPOLFILE, or a FITS file or text file of cards with WCS keywords, "
     "or WISE meta-data"
 )
 
@@ -55,7 +51,7 @@ def describe(path: str | os.PathLike[str]) -> str:
     Parameters
     ----------
     path : path-like
-        An IDCTAB, a D2IMFILE or NPOLFILE, a FITS file or text header with SIP keywords, or a WISE
+        An IDCTAB, a D2IMFILE or NPOLFILE, a FITS file or text header with WCS keywords, or a WISE
         meta-data file.
 
     Returns
@@ -78,8 +74,9 @@ def describe(path: str | os.PathLike[str]) -> str:
         return describe_idctab(IdcTab(blocks, name))
     if any(block.name in AXES for block in blocks[1:]):
         return describe_lookup_file(LookupFile(blocks, name))
-    if holds_sip(path):  # also of a header without its data, which is no whole FITS file
-        return describe_sip(read_sip(path), name)
+    file = header_file(path)  # also of headers without their data, which are no whole FITS file
+    if any(holds_wcs(hdu.header) for hdu in file.hdus):
+        return describe_wcs(file)
     if holds_wise_meta(path):
         return describe_wise_meta(read_wise_meta(path), name)
     if damaged is not None and _looks_like_fits(path):
@@ -135,7 +132,7 @@ def describe_idctab(tab: IdcTab) -> str:
         )
     for row in _first_rows(tab):
         lines += ["", *_row_text(tab, row)]
-    return "\n".join([*lines, "", *_finding_text(lint_idctab(tab))])
+    return "\n".join([*lines, "", *finding_lines(lint_idctab(tab))])
 
 
 def _first_rows(tab: IdcTab) -> list[int]:
@@ -192,94 +189,6 @@ def _non_linear(tab: IdcTab, row: int) -> str:
     return " and ".join(out)
 
 
-# -- SIP -----------------------------------------------------------------------------------------
-
-
-def describe_sip(sip: SipHeader, name: str = "SIP header") -> str:
-    """Text of a SIP header.
-
-    Parameters
-    ----------
-    sip : SipHeader
-    name : str
-        What to call it.
-
-    Returns
-    -------
-    str
-    """
-    size = "unknown" if sip.size is None else f"{sip.size[0]} x {sip.size[1]} px"
-    lines = [
-        f"{name}: SIP header, A_ORDER {sip.order[0]}, B_ORDER {sip.order[1]}, image size {size}",
-        f"  CTYPE     {sip.ctype[0]}, {sip.ctype[1]}",
-        f"  CRPIX     {sip.crpix[0]:.10g}, {sip.crpix[1]:.10g}",
-        f"  CRVAL     {sip.crval[0]:.10g}, {sip.crval[1]:.10g} deg",
-        f"  scale     {3600 * np.sqrt(abs(np.linalg.det(sip.cd))):.8g} arcsec/px",
-        f"  CD        {' '.join(f'{value:.10g}' for value in sip.cd.flat)}",
-    ]
-    if sip.offset is not None:
-        lines.append(f"  offset    {sip.offset[0]:.10g}, {sip.offset[1]:.10g} {sip.unit} at CRVAL")
-    for prefix, value in zip("AB", sip.dmax, strict=True):
-        if value is not None:
-            lines.append(f"  {prefix}_DMAX    {value:.6g} px")
-    if sip.inverse_order is not None:
-        stated = "not stated" if sip.closure is None else f"{sip.closure:.3g} px"
-        lines.append(f"  inverse   AP_ORDER {sip.inverse_order[0]}, worst closure {stated}")
-    return "\n".join([*lines, *_all_terms(sip), "", *_finding_text(lint_sip(sip))])
-
-
-def describe_wise_meta(bands: Iterable[WiseBand], name: str = "WISE meta-data") -> str:
-    """Text of a WISE meta-data file: its bands, each with what contradicts what.
-
-    Parameters
-    ----------
-    bands : iterable of WiseBand
-    name : str
-        What to call it.
-
-    Returns
-    -------
-    str
-    """
-    bands = tuple(bands)
-    lines = [f"{name}: WISE meta-data, {', '.join(f'W{one.band}' for one in bands)}"]
-    for one in bands:
-        sip = one.sip
-        lines += ["", f"W{one.band}: {sip.size[0]} x {sip.size[1]} px, A_ORDER {sip.order[0]}, "
-                  f"B_ORDER {sip.order[1]}, SKEW {one.skew:g} rad"]  # fmt: skip
-        lines += [
-            f"  {prefix}_DMAX    {one.printed[f'{prefix}_DMAX']} px"
-            for prefix in "AB"
-            if f"{prefix}_DMAX" in one.printed
-        ]
-        if sip.has_inverse:
-            lines.append(f"  closure   {worst_closure(sip, sip.size):.2g} px at worst")
-        lines += [*_all_terms(sip), "", *_finding_text(lint_wise_band(one))]
-    return "\n".join(lines)
-
-
-def _all_terms(sip: SipHeader) -> list[str]:
-    lines = []
-    for prefix, terms, sigma in (
-        ("A", sip.a, sip.sigma_a), ("B", sip.b, sip.sigma_b), ("AP", sip.ap, {}), ("BP", sip.bp, {})
-    ):  # fmt: skip
-        if terms:
-            lines += ["", *_term_lines(prefix, terms, sigma)]
-    return lines
-
-
-def _term_lines(
-    prefix: str,
-    terms: Mapping[tuple[int, int], float],
-    sigma: Mapping[tuple[int, int], float],
-) -> list[str]:
-    out = []
-    for powers in sorted(terms, key=lambda t: (sum(t), -t[0])):
-        error = f"  +- {sigma[powers]:.3e}" if powers in sigma else ""
-        out.append(f"  {sip_keyword(prefix, *powers):<7} {terms[powers]:21.13e}{error}")
-    return out
-
-
 # -- look-up tables ------------------------------------------------------------------------------
 
 
@@ -328,11 +237,4 @@ def describe_lookup_file(file: LookupFile) -> str:
             if plane.name in sigma:
                 row += f"{np.median(sigma[plane.name].nodes):15.4f}"
             lines.append(row)
-    return "\n".join([*lines, "", *_finding_text(lint_lookup_file(file))])
-
-
-def _finding_text(findings: tuple[Finding, ...]) -> list[str]:
-    if not findings:
-        return ["Findings: none"]
-    ordered = sorted(findings, key=lambda f: LEVELS.index(f.level))
-    return ["Findings:", *(f"  {finding}" for finding in ordered)]
+    return "\n".join([*lines, "", *finding_lines(lint_lookup_file(file))])

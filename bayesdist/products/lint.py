@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-__all__ = ["LEVELS", "Finding", "repeated_values"]
+__all__ = ["LEVELS", "Finding", "finding_lines", "repeated_values"]
 
 LEVELS = ("error", "warning", "note")
 
@@ -51,3 +51,20 @@ def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
         if value != 0:
             groups.setdefault(abs(value), []).append(name)
     return [tuple(names) for names in groups.values() if len(names) > 1]
+
+
+def finding_lines(findings: Sequence[Finding]) -> list[str]:
+    """Lines of text, the weightiest finding first.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+
+    Returns
+    -------
+    list of str
+    """
+    if not findings:
+        return ["Findings: none"]
+    ordered = sorted(findings, key=lambda f: LEVELS.index(f.level))
+    return ["Findings:", *(f"  {finding}" for finding in ordered)]

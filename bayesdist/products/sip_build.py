@@ -16,6 +16,7 @@ from bayesdist.products.cards import convergence_cards, number_card, text_card
 from bayesdist.products.monomials import ChipPolynomial, chip_polynomial
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
 from bayesdist.products.sip_inverse import fit_inverse, worst_closure
+from bayesdist.products.sky_polynomial import sky_polynomial
 
 __all__ = ["ARCSEC", "sip_from_solution"]
 
@@ -33,7 +34,8 @@ def sip_from_solution(
     epoch: float | None = None,
     inverse_order: int | None = None,
     linear: str = "cd",
-    crval: tuple[float, float] = (0.0, 0.0),
+    crval: tuple[float, float] | None = None,
+    tangent_point: tuple[float, float] | None = None,
     scale_arcsec: float | None = None,
     origin: tuple[float, float] | None = None,
     notes: Sequence[str] = (),
@@ -41,6 +43,8 @@ def sip_from_solution(
     """SIP header of one chip at one epoch.
 
     (u, v) are taken as the axes (xi, eta) of the tangent plane, in the frame of the first exposure.
+    Where the sky position at which that plane touches is known, the header is right on the sky by
+    itself.
 
     Parameters
     ----------
@@ -56,17 +60,23 @@ def sip_from_solution(
         stands for the reference pixel.  'sip': the CD matrix is a pure scale, and A and B hold
         constant and linear terms too, relative to u = x and v = y in pixels, as the WISE pipeline
         has it (WSDC D-T033, Appendix B); CRVAL stands for `origin`.
-    crval : tuple of float
-        Sky position that the header states, degrees.
+    crval : tuple of float, optional
+        Sky position that the header states, degrees.  With `tangent_point` that of the reference
+        pixel by default, and CRPIX is the pixel of any other one that is given; where the solution
+        has no such pixel, A_0_0 and B_0_0 are what they must be.  Without `tangent_point` it is
+        written as it is, (0, 0) by default.
+    tangent_point : tuple of float, optional
+        Sky position of (u, v) = (0, 0), degrees: `MatchTable.tangent_point`.  The polynomial is
+        brought to the plane of CRVAL, to 1e-5 pixels, with a higher order where that takes one.
     scale_arcsec : float, optional
         Arcseconds per pixel, for u, v in pixels; without it 1 arcsec is written and called nominal.
         With ``linear="sip"`` also for angular u, v; without it their mean scale at the reference
         pixel.
     origin : tuple of float, optional
-        (u, v) from which ``linear="sip"`` counts.  By default (0, 0) where u, v are offsets from
-        the reference pixel, and the reference pixel where they are positions on the detector: of
-        the two, the one that leaves the smaller constant terms.  The header states it in BDU0,
-        BDV0.
+        (u, v) from which ``linear="sip"`` counts, without `tangent_point`.  By default (0, 0)
+        where u, v are offsets from the reference pixel, and the reference pixel where they are
+        positions on the detector: of the two, the one that leaves the smaller constant terms.  The
+        header states it in BDU0, BDV0.
     notes : sequence of str
         Sentences for COMMENT.
 
@@ -78,8 +88,8 @@ def sip_from_solution(
     ------
     InputError
         For an unknown chip or `linear`, a missing epoch, an order that cannot be written, a linear
-        part that is singular ('cd') or far from the identity ('sip'), or a distortion without
-        inverse.
+        part that is singular ('cd') or far from the identity ('sip'), a distortion without inverse,
+        a tangent point of u, v in pixels, or a `crval` that is no position of the field.
     """
     if linear not in ("cd", "sip"):
         raise InputError(
@@ -96,9 +106,19 @@ def sip_from_solution(
         )
     poly = chip_polynomial(solution, chip=chip, epoch=epoch)
     _check_linear(poly)
-    order = max(model.order, SIP_ORDERS[0])  # readers ignore order 1
-    inverse = _inverse_order(inverse_order, order)
     unit_arcsec = ARCSEC[model.unit] if model.unit != "pix" else (scale_arcsec or 1.0)
+    sky = None
+    if tangent_point is not None:
+        if model.unit == "pix" or origin is not None:
+            raise InputError(
+                "a tangent point is given beside u, v in pixels or an origin of one's own",
+                where="tangent_point",
+                do="leave one of them out",
+            )
+        sky = sky_polynomial(poly, unit_arcsec, tangent_point, crval)
+        poly, crval = sky.poly, sky.crval
+    order = max(SIP_ORDERS[0], *(i + j for i, j in poly.terms))  # readers ignore order 1
+    inverse = _inverse_order(inverse_order, order)
     if linear == "cd":
         cd = poly.linear * unit_arcsec / 3600.0
         offset = (float(poly.constant[0]), float(poly.constant[1]))
@@ -111,18 +131,24 @@ def sip_from_solution(
     variance = np.einsum("akd,akd->ak", jacobian @ np.asarray(solution.cov, float), jacobian)
     sigma = np.sqrt(np.maximum(variance, 0.0))  # a variance of -1e-40 is a rounded zero
     kept = [k for k, (i, j) in enumerate(poly.terms) if linear == "sip" or i + j >= 2]
+    if sky is not None:
+        offset = sky.offset
+        if linear == "cd" and poly.constant.any():  # no pixel has CRVAL: only A and B can say so
+            kept.insert(0, poly.index(0, 0))
+            notes = (*notes, "No pixel of the solution has CRVAL: A_0_0 and B_0_0 hold the rest.")
     a, b = ({poly.terms[k]: float(terms[axis, k]) for k in kept} for axis in (0, 1))
     if not kept:
         a = b = dict.fromkeys(((2, 0), (1, 1), (0, 2)), 0.0)
     cards = _cards(
         poly, linear, epoch if model.time is not None else None, model.unit, scale_arcsec
     )
+    cards += _sky_cards(tangent_point, crval)
     cards += tuple(text_card("COMMENT", part) for note in notes for part in wrap(note, 70))
     cards += tuple(convergence_cards(solution))
     size = (int(poly.chip.size[0]), int(poly.chip.size[1]))
     sip = SipHeader(
         crpix=poly.chip.reference_pixel,
-        crval=(float(crval[0]), float(crval[1])),
+        crval=(0.0, 0.0) if crval is None else (float(crval[0]), float(crval[1])),
         cd=cd,
         ctype=("RA---TAN-SIP", "DEC--TAN-SIP"),
         order=(order, order),
@@ -240,3 +266,21 @@ def _cards(
     if epoch is not None:
         cards.append(number_card("BDEPOCH", float(epoch), "[yr] epoch of the coefficients"))
     return tuple(cards)
+
+
+def _sky_cards(
+    tangent_point: tuple[float, float] | None, crval: tuple[float, float] | None
+) -> tuple[str, ...]:
+    """What CRVAL rests on."""
+    if tangent_point is None:
+        if crval is not None:
+            return ()
+        return (
+            text_card("COMMENT", "Where u, v lie on the sky is not known: CRVAL is a placeholder."),
+        )
+    return (
+        text_card("COMMENT", "CRVAL and CRPIX are those of the solution, on the sky of its stars."),
+        number_card("LONPOLE", 180.0, "[deg] north is up also at a pole"),
+        number_card("BDTAN1", float(tangent_point[0]), "[deg] sky position of u, v = 0: RA"),
+        number_card("BDTAN2", float(tangent_point[1]), "[deg] sky position of u, v = 0: Dec"),
+    )

@@ -208,8 +208,15 @@ def cd_matrix(header: fits.Header, where: str) -> NDArray[np.float64]:
 
 
 def image_size(header: fits.Header) -> tuple[int, int] | None:
-    """Columns and rows that a header states; a side of one pixel is a placeholder."""
-    for names in (("NAXIS1", "NAXIS2"), ("IMAGEW", "IMAGEH")):
+    """Columns and rows that a header states; a side of one pixel is a placeholder.
+
+    A compressed image is a table, and its size stands in ZNAXIS; HST writes NPIX where all pixels
+    have one value and no data follow.
+    """
+    pairs = [("ZNAXIS1", "ZNAXIS2"), ("IMAGEW", "IMAGEH"), ("NPIX1", "NPIX2")]
+    if "TABLE" not in str(header.get("XTENSION", "")):
+        pairs.insert(0, ("NAXIS1", "NAXIS2"))
+    for names in pairs:
         n = [header.get(name, 0) for name in names]
         if all(isinstance(k, int | float) and k > 1 for k in n):
             return int(n[0]), int(n[1])

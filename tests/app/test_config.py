@@ -180,6 +180,11 @@ def test_a_key_like_no_other_lists_the_known_ones():
         ("data", {"matches": "a", "sigma": -0.1}, ["data.sigma", "-0.1", "greater than 0"]),
         ("data", {"matches": "a", "sigma": "colums"}, ["'columns' or 'by_magnitude'", "number"]),
         ("data", {"matches": "a", "unit": "furlong"}, ["data.unit", "'mas'"]),
+        (
+            "data",
+            {"matches": "a", "unit": "mm"},
+            ["'mm'", "divide u, v", "size of a pixel", "'pix'"],
+        ),
         ("data", {"matches": "a", "format": "xls"}, ["data.format", "'hst1pass'"]),
         ("data", {"matches": "a", "pixel_origin": 2}, ["data.pixel_origin", "0 or 1"]),
         ("data", {"matches": "a", "columns": {"x": 1}}, ["data.columns.x", "text"]),

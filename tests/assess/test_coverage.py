@@ -44,6 +44,15 @@ def test_a_gap_of_known_area_is_found(rng, n, half):
     assert "chip A" in covered(*even(rng, n, half), several=True).sentence
 
 
+def test_the_sentence_states_where_stars_reach(rng):
+    """To the pixel, not to a point of some grid."""
+    x, y = even(rng, 2000)
+    inside = (x > 90.0) & (x < 950.0) & (y > 70.0)
+    x, y = x[inside], y[inside]
+    text = covered(x, y).sentence
+    assert f"within x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to {y.max():.0f})" in text
+
+
 def test_missing_corners_are_a_gap(rng):
     """Within a circle through the middles of the sides: 1 - pi / 4 of the area is missing."""
     x, y = even(rng, 20_000)

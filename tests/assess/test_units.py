@@ -4,6 +4,7 @@ import astropy.units as u
 import pytest
 
 from bayesdist.assess import UNITS, convert, pixel_scale_of
+from bayesdist.assess.units import pixel_doubt
 from bayesdist.errors import InputError
 
 SCALE = 49.7  # mas, ACS/WFC
@@ -57,3 +58,17 @@ def test_the_scale_of_a_solution_in_pixels_must_be_given(anisotropic):
     assert pixel_scale_of(anisotropic("pix"), scale_mas=49.7) == 49.7
     with pytest.raises(InputError, match="scale is -1"):
         pixel_scale_of(anisotropic("pix"), scale_mas=-1.0)
+
+
+@pytest.mark.parametrize(
+    ("pixel", "doubted"), [(1.0, False), (0.5, False), (0.009, True), (40, True)]
+)
+def test_millimetres_that_are_called_pixels_are_doubted(from_monomials, pixel, doubted):
+    """Pixels of 9 micrometres in mm, as a fibre instrument's metrology has them."""
+    linear = {(1, 0): pixel}, {(0, 1): -pixel}
+    chip = {"order": 2, "size": (6000.0, 6000.0), "reference_pixel": (3000.5, 3000.5)}
+    text = pixel_doubt(from_monomials(*linear, unit="pix", **chip))
+    assert bool(text) == doubted
+    if doubted:
+        assert f"one pixel of x, y is {pixel:.4g} of theirs" in text
+    assert pixel_doubt(from_monomials(*linear, unit="arcsec", **chip)) == ""

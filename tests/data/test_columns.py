@@ -212,3 +212,15 @@ def test_inputs_stay_as_they_are():
     m = read(t, pixel_origin=0)
     m.u[:] = 0.0
     assert (t["x"] == before["x"]).all() and t.colnames == before.colnames
+
+
+@pytest.mark.parametrize("unit", [None, "pix", "mm"])
+def test_lengths_are_refused_with_what_to_do(unit):
+    """u and v in millimetres of a focal plane."""
+    t = stars()
+    for name in ("u", "v"):
+        t[name].unit = "mm"
+    with pytest.raises(
+        InputError, match="divide u, v and their errors by the size of a pixel in mm"
+    ):
+        read(t, unit=unit)

@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 
 from bayesdist.data import mean_direction, tangent_plane
-from bayesdist.data.tangent import tangent_jacobian
+from bayesdist.data.tangent import sky_of_plane, tangent_jacobian
 from bayesdist.errors import InputError
 
 
@@ -20,6 +21,8 @@ def test_the_plane_is_that_of_astropy_wcs(point, rng):
     ra, dec = wcs.wcs_pix2world(xi, eta, 1)
     found = tangent_plane(ra, dec, point)
     np.testing.assert_allclose(found, [xi, eta], rtol=0, atol=1e-8)
+    back = SkyCoord(*sky_of_plane(xi, eta, point), unit="deg")
+    assert back.separation(SkyCoord(ra, dec, unit="deg")).arcsec.max() < 1e-8
 
 
 def test_xi_grows_to_the_east_and_eta_to_the_north():

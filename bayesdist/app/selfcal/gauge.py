@@ -15,7 +15,7 @@ from bayesdist.app.selfcal.inputs import Commanded
 from bayesdist.errors import InputError
 from bayesdist.infer.prior import GaussianPriors
 from bayesdist.infer.selfcal.calibrate import curvatures
-from bayesdist.infer.selfcal.gauge import Gauge, NamedDirection, find_gauge, functionals
+from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge, functionals
 from bayesdist.infer.selfcal.information import (
     Information,
     frame_information,
@@ -32,7 +32,6 @@ Piece = Callable[[Float], Information]
 
 CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"
 CONTRADICTS = 1e-4  # probability of a chi-square at which a piece and the detections do not agree
-FAR = 3.0  # times the final error: a piece by which a direction is known no better fixes it not
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,17 +138,7 @@ def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> I
 def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> Information:
     """A tie of the pixel at the first chip's reference pixel to a size."""
     row = functionals(model, theta)["scale"]
-    return tie(theta, row, float(np.log(size / _pixel(model, theta))), sigma)
-
-
-def _pixel(model: DistortionModel, theta: Float) -> float:
-    """Side of a pixel at the reference pixel, also where u and v are called pixels."""
-    basis = model.basis()
-    linear = [
-        basis.to_monomials(theta[model.coefficient_slice(model.chips[0].number, axis)])[1:3]
-        for axis in (0, 1)
-    ]
-    return float(np.sqrt(abs(np.linalg.det(linear))))
+    return tie(theta, row, float(np.log(size / model.linear_scale(theta))), sigma)
 
 
 # -- told -----------------------------------------------------------------------------------------
@@ -183,7 +172,7 @@ def _fixed_by(direction: NamedDirection, sigmas: Mapping[str, Mapping[str, float
         return CONVENTION
     limit = FAR * direction.sigma_fixed
     found = [name for name, of in sigmas.items() if of[direction.name] < limit]
-    if np.isfinite(direction.sigma) and direction.sigma < limit:
+    if direction.by_detections:
         return DETECTIONS
     return " and ".join(found) or "all together"
 

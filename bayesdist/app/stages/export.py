@@ -8,6 +8,7 @@ from typing import Any
 
 from bayesdist.app.made_files import idctab_of, sip_of, wise_sip_of
 from bayesdist.app.session import Session
+from bayesdist.app.sky_closure import sky_closure
 from bayesdist.assess.product_terms import PRODUCT, with_product
 from bayesdist.products import (
     lint_idctab,
@@ -39,6 +40,7 @@ def run_export(session: Session, written: Sequence[dict[str, Any]] = ()) -> None
             header = sip_of(session, session.solution, chip.number)
             write_sip(header, path)
             findings = lint_sip(read_sip(path), size=chip.size)
+            sky = sky_closure(session, path, chip.number)
             products.append(
                 {
                     "path": path.name,
@@ -47,9 +49,13 @@ def run_export(session: Session, written: Sequence[dict[str, Any]] = ()) -> None
                     "closure_pix": header.closure,
                     "a_dmax": header.a_dmax,
                     "b_dmax": header.b_dmax,
+                    **({} if sky is None else {"sky": sky.summary}),
                     "findings": [f"{f.level}: {f.where}: {f.message}" for f in findings],
                 }
             )
+            if sky is not None:
+                log.log(sky.level, "export: %s: %s", path.name, sky.sentence)
+                products[-1]["findings"] += sky.findings
     idc = config.products.idctab
     if idc is not None:
         path = run / f"{idc.instrument}_{idc.detector}_idc.fits".lower()

@@ -194,6 +194,11 @@ def _product_checks(product: dict[str, Any], check: Callable[..., Any]) -> list[
         out.append(check("worst closure of the inverse (pix)", product["closure_pix"]))
         out.append(check("A_DMAX (pix)", product["a_dmax"]))
         out.append(check("B_DMAX (pix)", product["b_dmax"]))
+    if product.get("sky"):
+        sky = product["sky"]
+        name = f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"
+        out.append(check(name, sky["rms_arcsec"]))
+        out.append(check("largest distance from the solution (arcsec)", sky["solution_arcsec"]))
     levels = {"error": "fail", "warning": "warn", "note": "note"}
     for finding in product["findings"]:
         level, _, text = finding.partition(": ")

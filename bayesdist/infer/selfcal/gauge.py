@@ -20,6 +20,7 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
 __all__ = [
+    "FAR",
     "GENERATORS",
     "SAME_ROLL",
     "Gauge",
@@ -47,6 +48,7 @@ POINTS = ("zero_point_u", "zero_point_v")
 NULL = 1e-10  # of the largest eigenvalue: no information but rounding
 FREE_PIX = 10.0  # error at the detector's edge above which a direction counts as free
 WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as nearly free
+FAR = 3.0  # times the final error: what knows a direction no better than this does not fix it
 EXPLAINED = 1e-2  # share of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
 LEAST_PIVOT = 0.02
@@ -85,6 +87,12 @@ class NamedDirection:
     def weak(self) -> bool:
         """Whether they say next to nothing."""
         return self.free or self.sigma * self.edge_pix > WEAK_PIX
+
+    @property
+    def by_detections(self) -> bool:
+        """Whether nothing that is known beside the detections makes it much better."""
+        known = np.isfinite(self.sigma) and np.isfinite(self.sigma_fixed)
+        return bool(known and self.sigma < FAR * self.sigma_fixed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +185,8 @@ class Gauge:
 
 
 def _fixed(one: NamedDirection) -> str:
+    if one.by_detections:
+        return "nothing that is given fixes it better"
     if np.isfinite(one.sigma_fixed):
         return f"fixed by what is given beside them, sigma {one.sigma_fixed:.2g} {one.unit}".strip()
     return "held by convention"

@@ -100,3 +100,21 @@ def test_a_tie_of_the_scale():
     scale = next(d for d in gauge.directions if d.name == "scale")
     assert scale.sigma_fixed == pytest.approx(3e-5, rel=1e-6)
     assert gauge.open.shape[1] == 3
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_nothing_that_is_not_given_is_said_to_fix(tied):
+    """Rolls within half a degree, and nothing given: what is nearly free is so by detections.
+
+    A skew that is tied as well as the edge of the detector is wide is fixed by that.
+    """
+    simulated = field(6, 9, 300, rolls=(0, 0.25, 0.5))
+    row = functionals(simulated.model, simulated.theta)["skew_plus"]
+    gauge, _ = _gauge(simulated, tie(simulated.theta, row, 0.0, 1e-7) if tied else None)
+    weak = {d.name: d for d in gauge.directions if d.weak and not d.free}
+    assert SKEW <= set(weak)
+    said = [text for text in gauge.sentences if text.startswith("skew_plus: nearly free")]
+    assert len(said) == 1
+    assert said[0].endswith("nothing that is given fixes it better") != tied
+    assert ("fixed by what is given" in said[0]) == tied
+    assert weak["skew_plus"].by_detections != tied and weak["skew_cross"].by_detections
