@@ -289,8 +289,8 @@ class RunDirectory:
 
     @staticmethod
     def _hashes(config: Config, base: Path) -> dict[str, str]:
-        """SHA-256 of every file that the configuration names."""
-        return {str(f): sha256_of(f) for f in input_files(_named(config, base))}
+        """SHA-256 of every file that the configuration names, by its absolute path."""
+        return {str(f): sha256_of(f) for f in input_files(_named(config, base.resolve()))}
 
     def _check_unchanged(
         self, config: Config, text: str, inputs: dict[str, str], seed: int | None

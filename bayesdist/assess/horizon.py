@@ -63,7 +63,8 @@ class Horizon:
         if self.date is None:
             return f"{name}: the probability stays at {asked:g} or more until {last:.1f}"
         if self.date == first:
-            return f"{name}: the probability is below {asked:g} from {first:.1f} on"
+            found = float(self.probability[0])
+            return f"{name}: the probability is below {asked:g} already at {first:.1f} ({found:.2g})"
         early, late = self.interval
         until = f"{late:.1f}" if late is not None else f"after {last:.1f}"
         since = first if early is None else early
@@ -98,7 +99,8 @@ def horizon_of(
     """Follow a requirement through time.
 
     The error at each epoch is that of the drift as the model has it, extrapolated with its
-    covariance.  What a model of linear drift cannot know, a drift that bends, is not in it.
+    covariance, and with the curvature that the data and its prior leave open, where the errors hold
+    it.
 
     Parameters
     ----------

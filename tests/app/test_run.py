@@ -384,6 +384,19 @@ def _tables(folder):
     }
 
 
+def test_a_stage_after_a_run_by_relative_paths(tmp_path, monkeypatch):
+    """Inputs are the same files from wherever they are named."""
+    config = write_job(tmp_path / "job")
+    run = config.parent / "run"
+    run.mkdir()
+    text = config.read_text().replace('"stars.ecsv"', '"../stars.ecsv"')
+    (run / "config.toml").write_text(text)
+    monkeypatch.chdir(config.parent)
+    good("fit", "run")
+    monkeypatch.chdir("/")
+    good("sample", run)
+
+
 def test_each_stage_by_itself_gives_the_same_numbers(copy, posterior):
     before, tables = summary_of(copy), _tables(copy)
     maps = fits.getdata(copy / "maps.fits", "MIX_CORR")

@@ -77,7 +77,9 @@ class Matching:
             f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in "
             f"common with them, and the usual share is {100 * usual[k]:.0f} %{told}",
             where="selfcal.lists",
-            do=TURN_BACK if half else "check its pixels, or leave it out",
+            do=TURN_BACK
+            if half
+            else "check its pixels and its commanded offset and roll, or leave it out",
         )
 
 
