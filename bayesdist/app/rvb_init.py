@@ -8,6 +8,7 @@ from bayesdist.data import input_files
 from bayesdist.data.parquet_files import describe_part
 from bayesdist.data.rvb import rvb_bands, stream_rvb
 from bayesdist.data.rvb_files import ARRAY_SIZE, IPAC, MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.data.tables import read_table
 from bayesdist.errors import InputError
 
 __all__ = ["is_rvb", "rvb_template"]
@@ -41,7 +42,7 @@ scale_mas = {scale:.0f}
 
 
 def is_rvb(matches: str | Path) -> bool:
-    """Whether these are RvB pairs: IPAC tables, or Parquet with a column of WISE's bands.
+    """Whether these are RvB pairs: IPAC tables with u, v, or Parquet with WISE's bands.
 
     Raises
     ------
@@ -50,7 +51,7 @@ def is_rvb(matches: str | Path) -> bool:
     """
     files = input_files(matches)
     if all(file.name.lower().endswith(IPAC) for file in files):
-        return True
+        return {"u", "v"} <= {name.lower() for name in read_table(files[0]).colnames}
     if any(file.suffix.lower() != ".parquet" for file in files):
         return False
     part = describe_part(files[0])

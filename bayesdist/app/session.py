@@ -16,7 +16,7 @@ from bayesdist.app.chips import check_chips
 from bayesdist.app.config import CATALOGUE_WORDS, Config
 from bayesdist.app.discrepancy import RunDiscrepancy, keep_discrepancy, kept_discrepancy
 from bayesdist.app.holdout import predictive_of_run, split_of
-from bayesdist.app.matches import load_matches
+from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.rvb import RvbInput
 from bayesdist.app.score_tests import keep_score_tests, kept_score_tests
@@ -140,15 +140,7 @@ class Session:
         assert data is not None
         if data.format == "rvb":
             return self._rvb.load()
-        return load_matches(
-            self.run.matches,
-            format=data.format,
-            columns=data.columns,
-            unit=data.unit,
-            sigma=data.sigma,
-            pixel_origin=data.pixel_origin,
-            tangent_point=data.tangent_point,
-        )
+        return load_matches(self.run.matches, **reading_options(data, self.config.chip))
 
     @cached_property
     def _rvb(self) -> RvbInput:
