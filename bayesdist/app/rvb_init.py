@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bayesdist.app.init_columns import column_lines
 from bayesdist.data import input_files
 from bayesdist.data.parquet_files import describe_part
 from bayesdist.data.rvb import rvb_bands, stream_rvb
@@ -96,6 +97,7 @@ def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]]:
     scale = MAS * ARRAY_SIZE["W1"][0] / nx
     return n, {
         "format": _FORMAT.format(band=band, found=comment),
+        "columns": column_lines(None, None),
         "unit_line": "",
         "sigma": said[sigma],
         "detector": _SELECTION.format(colour=_COLOUR if coloured else "")

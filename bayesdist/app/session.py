@@ -45,6 +45,7 @@ from bayesdist.assess.solution import Solution
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.data.holdout import Split
 from bayesdist.diagnose import ScoreTest, score_tests
+from bayesdist.diagnose.epoch_shift import EpochShift, epoch_shift
 from bayesdist.errors import ConfigError
 from bayesdist.infer import (
     GaussianPriors,
@@ -196,6 +197,7 @@ class Session:
             "stars",
             "misfits",
             "_sample",
+            "epoch_shift",
         ):
             self.__dict__.pop(name, None)
 
@@ -367,6 +369,11 @@ class Session:
     def doubts(self) -> list[str]:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
         return [f"{t.finding}: {t.remedy}" for t in self.score_tests if t.significant]
+
+    @cached_property
+    def epoch_shift(self) -> EpochShift | None:
+        """Error of the epochs that the residuals of the fit show; None without proper motions."""
+        return None if self.config.data is None else epoch_shift(self._sample, self.fit)
 
     @property
     def gauge_words(self) -> str:

@@ -16,6 +16,8 @@ def warnings_of(session: Session) -> list[str]:
     """What a reader of the numbers has to know, each as a sentence."""
     fit, out, circle = session.fit, [*session.doubts], session.in_circle
     out += [one.sentence for one in session.coverages if one.significant]
+    if session.epoch_shift is not None and session.epoch_shift.significant:
+        out.append(session.epoch_shift.sentence)
     if session.majority:
         out.append(session.majority)
     if session.misfit.significant:

@@ -163,6 +163,8 @@ def reference_sky(
     step = np.hypot(*motion) * np.abs(dt)
     first, last = float(epoch.min()), float(epoch.max())
     to = f"{first:.2f}" + (f" to {last:.2f}" if last - first > 0.005 else "")
+    if not np.any(step) and parallax is None:
+        return ReferenceSky(ra, dec, sigma, motion, ("positions are of the exposures' epoch",))
     note = (
         f"positions of {np.median(start):.2f} were moved to {to} by proper motions"
         f"{'' if parallax is None else ' and parallaxes'} (median {np.median(step):.2g}, "
@@ -200,7 +202,7 @@ def _in_unit(column: SourceColumn, key: str, unit: str, *, missing: bool) -> Flo
     if own is None and unit:
         # catalogues write degrees for positions and mas for the rest: no guess is safe
         raise InputError(
-            "has no unit",
+            "has no unit, and its name is that of no known catalogue",
             where=column.where,
             do="write it into the file (mas, or mas / yr), or leave the column out: "
             f'columns = {{{key} = ""}}',

@@ -79,6 +79,8 @@ class ScoredSample:
         Number of the star, from 0: detections of one star share the error of its reference
         position.
     blocks : tuple of Block
+    motion : ndarray, shape (2, N), or None
+        Proper motions along u and v, in the unit of u, v per year.
     """
 
     model: DistortionModel
@@ -94,6 +96,7 @@ class ScoredSample:
     epoch: Float | None
     star: Int
     blocks: tuple[Block, ...]
+    motion: Float | None = None
 
     def __len__(self) -> int:
         return len(self.X)
@@ -162,6 +165,7 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
         epoch=None if table.epoch is None else table.epoch[rows],
         star=np.unique(codes, return_inverse=True)[1],
         blocks=_blocks(stars, table.exposure[rows], scores.theta),
+        motion=None if table.pm_u is None else np.stack([table.pm_u, table.pm_v])[:, rows],
     )
 
 

@@ -40,8 +40,6 @@ class Layout:
         Of the pixels in the file.
     chips : tuple of str
         Names of the chips, where there are several.
-    edits : tuple of (str, str)
-        What `init` names as still to be given: text of the configuration, and its replacement.
     options : tuple of str
         Of the command line, which the message of `init` names.
     """
@@ -51,7 +49,6 @@ class Layout:
     taken: dict[str, str] = field(default_factory=dict)
     origin: int = 1
     chips: tuple[str, ...] = ()
-    edits: tuple[tuple[str, str], ...] = ()
     options: tuple[str, ...] = ()
 
 
@@ -119,7 +116,8 @@ def ascii_head(f: Field, path: Path) -> None:
 
 
 def ldac(f: Field, path: Path) -> None:
-    card = fits.Column("Field Header Card", "80A", array=np.array(["SIMPLE  =                    T"]))
+    text = np.array(["SIMPLE  =                    T"])
+    card = fits.Column("Field Header Card", "80A", array=text)
     head = fits.BinTableHDU.from_columns([card], name="LDAC_IMHEAD")
     objects = fits.BinTableHDU(_sextractor(f).as_array(), name="LDAC_OBJECTS")
     fits.HDUList([fits.PrimaryHDU(), head, objects]).writeto(path)
@@ -152,9 +150,8 @@ def daophot(f: Field, path: Path) -> None:
     wide = [9, 10, 10, 12, 14, 14, 14]
 
     def line(cells: list[str], mark: str = "") -> str:
-        return mark + "".join(
-            f"{c:<{w - len(mark) * (k == 0)}}" for k, (c, w) in enumerate(zip(cells, wide, strict=True))
-        )
+        padded = [f"{cell:<{width}}" for cell, width in zip(cells, wide, strict=True)]
+        return mark + f"{cells[0]:<{wide[0] - len(mark)}}" + "".join(padded[1:])
 
     out = ["#K IRAF       = NOAO/IRAFV2.16          version    %-23s     ",
            line(names, "#N "), line(units, "#U "), line(formats, "#F "), "#"]  # fmt: skip
@@ -170,7 +167,7 @@ def gaia_table(f: Field, *, epoch: float | None = 2016.0) -> Table:
     table = Table(
         {"x": f.x, "y": f.y, "source_id": 4_000_000_000_000_000_000 + np.arange(n),
          "ref_epoch": np.full(n, 2016.0), "ra": f.ra, "ra_error": np.full(n, 0.1), "dec": f.dec,
-         "dec_error": np.full(n, 0.1), "parallax": np.full(n, 0.5),
+         "dec_error": np.full(n, 0.1), "parallax": np.full(n, 1e-6),
          "parallax_error": np.full(n, 0.1), "pmra": f.rng.normal(0, 5, n),
          "pmra_error": np.full(n, 0.1), "pmdec": f.rng.normal(0, 5, n),
          "pmdec_error": np.full(n, 0.1), "phot_g_mean_mag": f.mag}
@@ -309,7 +306,6 @@ def own_names(f: Field, path: Path) -> None:
 
 
 SKY = {"ra": "ra", "dec": "dec"}
-NEITHER = 'sigma = "by_magnitude"'
 
 LAYOUTS = (
     Layout("ascii_head.cat", ascii_head,
@@ -330,7 +326,7 @@ LAYOUTS = (
     Layout("lsst.parquet", lsst,
            {"x": "slot_Centroid_x", "chip": "detector", "flux": "instFlux"}, origin=0),
     Layout("afw.fits", radians, {"x": "base_SdssCentroid_x", "ra": "coord_ra"}, origin=0),
-    Layout("des.fits", des, {"chip": "ccd", "exposure": "EXPNUM"}, chips=("25", "31")),
+    Layout("des.fits", des, {"chip": "ccd", "exposure": "EXPNUM"}, chips=("chip 25", "chip 31")),
     Layout("detpos.fits", des_positions, {"chip": "detpos"}, chips=("N4", "S1")),
     Layout("plane.csv", plane_csv, {"u": "XI", "v": "ETA", "sigma_u": "E_XI"}),
     Layout("savetxt.dat", commented_header, {"x": "x", "ra": "RA"}),
