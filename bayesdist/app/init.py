@@ -189,10 +189,8 @@ def _chip_names(matches: Matches) -> tuple[str, ...]:
     return own or tuple(f"chip {number}" for number in matches.chip_numbers)
 
 
-def _read(
-    matches: str | Path, columns: Mapping[str, str] | None
-) -> tuple[Matches, str, str, bool]:
-    """Matches, the line about their unit, how errors are to be had, and whether columns have them."""
+def _read(matches: str | Path, columns: Mapping[str, str] | None) -> tuple[Matches, str, str, bool]:
+    """Matches, the line about their unit, where errors come from, and whether columns are read."""
     unit, line = None, ""
     sigma: float | str = "columns"
     while True:

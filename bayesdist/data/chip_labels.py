@@ -56,7 +56,13 @@ def numbered_chips(
     if not names:
         numbers, codes = np.unique(column.integers(), return_inverse=True)
         return codes, tuple(numbers.tolist()), ()
-    number_of = chips or numbered(names)
+    number_of = numbered(names) if chips is None else chips
+    if not number_of:
+        raise InputError(
+            f"holds names of chips ({names[0]!r}), and tables on disk need their numbers first",
+            where=column.where,
+            do="give [[chip]] blocks of these names, or write numbers",
+        )
     own, labels = column.labels()
     for name in labels:
         if name not in number_of:

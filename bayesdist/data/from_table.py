@@ -61,8 +61,9 @@ def sky_positions(
     found = find_columns(table.colnames, columns, ALIASES, source=source, pairs=PAIRS)
     if not is_on_sky(table.colnames, found, columns, source):
         return None
-    stay = ~(absent(table[found["ra"]], not_finite=True) | absent(table[found["dec"]],
-                                                                  not_finite=True))
+    stay = ~(
+        absent(table[found["ra"]], not_finite=True) | absent(table[found["dec"]], not_finite=True)
+    )
     table = table if stay.all() else table[stay]
     return sky_columns(Quantities(table, found, source))
 

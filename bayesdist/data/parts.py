@@ -117,7 +117,7 @@ class MatchPart:
                 tangent_point=self.tangent_point,
                 epoch=self.epoch,
                 catalogue_epoch=self.catalogue_epoch,
-                chips=self.chips,
+                chips=self.chips or {},  # names alone have no numbers before all are known
             )
             for key, labels in _LABELS.items():
                 if key not in found:
@@ -157,7 +157,7 @@ def match_part(
     Parameters
     ----------
     part : ParquetPart
-    columns, unit, read_sigma, pixel_origin, tangent_point, exposure_name, epoch, catalogue_epoch,
+    columns, unit, read_sigma, pixel_origin, tangent_point, exposure_name, epoch, catalogue_epoch
     chips
         As `matches_from_table`.
 
@@ -173,12 +173,6 @@ def match_part(
     source = str(part.path)
     found = needed_columns(part.colnames, columns, source=source, read_sigma=read_sigma)
     found.pop("flux", None)  # magnitudes of all rows or of none: that takes all of them
-    if "chip" in found and chips is None and found["chip"] in part.texts:
-        raise InputError(
-            "holds names of chips, and large tables need their numbers first",
-            where=f"{source}, column {found['chip']!r}",
-            do="give [[chip]] blocks of these names, or write numbers",
-        )
     notes: tuple[str, ...] = ()
     if pixel_origin is None:
         pixel_origin, why = origin_of(found["x"], part.colnames, {})

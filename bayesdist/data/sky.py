@@ -102,9 +102,7 @@ def _sexagesimal(column: SourceColumn, texts: NDArray[np.str_], key: str) -> Flo
             try:
                 Angle(text, unit=unit)
             except (ValueError, TypeError, apu.UnitsError):
-                raise column.fail(
-                    index, f"{text[:40]!r} stands where an angle must be"
-                ) from None
+                raise column.fail(index, f"{text[:40]!r} stands where an angle must be") from None
         raise
 
 

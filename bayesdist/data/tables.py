@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
 import io
 import warnings
@@ -110,7 +111,7 @@ def _read_ecsv(path: Path) -> Table:
 
 
 def _read_csv(path: Path) -> Table:
-    return Table.read(_bare_lines(path), format="ascii.csv", comment="#", guess=False)
+    return _separated(path, ",", "ascii.csv")
 
 
 def _read_text(path: Path) -> Table:
@@ -118,7 +119,28 @@ def _read_text(path: Path) -> Table:
 
 
 def _read_tsv(path: Path) -> Table:
-    return Table.read(_bare_lines(path), format="ascii.tab", comment="#", guess=False)
+    return _separated(path, "\t", "ascii.tab")
+
+
+def _separated(path: Path, mark: str, format: str) -> Table:
+    lines = _bare_lines(path)
+    _refuse_short_rows(lines, mark, path)
+    return Table.read(lines, format=format, comment="#", guess=False)
+
+
+def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
+    """Refuse rows with fewer cells than there are names: astropy fills them up in silence."""
+    width, row = 0, 0
+    for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
+        if not cells or cells == [""]:
+            continue
+        if width and len(cells) < width:
+            raise FormatError(
+                f"has {len(cells)} of {width} cells",
+                where=f"{path}, row {row}",
+                do="the table may be truncated: fetch or write it again",
+            )
+        width, row = width or len(cells), row + 1
 
 
 def _read_votable(path: Path) -> Table:

@@ -1,4 +1,4 @@
-"""Residuals that go with the proper motions of the stars: the epochs are not what they are taken for.
+"""Residuals that go with the proper motions of the stars: the epochs are not as they are taken.
 
     r_i = -mu_i dt        mu_i the proper motion of star i, dt the same for all
 

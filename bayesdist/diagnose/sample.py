@@ -165,8 +165,14 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
         epoch=None if table.epoch is None else table.epoch[rows],
         star=np.unique(codes, return_inverse=True)[1],
         blocks=_blocks(stars, table.exposure[rows], scores.theta),
-        motion=None if table.pm_u is None else np.stack([table.pm_u, table.pm_v])[:, rows],
+        motion=_motion(table, rows),
     )
+
+
+def _motion(table: MatchTable, rows: Int) -> Float | None:
+    if table.pm_u is None or table.pm_v is None:
+        return None
+    return np.stack([table.pm_u[rows], table.pm_v[rows]])
 
 
 def _blocks(stars: Stars, exposure: Int, theta: Float) -> tuple[Block, ...]:

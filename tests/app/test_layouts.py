@@ -8,11 +8,11 @@ import warnings
 import numpy as np
 import pytest
 from astropy.table import Table
-from tests.app.layouts import LAYOUTS, POINT, SCALE, SIGMA, field_of, gaia_table, plane_of, sky_of
-from tests.app.support import good, refused
 
 from bayesdist.data import read_matches, tangent_plane
 from bayesdist.infer import load_posterior
+from tests.app.layouts import LAYOUTS, POINT, SCALE, SIGMA, field_of, gaia_table, plane_of, sky_of
+from tests.app.support import good, refused
 
 BY_NAME = {layout.name: layout for layout in LAYOUTS}
 RUN = ("ascii_head.cat", "photutils.ecsv", "gaia.csv", "wise.txt", "detpos.fits")
@@ -64,7 +64,7 @@ def test_a_layout_goes_from_init_to_check(tmp_path, name):
 @pytest.mark.parametrize("name", RUN)
 def test_a_layout_runs(tmp_path, name):
     """Calibrated positions agree with the truth that no file holds."""
-    _, field, config = begun(name, tmp_path)
+    _, _, config = begun(name, tmp_path)
     good("run", config, "-o", tmp_path / "run")
     posterior = load_posterior(tmp_path / "run")
     if len(posterior.model.chips) > 1:

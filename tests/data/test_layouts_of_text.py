@@ -40,6 +40,17 @@ def test_a_truncated_ipac_table_is_refused(tmp_path):
         read_matches(path, sigma=1.0, unit="pix")
 
 
+@pytest.mark.parametrize("suffix", ["csv", "tsv"])
+def test_a_row_that_is_cut_short_is_refused(tmp_path, suffix):
+    path = tmp_path / f"stars.{suffix}"
+    stars().write(path, format={"csv": "ascii.csv", "tsv": "ascii.tab"}[suffix])
+    text = path.read_text()
+    assert len(read_matches(path, sigma=1.0, unit="pix")) == 6
+    path.write_text(text[: text.rindex("," if suffix == "csv" else "\t")])
+    with pytest.raises(InputError, match=rf"stars\.{suffix}, row 6: has 3 of 4 cells"):
+        read_matches(path, sigma=1.0, unit="pix")
+
+
 def test_columns_in_plain_text(tmp_path):
     rows = "".join(f"{r['x']} {r['y']} {r['u']} {r['v']}\n" for r in stars())
     for head in ("x y u v\n", "# a remark\n# x y u v\n", "#x y u v\n"):
@@ -84,7 +95,7 @@ def test_chips_by_name_keep_one_numbering(tmp_path):
 
 def test_chips_by_name_on_disk_need_their_numbers(tmp_path):
     stars(detpos=["S10"] * 3 + ["S2"] * 3).write(tmp_path / "a.parquet")
-    with pytest.raises(InputError, match=r"column 'detpos': holds names of chips"):
+    with pytest.raises(InputError, match=r"column 'detpos': holds names of chips \('S10'\)"):
         open_matches(tmp_path / "a.parquet", sigma=1.0, unit="pix")
     m = open_matches(tmp_path / "a.parquet", sigma=1.0, unit="pix", chips={"S2": 1, "S10": 2})
     assert m.chip_numbers == (1, 2)

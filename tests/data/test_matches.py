@@ -68,7 +68,9 @@ def test_quantities_are_converted():
     t = table(u=(k + 1) * apu.deg, v=Masked(k * apu.mas, mask=k == 4), unit="arcsec",
               sigma_u=np.ones(5) * apu.mas, sigma_v=np.ones(5), pm_u=k * apu.mas / apu.yr,
               pm_v=k, x=k * apu.pix)  # fmt: skip
-    assert t.u.tolist() == [3600, 7200, 10800, 14400] and t.rejected == {"no value in column 'v'": 1}
+    assert t.u.tolist() == [3600, 7200, 10800, 14400] and t.rejected == {
+        "no value in column 'v'": 1
+    }
     np.testing.assert_allclose(t.v, [0, 1e-3, 2e-3, 3e-3])
     np.testing.assert_allclose(t.sigma_u, 1e-3)
     np.testing.assert_allclose(t.pm_u, [0, 1e-3, 2e-3, 3e-3])

@@ -84,7 +84,7 @@ def test_errors_grow_with_those_of_motions_and_parallaxes(rng):
     dt, n = 2003.1 - 2016.0, 200_000
     when = Time(2003.1, format="jyear", scale="tdb")
     earth = get_body_barycentric("earth", when, ephemeris="builtin").xyz.to_value("au")
-    r, east, north = directions(t[:1])
+    _, east, north = directions(t[:1])
     found = []
     for axis, s, s_pm, rho in ((east, 0.3, 0.4, -0.6), (north, 0.2, 0.1, 0.3)):
         cov = [[s**2, rho * s * s_pm], [rho * s * s_pm, s_pm**2]]
