@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -10,6 +13,7 @@ from astropy.table import Table
 from bayesdist.data import matches_from_table, open_matches, read_matches
 from bayesdist.data.chip_labels import numbered
 from bayesdist.data.text_tables import is_text_table
+from bayesdist.data.usual_names import ALIASES
 from bayesdist.errors import InputError
 
 
@@ -138,3 +142,11 @@ def test_names_of_a_pair_go_together():
     t.remove_column("y")
     m = matches_from_table(t[:1], unit="pix")
     assert m.x.tolist() == [1.0] and m.y.tolist() == [1.0]
+
+
+def test_the_documentation_lists_every_name():
+    page = (Path(__file__).parents[2] / "docs" / "your_table.md").read_text(encoding="utf-8")
+    for key, names in ALIASES.items():
+        assert re.search(rf"\b{key}\b", page), key
+        for name in names:
+            assert f"`{name}`" in page, name
