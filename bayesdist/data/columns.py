@@ -283,6 +283,9 @@ def _projected(
         out["sigma_u"], out["sigma_v"] = np.sqrt(variance)
     if sky.motion is not None:
         out["pm_u"], out["pm_v"] = np.einsum("nij,jn->in", J, sky.motion)
+    if sky.sigma_motion is not None:
+        variance = np.einsum("nij,jn->in", J**2, sky.sigma_motion**2)
+        out["sigma_pm_u"], out["sigma_pm_v"] = np.sqrt(variance)
     return out
 
 

@@ -26,7 +26,7 @@ Int = NDArray[np.int64]
 _POSITIONS = ("x", "y", "u", "v")
 _SIGMAS = ("sigma_u", "sigma_v")
 _NOMINAL = ("u_nominal", "v_nominal")
-_MOTIONS = ("pm_u", "pm_v")
+_MOTIONS = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
 _OPTIONAL = ("epoch", "mag", "colour", *_NOMINAL, *_MOTIONS)
 _CODES = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
 _INTEGERS = ("row", "source", "star", *_CODES)
@@ -80,9 +80,10 @@ class MatchTable:
     u_nominal, v_nominal : ndarray, optional
         Where an earlier solution put the star, in `unit`: both or neither.  The match was looked
         for within a circle about it.
-    pm_u, pm_v : ndarray, optional
-        Proper motion of the reference star in `unit` per year, where the catalogue gives it: both
-        or neither.  u and v hold it already, if `notes` say that they were moved.
+    pm_u, pm_v, sigma_pm_u, sigma_pm_v : ndarray, optional
+        Proper motion of the reference star in `unit` per year, and its standard errors, where the
+        catalogue gives them: both axes or neither.  u and v hold it already, if `notes` say that
+        they were moved.
     chip_names : tuple of str
         Names of the chips of `chip_numbers`, where the file has names in place of numbers.
     notes : tuple of str
@@ -122,6 +123,8 @@ class MatchTable:
     v_nominal: Float | None = None
     pm_u: Float | None = None
     pm_v: Float | None = None
+    sigma_pm_u: Float | None = None
+    sigma_pm_v: Float | None = None
     chip_names: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 

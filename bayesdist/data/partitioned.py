@@ -38,7 +38,7 @@ Segment = tuple[int, int, int]  # part, first row, row after the last
 
 _ARRAYS = (
     *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour", "star"),
-    *("u_nominal", "v_nominal", "pm_u", "pm_v"),
+    *("u_nominal", "v_nominal", "pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"),
 )
 
 

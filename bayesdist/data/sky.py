@@ -46,6 +46,8 @@ class ReferenceSky:
         Standard errors along east and north, arcsec; None where the table has none.
     motion : ndarray, shape (2, N), or None
         Proper motions to the east (with the factor cos(dec)) and north, arcsec per year.
+    sigma_motion : ndarray, shape (2, N), or None
+        Their standard errors.
     notes : tuple of str
         What was done, as clauses.
     """
@@ -54,6 +56,7 @@ class ReferenceSky:
     dec: Float
     sigma: Float | None
     motion: Float | None
+    sigma_motion: Float | None
     notes: tuple[str, ...]
 
 
@@ -143,12 +146,15 @@ def reference_sky(
     moves = epoch is not None and start is not None
     motion = _pair(quantities, ("pm_ra", "pm_dec"), "arcsec / yr", missing=not moves)
     if motion is None:
-        return ReferenceSky(ra, dec, sigma, None, ())
+        return ReferenceSky(ra, dec, sigma, None, None, ())
+    sigma_motion = _pair(
+        quantities, ("sigma_pm_ra", "sigma_pm_dec"), "arcsec / yr", missing=not moves
+    )
     if epoch is None or start is None:
         lacks = "the epoch of the exposures" if epoch is None else "the epoch of the catalogue"
         key = "data.epoch" if epoch is None else "data.catalogue_epoch"
         note = f"proper motions are not used: {lacks} is not given ({key})"
-        return ReferenceSky(ra, dec, sigma, motion, (note,))
+        return ReferenceSky(ra, dec, sigma, motion, sigma_motion, (note,))
     dt = epoch - start
     new_ra, new_dec = _moved(ra, dec, motion, start, epoch)
     factors, parallax = np.zeros((2, len(ra))), _optional(quantities, "parallax", "arcsec")
@@ -157,18 +163,19 @@ def reference_sky(
         new_ra = new_ra + parallax * factors[0] / 3600 / np.cos(np.radians(new_dec))
         new_dec = new_dec + parallax * factors[1] / 3600
     if sigma is not None:
-        sigma = _sigma_at(quantities, sigma, dt, factors)
+        sigma = _sigma_at(quantities, sigma, sigma_motion, dt, factors)
     step = np.hypot(*motion) * np.abs(dt)
     first, last = float(epoch.min()), float(epoch.max())
     to = f"{first:.2f}" + (f" to {last:.2f}" if last - first > 0.005 else "")
     if not np.any(step) and parallax is None:
-        return ReferenceSky(ra, dec, sigma, motion, ("positions are of the exposures' epoch",))
+        note = "positions are of the exposures' epoch"
+        return ReferenceSky(ra, dec, sigma, motion, sigma_motion, (note,))
     note = (
         f"positions of {np.median(start):.2f} were moved to {to} by proper motions"
         f"{'' if parallax is None else ' and parallaxes'} (median {np.median(step):.2g}, "
         f"at most {step.max():.2g} arcsec)"
     )
-    return ReferenceSky(new_ra, new_dec, sigma, motion, (note,))
+    return ReferenceSky(new_ra, new_dec, sigma, motion, sigma_motion, (note,))
 
 
 def _pair(
@@ -235,9 +242,10 @@ def _factors(epoch: Float, direction: tuple[float, float]) -> Float:
     return np.asarray(parallax_factors(dates, *direction)[of].T, float)
 
 
-def _sigma_at(quantities: Quantities, sigma: Float, dt: Float, factors: Float) -> Float:
+def _sigma_at(
+    quantities: Quantities, sigma: Float, sigma_pm: Float | None, dt: Float, factors: Float
+) -> Float:
     """Errors (2, N) at the new epoch: those of position, motion and parallax."""
-    sigma_pm = _pair(quantities, ("sigma_pm_ra", "sigma_pm_dec"), "arcsec / yr")
     variance = sigma**2
     if sigma_pm is not None:
         for axis, key in enumerate(("corr_ra", "corr_dec")):

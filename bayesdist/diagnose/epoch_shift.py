@@ -5,7 +5,10 @@
 What the model can take up of both sides is taken from them by a polynomial of the model's order on
 each chip of each exposure.  A scan of dt finds the smallest median residual, whatever false matches
 and fast stars there are; a reweighted fit about it gives dt and, from the scores of single stars,
-its error.
+its error.  Errors of the motions s_i would draw dt to 0: only stars whose motions are well known
+have a part, and of these
+
+    dt = -sum w r mu / sum w (mu^2 - s^2)
 """
 
 from __future__ import annotations
@@ -33,6 +36,9 @@ FARTHEST = 60.0  # years that are scanned
 STEPS = 481  # of the scan, a quarter of a year each
 SIGNIFICANT = 5.0  # standard errors
 ROUNDS = 30
+WELL_KNOWN = (
+    0.2  # error of a motion over the scatter of motions, at most: larger ones are often too small
+)
 BIWEIGHT = 4.685  # robust standard deviations, beyond which a star has no weight (Tukey)
 NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 
@@ -48,7 +54,8 @@ class EpochShift:
     sigma : float
         Its standard error.
     before, after : float
-        Robust scatter of the residuals along an axis, as they are and with the shift, in `unit`.
+        Robust scatter of the residuals along an axis, as they are and with the shift, in `unit`; of
+        stars with well known motions.
     unit : str
         Of u and v.
     significant : bool
@@ -92,35 +99,51 @@ def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
         return None
     sample = scored_sample(table.sample(SAMPLE), solution)
     motion = sample.motion
-    if motion is None or (np.hypot(*motion) > 0).sum() < FEWEST:
+    if motion is None:
         return None
-    used = sample.inlier > 0.5
-    residual, P = _left_over(sample, used.astype(float), sample.residual, motion)
+    moving = np.any(motion != 0, axis=0)  # 0 on both axes is that none was measured
+    if moving.sum() < FEWEST:
+        return None
+    error = np.zeros_like(motion) if sample.motion_sigma is None else sample.motion_sigma
+    known = moving & (error < WELL_KNOWN * _scatter(motion[:, moving])).all(axis=0)
+    if known.sum() < FEWEST:
+        return None
+    residual, P = _left_over(sample, known * sample.inlier, sample.residual, motion)
     grid = np.linspace(-FARTHEST, FARTHEST, STEPS)
-    sizes = [float(np.median(np.abs(residual + dt * P))) for dt in grid]
+    sizes = [float(np.median(np.abs((residual + dt * P)[:, known]))) for dt in grid]
     dt = float(grid[int(np.argmin(sizes))])
-    before = NORMAL * float(np.median(np.abs(residual)))
-    weight, E = np.zeros(len(sample)), residual
+    before = _scatter(residual[:, known])
+    weight = information = np.zeros(0)
     for _ in range(ROUNDS):
-        scale = NORMAL * np.median(np.abs(residual + dt * P))
-        if not scale > 0:
+        scale = np.sqrt(_scatter((residual + dt * P)[:, known]) ** 2 + (dt * error) ** 2)
+        if not (scale > 0).all():
             return None
-        z2 = ((residual + dt * P) ** 2).sum(axis=0) / (2 * (BIWEIGHT * scale) ** 2)
-        weight = np.where(z2 < 1, (1 - np.minimum(z2, 1)) ** 2, 0.0)
-        residual, P = _left_over(sample, weight, sample.residual, motion)
-        new = -float((weight * residual * P).sum() / (weight * P**2).sum())
-        E = residual + new * P
+        z2 = (((residual + dt * P) / scale) ** 2).sum(axis=0) / (2 * BIWEIGHT**2)
+        single = np.where(known & (z2 < 1), (1 - np.minimum(z2, 1)) ** 2, 0.0)
+        weight = single / scale**2
+        residual, P = _left_over(sample, single, sample.residual, motion)
+        information = (weight * (P**2 - error**2)).sum()
+        if not information > 0:
+            return None
+        new = -float((weight * residual * P).sum() / information)
         if abs(new - dt) < 1e-6:
             break
         dt = new
-    # a star has the same motion in all of its detections
+    left = residual + dt * P
+    # a star has one motion in all of its detections, and its error is in both factors
     _, star = np.unique(motion, axis=1, return_inverse=True)
-    scores = np.bincount(star.ravel(), (weight * E * P).sum(axis=0))
-    information = float((weight * P**2).sum())
-    sigma = float(np.sqrt((scores**2).sum()) / information) if information > 0 else np.inf
-    after = NORMAL * float(np.median(np.abs(E)))
+    score = (weight * (left * P - dt * error**2)).sum(axis=0)
+    scores = np.bincount(star.ravel(), score)
+    sigma = float(np.sqrt((scores**2).sum()) / information)
+    after = _scatter(left[:, known])
     found = abs(dt) > SIGNIFICANT * sigma and after < before
     return EpochShift(dt, sigma, before, after, sample.model.unit, bool(found))
+
+
+def _scatter(values: Float) -> float:
+    """Robust standard deviation about the median of each axis, both together."""
+    middle = np.median(values, axis=1, keepdims=True)
+    return NORMAL * float(np.median(np.abs(values - middle)))
 
 
 def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[Float]:
