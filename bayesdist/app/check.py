@@ -67,6 +67,10 @@ def _lines(session: Session) -> Iterator[str]:
         f"matches      {len(matches)} of {matches.n_rows} rows, "
         f"{len(matches.exposure_names)} exposure(s), u and v in {matches.unit}"
     )
+    for note in matches.notes:
+        yield f"read         {note}"
+    for reason, count in matches.rejected.items():
+        yield f"left out     {count} rows: {reason}"
     yield (
         f"errors       median {number(sigma)} {matches.unit}"
         + (" (by magnitude)" if errors is not None else "")

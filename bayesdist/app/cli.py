@@ -246,6 +246,10 @@ def _parser() -> argparse.ArgumentParser:
     sub = add("init", _init, "a commented configuration for a file of matches")
     sub.add_argument("config", metavar="CONFIG.toml")
     sub.add_argument("--matches", required=True, metavar="FILE")
+    text = "columns that are not found by their names (KEY= leaves one out)"
+    sub.add_argument("--columns", nargs="+", default=[], metavar="KEY=NAME", help=text)
+    text = "columns and rows of each chip; by default guessed from the positions"
+    sub.add_argument("--size", nargs=2, type=int, metavar=("NX", "NY"), help=text)
     sub.add_argument("--force", action="store_true", help="replace the file that is there")
     return parser
 
@@ -498,8 +502,15 @@ def _simulate_wise(options: argparse.Namespace) -> None:
 
 def _init(options: argparse.Namespace) -> None:
     from bayesdist.app.init import init
+    from bayesdist.app.init_columns import columns_of_options
 
-    n = init(options.config, options.matches, force=options.force)
+    n = init(
+        options.config,
+        options.matches,
+        columns=columns_of_options(options.columns),
+        size=None if options.size is None else tuple(options.size),
+        force=options.force,
+    )
     print(f"{options.config}: for {n} matches; read it, then 'bayesdist check' it")
 
 

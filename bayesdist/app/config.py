@@ -67,8 +67,11 @@ class Data(Section):
     columns: dict[str, str] | None = None
     unit: Unit | None = None
     sigma: Literal["columns", "by_magnitude"] | PositiveFloat = "columns"
-    pixel_origin: Literal[0, 1] = 1
+    pixel_origin: Literal[0, 1] | None = None
     tangent_point: tuple[float, float] | None = None
+    epoch: float | str | None = None
+    catalogue_epoch: float | None = None
+    not_finite: Literal["refuse", "reject"] = "refuse"
     rvb: RvbBlock | None = None
 
     @field_validator("unit", mode="before")
@@ -94,6 +97,11 @@ class Data(Section):
                 "data.tangent_point is given, but RvB pairs lie in pixels of the band frame; "
                 "leave it out"
             )
+        for key in ("epoch", "catalogue_epoch"):
+            if self.format == "rvb" and getattr(self, key) is not None:
+                raise ValueError(
+                    f"data.{key} is given, and RvB pairs have no proper motions; leave it out"
+                )
         return self
 
 

@@ -3,32 +3,40 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bayesdist.app.config import parse_config
+from bayesdist.app.init_columns import column_lines, quoted
+from bayesdist.app.init_sigma import guessed_sigma
 from bayesdist.app.matches import load_matches
 from bayesdist.app.output import refuse_existing
 from bayesdist.app.rvb_init import is_rvb, rvb_template
 from bayesdist.data import MatchTable, atomic_path
+from bayesdist.data.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
 from bayesdist.infer import Matches
 
 __all__ = ["init"]
 
 SIGMA = 0.05  # for tables that say nothing about their errors
+SAMPLE = 20_000  # matches that are looked at
+# size of u, v beside x, y
+LIKE_PIXELS = (0.5, 2.0)
+DEGREES = 1e-3  # below it is the degree: pixels of more than 3.6 arcsec are rare
+MAS = 20.0
 
-_GUESSED_UNIT = 'unit = "pix"                    # GUESSED: the table does not say\n'
+_GUESSED_UNIT = "unit = {unit:22s}# GUESSED: the table does not say\n"
 
 _TEMPLATE = """\
 # A calibration of geometric distortion; see docs/configuration.md for every key.
 
 [data]
 matches = {matches}
-{format}# columns = {{x = "x", y = "y", u = "u", v = "v"}}  # they are found by their names
-{unit_line}sigma = {sigma}
-pixel_origin = 1                # of x, y: 1 as in FITS, or 0
+{format}{columns}{unit_line}sigma = {sigma}
 
 {detector}
 [model]
@@ -92,20 +100,27 @@ _CENTRE = """\
 _DETECTOR = """\
 [detector]
 name = "{name}"
-size = [{nx}, {ny}]             # columns, rows; guessed from x up to {x:.1f}, y up to {y:.1f}
+size = [{nx}, {ny}]             # columns, rows; {how}
 # scale_mas = 50.0              # size of a pixel, to state errors in mas beside pixels
 """
 
 _CHIP = """\
 [[chip]]
 number = {number}
-name = "chip {number}"
-size = [{nx}, {ny}]             # columns, rows; guessed from x up to {x:.1f}, y up to {y:.1f}
+name = {name}
+size = [{nx}, {ny}]             # columns, rows; {how}
 reference_pixel = [{cx}, {cy}]  # zero point of the polynomial
 """
 
 
-def init(path: str | Path, matches: str | Path, *, force: bool = False) -> int:
+def init(
+    path: str | Path,
+    matches: str | Path,
+    *,
+    columns: Mapping[str, str] | None = None,
+    size: tuple[int, int] | None = None,
+    force: bool = False,
+) -> int:
     """Write a commented configuration for a file of matches.
 
     Parameters
@@ -114,6 +129,10 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> int:
         TOML file to write.
     matches : path
         Input, as in ``data.matches``.
+    columns : mapping of str to str, optional
+        As ``data.columns``.
+    size : tuple of int, optional
+        Columns and rows of each chip; by default as large as the positions ask for.
     force : bool
         Replace a file that is there.
 
@@ -128,9 +147,9 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> int:
     """
     path = Path(path)
     refuse_existing(path, force)
-    relative = _toml(os.path.relpath(Path(matches), path.resolve().parent))
-    rvb = rvb_template(matches) if is_rvb(matches) else None
-    n, values = _of_matches(matches) if rvb is None else rvb
+    relative = quoted(os.path.relpath(Path(matches), path.resolve().parent))
+    rvb = rvb_template(matches) if columns is None and is_rvb(matches) else None
+    n, values = _of_matches(matches, columns, size) if rvb is None else rvb
     order = 4 if n >= 300 else 3 if n >= 100 else 2
     text = _TEMPLATE.format(matches=relative, order=order, **values)
     parse_config(text, str(path))
@@ -139,16 +158,21 @@ def init(path: str | Path, matches: str | Path, *, force: bool = False) -> int:
     return n
 
 
-def _of_matches(matches: str | Path) -> tuple[int, dict[str, object]]:
+def _of_matches(
+    matches: str | Path, columns: Mapping[str, str] | None, size: tuple[int, int] | None
+) -> tuple[int, dict[str, object]]:
     """How many there are, and what a table of matches puts into the template."""
-    table, unit_line, sigma = _read(matches)
-    chips = {n: _size(*reach) for n, reach in _reach(table).items()}
+    table, unit_line, sigma, read_sigma = _read(matches, columns)
+    layout = table_layout(matches, columns, read_sigma=read_sigma)
+    chips = {n: _size(*reach, size) for n, reach in _reach(table).items()}
     several = len(chips) > 1
     first = next(iter(chips.values()))
     name = Path(matches).stem.replace('"', "")
-    blocks = [_CHIP.format(number=n, **size) for n, size in chips.items()]
+    names = dict(zip(table.chip_numbers, _chip_names(table), strict=True))
+    blocks = [_CHIP.format(number=n, name=quoted(names[n]), **one) for n, one in chips.items()]
     return len(table), {
         "format": _AUTO,
+        "columns": column_lines(layout, columns),
         "unit_line": unit_line,
         "sigma": sigma,
         "detector": "\n".join(blocks) if several else _DETECTOR.format(name=name, **first),
@@ -159,28 +183,56 @@ def _of_matches(matches: str | Path) -> tuple[int, dict[str, object]]:
     }
 
 
-def _read(matches: str | Path) -> tuple[Matches, str, str]:
-    """The matches, the line about their unit, and how their errors are to be had."""
+def _chip_names(matches: Matches) -> tuple[str, ...]:
+    """Names of the chips, in the order of their numbers."""
+    own = matches.chip_names if isinstance(matches, MatchTable) else ()
+    return own or tuple(f"chip {number}" for number in matches.chip_numbers)
+
+
+def _read(matches: str | Path, columns: Mapping[str, str] | None) -> tuple[Matches, str, str, bool]:
+    """Matches, the line about their unit, where errors come from, and whether columns are read."""
     unit, line = None, ""
     sigma: float | str = "columns"
     while True:
         try:
-            table = load_matches(matches, sigma=sigma, unit=unit)
+            table = load_matches(matches, columns=columns, sigma=sigma, unit=unit)
         except InputError as error:
             if error.cause == "has no unit" and unit is None:
-                unit, line = "pix", _GUESSED_UNIT
+                table = load_matches(matches, columns=columns, sigma=1.0, unit="pix")
+                unit = _guessed_unit(table, table_layout(matches, columns))
+                line = _GUESSED_UNIT.format(unit=quoted(unit))
             elif error.cause == "holds no errors of the positions" and sigma == "columns":
                 sigma = SIGMA
             else:
                 raise
         else:
             break
+    layout = table_layout(matches, columns)
+    taken = {} if layout is None else layout.taken
+    if sigma == "columns" and "sigma_ra" in taken and table.has_mag:
+        errors = f"{taken['sigma_ra']}, {taken['sigma_dec']}"
+        why = f"the errors of the table ({errors}) are the catalogue's alone"
+        return table, line, f'"by_magnitude"        # {why}', True
     if sigma == "columns":
-        return table, line, '"columns"'
+        return table, line, '"columns"', True
     if table.has_mag:
-        return table, line, '"by_magnitude"        # the table carries no errors'
-    guess = f"{SIGMA}                    # GUESSED: the table carries neither errors nor magnitudes"
-    return table, line, guess
+        return table, line, '"by_magnitude"        # the table carries no errors', False
+    what = "GUESSED: the table carries neither errors nor magnitudes"
+    found = guessed_sigma(table.sample(SAMPLE))
+    if found is None:
+        return table, line, f"{SIGMA}                    # {what}", False
+    how = "the scatter about a polynomial"
+    return table, line, f"{found:<24g}# {what}; {how}", False
+
+
+def _guessed_unit(table: Matches, layout: TableLayout | None) -> str:
+    """Unit of u and v by their size beside pixels, and by their names."""
+    some = table.sample(SAMPLE)
+    ratio = float(np.ptp(some.u) / max(np.ptp(some.x), 1.0))
+    is_angle = layout is not None and layout.taken.get("u", "").lower() == "xi"
+    if LIKE_PIXELS[0] < ratio < LIKE_PIXELS[1]:
+        return "arcsec" if is_angle else "pix"
+    return "deg" if ratio < DEGREES else "mas" if ratio > MAS else "arcsec"
 
 
 def _reach(matches: Matches) -> dict[int, tuple[float, float]]:
@@ -199,10 +251,14 @@ def _reach(matches: Matches) -> dict[int, tuple[float, float]]:
     return dict(sorted(out.items()))
 
 
-def _size(x: float, y: float) -> dict[str, float]:
-    """What a chip's size is, as far as its stars say."""
-    nx, ny = _guess_size(x), _guess_size(y)
-    return {"nx": nx, "ny": ny, "x": x, "y": y, "cx": (nx + 1) / 2, "cy": (ny + 1) / 2}
+def _size(x: float, y: float, given: tuple[int, int] | None) -> dict[str, Any]:
+    """What a chip's size is: as given, or as far as its stars say."""
+    if given is not None:
+        (nx, ny), how = given, "as given"
+    else:
+        nx, ny = _guess_size(x), _guess_size(y)
+        how = f"guessed from x up to {x:.1f}, y up to {y:.1f}"
+    return {"nx": nx, "ny": ny, "how": how, "cx": (nx + 1) / 2, "cy": (ny + 1) / 2}
 
 
 def _guess_size(largest: float) -> int:
@@ -212,7 +268,3 @@ def _guess_size(largest: float) -> int:
         if 0.97 * power <= largest <= power:
             return power
     return int(np.ceil(largest / 2) * 2)
-
-
-def _toml(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -6,11 +6,13 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from bayesdist.app.config import ChipBlock, Data
 from bayesdist.data import input_files, open_matches, read_matches
 from bayesdist.data.parquet_files import describe_part
+from bayesdist.errors import InputError
 from bayesdist.infer import Matches
 
-__all__ = ["IN_MEMORY", "is_large", "load_matches"]
+__all__ = ["IN_MEMORY", "is_large", "load_matches", "reading_options"]
 
 IN_MEMORY = 1_000_000  # rows of Parquet above which they stay on disk
 
@@ -37,8 +39,32 @@ def load_matches(
         As `read_matches`.
     """
     if format in ("auto", "table") and is_large(path):
+        if options.pop("not_finite", "refuse") == "reject":
+            raise InputError(
+                f"rows of tables of more than {IN_MEMORY} rows cannot be left out in reading",
+                where="data.not_finite",
+                do="write the table without them",
+            )
         return open_matches(path, **options)
     return read_matches(path, format=format, **options)
+
+
+def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
+    """Options of `load_matches` that a configuration gives.
+
+    Parameters
+    ----------
+    data : Data
+        Section [data].
+    chips : sequence of ChipBlock
+        Their names stand for their numbers in tables that have names.
+    """
+    names = (
+        *("format", "columns", "unit", "sigma", "pixel_origin", "tangent_point"),
+        *("epoch", "catalogue_epoch", "not_finite"),
+    )
+    numbers = {chip.name: chip.number for chip in chips}
+    return {name: getattr(data, name) for name in names} | {"chips": numbers or None}
 
 
 def is_large(path: PathLike | Sequence[PathLike]) -> bool:

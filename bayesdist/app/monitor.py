@@ -12,9 +12,9 @@ from astropy.table import Table
 from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.comparison_files import joined, mosaic_of
-from bayesdist.app.config import Config, Data, load_config
+from bayesdist.app.config import Config, load_config
 from bayesdist.app.folder import whole_folder
-from bayesdist.app.matches import load_matches
+from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.rvb import load_rvb
 from bayesdist.app.session import Session, write_table
@@ -137,7 +137,10 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
         names = data.matches
         path: Any = base / names if isinstance(names, str) else [base / n for n in names]
     else:
-        data, path, size = config.data, new, config.detector.size
+        # the date of the run's exposures is not that of new ones
+        own = config.data
+        data = None if own is None else own.model_copy(update={"epoch": None})
+        path, size = new, config.detector.size
         if not new.exists():
             raise InputError("there is no such file", where=str(new), do="check the name")
         if (new / "run.json").exists():
@@ -152,7 +155,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
     if data.format == "rvb" and size is not None:
         matches: Matches = load_rvb(path, data, size)
     else:
-        matches = load_matches(path, **_reading(data))
+        matches = load_matches(path, **reading_options(data, config.chip))
     if data.sigma != "by_magnitude":
         return matches
     errors = Session(run).kept_errors()
@@ -175,17 +178,6 @@ def _refuse_the_same(run: RunDirectory, path: Any) -> None:
                 where=str(file),
                 do="give matches that were not in its fit",
             )
-
-
-def _reading(data: Data) -> dict[str, Any]:
-    return {
-        "format": data.format,
-        "columns": data.columns,
-        "unit": data.unit,
-        "sigma": data.sigma,
-        "pixel_origin": data.pixel_origin,
-        "tangent_point": data.tangent_point,
-    }
 
 
 def _misfit(new: NewFit) -> Misfit:

@@ -192,7 +192,7 @@ def _options(data: Data, size: tuple[float, float]) -> dict[str, Any]:
         "columns": data.columns,
         "unit": data.unit or "pix",
         "sigma": data.sigma,
-        "pixel_origin": data.pixel_origin,
+        "pixel_origin": 1 if data.pixel_origin is None else data.pixel_origin,
         "size": size,
     }
 

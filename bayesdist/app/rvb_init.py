@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bayesdist.app.init_columns import column_lines
 from bayesdist.data import input_files
 from bayesdist.data.parquet_files import describe_part
 from bayesdist.data.rvb import rvb_bands, stream_rvb
 from bayesdist.data.rvb_files import ARRAY_SIZE, IPAC, MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.data.tables import read_table
 from bayesdist.errors import InputError
 
 __all__ = ["is_rvb", "rvb_template"]
@@ -41,7 +43,7 @@ scale_mas = {scale:.0f}
 
 
 def is_rvb(matches: str | Path) -> bool:
-    """Whether these are RvB pairs: IPAC tables, or Parquet with a column of WISE's bands.
+    """Whether these are RvB pairs: IPAC tables with u, v, or Parquet with WISE's bands.
 
     Raises
     ------
@@ -50,7 +52,7 @@ def is_rvb(matches: str | Path) -> bool:
     """
     files = input_files(matches)
     if all(file.name.lower().endswith(IPAC) for file in files):
-        return True
+        return {"u", "v"} <= {name.lower() for name in read_table(files[0]).colnames}
     if any(file.suffix.lower() != ".parquet" for file in files):
         return False
     part = describe_part(files[0])
@@ -95,6 +97,7 @@ def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]]:
     scale = MAS * ARRAY_SIZE["W1"][0] / nx
     return n, {
         "format": _FORMAT.format(band=band, found=comment),
+        "columns": column_lines(None, None),
         "unit_line": "",
         "sigma": said[sigma],
         "detector": _SELECTION.format(colour=_COLOUR if coloured else "")

@@ -16,7 +16,7 @@ from bayesdist.app.chips import check_chips
 from bayesdist.app.config import CATALOGUE_WORDS, Config
 from bayesdist.app.discrepancy import RunDiscrepancy, keep_discrepancy, kept_discrepancy
 from bayesdist.app.holdout import predictive_of_run, split_of
-from bayesdist.app.matches import load_matches
+from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.rvb import RvbInput
 from bayesdist.app.score_tests import keep_score_tests, kept_score_tests
@@ -45,6 +45,7 @@ from bayesdist.assess.solution import Solution
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.data.holdout import Split
 from bayesdist.diagnose import ScoreTest, score_tests
+from bayesdist.diagnose.epoch_shift import EpochShift, epoch_shift
 from bayesdist.errors import ConfigError
 from bayesdist.infer import (
     GaussianPriors,
@@ -140,15 +141,7 @@ class Session:
         assert data is not None
         if data.format == "rvb":
             return self._rvb.load()
-        return load_matches(
-            self.run.matches,
-            format=data.format,
-            columns=data.columns,
-            unit=data.unit,
-            sigma=data.sigma,
-            pixel_origin=data.pixel_origin,
-            tangent_point=data.tangent_point,
-        )
+        return load_matches(self.run.matches, **reading_options(data, self.config.chip))
 
     @cached_property
     def _rvb(self) -> RvbInput:
@@ -204,6 +197,7 @@ class Session:
             "stars",
             "misfits",
             "_sample",
+            "epoch_shift",
         ):
             self.__dict__.pop(name, None)
 
@@ -389,6 +383,11 @@ class Session:
     def doubts(self) -> list[str]:
         """What else, beside misfit and errors, a reader of the numbers has to know."""
         return [f"{t.finding}: {t.remedy}" for t in self.score_tests if t.significant]
+
+    @cached_property
+    def epoch_shift(self) -> EpochShift | None:
+        """Error of the epochs that the residuals of the fit show; None without proper motions."""
+        return None if self.config.data is None else epoch_shift(self._sample, self.fit)
 
     @property
     def gauge_words(self) -> str:

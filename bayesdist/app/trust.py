@@ -20,6 +20,8 @@ def warnings_of(session: Session) -> list[str]:
     out += [one.sentence for one in session.coverages if one.significant]
     if doubt := pixel_doubt(fit):
         out.append(doubt)
+    if session.epoch_shift is not None and session.epoch_shift.significant:
+        out.append(session.epoch_shift.sentence)
     if session.majority:
         out.append(session.majority)
     if session.misfit.significant:

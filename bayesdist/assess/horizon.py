@@ -64,7 +64,9 @@ class Horizon:
             return f"{name}: the probability stays at {asked:g} or more until {last:.1f}"
         if self.date == first:
             found = float(self.probability[0])
-            return f"{name}: the probability is below {asked:g} already at {first:.1f} ({found:.2g})"
+            return (
+                f"{name}: the probability is below {asked:g} already at {first:.1f} ({found:.2g})"
+            )
         early, late = self.interval
         until = f"{late:.1f}" if late is not None else f"after {last:.1f}"
         since = first if early is None else early

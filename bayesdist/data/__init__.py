@@ -9,10 +9,10 @@ been checked.  What outgrows the memory is Parquet: `open_matches` leaves it on 
 from bayesdist.data.aberration import velocity_aberration
 from bayesdist.data.campaign import CampaignMatches, ExposureReport, match_campaign
 from bayesdist.data.catalog import ReferenceCatalog, catalog_from_table, read_catalog
-from bayesdist.data.columns import matches_from_table
 from bayesdist.data.exposure_log import Exposure, ExposureLog
 from bayesdist.data.exposures import exposure_of_headers, read_exposures, write_exposures
 from bayesdist.data.files import atomic_path, is_leftover, remove_leftovers, sha256_of
+from bayesdist.data.from_table import matches_from_table
 from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
 from bayesdist.data.linear_map import LinearMap
 from bayesdist.data.magnitude_errors import MagnitudeErrors

@@ -4,32 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.columns import matches_from_table
+from bayesdist.data.from_table import matches_from_table
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.usual_names import ALIASES
 
 __all__ = ["COLUMNS", "is_astrometrynet", "matches_from_corr"]
 
 # the other quantities are left out: 'mag' there is one of the index, if it is there at all
-COLUMNS = {
+COLUMNS = dict.fromkeys(ALIASES, "") | {
     "x": "field_x",
     "y": "field_y",
     "ra": "index_ra",
     "dec": "index_dec",
-    "sigma_u": "",
-    "sigma_v": "",
-    "epoch": "",
-    "exposure": "",
-    "chip": "",
-    "filter": "",
-    "mag": "",
-    "colour": "",
-    "star": "",
-    "u_nominal": "",
-    "v_nominal": "",
 }
 
 
@@ -44,6 +32,8 @@ def matches_from_corr(
     source: str = "corr.fits",
     tangent_point: tuple[float, float] | None = None,
     exposure_name: str | None = None,
+    epoch: float | str | None = None,
+    not_finite: str = "refuse",
 ) -> MatchTable:
     """MatchTable from the columns of a `corr.fits`.
 
@@ -58,7 +48,8 @@ def matches_from_corr(
         File, for errors.
     tangent_point : tuple of float, optional
         RA and Dec in degrees; by default the mean direction of the stars.
-    exposure_name : str, optional
+    exposure_name, epoch, not_finite
+        As `matches_from_table`.
 
     Returns
     -------
@@ -69,13 +60,7 @@ def matches_from_corr(
     InputError
         For missing columns or values.
     """
-    columns = dict(COLUMNS)
-    if "FLUX" in table.colnames and len(table):
-        flux = SourceColumn(table["FLUX"], source, "FLUX").numbers()
-        if (flux > 0).all():
-            table = table.copy(copy_data=False)
-            table["instrumental_mag"] = -2.5 * np.log10(flux)
-            columns["mag"] = "instrumental_mag"
+    columns = COLUMNS | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
     return matches_from_table(
         table,
         columns,
@@ -83,4 +68,6 @@ def matches_from_corr(
         read_sigma=False,
         tangent_point=tangent_point,
         exposure_name=exposure_name,
+        epoch=epoch,
+        not_finite=not_finite,
     )

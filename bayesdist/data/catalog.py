@@ -16,6 +16,7 @@ from bayesdist.data.naming import find_columns
 from bayesdist.data.tables import read_table
 from bayesdist.data.tangent import mean_direction, tangent_jacobian, tangent_plane
 from bayesdist.data.units import check_unit, conversion
+from bayesdist.data.usual_names import known_unit
 from bayesdist.data.values import SourceColumn
 from bayesdist.errors import InputError
 
@@ -270,7 +271,8 @@ def catalog_from_table(
         File, for errors.
     unit : str, optional
         Unit of u and v where the table does not say.  Errors and motions without a unit are in that
-        of u and v, per year; beside ra and dec they must have one.
+        of u and v, per year; beside ra and dec they must have one, in the file or by their names
+        (those of the Gaia archive and of VizieR).
     epoch : float, optional
         Decimal year, where the table has no such column.
     tangent_point : tuple of float, optional
@@ -297,7 +299,8 @@ def catalog_from_table(
         )
 
     def column(key: str) -> SourceColumn:
-        return SourceColumn(table[found[key]], source, found[key])
+        unit = known_unit(found[key], table.colnames)
+        return SourceColumn(table[found[key]], source, found[key], usual_unit=unit)
 
     base = "deg" if on_sky else position_unit((column("u"), column("v")), unit)
 

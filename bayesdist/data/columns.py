@@ -1,58 +1,34 @@
-"""From the columns of any table to a MatchTable."""
+"""Columns of a table to the arrays of a MatchTable."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
-from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.chip_labels import numbered_chips
 from bayesdist.data.naming import find_columns
-from bayesdist.data.tangent import mean_direction, tangent_plane
+from bayesdist.data.quantities import Quantities
+from bayesdist.data.sky import SKY_QUANTITIES, reference_sky
+from bayesdist.data.tangent import mean_direction, tangent_jacobian, tangent_plane
 from bayesdist.data.units import check_unit, conversion
-from bayesdist.data.values import Place, SourceColumn, row_number
+from bayesdist.data.usual_names import ALIASES, PAIRS
+from bayesdist.data.values import SourceColumn, year_of
 from bayesdist.errors import InputError
 
 __all__ = [
-    "ALIASES",
-    "Columns",
+    "is_on_sky",
     "match_columns",
-    "matches_from_table",
     "needed_columns",
     "nominal_columns",
     "plane_unit",
     "position_unit",
-    "sky_columns",
-    "sky_positions",
 ]
 
 Float = NDArray[np.float64]
-
-# lower case; the first that the file has is taken
-ALIASES: dict[str, tuple[str, ...]] = {
-    "x": ("x", "x_pix", "xpix", "x_raw", "x_image"),
-    "y": ("y", "y_pix", "ypix", "y_raw", "y_image"),
-    "u": ("u",),
-    "v": ("v",),
-    "ra": ("ra",),
-    "dec": ("dec",),
-    "sigma_u": ("sigma_u", "su", "sig_u", "u_error", "u_err", "u_sigma", "e_u", "err_u", "sigma"),
-    "sigma_v": ("sigma_v", "sv", "sig_v", "v_error", "v_err", "v_sigma", "e_v", "err_v", "sigma"),
-    "epoch": ("epoch", "year"),
-    "exposure": ("exposure", "exp", "frame", "exposure_name"),
-    "chip": ("chip", "ccdchip", "ccd_chip"),
-    "filter": ("filter", "filt", "filter_name"),
-    "mag": ("mag", "magnitude"),
-    "colour": ("colour", "color"),
-    "star": ("star",),
-    "u_nominal": ("u_nominal",),
-    "v_nominal": ("v_nominal",),
-}
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
@@ -103,172 +79,40 @@ def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> 
     return own_unit or unit or ""
 
 
-class Columns(Protocol):
-    """Named columns of one length, as an astropy Table has them."""
-
-    @property
-    def colnames(self) -> Sequence[str]:
-        """Names."""
-
-    def __len__(self) -> int:
-        """Rows."""
-
-    def __getitem__(self, name: str) -> Any:
-        """What `SourceColumn` takes."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Quantities:
-    """The columns of a table by what they are."""
-
-    table: Columns
-    found: Mapping[str, str]
-    source: str
-    place: Place
-
-    def __getitem__(self, key: str) -> SourceColumn:
-        name = self.found[key]
-        return SourceColumn(self.table[name], self.source, name, self.place)
-
-
-def _as_table(data: Any, source: str) -> Table:
-    if isinstance(data, Table):
-        return data
-    try:
-        return Table(dict(data))
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"columns do not make a table ({error})", where=source, do="give columns of one length"
-        ) from error
-
-
-def _degrees(column: SourceColumn) -> Float:
-    unit = column.unit
-    factor = 1.0 if unit is None else conversion(unit, "deg", where=column.where)
-    return column.numbers() * factor
-
-
-def sky_positions(
-    data: Any, columns: Mapping[str, str] | None = None, *, source: str = "table"
-) -> tuple[Float, Float] | None:
-    """Right ascension and declination, where the reference positions of a table are on the sky.
+def is_on_sky(
+    names: Iterable[str],
+    found: Mapping[str, str],
+    columns: Mapping[str, str] | None,
+    source: str,
+) -> bool:
+    """True where ra, dec are the reference positions, not u, v.
 
     Parameters
     ----------
-    data, columns, source
-        As `matches_from_table`.
+    names : iterable of str
+        Columns of the table.
+    found : mapping of str to str
+        Column of each quantity.
+    columns : mapping of str to str, or None
+        As the user names them.
+    source : str
 
-    Returns
-    -------
-    tuple of ndarray, shape (N,), or None
-        Degrees; None where u and v are columns of the table.
+    Raises
+    ------
+    InputError
+        When the user names both.
     """
-    table = _as_table(data, source)
-    found = find_columns(table.colnames, columns, ALIASES, source=source)
-    if not _on_sky(found, columns, source):
-        return None
-    return sky_columns(table, found, source=source)
-
-
-def sky_columns(
-    table: Columns, found: Mapping[str, str], *, source: str, place: Place = row_number
-) -> tuple[Float, Float]:
-    """Right ascension and declination of some rows of a table.
-
-    Parameters
-    ----------
-    table, found, source, place
-        As `match_columns`.
-
-    Returns
-    -------
-    tuple of ndarray, shape (N,)
-        Degrees.
-    """
-    return _sky(_Quantities(table, found, source, place))
-
-
-def _sky(quantities: _Quantities) -> tuple[Float, Float]:
-    ra, dec = (_degrees(quantities[key]) for key in ("ra", "dec"))
-    beyond = np.abs(dec) > 90.0
-    if beyond.any():
-        bad = int(np.argmax(beyond))
-        raise quantities["dec"].fail(bad, f"declination is {dec[bad]:g} degrees")
-    return ra, dec
-
-
-def _on_sky(found: Mapping[str, str], columns: Mapping[str, str] | None, source: str) -> bool:
-    """Whether ra, dec are the reference positions, not u, v."""
     named = {key for key, column in (columns or {}).items() if column}
     plane, sky = named & {"u", "v"}, named & {"ra", "dec"}
     if plane and sky:
         raise InputError(
             "columns names both u, v and ra, dec", where=source, do="name one of the two pairs"
         )
-    if plane or ({"u", "v"} <= set(found) and not sky):
+    on_sky, on_plane = {"ra", "dec"} <= set(found), {"u", "v"} <= set(found)
+    if plane or not on_sky:
         return False
-    return {"ra", "dec"} <= set(found)
-
-
-def matches_from_table(
-    data: Any,
-    columns: Mapping[str, str] | None = None,
-    *,
-    source: str = "table",
-    unit: str | None = None,
-    read_sigma: bool = True,
-    pixel_origin: int = 1,
-    tangent_point: tuple[float, float] | None = None,
-    exposure_name: str | None = None,
-) -> MatchTable:
-    """MatchTable from a table's columns.
-
-    Parameters
-    ----------
-    data : astropy Table or mapping of arrays
-    columns : mapping of str to str, optional
-        Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag
-        colour star u_nominal v_nominal.  What is not named is looked for under its usual names
-        (`ALIASES`), in any case of letters; an empty name leaves a quantity out.  With ra and dec,
-        u and v are the tangent plane in arcsec.
-    source : str, optional
-        File, for errors.
-    unit : str, optional
-        Unit of u and v, where the table does not say.
-    read_sigma : bool, optional
-        Whether the columns of errors are read.
-    pixel_origin : {0, 1}, optional
-        Coordinate of the centre of the first pixel.
-    tangent_point : tuple of float, optional
-        RA and Dec in degrees; by default the mean direction of the stars.
-    exposure_name : str, optional
-        Name of the one exposure, where the table has no column of them.
-
-    Returns
-    -------
-    MatchTable
-
-    Raises
-    ------
-    InputError
-        For a missing column, text or missing values among numbers, units that are missing or
-        contradict each other, no rows, and all that `MatchTable` refuses.
-    """
-    table = _as_table(data, source)
-    found = needed_columns(table.colnames, columns, source=source, read_sigma=read_sigma)
-    if len(table) == 0:
-        raise InputError("holds no rows", where=source, do="give a table with matched stars")
-    out = match_columns(
-        table,
-        found,
-        source=source,
-        unit=unit,
-        pixel_origin=pixel_origin,
-        tangent_point=tangent_point,
-    )
-    if exposure_name is not None:
-        out.setdefault("exposure_names", (exposure_name,))
-    return MatchTable(**out, sources=(source,))
+    # beside a magnitude B, the U and V of a table are magnitudes, too
+    return bool(sky) or not on_plane or "b" in {name.lower() for name in names}
 
 
 def needed_columns(
@@ -298,42 +142,43 @@ def needed_columns(
         For a missing column.
     """
     names = list(names)
-    found = find_columns(names, columns, ALIASES, source=source)
-    on_sky = _on_sky(found, columns, source)
+    found = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
+    on_sky = is_on_sky(names, found, columns, source)
     for key in ("x", "y") if on_sky else ("x", "y", "u", "v"):
         if key not in found:
             raise InputError(
                 f"no column for {key!r} among {', '.join(names) or 'none'}",
                 where=source,
-                do="name it in the option 'columns'",
+                do=f"name it in the option 'columns' (bayesdist init --columns {key}=NAME)",
             )
-    unread = {"u", "v"} if on_sky else {"ra", "dec"}
+    unread = {"u", "v"} if on_sky else {"ra", "dec", *SKY_QUANTITIES}
     if not read_sigma:
         unread |= {"sigma_u", "sigma_v"}
+    if not read_sigma or "sigma_u" in found:  # the errors of the match hold those of the catalogue
+        unread |= {"sigma_ra", "sigma_dec"}
+    if "mag" in found:
+        unread.add("flux")
     return {key: name for key, name in found.items() if key not in unread}
 
 
 def match_columns(
-    table: Columns,
-    found: Mapping[str, str],
+    quantities: Quantities,
     *,
-    source: str,
     unit: str | None = None,
     pixel_origin: int = 1,
     tangent_point: tuple[float, float] | None = None,
-    place: Place = row_number,
+    epoch: float | str | None = None,
+    catalogue_epoch: float | None = None,
+    chips: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
     """What a MatchTable is made of, from some rows of a table.
 
     Parameters
     ----------
-    table : astropy Table, or what has columns like one
-    found : mapping of str to str
-        Column of each quantity, as `needed_columns` gives it.
-    source, unit, pixel_origin, tangent_point
+    quantities : Quantities
+        Columns as `needed_columns` finds them.
+    unit, pixel_origin, tangent_point, epoch, catalogue_epoch, chips
         As `matches_from_table`.
-    place : callable, optional
-        Name of a row, by its index.
 
     Returns
     -------
@@ -345,17 +190,26 @@ def match_columns(
     InputError
         As `matches_from_table`.
     """
-    quantities = _Quantities(table, found, source, place)
-    column = quantities.__getitem__
+    found, column = quantities.found, quantities.__getitem__
     out: dict[str, Any] = {}
     out["x"], out["y"] = (_pixels(column(key), pixel_origin) for key in ("x", "y"))
+    if "epoch" in found:
+        if epoch is not None:
+            raise InputError(
+                "an epoch of the exposures is given, and the table has a column of it",
+                where=column("epoch").where,
+                do='leave one of them out (columns = {epoch = ""})',
+            )
+        out["epoch"] = column("epoch").years()
+    elif epoch is not None:
+        out["epoch"] = np.full(len(quantities), year_of(epoch, where="data.epoch"))
     if "ra" in found:
-        out |= _projected(quantities, unit, tangent_point)
+        out |= _projected(quantities, unit, tangent_point, out.get("epoch"), catalogue_epoch)
     else:
         if tangent_point is not None:
             raise InputError(
                 "a tangent point is given, but the reference positions are u, v",
-                where=source,
+                where=quantities.source,
                 do="name the columns ra and dec, or leave the tangent point out",
             )
         out["u"], out["v"] = (column(key).numbers() for key in ("u", "v"))
@@ -363,13 +217,16 @@ def match_columns(
     for key in ("sigma_u", "sigma_v"):
         if key in found:
             out[key] = _sigma(column(key), out["unit"])
-    if nominal := nominal_columns(found, source=source, tangent_point=tangent_point):
-        for key in nominal:
-            out[key] = _in_unit(column(key), out["unit"])
-    if "epoch" in found:
-        out["epoch"] = column("epoch").years()
+    nominal = nominal_columns(found, source=quantities.source, tangent_point=tangent_point)
+    for key in nominal:
+        out[key] = _in_unit(column(key), out["unit"])
     if "mag" in found:
         out["mag"] = column("mag").numbers()
+    elif "flux" in found:
+        with contextlib.suppress(InputError):  # magnitudes are needed by few: none for all then
+            flux = column("flux").numbers()
+            if (flux > 0).all():
+                out["mag"] = -2.5 * np.log10(flux)
     if "colour" in found:
         # colours serve a test alone: where stars have none, the table is read without
         with contextlib.suppress(InputError):
@@ -381,8 +238,7 @@ def match_columns(
     if "star" in found:
         out["star"] = column("star").integers()
     if "chip" in found:
-        numbers, out["chip"] = np.unique(column("chip").integers(), return_inverse=True)
-        out["chip_numbers"] = tuple(numbers.tolist())
+        out["chip"], out["chip_numbers"], out["chip_names"] = numbered_chips(column("chip"), chips)
     return out
 
 
@@ -402,14 +258,35 @@ def _pixels(column: SourceColumn, pixel_origin: int) -> Float:
 
 
 def _projected(
-    quantities: _Quantities, unit: str | None, tangent_point: tuple[float, float] | None
+    quantities: Quantities,
+    unit: str | None,
+    tangent_point: tuple[float, float] | None,
+    epoch: Float | None,
+    catalogue_epoch: float | None,
 ) -> dict[str, Any]:
-    """u, v on the tangent plane."""
-    unit = plane_unit(unit, source=quantities.source)
-    sky = _sky(quantities)
-    point = mean_direction(*sky) if tangent_point is None else tangent_point
-    u, v = tangent_plane(*sky, point, where=quantities.source, place=quantities.place)
-    return {"u": u, "v": v, "unit": unit, "tangent_point": (float(point[0]), float(point[1]))}
+    """Positions on the tangent plane, their errors and motions."""
+    unit, where = plane_unit(unit, source=quantities.source), quantities.source
+    sky = reference_sky(quantities, epoch=epoch, catalogue_epoch=catalogue_epoch)
+    point = mean_direction(sky.ra, sky.dec) if tangent_point is None else tangent_point
+    u, v = tangent_plane(sky.ra, sky.dec, point, where=where, place=quantities.place)
+    out: dict[str, Any] = {"u": u, "v": v, "unit": unit, "notes": sky.notes}
+    out["tangent_point"] = (float(point[0]), float(point[1]))
+    if sky.sigma is None and sky.motion is None:
+        return out
+    J = tangent_jacobian(sky.ra, sky.dec, point, where=where)
+    if sky.sigma is not None:
+        good = (sky.sigma > 0).all(axis=0)
+        if not good.all():
+            bad = int(np.argmin(good))
+            raise quantities["sigma_ra"].fail(bad, "the error of the position is not positive")
+        variance = np.einsum("nij,jn->in", J**2, sky.sigma**2)
+        out["sigma_u"], out["sigma_v"] = np.sqrt(variance)
+    if sky.motion is not None:
+        out["pm_u"], out["pm_v"] = np.einsum("nij,jn->in", J, sky.motion)
+    if sky.sigma_motion is not None:
+        variance = np.einsum("nij,jn->in", J**2, sky.sigma_motion**2)
+        out["sigma_pm_u"], out["sigma_pm_v"] = np.sqrt(variance)
+    return out
 
 
 def plane_unit(unit: str | None, *, source: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.duplicates import first_duplicate
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
 from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
+from bayesdist.data.missing import absent, counted
 from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
-from bayesdist.data.units import check_unit
+from bayesdist.data.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
 
 __all__ = ["MatchTable"]
@@ -25,7 +26,8 @@ Int = NDArray[np.int64]
 _POSITIONS = ("x", "y", "u", "v")
 _SIGMAS = ("sigma_u", "sigma_v")
 _NOMINAL = ("u_nominal", "v_nominal")
-_OPTIONAL = ("epoch", "mag", "colour", *_NOMINAL)
+_MOTIONS = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
+_OPTIONAL = ("epoch", "mag", "colour", *_NOMINAL, *_MOTIONS)
 _CODES = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
 _INTEGERS = ("row", "source", "star", *_CODES)
 
@@ -35,7 +37,8 @@ class MatchTable:
     """Matched stars.
 
     All arrays have length N and are float64, codes and rows int64; anything that converts to them
-    is taken.  Only x, y, u, v are needed.
+    is taken.  Quantities are converted to `unit` (x and y to pixels), and rows with a masked value
+    are left out and counted in `rejected`.  Only x, y, u, v are needed.
 
     Parameters
     ----------
@@ -77,6 +80,14 @@ class MatchTable:
     u_nominal, v_nominal : ndarray, optional
         Where an earlier solution put the star, in `unit`: both or neither.  The match was looked
         for within a circle about it.
+    pm_u, pm_v, sigma_pm_u, sigma_pm_v : ndarray, optional
+        Proper motion of the reference star in `unit` per year, and its standard errors, where the
+        catalogue gives them: both axes or neither.  u and v hold it already, if `notes` say that
+        they were moved.
+    chip_names : tuple of str
+        Names of the chips of `chip_numbers`, where the file has names in place of numbers.
+    notes : tuple of str
+        What was done in reading, as clauses.
 
     Raises
     ------
@@ -110,6 +121,12 @@ class MatchTable:
     tangent_point: tuple[float, float] | None = None
     u_nominal: Float | None = None
     v_nominal: Float | None = None
+    pm_u: Float | None = None
+    pm_v: Float | None = None
+    sigma_pm_u: Float | None = None
+    sigma_pm_v: Float | None = None
+    chip_names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self._complete()
@@ -156,6 +173,8 @@ class MatchTable:
 
     def _complete(self) -> None:
         """Give what was left out its default, and every array its type."""
+        self._without_units()
+        self._without_masks()
         n = np.size(self.x)
         if n == 0:
             raise InputError(
@@ -178,6 +197,42 @@ class MatchTable:
                 )
         object.__setattr__(self, "n_rows", n if self.n_rows is None else int(self.n_rows))
         object.__setattr__(self, "rejected", dict(self.rejected))
+
+    def _without_units(self) -> None:
+        """Numbers in place of quantities."""
+        units = dict.fromkeys(("x", "y"), "pix") | dict.fromkeys(_MOTIONS, f"{self.unit} / yr")
+        units |= {"epoch": "yr", "mag": "mag", "colour": "mag"}
+        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
+            own = unit_of(getattr(self, name), where=f"column {name!r}")
+            if own is None:
+                continue
+            unit = units.get(name, self.unit)
+            factor = conversion(own, unit, where=f"{', '.join(self.sources)}, column {name!r}")
+            object.__setattr__(self, name, factor * without_unit(getattr(self, name)))
+
+    def _without_masks(self) -> None:
+        """Rows with a masked value are left out and counted."""
+        names = list(self._array_names())
+        masked = [name for name in names if hasattr(getattr(self, name), "mask")]
+        n, shapes = np.size(self.x), {np.shape(getattr(self, name)) for name in names}
+        if not masked or shapes != {(n,)}:
+            return  # unequal lengths are refused where they are compared
+        reasons = [
+            (f"no value in column {name!r}", absent(getattr(self, name), not_finite=False))
+            for name in masked
+        ]
+        stay, counts = counted(reasons, n)
+        if not counts:
+            return
+        if self.row is None:
+            object.__setattr__(self, "row", np.arange(n))
+            names.append("row")
+        for name in names:
+            values = getattr(self, name)
+            plain = np.asarray(getattr(values, "unmasked", values))
+            object.__setattr__(self, name, plain[stay])
+        object.__setattr__(self, "n_rows", n if self.n_rows is None else self.n_rows)
+        object.__setattr__(self, "rejected", merged_counts([self.rejected, counts]))
 
     def _array_names(self) -> Iterator[str]:
         for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL, *_INTEGERS):
@@ -441,8 +496,17 @@ class MatchTable:
                 [getattr(t, labels) for t in tables],
                 ordered=name == "chip",
             )
+        name_of = {
+            number: name
+            for t in tables
+            for number, name in zip(t.chip_numbers, t.chip_names, strict=False)
+        }
+        chips = cast("tuple[int, ...]", joined["chip_numbers"])
+        if len(name_of) == len(chips):
+            joined["chip_names"] = tuple(name_of[number] for number in chips)
         return MatchTable(
             **joined,  # type: ignore[arg-type]
+            notes=tuple(dict.fromkeys(note for t in tables for note in t.notes)),
             unit=first.unit,
             tangent_point=first.tangent_point,
             n_rows=sum(t.n_rows for t in tables),

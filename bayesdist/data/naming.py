@@ -16,6 +16,7 @@ def find_columns(
     aliases: Mapping[str, tuple[str, ...]],
     *,
     source: str,
+    pairs: Iterable[tuple[str, str]] = (),
 ) -> dict[str, str]:
     """Which column of a file is what.
 
@@ -29,6 +30,8 @@ def find_columns(
         Usual names, in lower case, for quantities that `mapping` does not name.
     source : str
         File, for the error.
+    pairs : iterable of (str, str), optional
+        Quantities whose names go together: usual names of which the file has both come first.
 
     Returns
     -------
@@ -59,6 +62,12 @@ def find_columns(
         # where only case tells two columns apart, the lower-case one is the usual one
         if name.lower() not in lower or name == name.lower():
             lower[name.lower()] = name
+    for one, other in pairs:
+        if one not in found and other not in found:
+            both = zip(aliases[one], aliases[other], strict=True)
+            first = next((two for two in both if lower.keys() >= set(two)), None)
+            if first is not None:
+                found[one], found[other] = lower[first[0]], lower[first[1]]
     for key, usual in aliases.items():
         if key not in found:
             found[key] = next((lower[a] for a in usual if a in lower), "")

@@ -38,7 +38,7 @@ Segment = tuple[int, int, int]  # part, first row, row after the last
 
 _ARRAYS = (
     *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour", "star"),
-    *("u_nominal", "v_nominal"),
+    *("u_nominal", "v_nominal", "pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"),
 )
 
 
@@ -89,7 +89,7 @@ class PartPiece:
     def _segment(self, part: MatchPart, segment: Segment) -> dict[str, Any]:
         """Arrays of the rows in one file."""
         code, start, stop = segment
-        without = ("sigma_u", "sigma_v") if self.errors is not None else ()
+        without = ("sigma_u", "sigma_v", "sigma_ra", "sigma_dec") if self.errors is not None else ()
         (block,) = part.blocks(start=start, stop=stop, size=stop - start, without=without)
         out = {name: block[name] for name in _ARRAYS if name in block}
         for key in ("exposure", "chip", "filter"):
@@ -194,9 +194,14 @@ class PartitionedMatches:
         return self.whole.tangent_point
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What was found out about the files, as clauses."""
+        return tuple(dict.fromkeys(note for part in self.parts for note in part.notes))
+
+    @property
     def has_epoch(self) -> bool:
         """Whether the stars have epochs."""
-        return "epoch" in self.parts[0].found
+        return "epoch" in self.parts[0].found or self.parts[0].epoch is not None
 
     @property
     def has_mag(self) -> bool:
@@ -206,7 +211,7 @@ class PartitionedMatches:
     @property
     def has_sigma(self) -> bool:
         """Whether the stars have errors."""
-        return self.errors is not None or "sigma_u" in self.parts[0].found
+        return self.errors is not None or _has_errors(self.parts[0])
 
     @property
     def has_nominal(self) -> bool:
@@ -322,6 +327,11 @@ class PartitionedMatches:
         return replace(self, errors=(float(sigma_u), float(sigma_v)))
 
 
+def _has_errors(part: MatchPart) -> bool:
+    """True where a file has errors of the matches, or of the reference positions."""
+    return bool({"sigma_u", "sigma_ra"} & set(part.found))
+
+
 def _columns(table: MatchTable) -> dict[str, NDArray[Any]]:
     """Arrays of a table that it has."""
     names = (*_ARRAYS, "exposure", "chip", "filter", "row", "source")
@@ -345,8 +355,11 @@ def open_matches(
     columns: Mapping[str, str] | None = None,
     unit: str | None = None,
     sigma: str | float = "columns",
-    pixel_origin: int = 1,
+    pixel_origin: int | None = None,
     tangent_point: tuple[float, float] | None = None,
+    epoch: float | str | None = None,
+    catalogue_epoch: float | None = None,
+    chips: Mapping[str, int] | None = None,
 ) -> PartitionedMatches:
     """Matched star positions that stay on disk.
 
@@ -354,8 +367,8 @@ def open_matches(
     ----------
     path : path-like or sequence of path-like
         Parquet: a file, a list of files, a pattern, or a folder of parts of one table.
-    columns, unit, sigma, pixel_origin, tangent_point
-        As `read_matches`.
+    columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips
+        As `read_matches`; a row with a missing value is refused.
 
     Returns
     -------
@@ -390,12 +403,15 @@ def open_matches(
             pixel_origin=pixel_origin,
             tangent_point=tangent_point,
             exposure_name=name,
+            epoch=epoch,
+            catalogue_epoch=catalogue_epoch,
+            chips=chips,
         )
         for file, name in zip(files, names, strict=True)
     )
     _refuse_differences(parts)
     first = parts[0]
-    refuse_missing_errors(sigma, "sigma_u" in first.found, "mag" in first.found, where=first.source)
+    refuse_missing_errors(sigma, _has_errors(first), "mag" in first.found, where=first.source)
     if first.on_sky and tangent_point is None:
         point = tangent_point_of(parts)
         parts = tuple(replace(one, tangent_point=point) for one in parts)

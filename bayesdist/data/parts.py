@@ -17,11 +17,13 @@ from bayesdist.data.columns import (
     nominal_columns,
     plane_unit,
     position_unit,
-    sky_columns,
 )
 from bayesdist.data.duplicates import buckets_for, first_repetition
-from bayesdist.data.parquet_files import ParquetPart
+from bayesdist.data.parquet_files import ParquetPart, RowBlock
+from bayesdist.data.quantities import Quantities
+from bayesdist.data.sky import sky_columns
 from bayesdist.data.tangent import direction_of, direction_sum
+from bayesdist.data.usual_names import origin_of
 from bayesdist.data.values import SourceColumn
 from bayesdist.errors import InputError
 
@@ -49,6 +51,10 @@ class MatchPart:
         Name of the one exposure, where there is no column of them.
     pixel_origin : int
     tangent_point : tuple of float or None
+    epoch, catalogue_epoch, chips
+        As `matches_from_table`.
+    notes : tuple of str
+        What was found out about the file, as clauses.
     """
 
     part: ParquetPart
@@ -57,6 +63,10 @@ class MatchPart:
     exposure_name: str | None
     pixel_origin: int
     tangent_point: tuple[float, float] | None
+    epoch: float | str | None = None
+    catalogue_epoch: float | None = None
+    chips: Mapping[str, int] | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def source(self) -> str:
@@ -101,13 +111,13 @@ class MatchPart:
         columns = list(dict.fromkeys(found.values()))
         for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
             out = match_columns(
-                block,
-                found,
-                source=self.source,
+                self._quantities(block, found),
                 unit=self.unit,
                 pixel_origin=self.pixel_origin,
                 tangent_point=self.tangent_point,
-                place=self.part.place(block.first),
+                epoch=self.epoch,
+                catalogue_epoch=self.catalogue_epoch,
+                chips=self.chips or {},  # names alone have no numbers before all are known
             )
             for key, labels in _LABELS.items():
                 if key not in found:
@@ -120,10 +130,13 @@ class MatchPart:
         total = np.zeros(3, object)
         columns = [self.found["ra"], self.found["dec"]]
         for block in self.part.blocks(columns, size=_BLOCK):
-            place = self.part.place(block.first)
-            total += direction_sum(*sky_columns(block, self.found, source=self.source, place=place))
+            total += direction_sum(*sky_columns(self._quantities(block, self.found)))
         x, y, z = total.tolist()
         return x, y, z
+
+    def _quantities(self, block: RowBlock, found: Mapping[str, str]) -> Quantities:
+        place = self.part.place(block.first)
+        return Quantities(block, found, self.source, place, self.part.colnames)
 
 
 def match_part(
@@ -132,16 +145,20 @@ def match_part(
     *,
     unit: str | None,
     read_sigma: bool,
-    pixel_origin: int,
+    pixel_origin: int | None,
     tangent_point: tuple[float, float] | None,
     exposure_name: str | None,
+    epoch: float | str | None = None,
+    catalogue_epoch: float | None = None,
+    chips: Mapping[str, int] | None = None,
 ) -> MatchPart:
     """What a file holds, by the names and units of its columns alone.
 
     Parameters
     ----------
     part : ParquetPart
-    columns, unit, read_sigma, pixel_origin, tangent_point, exposure_name
+    columns, unit, read_sigma, pixel_origin, tangent_point, exposure_name, epoch, catalogue_epoch
+    chips
         As `matches_from_table`.
 
     Returns
@@ -155,6 +172,11 @@ def match_part(
     """
     source = str(part.path)
     found = needed_columns(part.colnames, columns, source=source, read_sigma=read_sigma)
+    found.pop("flux", None)  # magnitudes of all rows or of none: that takes all of them
+    notes: tuple[str, ...] = ()
+    if pixel_origin is None:
+        pixel_origin, why = origin_of(found["x"], part.colnames, {})
+        notes = (f"the first pixel is taken as {pixel_origin}: {why}",) if why else ()
     if "sigma_u" in found or "sigma_v" in found:
         for key in ("sigma_u", "sigma_v"):
             if key not in found:
@@ -172,7 +194,18 @@ def match_part(
             for key in ("u", "v")
         )
         own = position_unit((u, v), unit)
-    return MatchPart(part, found, own, exposure_name, pixel_origin, tangent_point)
+    return MatchPart(
+        part,
+        found,
+        own,
+        exposure_name,
+        pixel_origin,
+        tangent_point,
+        epoch,
+        catalogue_epoch,
+        chips,
+        notes,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,19 +7,26 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.table import Table
 
 from bayesdist.data.astrometrynet import COLUMNS as CORR_COLUMNS
 from bayesdist.data.astrometrynet import is_astrometrynet, matches_from_corr
-from bayesdist.data.columns import matches_from_table, sky_positions
+from bayesdist.data.chip_labels import numbered, text_labels
+from bayesdist.data.from_table import matches_from_table, sky_positions
 from bayesdist.data.hst1pass import is_hst1pass, is_matchup, read_hst1pass, read_matchup
 from bayesdist.data.magnitude_errors import no_magnitudes
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching import match_table
-from bayesdist.data.tables import TABLE_SUFFIXES, read_lines, read_table
+from bayesdist.data.missing import absent
+from bayesdist.data.naming import find_columns
+from bayesdist.data.tables import TABLE_SUFFIXES, is_binary, is_fits, read_lines, read_table
 from bayesdist.data.tangent import mean_direction
+from bayesdist.data.text_tables import is_text_table
+from bayesdist.data.usual_names import ALIASES
+from bayesdist.data.values import SourceColumn
 from bayesdist.errors import FormatError, InputError
 
 __all__ = [
@@ -27,6 +34,7 @@ __all__ = [
     "check_sigma",
     "exposure_names",
     "input_files",
+    "kind_of",
     "read_matches",
     "refuse_missing_errors",
 ]
@@ -34,6 +42,7 @@ __all__ = [
 FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")
 
 PathLike = str | os.PathLike[str]
+IN_MEMORY = "table"  # what a table that is no file is called in errors
 
 
 def input_files(path: PathLike | Sequence[PathLike]) -> list[Path]:
@@ -89,12 +98,16 @@ class _Options:
     columns: Mapping[str, str] | None
     unit: str | None
     read_sigma: bool
-    pixel_origin: int
+    pixel_origin: int | None
     tangent_point: tuple[float, float] | None
+    epoch: float | str | None = None
+    catalogue_epoch: float | None = None
+    chips: Mapping[str, int] | None = None
+    not_finite: str = "refuse"
 
     def refuse(self, source: str, kind: str, *names: str) -> None:
         """Refuse options that a format leaves no room for."""
-        blank = _Options(None, None, True, 1, None)
+        blank = _Options(None, None, True, None, None)
         for name in names:
             if getattr(self, name) != getattr(blank, name):
                 raise InputError(
@@ -105,24 +118,30 @@ class _Options:
 
 
 def read_matches(
-    path: PathLike | Sequence[PathLike],
+    path: PathLike | Sequence[PathLike] | Any,
     *,
     format: str = "auto",
     columns: Mapping[str, str] | None = None,
     unit: str | None = None,
     sigma: str | float = "columns",
-    pixel_origin: int = 1,
+    pixel_origin: int | None = None,
     tangent_point: tuple[float, float] | None = None,
+    epoch: float | str | None = None,
+    catalogue_epoch: float | None = None,
+    chips: Mapping[str, int] | None = None,
+    not_finite: str = "refuse",
 ) -> MatchTable:
     """Read matched star positions.
 
     Parameters
     ----------
-    path : path-like or sequence of path-like
+    path : path-like, sequence of path-like, or table
         A file, a list of files, a pattern, or a folder of Parquet files (parts of one table).  Of
         several files each is one exposure, named for the file, where it has no column of exposures.
+        Also an astropy Table or QTable, a pandas DataFrame, or a mapping of arrays.
     format : str, optional
-        'table' (.ecsv, .csv, .fits, .parquet), 'hst1pass' (lists with raw and corrected positions),
+        'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
+        'hst1pass' (lists with raw and corrected positions),
         'matchup' (such lists beside the MATCHUP master that they are then matched with),
         'astrometry.net' (corr.fits), or 'auto': by name and content.
     columns : mapping of str to str, optional
@@ -132,8 +151,8 @@ def read_matches(
     sigma : {'columns', 'by_magnitude'} or float, optional
         Where errors come from: from columns; left to be estimated from residuals by magnitude (they
         are then None); or one number, in the unit of u and v.
-    pixel_origin : {0, 1}, optional
-        Coordinate of the centre of the first pixel in the file.
+    pixel_origin, epoch, catalogue_epoch, chips, not_finite
+        As `matches_from_table`.
     tangent_point : tuple of float, optional
         RA and Dec in degrees of the plane for sky positions; by default the mean direction of all
         stars.
@@ -152,9 +171,27 @@ def read_matches(
             f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(FORMATS)}"
         )
     check_sigma(sigma)
+    options = _Options(
+        columns,
+        unit,
+        sigma == "columns",
+        pixel_origin,
+        tangent_point,
+        epoch,
+        catalogue_epoch,
+        chips,
+        not_finite,
+    )
+    if isinstance(path, Table | Mapping) or hasattr(path, "to_parquet"):  # a DataFrame
+        if format not in ("auto", "table"):
+            raise InputError(
+                f"format is {format!r}, but a table is given, no file",
+                where="format",
+                do="leave it out",
+            )
+        return _with_errors(_read_table(IN_MEMORY, path, None, options), sigma)
     files = input_files(path)
-    options = _Options(columns, unit, sigma == "columns", pixel_origin, tangent_point)
-    kinds = [_kind(file, columns) if format == "auto" else format for file in files]
+    kinds = [kind_of(file, columns) if format == "auto" else format for file in files]
     masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
     if masters:
         table = _read_with_master(files, kinds, options)
@@ -205,20 +242,22 @@ def refuse_missing_errors(
         raise no_magnitudes(where)
 
 
-def _kind(file: Path, columns: Mapping[str, str] | None) -> str:
+def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
     """Format of a file, by its name and then by its content."""
     name = file.name.lower().removesuffix(".gz")
     if name.endswith(tuple(TABLE_SUFFIXES)):
         if columns is None and name.endswith((".fits", ".fit")):
             return "astrometry.net" if is_astrometrynet(read_table(file).colnames) else "table"
         return "table"
-    lines = read_lines(file)
+    lines = [] if is_binary(file) else read_lines(file)
     if is_hst1pass(lines):
         return "hst1pass"
     if is_matchup(lines):
         return "matchup"
     if name.endswith("uvwxympq"):
         return "hst1pass"  # its reader says what is wrong with it
+    if is_text_table(lines) or is_fits(file):
+        return "table"
     raise FormatError(
         "is of no known kind",
         where=str(file),
@@ -254,20 +293,11 @@ def _read_plain(
         for file, kind in zip(files, kinds, strict=True)
         if kind in ("table", "astrometry.net")
     }
-    options = _with_common_point(tables, kinds, options)
+    options = _with_common_chips(tables, _with_common_point(tables, kinds, options))
     readers: dict[str, Callable[[Path, str | None], MatchTable]] = {
         "hst1pass": lambda file, name: _read_list(file, name, options),
         "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
-        "table": lambda file, name: matches_from_table(
-            tables[file],
-            options.columns,
-            source=str(file),
-            unit=options.unit,
-            read_sigma=options.read_sigma,
-            pixel_origin=options.pixel_origin,
-            tangent_point=options.tangent_point,
-            exposure_name=name,
-        ),
+        "table": lambda file, name: _read_table(str(file), tables[file], name, options),
     }
     return MatchTable.concatenate(
         [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
@@ -290,8 +320,39 @@ def _with_common_point(
     return replace(options, tangent_point=mean_direction(ra, dec))
 
 
+def _with_common_chips(tables: Mapping[Path, Table], options: _Options) -> _Options:
+    """One numbering of the chips of all files, where these give names."""
+    if options.chips is not None or len(tables) < 2:
+        return options
+    names: set[str] = set()
+    for file, table in tables.items():
+        found = find_columns(table.colnames, options.columns, ALIASES, source=str(file))
+        if "chip" in found:
+            column = table[found["chip"]]
+            present = column[~absent(column, not_finite=False)]
+            names.update(text_labels(SourceColumn(present, str(file), found["chip"])))
+    return replace(options, chips=numbered(names)) if names else options
+
+
+def _read_table(source: str, data: Any, name: str | None, options: _Options) -> MatchTable:
+    return matches_from_table(
+        data,
+        options.columns,
+        source=source,
+        unit=options.unit,
+        read_sigma=options.read_sigma,
+        pixel_origin=options.pixel_origin,
+        tangent_point=options.tangent_point,
+        exposure_name=name,
+        epoch=options.epoch,
+        catalogue_epoch=options.catalogue_epoch,
+        chips=options.chips,
+        not_finite=options.not_finite,
+    )
+
+
 def _read_list(file: Path, name: str | None, options: _Options) -> MatchTable:
-    options.refuse(str(file), "hst1pass", "columns", "pixel_origin", "tangent_point")
+    options.refuse(str(file), "hst1pass", "columns", "pixel_origin", "tangent_point", "epoch")
     if options.unit not in (None, "pix"):
         options.refuse(str(file), "hst1pass", "unit")
     return read_hst1pass(file).matches(name=name)
@@ -302,7 +363,12 @@ def _read_corr(file: Path, table: Table, name: str | None, options: _Options) ->
     if options.unit not in (None, "arcsec"):
         options.refuse(str(file), "astrometry.net", "unit")
     return matches_from_corr(
-        table, source=str(file), tangent_point=options.tangent_point, exposure_name=name
+        table,
+        source=str(file),
+        tangent_point=options.tangent_point,
+        exposure_name=name,
+        epoch=options.epoch,
+        not_finite=options.not_finite,
     )
 
 

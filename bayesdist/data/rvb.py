@@ -16,8 +16,9 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import Columns, match_columns
+from bayesdist.data.columns import match_columns
 from bayesdist.data.matches import MatchTable
+from bayesdist.data.quantities import Columns, Quantities
 from bayesdist.data.readers import check_sigma, refuse_missing_errors
 from bayesdist.data.rvb_array import ArrayCheck
 from bayesdist.data.rvb_files import (
@@ -221,9 +222,8 @@ def _pairs(
     if sigma != "columns":
         unread |= {"sigma_u", "sigma_v"}
     plain = {key: name for key, name in file.found.items() if key not in unread}
-    out = match_columns(
-        table, plain, source=file.source, unit=unit, pixel_origin=pixel_origin, place=place
-    )
+    quantities = Quantities(table, plain, file.source, place)
+    out = match_columns(quantities, unit=unit, pixel_origin=pixel_origin)
     if "mjd" in file.found and "epoch" not in file.found:
         column = file.column(table, "mjd", place)
         out["epoch"] = SourceColumn(

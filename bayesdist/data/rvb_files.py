@@ -5,20 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import ALIASES, Columns
 from bayesdist.data.naming import find_columns
 from bayesdist.data.parquet_files import ParquetPart, describe_part
 from bayesdist.data.pieces import PIECE
+from bayesdist.data.quantities import Columns
 from bayesdist.data.readers import input_files
-from bayesdist.data.tables import read_lines, read_table, reading
+from bayesdist.data.tables import read_table
+from bayesdist.data.usual_names import BASIC
 from bayesdist.data.values import Place, SourceColumn, row_number
-from bayesdist.errors import FormatError, InputError
+from bayesdist.errors import InputError
 
 __all__ = [
     "ARRAY_SIZE",
@@ -28,7 +28,6 @@ __all__ = [
     "RvbFile",
     "band_name",
     "open_rvb_files",
-    "read_any_table",
 ]
 
 PathLike = str | os.PathLike[str]
@@ -45,9 +44,9 @@ MAGNITUDES = tuple(f"mag_{band.lower()}" for band in ARRAY_SIZE)
 
 # lower case; the first that the file has is taken
 RVB_ALIASES: dict[str, tuple[str, ...]] = {
-    **{key: ALIASES[key] for key in ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag")},
-    "exposure": ("frame", "frame_id", "frameset", *ALIASES["exposure"]),
-    "star": ALIASES["star"],
+    **{key: BASIC[key] for key in ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag")},
+    "exposure": ("frame", "frame_id", "frameset", *BASIC["exposure"]),
+    "star": BASIC["star"],
     "band": ("band", "filter", "channel"),
     "mjd": ("mjd", "mjd_obs"),
     "colour": ("colour", "color"),
@@ -133,7 +132,7 @@ def open_rvb_files(
         if name.endswith(".parquet"):
             contents = describe_part(file)
         else:
-            contents = read_any_table(file)
+            contents = read_table(file)
         names = list(contents.colnames)
         found = find_columns(names, columns, RVB_ALIASES, source=str(file))
         for key in ("x", "y", "u", "v"):
@@ -145,41 +144,3 @@ def open_rvb_files(
                 )
         out.append(RvbFile(str(file), contents, found))
     return out
-
-
-def read_any_table(path: Path) -> Table:
-    """Table of a file: what `read_table` knows, and IPAC tables (.tbl, .ipac).
-
-    Raises
-    ------
-    InputError
-        As `read_table`.
-    """
-    return _read_ipac(path) if path.name.lower().endswith(IPAC) else read_table(path)
-
-
-def _read_ipac(path: Path) -> Table:
-    text = read_lines(path)
-    lines = [line.rstrip("\r\n") for line in text]
-    _refuse_short_rows(lines, path, ended=not text or text[-1] != lines[-1])
-    with reading(path):
-        return Table.read(lines, format="ascii.ipac")
-
-
-def _refuse_short_rows(lines: Sequence[str], path: Path, *, ended: bool) -> None:
-    """Refuse rows that end before the last column begins: astropy drops or shortens them."""
-    header = next((line.rstrip() for line in lines if line.startswith("|")), "")
-    last_column = header[:-1].rfind("|")
-    row = 0
-    for number, line in enumerate(lines):
-        if line[:1] in ("\\", "|") or not line:
-            continue
-        row += 1
-        # without an end of line the last number may have lost its last digits
-        cut = number == len(lines) - 1 and not ended and len(line) < len(header) - 1
-        if cut or len(line.rstrip()) <= last_column:
-            raise FormatError(
-                f"ends after {len(line.rstrip())} of {len(header)} characters",
-                where=f"{path}, row {row}",
-                do="the table may be truncated: fetch or write it again",
-            )

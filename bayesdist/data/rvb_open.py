@@ -6,12 +6,12 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from bayesdist.data.columns import ALIASES
 from bayesdist.data.parquet_files import ParquetPart
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
 from bayesdist.data.rvb import chosen_band
 from bayesdist.data.rvb_array import ArrayCheck
 from bayesdist.data.rvb_files import MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.data.usual_names import ALIASES
 from bayesdist.data.values import Place
 
 __all__ = ["open_rvb"]

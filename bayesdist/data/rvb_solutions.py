@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.data.naming import find_columns
-from bayesdist.data.rvb_files import RVB_ALIASES, read_any_table
+from bayesdist.data.rvb_files import RVB_ALIASES
 from bayesdist.data.rvb_transform import PARAMETERS, RvbTransform
+from bayesdist.data.tables import read_table
 from bayesdist.data.values import SourceColumn
 from bayesdist.errors import InputError
 
@@ -52,7 +53,7 @@ def read_solutions(
         is no number.
     """
     file = Path(path)
-    table = read_any_table(file)
+    table = read_table(file)
     found = find_columns(table.colnames, columns, SOLUTION_ALIASES, source=str(file))
     given = [name for name in PARAMETERS if name in found]
     if "frame" not in found or not given:

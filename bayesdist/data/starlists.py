@@ -11,11 +11,11 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.columns import ALIASES
 from bayesdist.data.hst1pass import Hst1passList, is_hst1pass, read_hst1pass
 from bayesdist.data.naming import find_columns
 from bayesdist.data.readers import exposure_names, input_files
 from bayesdist.data.tables import TABLE_SUFFIXES, read_lines, read_table
+from bayesdist.data.usual_names import BASIC
 from bayesdist.data.values import SourceColumn
 from bayesdist.errors import FormatError, InputError
 
@@ -26,9 +26,9 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 Limit: TypeAlias = "float | Callable[[Float], ArrayLike]"
 
-_LIST_ALIASES = {key: ALIASES[key] for key in ("x", "y", "exposure", "chip", "mag")} | {
+_LIST_ALIASES = {key: BASIC[key] for key in ("x", "y", "exposure", "chip", "mag")} | {
     "q": ("q", "qfit", "quality"),
-    "epoch": ALIASES["epoch"],
+    "epoch": BASIC["epoch"],
 }
 _LIST_ALIASES["mag"] = (*_LIST_ALIASES["mag"], "m")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
 import io
 import warnings
@@ -10,10 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from astropy.io import fits
-from astropy.table import Column, MaskedColumn, Table
+from astropy.table import Column, MaskedColumn, Table, vstack
 from astropy.table.meta import get_header_from_yaml
 
+from bayesdist.data.text_tables import is_text_table, parse_text_table
 from bayesdist.errors import FormatError, InputError
 
 if TYPE_CHECKING:
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "TABLE_SUFFIXES",
+    "is_binary",
+    "is_fits",
     "naming_faults",
     "parquet_column",
     "parquet_units",
@@ -28,6 +33,8 @@ __all__ = [
     "read_table",
     "reading",
 ]
+
+_FITS = b"SIMPLE  ="
 
 
 @contextmanager
@@ -104,7 +111,40 @@ def _read_ecsv(path: Path) -> Table:
 
 
 def _read_csv(path: Path) -> Table:
-    return Table.read(_bare_lines(path), format="ascii.csv", comment="#", guess=False)
+    return _separated(path, ",", "ascii.csv")
+
+
+def _read_text(path: Path) -> Table:
+    return parse_text_table(read_lines(path), where=str(path))
+
+
+def _read_tsv(path: Path) -> Table:
+    return _separated(path, "\t", "ascii.tab")
+
+
+def _separated(path: Path, mark: str, format: str) -> Table:
+    lines = _bare_lines(path)
+    _refuse_short_rows(lines, mark, path)
+    return Table.read(lines, format=format, comment="#", guess=False)
+
+
+def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
+    """Refuse rows with fewer cells than there are names: astropy fills them up in silence."""
+    width, row = 0, 0
+    for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
+        if not cells or cells == [""]:
+            continue
+        if width and len(cells) < width:
+            raise FormatError(
+                f"has {len(cells)} of {width} cells",
+                where=f"{path}, row {row}",
+                do="the table may be truncated: fetch or write it again",
+            )
+        width, row = width or len(cells), row + 1
+
+
+def _read_votable(path: Path) -> Table:
+    return Table.read(io.BytesIO(path.read_bytes()), format="votable")
 
 
 def _read_fits(path: Path) -> Table:
@@ -113,11 +153,32 @@ def _read_fits(path: Path) -> Table:
         content = gzip.decompress(content)
     # from memory: after a failure astropy leaves a file of its own open
     with fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False) as hdus:
-        for hdu in hdus:
-            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
-                # NaN stays NaN: to call it a missing value would name the wrong fault
-                return Table.read(hdu, format="fits", mask_invalid=False)
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+        objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"]
+        if objects:
+            return _ldac(hdus, objects)
+        if tables:
+            # NaN stays NaN: to call it a missing value would name the wrong fault
+            return Table.read(tables[0], format="fits", mask_invalid=False)
     raise FormatError("holds no table extension", where=str(path), do="give a FITS table")
+
+
+def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
+    """Objects of a FITS_LDAC catalogue, with the date of the image; several are chips."""
+    tables = [Table.read(hdu, format="fits", mask_invalid=False) for hdu in objects]
+    heads = [hdu for hdu in hdus if hdu.name == "LDAC_IMHEAD"]
+    cards = np.ravel(heads[0].data.field(0)) if heads and heads[0].data is not None else []
+    text = "".join(str(card) for card in cards)
+    image = fits.Header.fromstring(text if len(text) % 80 == 0 else "")
+    for number, table in enumerate(tables, 1):
+        if len(tables) > 1 and "EXT_NUMBER" not in table.colnames:
+            table["EXT_NUMBER"] = number
+        table.meta = {}  # what SExtractor was told
+    out = vstack(tables, metadata_conflicts="silent") if len(tables) > 1 else tables[0]
+    for key in ("MJD-OBS", "DATE-OBS"):
+        if key in image:
+            out.meta[key] = image[key]
+    return out
 
 
 def _read_parquet(path: Path) -> Table:
@@ -155,10 +216,35 @@ def parquet_units(schema: pyarrow.Schema) -> dict[str, str]:
 TABLE_SUFFIXES: dict[str, Callable[[Path], Table]] = {
     ".ecsv": _read_ecsv,
     ".csv": _read_csv,
+    ".tsv": _read_tsv,
     ".fits": _read_fits,
     ".fit": _read_fits,
+    ".ldac": _read_fits,
     ".parquet": _read_parquet,
+    ".vot": _read_votable,
+    ".xml": _read_votable,
+    ".tbl": _read_text,
+    ".ipac": _read_text,
 }
+
+
+def is_binary(path: Path) -> bool:
+    """True where a file is no text; a file that cannot be read is left to its reader."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(4096)
+    except OSError:
+        return False
+    return b"\0" in head or head.startswith(_FITS)
+
+
+def is_fits(path: Path) -> bool:
+    """True where a file begins as FITS does."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_FITS)) == _FITS
+    except OSError:
+        return False
 
 
 def read_table(path: Path) -> Table:
@@ -167,7 +253,9 @@ def read_table(path: Path) -> Table:
     Parameters
     ----------
     path : pathlib.Path
-        .ecsv, .csv, .fits (first table extension; also .fits.gz) or .parquet.
+        .ecsv, .csv, .tsv, .fits (first table extension, of FITS_LDAC the objects; also .fits.gz),
+        .parquet, .vot or .xml (VOTable), .tbl or .ipac; other names by content: FITS, and text as
+        `parse_text_table` knows it.
 
     Returns
     -------
@@ -180,6 +268,10 @@ def read_table(path: Path) -> Table:
     """
     name = path.name.lower().removesuffix(".gz")
     reader = next((r for end, r in TABLE_SUFFIXES.items() if name.endswith(end)), None)
+    if reader is None and is_fits(path):
+        reader = _read_fits
+    if reader is None and not is_binary(path) and is_text_table(read_lines(path)):
+        reader = _read_text
     if reader is None:
         raise InputError(
             f"extension {path.suffix!r} is not one of a table",

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import astropy.units as apu
+import numpy as np
 
 from bayesdist.errors import InputError
 
-__all__ = ["UNITS", "check_unit", "conversion", "length_advice", "unit_of"]
+__all__ = ["UNITS", "check_unit", "conversion", "length_advice", "unit_of", "without_unit"]
 
 UNITS = ("pix", "arcsec", "mas", "deg")
 
@@ -95,3 +96,12 @@ def conversion(unit: apu.UnitBase, to: str, *, where: str) -> float:
             where=where,
             do=length_advice(str(unit)) or "correct the unit in the file or in the configuration",
         ) from None
+
+
+def without_unit(column: Any) -> Any:
+    """Numbers of a column with a unit, masked where it is."""
+    if hasattr(column, "to_value"):  # a Quantity, plain or Masked
+        return column.value
+    if isinstance(column, np.ma.MaskedArray):
+        return np.ma.MaskedArray(column.data, mask=column.mask)
+    return np.asarray(column)

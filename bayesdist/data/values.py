@@ -13,10 +13,11 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from bayesdist.data.merging import encoded
+from bayesdist.data.missing import absent
 from bayesdist.data.units import unit_of
 from bayesdist.errors import InputError
 
-__all__ = ["EncodedColumn", "Place", "SourceColumn", "row_number"]
+__all__ = ["EncodedColumn", "Place", "SourceColumn", "row_number", "year_of"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -67,12 +68,15 @@ class SourceColumn:
         Column.
     place : callable, optional
         Name of a row, by its index in `values`.
+    usual_unit : str, optional
+        Unit of a column of this name, where the file gives none.
     """
 
     values: Any
     source: str
     name: str
     place: Place = row_number
+    usual_unit: str | None = None
 
     @property
     def where(self) -> str:
@@ -81,8 +85,9 @@ class SourceColumn:
 
     @property
     def unit(self) -> apu.UnitBase | None:
-        """Unit that the file gives, or None."""
-        return unit_of(self.values, where=self.where)
+        """Unit that the file gives, else the usual one, or None."""
+        own = unit_of(self.values, where=self.where)
+        return apu.Unit(self.usual_unit) if own is None and self.usual_unit else own
 
     def fail(self, index: int, cause: str, do: str = "correct the row or drop it") -> InputError:
         """The error about one value."""
@@ -145,6 +150,27 @@ class SourceColumn:
             bad = int(np.argmin(good))
             raise self.fail(bad, f"value is {out[bad]:g}, and must be finite")
         return out
+
+    def numbers_or(self, value: float) -> Float:
+        """Numbers, with one value in place of those that are missing or not finite.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+
+        Raises
+        ------
+        InputError
+            For text.
+        """
+        if isinstance(self.values, EncodedColumn):
+            return replace(self, values=self.values.plain).numbers_or(value)
+        mask = absent(self.values, not_finite=True)
+        plain = getattr(self.values, "unmasked", self.values)
+        filled = np.array(getattr(plain, "value", plain))
+        if mask.any():
+            filled[mask] = value
+        return replace(self, values=filled).numbers()
 
     def _parsed(
         self, texts: NDArray[Any], parse: Callable[[str], Any], wanted: str
@@ -299,3 +325,14 @@ def _all_numbers(texts: Iterable[Any]) -> bool:
     except (ValueError, TypeError):
         return False
     return True
+
+
+def year_of(date: float | str, *, where: str) -> float:
+    """Decimal year of a year or an ISO date.
+
+    Raises
+    ------
+    InputError
+        For what is no date.
+    """
+    return float(SourceColumn(np.array([date]), where, "epoch").years()[0])

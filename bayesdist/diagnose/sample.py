@@ -79,6 +79,10 @@ class ScoredSample:
         Number of the star, from 0: detections of one star share the error of its reference
         position.
     blocks : tuple of Block
+    motion : ndarray, shape (2, N), or None
+        Proper motions along u and v, in the unit of u, v per year.
+    motion_sigma : ndarray, shape (2, N), or None
+        Their standard errors, where the table has them.
     """
 
     model: DistortionModel
@@ -94,6 +98,8 @@ class ScoredSample:
     epoch: Float | None
     star: Int
     blocks: tuple[Block, ...]
+    motion: Float | None = None
+    motion_sigma: Float | None = None
 
     def __len__(self) -> int:
         return len(self.X)
@@ -162,7 +168,14 @@ def scored_sample(table: MatchTable, solution: Solution) -> ScoredSample:
         epoch=None if table.epoch is None else table.epoch[rows],
         star=np.unique(codes, return_inverse=True)[1],
         blocks=_blocks(stars, table.exposure[rows], scores.theta),
+        motion=_both(table.pm_u, table.pm_v, rows),
+        motion_sigma=_both(table.sigma_pm_u, table.sigma_pm_v, rows),
     )
+
+
+def _both(u: Float | None, v: Float | None, rows: Int) -> Float | None:
+    """Two columns of a table as one array (2, n), where it has both."""
+    return None if u is None or v is None else np.stack([u[rows], v[rows]])
 
 
 def _blocks(stars: Stars, exposure: Int, theta: Float) -> tuple[Block, ...]:

@@ -87,7 +87,7 @@ def _text(table: Table) -> Table:
 
 
 def _masked(table: Table) -> Table:
-    table["v"] = MaskedColumn(table["v"], mask=np.arange(len(table)) == 4)
+    table["v"] = MaskedColumn(table["v"], mask=True)
     return table
 
 
@@ -111,7 +111,7 @@ BAD_TABLES: dict[str, tuple[Callable[[Table], Table], list[str]]] = {
     "negative sigma": (_set("sigma_u", 3, -0.1), ["row 3, column 'sigma_u'", "-0.1", "positive"]),
     "zero sigma": (_set("sigma_v", 3, 0.0), ["row 3, column 'sigma_v'", "positive"]),
     "nan sigma": (_set("sigma_v", 9, np.nan), ["row 9, column 'sigma_v'"]),
-    "masked": (_masked, ["row 5, column 'v'", "missing"]),
+    "all masked": (_masked, ["stars.ecsv", "no value in column 'v' (400 rows)"]),
     "text": (_text, ["row 11, column 'x'", "'n/a'", "number"]),
     "empty": (lambda t: t[:0], ["stars.ecsv", "no rows"]),
     "fewer stars than parameters": (lambda t: t[:5], ["5", "12 parameters"]),

@@ -61,11 +61,24 @@ def test_text_among_numbers_is_named():
         read(t)
 
 
-def test_missing_values_are_named():
+def test_rows_with_missing_values_are_left_out_and_counted():
     t = stars(su=np.ones(6), sv=np.ones(6))
-    t["sv"] = MaskedColumn(np.ones(6), mask=[0, 0, 0, 1, 0, 0])
-    with pytest.raises(InputError, match="row 4, column 'sv': value is missing"):
+    t["sv"] = MaskedColumn(np.full(6, 99999.0), mask=[0, 0, 0, 1, 0, 1])
+    t["sv"][[0, 1, 2, 4]] = 0.5
+    m = read(t)
+    assert m.rejected == {"no value in column 'sv'": 2} and m.n_rows == 6
+    assert m.row.tolist() == [0, 1, 2, 4] and m.sigma_v.tolist() == [0.5] * 4
+    t["u"][4] = np.nan  # the row is named as the file has it
+    with pytest.raises(InputError, match=r"row 5, column 'u': value is nan"):
         read(t)
+    m = read(t, not_finite="reject")
+    assert m.rejected == {"no value in column 'u'": 1, "no value in column 'sv'": 2}
+    assert m.row.tolist() == [0, 1, 2]
+    t["sv"].mask = True
+    with pytest.raises(InputError, match=r"no row has a value in every column.*'sv' \(6 rows\)"):
+        read(t)
+    with pytest.raises(InputError, match="not_finite is 'drop'"):
+        read(t, not_finite="drop")
 
 
 @pytest.mark.parametrize("value", [0.0, -0.1, np.nan])

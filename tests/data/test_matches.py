@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import astropy.units as apu
 import numpy as np
 import pytest
+from astropy.utils.masked import Masked
 
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
@@ -43,6 +45,37 @@ def test_errors_must_be_positive(value):
     sigma = np.array([1, 1, value, 1, 1])
     with pytest.raises(InputError, match=r"row 3, column 'sigma_v'.*positive"):
         table(sigma_u=np.ones(5), sigma_v=sigma)
+
+
+def test_masked_values_are_left_out_and_counted():
+    v = np.ma.MaskedArray([0.0, -1.0, 99999.0, -3.0, -4.0], mask=[0, 0, 1, 0, 0])
+    mag = Masked(np.arange(5.0), mask=[0, 0, 1, 1, 0])
+    t = table(v=v, mag=mag)
+    assert t.rejected == {"no value in column 'v'": 1, "no value in column 'mag'": 1}
+    assert (len(t), t.n_rows, t.row.tolist()) == (3, 5, [0, 1, 4])
+    assert t.v.tolist() == [0.0, -1.0, -4.0] and type(t.v) is np.ndarray
+    assert t.mag.tolist() == [0, 1, 4]
+    with pytest.raises(InputError, match="no rows"):
+        table(v=np.ma.MaskedArray(np.zeros(5), mask=True))
+    # what is not finite and not masked is an error of its own row
+    v = np.ma.MaskedArray([0.0, -1.0, 99999.0, np.nan, -4.0], mask=[0, 0, 1, 0, 0])
+    with pytest.raises(InputError, match=r"row 4, column 'v': value is nan"):
+        table(v=v)
+
+
+def test_quantities_are_converted():
+    k = np.arange(5.0)
+    t = table(u=(k + 1) * apu.deg, v=Masked(k * apu.mas, mask=k == 4), unit="arcsec",
+              sigma_u=np.ones(5) * apu.mas, sigma_v=np.ones(5), pm_u=k * apu.mas / apu.yr,
+              pm_v=k, x=k * apu.pix)  # fmt: skip
+    assert t.u.tolist() == [3600, 7200, 10800, 14400] and t.rejected == {
+        "no value in column 'v'": 1
+    }
+    np.testing.assert_allclose(t.v, [0, 1e-3, 2e-3, 3e-3])
+    np.testing.assert_allclose(t.sigma_u, 1e-3)
+    np.testing.assert_allclose(t.pm_u, [0, 1e-3, 2e-3, 3e-3])
+    with pytest.raises(InputError, match="column 'x': unit mm cannot be brought to pix"):
+        table(x=k * apu.mm)
 
 
 def test_half_a_pair_of_errors_is_refused():

@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs.utils import fit_wcs_from_points
 
-from bayesdist.data import input_files, read_matches
+from bayesdist.data import input_files, open_matches, read_matches
 from bayesdist.errors import FormatError, InputError
 
 
@@ -66,8 +66,10 @@ def test_a_field_of_metadata_carries_a_parquet_unit(stars, tmp_path):
 def test_nulls_are_missing_values(tmp_path):
     columns = {n: [1.0, None, 3.0] if n == "v" else [1.0, 2.0, 3.0] for n in "xyuv"}
     pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    found = read_matches(tmp_path / "a.parquet", unit="pix", sigma=1)
+    assert found.rejected == {"no value in column 'v'": 1} and found.row.tolist() == [0, 2]
     with pytest.raises(InputError, match="row 2, column 'v': value is missing"):
-        read_matches(tmp_path / "a.parquet", unit="pix", sigma=1)
+        open_matches(tmp_path / "a.parquet", unit="pix", sigma=1)  # nothing is left out on disk
 
 
 def test_nan_in_fits_is_nan(stars, tmp_path):

@@ -27,9 +27,16 @@ def run_fit(session: Session) -> None:
     # this fit is what all goes by from now on
     if errors is not None:
         session.errors_changed()
-    for stale in ("fit", "sums", "misfits", "stars"):
+    for stale in ("fit", "sums", "misfits", "stars", "epoch_shift"):
         session.__dict__.pop(stale, None)
     summarise_fit(session, fit)
+    for note in session.raw_matches.notes:
+        log.info("fit: %s", note)
+    for reason, count in session.raw_matches.rejected.items():
+        log.info("fit: %d rows were left out in reading: %s", count, reason)
+    shift = session.epoch_shift
+    if shift is not None and shift.significant:
+        log.warning("fit: WARNING: %s", shift.sentence)
     majority = majority_sentence(fit)
     if majority:  # said before hours of sampling
         log.warning("fit: WARNING: %s", majority)

@@ -1,0 +1,89 @@
+"""What `bayesdist init` writes of a table's columns: those taken, and those to be asked about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from bayesdist.data.layout import TableLayout
+from bayesdist.errors import InputError
+
+__all__ = ["column_lines", "columns_of_options", "quoted"]
+
+# names under which SExtractor writes what the image's own WCS makes of the pixels
+_BY_THE_IMAGE = ("alpha_j2000", "alphawin_j2000", "alphapsf_j2000", "sky_centroid.ra")
+_TOLD = 3  # columns that may be chips
+
+_NONE = """\
+# columns = {x = "x", y = "y", u = "u", v = "v"}  # they are found by their names
+"""
+
+
+def quoted(text: str) -> str:
+    """Text as TOML has it."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def columns_of_options(given: list[str]) -> dict[str, str] | None:
+    """Columns that are named as KEY=NAME; None where none is.
+
+    Raises
+    ------
+    InputError
+        For what is not KEY=NAME.
+    """
+    pairs = [one.partition("=") for one in given]
+    for key, mark, _ in pairs:
+        if not mark or not key.strip():
+            raise InputError(
+                f"{key!r} is not KEY=NAME", where="--columns", do="write it so, as x=XWIN_IMAGE"
+            )
+    return {key.strip(): name.strip() for key, _, name in pairs} or None
+
+
+def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) -> str:
+    """Lines of [data] that name the columns taken, the pixel origin and the epochs.
+
+    Parameters
+    ----------
+    layout : TableLayout or None
+        None of a format that fixes its columns.
+    columns : mapping of str to str, or None
+        As the user names them; empty names stay.
+    """
+    if layout is None:
+        return _NONE + "# pixel_origin = 1              # of x, y: 1 as in FITS, or 0\n"
+    taken = layout.taken | {key: "" for key, name in (columns or {}).items() if not name}
+    pairs = ", ".join(f"{key} = {quoted(name)}" for key, name in taken.items())
+    out = [f"columns = {{{pairs}}}"]
+    out += [f"# {text}" for text in _remarks(layout)]
+    why = layout.why or "of x, y: 1 as in FITS, or 0"
+    out.append(f"pixel_origin = {layout.origin}                # {why}")
+    if "pm_ra" in taken and "epoch" not in taken and not layout.dated:
+        out.append(
+            "# epoch = 2012.5                # of the exposures: without it proper motions are not "
+            "used"
+        )
+    if "pm_ra" in taken and "catalogue_epoch" not in taken:
+        out.append(
+            "# catalogue_epoch = 2016.0      # of ra, dec (Gaia DR3: 2016.0, DR2: 2015.5): without "
+            "it proper motions are not used"
+        )
+    return "\n".join(out) + "\n"
+
+
+def _remarks(layout: TableLayout) -> list[str]:
+    """What a user has to look at."""
+    out = []
+    ra = layout.taken.get("ra", "")
+    if ra.lower() in _BY_THE_IMAGE:
+        out.append(
+            f"LOOK: {ra} is often made from the pixels by the image's own WCS: then it is no "
+            "reference"
+        )
+    if "chip" not in layout.taken:
+        for name, n in list(layout.like_chips.items())[:_TOLD]:
+            out.append(
+                f"LOOK: column {name} has {n} values; if these are chips, add chip = {quoted(name)}"
+                " (init --columns chip=NAME)"
+            )
+    return out

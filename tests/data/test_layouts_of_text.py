@@ -1,0 +1,152 @@
+"""Tables as text, chips by name, pixels from 0, and what is none of these."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from bayesdist.data import matches_from_table, open_matches, read_matches
+from bayesdist.data.chip_labels import numbered
+from bayesdist.data.text_tables import is_text_table
+from bayesdist.data.usual_names import ALIASES
+from bayesdist.errors import InputError
+
+
+def stars(n=6, **more):
+    k = np.arange(1.0, n + 1)
+    return Table({"x": 100 * k, "y": 50 * k + k**2, "u": k, "v": 2 * k, **more})
+
+
+def test_numbers_without_names_are_refused(tmp_path):
+    path = tmp_path / "stars.txt"
+    path.write_text("1 2 3 4\n5 6 7 8\n")
+    with pytest.raises(InputError, match=r"stars\.txt: is of no known kind"):
+        read_matches(path, sigma=1.0, unit="pix")
+    path.write_text("# made by hand\n1 2 3 4\n5 6 7 8\n")  # three words, four columns
+    assert not is_text_table(path.read_text().splitlines())
+    path = tmp_path / "stars.tbl"
+    path.write_text("1 2 3 4\n5 6 7 8\n")
+    with pytest.raises(InputError, match="no line with the names of its columns; write one"):
+        read_matches(path, sigma=1.0, unit="pix")
+
+
+def test_a_truncated_ipac_table_is_refused(tmp_path):
+    path = tmp_path / "stars.txt"
+    stars().write(path, format="ascii.ipac")
+    assert len(read_matches(path, sigma=1.0, unit="pix")) == 6
+    path.write_text(path.read_text()[:-9])
+    with pytest.raises(InputError, match=r"stars\.txt, row 6: ends after"):
+        read_matches(path, sigma=1.0, unit="pix")
+
+
+@pytest.mark.parametrize("suffix", ["csv", "tsv"])
+def test_a_row_that_is_cut_short_is_refused(tmp_path, suffix):
+    path = tmp_path / f"stars.{suffix}"
+    stars().write(path, format={"csv": "ascii.csv", "tsv": "ascii.tab"}[suffix])
+    text = path.read_text()
+    assert len(read_matches(path, sigma=1.0, unit="pix")) == 6
+    path.write_text(text[: text.rindex("," if suffix == "csv" else "\t")])
+    with pytest.raises(InputError, match=rf"stars\.{suffix}, row 6: has 3 of 4 cells"):
+        read_matches(path, sigma=1.0, unit="pix")
+
+
+def test_columns_in_plain_text(tmp_path):
+    rows = "".join(f"{r['x']} {r['y']} {r['u']} {r['v']}\n" for r in stars())
+    for head in ("x y u v\n", "# a remark\n# x y u v\n", "#x y u v\n"):
+        path = tmp_path / "stars.dat"
+        path.write_text(head + rows)
+        m = read_matches(path, sigma=1.0, unit="pix")
+        np.testing.assert_array_equal(m.x, stars()["x"])
+        np.testing.assert_array_equal(m.v, stars()["v"])
+
+
+def test_several_chips_of_an_ldac_catalogue(tmp_path):
+    hdus = [fits.PrimaryHDU()]
+    header = fits.Header({"SIMPLE": True, "DATE-OBS": "2009-05-14T12:00:00"})
+    text = np.array([header.tostring()])
+    for _ in range(2):
+        card = fits.Column("Field Header Card", f"{len(text[0])}A", array=text)
+        hdus.append(fits.BinTableHDU.from_columns([card], name="LDAC_IMHEAD"))
+        table = stars()
+        table.rename_columns(("x", "y"), ("XWIN_IMAGE", "YWIN_IMAGE"))
+        hdus.append(fits.BinTableHDU(table.as_array(), name="LDAC_OBJECTS"))
+    fits.HDUList(hdus).writeto(tmp_path / "chips.ldac")
+    m = read_matches(tmp_path / "chips.ldac", sigma=1.0, unit="pix")
+    assert m.chip_numbers == (1, 2) and m.chip.tolist() == [0] * 6 + [1] * 6
+
+
+def test_chips_by_name_keep_one_numbering(tmp_path):
+    assert numbered(["S10", "S2", "N1", "S2"]) == {"N1": 1, "S2": 2, "S10": 3}
+    a, b = stars(detpos=["S10"] * 3 + ["S2"] * 3), stars(detpos=["S2"] * 3 + ["N1"] * 3)
+    a.write(tmp_path / "a.csv")
+    b.write(tmp_path / "b.csv")
+    m = read_matches(tmp_path / "?.csv", sigma=1.0, unit="pix")
+    assert m.chip_numbers == (1, 2, 3) and m.chip_names == ("N1", "S2", "S10")
+    assert m.chip_number.tolist() == [3] * 3 + [2] * 3 + [2] * 3 + [1] * 3
+    given = {"S2": 7, "S10": 4, "N1": 9}
+    m = read_matches(tmp_path / "?.csv", sigma=1.0, unit="pix", chips=given)
+    assert m.chip_numbers == (4, 7, 9) and m.chip_names == ("S10", "S2", "N1")
+    with pytest.raises(InputError, match=r"column 'detpos': chip 'S10' is none of S2; add a"):
+        matches_from_table(a, unit="pix", chips={"S2": 1})
+    texts = matches_from_table(stars(ccd=["3"] * 3 + ["12"] * 3), unit="pix")
+    assert texts.chip_numbers == (3, 12) and texts.chip_names == ()
+
+
+def test_chips_by_name_on_disk_need_their_numbers(tmp_path):
+    stars(detpos=["S10"] * 3 + ["S2"] * 3).write(tmp_path / "a.parquet")
+    with pytest.raises(InputError, match=r"column 'detpos': holds names of chips \('S10'\)"):
+        open_matches(tmp_path / "a.parquet", sigma=1.0, unit="pix")
+    m = open_matches(tmp_path / "a.parquet", sigma=1.0, unit="pix", chips={"S2": 1, "S10": 2})
+    assert m.chip_numbers == (1, 2)
+    assert m.pieces()[0].read().chip_number.tolist() == [2] * 3 + [1] * 3
+
+
+@pytest.mark.parametrize(
+    ("names", "more", "header", "origin"),
+    [
+        (("x", "y"), (), {}, 1),
+        (("xcentroid", "ycentroid"), (), {}, 0),
+        (("x_fit", "y_fit"), (), {}, 0),
+        (("slot_Centroid_x", "slot_Centroid_y"), (), {}, 0),
+        (("XCENTER", "YCENTER"), ("MSKY",), {}, 1),  # IRAF's
+        (("xcenter", "ycenter"), ("aperture_sum",), {}, 0),  # photutils'
+        (("x", "y"), ("tnpix", "xcpeak"), {}, 0),  # sep's
+        (("x", "y"), (), {"version": {"photutils": "2.0"}}, 0),
+        (("x", "y"), (), {"PIXORIG": 0}, 0),
+        (("xcentroid", "ycentroid"), (), {"pixel_origin": 1}, 1),
+    ],
+)
+def test_pixels_that_count_from_zero_are_noticed(names, more, header, origin):
+    t = stars()
+    t.rename_columns(("x", "y"), names)
+    for name in more:
+        t[name] = 1.0
+    t.meta = header
+    m = matches_from_table(t, unit="pix")
+    assert (m.x == t[names[0]] + 1 - origin).all() and (m.y == t[names[1]] + 1 - origin).all()
+    assert any("first pixel is taken as 0" in note for note in m.notes) == (origin == 0)
+    # what is said wins
+    assert (matches_from_table(t, unit="pix", pixel_origin=1).x == t[names[0]]).all()
+
+
+def test_names_of_a_pair_go_together():
+    t = stars(X_IMAGE=np.ones(6), y_image=np.ones(6))
+    t.rename_column("x", "XWIN_IMAGE")  # without its partner
+    m = matches_from_table(t, {"y": "y"}, unit="pix")
+    assert (m.x == t["XWIN_IMAGE"]).all()
+    t.remove_column("y")
+    m = matches_from_table(t[:1], unit="pix")
+    assert m.x.tolist() == [1.0] and m.y.tolist() == [1.0]
+
+
+def test_the_documentation_lists_every_name():
+    page = (Path(__file__).parents[2] / "docs" / "your_table.md").read_text(encoding="utf-8")
+    for key, names in ALIASES.items():
+        assert re.search(rf"\b{key}\b", page), key
+        for name in names:
+            assert f"`{name}`" in page, name

@@ -1,0 +1,152 @@
+"""Catalogues' units, motions and errors, against vectors in space and against draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.coordinates import get_body_barycentric
+from astropy.table import MaskedColumn, Table
+from astropy.time import Time
+
+from bayesdist.data import matches_from_table, read_catalog, tangent_plane
+from bayesdist.errors import InputError
+
+POINT = (83.0, -66.0)  # near the pole of the ecliptic: parallaxes on both axes
+MAS = np.radians(1 / 3600e3)
+GAIA = {"ra_error": 0.3, "dec_error": 0.2, "pmra_error": 0.4, "pmdec_error": 0.1,
+        "parallax_error": 0.25, "ref_epoch": 2016.0}  # fmt: skip
+
+
+def catalogue(n=40, seed=1, **more):
+    rng = np.random.default_rng(seed)
+    t = Table({"x": rng.uniform(1, 1000, n), "y": rng.uniform(1, 1000, n),
+               "source_id": np.arange(n), "phot_g_mean_mag": rng.uniform(15, 20, n),
+               "ra": POINT[0] + rng.uniform(-0.1, 0.1, n),
+               "dec": POINT[1] + rng.uniform(-0.04, 0.04, n), "pmra": rng.normal(0, 800, n),
+               "pmdec": rng.normal(0, 800, n), "parallax": rng.uniform(0, 50, n)})  # fmt: skip
+    for name, value in (GAIA | more).items():
+        t[name] = value
+    return t
+
+
+def read(t, **options):
+    return matches_from_table(t, source="gaia.csv", tangent_point=POINT, **options)
+
+
+def directions(t):
+    """Unit vectors, and those to the east and north."""
+    a, d = np.radians(np.asarray(t["ra"])), np.radians(np.asarray(t["dec"]))
+    r = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
+    east = np.array([-np.sin(a), np.cos(a), 0 * a])
+    north = np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)])
+    return r, east, north
+
+
+def on_plane(vectors):
+    r = vectors / np.linalg.norm(vectors, axis=0)
+    ra, dec = np.degrees(np.arctan2(r[1], r[0])), np.degrees(np.arcsin(r[2]))
+    return np.array(tangent_plane(ra, dec, POINT))
+
+
+def test_positions_move_on_straight_lines_in_space_and_are_seen_from_the_earth():
+    t, epoch = catalogue(), 1999.37
+    m = read(t, epoch=epoch)
+    r, east, north = directions(t)
+    dt = epoch - 2016.0
+    mu = MAS * (east * np.asarray(t["pmra"]) + north * np.asarray(t["pmdec"]))
+    when = Time(epoch, format="jyear", scale="tdb")
+    earth = get_body_barycentric("earth", when, ephemeris="builtin").xyz.to_value("au")
+    # from the Earth: the star is 1 / parallax away
+    seen = r + mu * dt - MAS * np.asarray(t["parallax"]) * earth[:, None]
+    expected = on_plane(seen)
+    # the factors are those of the middle of the field, and of first order: 50 mas x 0.04 deg
+    np.testing.assert_allclose([m.u, m.v], expected, atol=1e-4)
+    without = read(t, epoch=epoch, columns={"parallax": ""})
+    np.testing.assert_allclose([without.u, without.v], on_plane(r + mu * dt), atol=2e-6)
+    assert np.hypot(without.u - m.u, without.v - m.v).max() > 0.02
+    (note,) = m.notes
+    assert note.startswith("positions of 2016.00 were moved to 1999.37 by proper motions and par")
+    assert m.epoch.tolist() == [epoch] * len(t)
+    np.testing.assert_allclose(m.pm_u, np.asarray(t["pmra"]) / 1e3, atol=2e-3 * 3)
+    # the date may be a column, or stand in the header
+    t.meta["DATE-OBS"] = Time(epoch, format="decimalyear", scale="tt").isot
+    np.testing.assert_allclose(read(t).u, m.u, atol=1e-5)
+    t["mjd"] = Time(epoch, format="decimalyear", scale="tt").mjd
+    np.testing.assert_allclose(read(t).u, m.u, atol=1e-5)
+    with pytest.raises(InputError, match="'mjd': an epoch of the exposures is given"):
+        read(t, epoch=epoch)
+
+
+def test_errors_grow_with_those_of_motions_and_parallaxes(rng):
+    """Standard deviations of draws from a correlated catalogue, propagated one by one."""
+    t = catalogue(ra_pmra_corr=-0.6, dec_pmdec_corr=0.3)
+    m = read(t, epoch=2003.1)
+    dt, n = 2003.1 - 2016.0, 200_000
+    when = Time(2003.1, format="jyear", scale="tdb")
+    earth = get_body_barycentric("earth", when, ephemeris="builtin").xyz.to_value("au")
+    _, east, north = directions(t[:1])
+    found = []
+    for axis, s, s_pm, rho in ((east, 0.3, 0.4, -0.6), (north, 0.2, 0.1, 0.3)):
+        cov = [[s**2, rho * s * s_pm], [rho * s * s_pm, s_pm**2]]
+        d = rng.multivariate_normal([0, 0], cov, n) @ [1, dt]
+        d = d - rng.normal(0, 0.25, n) * float(earth @ axis[:, 0])
+        found.append(d.std() / 1e3)
+    np.testing.assert_allclose([m.sigma_u[0], m.sigma_v[0]], found, rtol=0.012)
+    # at the epoch of the catalogue they are its own, mas as Gaia has them
+    same = read(t, epoch=2016.0, columns={"parallax": "", "sigma_parallax": ""})
+    np.testing.assert_allclose(same.sigma_u, 0.3e-3, rtol=1e-3)
+    np.testing.assert_allclose(same.sigma_v, 0.2e-3, rtol=1e-3)
+
+
+def test_units_by_name_need_the_company_of_the_catalogue():
+    t = catalogue()
+    t.keep_columns(["x", "y", "ra", "dec", "ra_error", "dec_error"])
+    with pytest.raises(InputError, match=r"column 'ra_error': has no unit.*sigma_ra = \"\""):
+        read(t)
+    assert read(t, columns={"sigma_ra": "", "sigma_dec": ""}).sigma_u is None
+    t["ra_error"].unit = t["dec_error"].unit = "arcsec"
+    assert read(t).sigma_u == pytest.approx(0.3, rel=1e-4)
+    t = catalogue()
+    t["pmra"].unit = "arcsec / yr"  # what the file says wins
+    moved = read(t, epoch=2016.001, columns={"parallax": ""})
+    assert np.abs(moved.pm_u).max() > 100
+
+
+def test_without_an_epoch_nothing_moves_and_it_is_said():
+    t = catalogue()
+    still = read(t)
+    assert still.notes == (
+        "proper motions are not used: the epoch of the exposures is not given (data.epoch)",
+    )
+    expected = tangent_plane(t["ra"], t["dec"], POINT)
+    np.testing.assert_allclose([still.u, still.v], expected)
+    t.remove_column("ref_epoch")
+    assert "data.catalogue_epoch" in read(t, epoch=2004.0).notes[0]
+    given = read(t, epoch=2004.0, catalogue_epoch=2016.0)
+    np.testing.assert_allclose(given.u, read(catalogue(), epoch=2004.0).u)
+
+
+def test_stars_without_motion_are_left_out_where_positions_move():
+    t = catalogue()
+    t["pmra"] = MaskedColumn(t["pmra"], mask=np.arange(40) < 3)
+    t["pmdec"][5] = np.nan  # as FITS has it
+    moved = read(t, epoch=2004.0)
+    assert moved.rejected == {"no proper motion": 4} and len(moved) == 36 and moved.n_rows == 40
+    assert len(read(t)) == 40
+    t["parallax"][10] = np.nan  # a parallax that is not known is none
+    assert len(read(t, epoch=2004.0)) == 36
+
+
+def test_photometry_beside_sky_positions_is_no_plane():
+    """U, B, V are magnitudes."""
+    t = catalogue()
+    for name in ("U", "B", "V"):
+        t[name] = 15.0 + np.arange(40) / 100
+    assert read(t).tangent_point == POINT
+
+
+def test_a_catalogue_from_the_gaia_archive_needs_no_units(tmp_path):
+    catalogue().write(tmp_path / "gaia.csv")
+    found = read_catalog(tmp_path / "gaia.csv", tangent_point=POINT)
+    assert found.sigma_u == pytest.approx(0.3e-3, rel=1e-3)
+    np.testing.assert_allclose(found.pm_v, np.asarray(catalogue()["pmdec"]) / 1e3, atol=5e-3)
