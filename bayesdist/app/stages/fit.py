@@ -31,6 +31,8 @@ def run_fit(session: Session) -> None:
         session.__dict__.pop(stale, None)
     summarise_fit(session, fit)
     majority = majority_sentence(fit)
+    if session.error_scale_sentence:
+        log.warning("fit: WARNING: %s", session.error_scale_sentence)
     if majority:  # said before hours of sampling
         log.warning("fit: WARNING: %s", majority)
 
@@ -57,6 +59,7 @@ def summarise_fit(session: Session, fit: LinearFit) -> None:
             "unit": fit.unit,
             "condition": fit.condition,
             "n_parameters": fit.model.n_params,
+            **({} if session.error_scale == 1.0 else {"error_scale": session.error_scale}),
             **(_skew(fit) if session.config.fit.skew else {}),
         },
     )
