@@ -44,6 +44,8 @@ def _caveats(session: Session) -> Iterator[Caveat]:
     for text in session.further_caveats:
         yield Caveat(text)
     yield from _of_matching(session)
+    if session.error_scale_sentence:
+        yield Caveat(session.error_scale_sentence)
     held = held_out_of(session)
     if held is not None and held.doubtful:
         yield Caveat(held.verdict)

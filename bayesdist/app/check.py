@@ -87,7 +87,8 @@ def _lines(session: Session) -> Iterator[str]:
     )
     yield _cost(session)
     idle = idle_dates(session.config, session.config.requirements())
-    for text in (*warnings_of(session), *([idle] if idle else [])):
+    scaled = session.error_scale_sentence
+    for text in (*warnings_of(session), *([idle] if idle else []), *([scaled] if scaled else [])):
         yield f"WARNING      {text}"
 
 

@@ -7,6 +7,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from astropy.table import Table
@@ -17,7 +18,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import Session, write_table
 from bayesdist.data import atomic_path
-from bayesdist.errors import InputError
+from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.order import select_order
 from bayesdist.infer.order_results import OrderSelection
 from bayesdist.model.basis import MAX_ORDER
@@ -56,7 +57,8 @@ def order(
     Raises
     ------
     BayesdistError
-        For whatever would stop the run, and as `select_order`.
+        For whatever would stop the run, and as `select_order`.  Orders that the data do not
+        determine are rows that say so, as long as two lower ones can be compared.
     """
     targets = [Path(name) for name in (output, figure) if name is not None]
     for target in targets:
@@ -79,22 +81,40 @@ def order(
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
         with closing(Session(run)) as session:
-            found = _selected(session, range(low, high + 1))
+            found, failed = _selected(session, range(low, high + 1))
     if output is not None:
-        write_table(_table(found), Path(output))
+        write_table(_table(found, failed), Path(output))
     if figure is not None:
         _draw(found, Path(figure))
-    return f"{_text(found)}\n\n{found.sentence}"
+    return "\n\n".join([_text(found, failed), found.sentence])
 
 
-def _selected(session: Session, orders: Sequence[int]) -> OrderSelection:
-    """Errors by magnitude are those of the highest order: its residuals hold the least misfit."""
+def _selected(session: Session, orders: Sequence[int]) -> tuple[OrderSelection, dict[int, str]]:
+    """The comparison, and why the orders above those compared cannot be fitted.
+
+    Errors by magnitude are those of the highest order: its residuals hold the least misfit.
+    """
     config = session.config
     # names of priors may be those of other orders
     free = config.model_copy(update={"prior": []})
     session.config = free.model_copy(
         update={"fit": config.fit.model_copy(update={"radial_weight": 1.0})}
     )
+    failed: dict[int, str] = {}
+    for top in sorted(orders, reverse=True):
+        try:
+            return _compared(session, range(min(orders), top + 1)), failed
+        except DegenerateError as error:
+            if top <= min(orders) + 1:
+                raise
+            failed[top] = error.sentence
+            session.errors_changed()
+            session.__dict__.pop("linear", None)
+    raise AssertionError("the lowest two orders are compared or refused")
+
+
+def _compared(session: Session, orders: Sequence[int]) -> OrderSelection:
+    config = session.config
     session.model = replace(session.model, order=max(orders))
     if config.data is not None and config.data.sigma == "by_magnitude":
         _, errors = session.linear
@@ -108,11 +128,21 @@ def _selected(session: Session, orders: Sequence[int]) -> OrderSelection:
     )
 
 
-def _table(found: OrderSelection) -> Table:
+def _rows(found: OrderSelection, failed: dict[int, str]) -> list[dict[str, Any]]:
+    """A row for each order, rising; of those that cannot be fitted nothing but their terms."""
     rows = found.rows()
+    empty = dict.fromkeys(rows[0])
+    more = [empty | {"order": n, "terms": (n + 1) * (n + 2) // 2} for n in sorted(failed)]
+    return rows + more
+
+
+def _table(found: OrderSelection, failed: dict[int, str]) -> Table:
+    rows = _rows(found, failed)
     table = Table(
         {key: [np.nan if row[key] is None else row[key] for row in rows] for key in rows[0]}
     )
+    if failed:
+        table["not_fitted"] = [failed.get(row["order"], "") for row in rows]
     for name in ("rms_u", "rms_v", "lost"):
         table[name].unit = found.unit
     noise = found.surfaces.noise
@@ -133,7 +163,7 @@ def _table(found: OrderSelection) -> Table:
     return table
 
 
-def _text(found: OrderSelection) -> str:
+def _text(found: OrderSelection, failed: dict[int, str]) -> str:
     """Surfaces on the left, what is held out on the right."""
     noise, s = found.surfaces.noise, found.surfaces
     rows = [
@@ -150,14 +180,15 @@ def _text(found: OrderSelection) -> str:
             "held-out regions": _with_error(row["regions"], row["regions_error"]),
             "lost": row["lost"],
         }
-        for row in found.rows()
+        for row in _rows(found, failed)
     ]
+    reasons = "".join(f"\norder {n} is not fitted: {failed[n]}" for n in sorted(failed))
     return (
         f"{found.n_used} pairs in {s.n_bins} bins; lengths in {found.unit}; noise of the bins "
         f"{noise[0]:.3g} (u), {noise[1]:.3g} (v); errors are {found.error_scale:.3g} times those "
         f"quoted\n\n{table_text(rows, 3)}\n\n"
         "*  chosen: F, p and what is held out (log density) are against this order; lost: how far "
-        f"the model is from that of order {found.orders[-1]}"
+        f"the model is from that of order {found.orders[-1]}{reasons}"
     )
 
 

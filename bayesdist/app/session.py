@@ -41,6 +41,7 @@ from bayesdist.assess.holdout_predictive import Predictive
 from bayesdist.assess.majority import majority_sentence
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map, with_local
 from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
+from bayesdist.assess.quoted_errors import error_scale, error_scale_sentence
 from bayesdist.assess.solution import Solution
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.data.holdout import Split
@@ -125,9 +126,28 @@ class Session:
         return self._all_matches.has_nominal
 
     @cached_property
+    def error_scale(self) -> float:
+        """Factor on all quoted errors that the fit found them to need; 1 where they will do."""
+        return float(self.run.summary.get("fit", {}).get("error_scale", 1.0))
+
+    @property
+    def error_scale_sentence(self) -> str:
+        """What was done to quoted errors that are far too small; empty where they will do."""
+        if self.error_scale == 1.0:
+            return ""
+        return error_scale_sentence(
+            self.error_scale,
+            self.shards.survey.reference_sigma,
+            self.model.unit,
+            by_magnitude=self.raw_matches.has_mag,
+        )
+
+    @cached_property
     def _all_matches(self) -> Matches:
-        """Matches as read."""
+        """Matches as read, their errors multiplied by `error_scale`."""
         matches = self._read_matches()
+        if self.error_scale != 1.0:
+            matches = matches.with_errors_times(self.error_scale)
         if matches.has_nominal:
             try:  # columns may be found by their names
                 self.config.refuse_circle()
@@ -248,6 +268,14 @@ class Session:
             options["compute"] = self.config.resources()
             solution, _, errors = fit_by_magnitude(self.raw_matches, self.model, **options)
             return solution, errors
+        solution = fit_linear(self.shards, self.model, **options)
+        factor = error_scale(solution, fit.clip_chi2)
+        if factor == 1.0:
+            return solution, None
+        self.error_scale *= factor
+        self.__dict__["_all_matches"] = self._all_matches.with_errors_times(factor)
+        self.__dict__.pop("_split", None)
+        self.errors_changed()
         return fit_linear(self.shards, self.model, **options), None
 
     @cached_property

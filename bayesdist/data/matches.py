@@ -425,6 +425,21 @@ class MatchTable:
             sigma_v=np.broadcast_to(np.asarray(sigma_v, float), shape),
         )
 
+    def with_errors_times(self, factor: float) -> MatchTable:
+        """The same stars with all errors multiplied by a factor.
+
+        Parameters
+        ----------
+        factor : float
+
+        Returns
+        -------
+        MatchTable
+        """
+        if self.sigma_u is None or self.sigma_v is None:
+            return self
+        return self.with_sigma(factor * self.sigma_u, factor * self.sigma_v)
+
     def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> MatchTable:
         """The same stars with errors by magnitude.
 

@@ -55,12 +55,15 @@ class PartPiece:
         For each of them its code, the first row, and the row after the last.
     errors : MagnitudeErrors or tuple of float, optional
         Errors in place of those in the files.
+    factor : float
+        On all errors.
     """
 
     whole: Whole
     parts: tuple[MatchPart, ...]
     segments: tuple[Segment, ...]
     errors: Errors | None = None
+    factor: float = 1.0
 
     def __len__(self) -> int:
         return sum(stop - start for _, start, stop in self.segments)
@@ -101,6 +104,9 @@ class PartPiece:
         elif self.errors is not None:
             for name, value in zip(("sigma_u", "sigma_v"), self.errors, strict=True):
                 out[name] = np.full(stop - start, value)
+        if self.factor != 1.0:
+            for name in ("sigma_u", "sigma_v"):
+                out[name] = self.factor * out[name]
         return out
 
 
@@ -124,6 +130,8 @@ class PartitionedMatches:
         Errors in place of those in the files.
     dropped : mapping of str to int
         Rows that were left out when the files were made, by reason.
+    factor : float
+        On all errors.
 
     Attributes
     ----------
@@ -144,6 +152,7 @@ class PartitionedMatches:
     parts: tuple[MatchPart, ...]
     errors: Errors | None = None
     dropped: Mapping[str, int] = field(default_factory=dict)
+    factor: float = 1.0
 
     def __len__(self) -> int:
         return self.whole.n_rows
@@ -246,6 +255,7 @@ class PartitionedMatches:
                 tuple(self.parts[code] for code, *_ in segments),
                 tuple(segments),
                 self.errors,
+                self.factor,
             )
             for segments in out
         )
@@ -300,7 +310,20 @@ class PartitionedMatches:
             Without magnitudes.
         """
         refuse_missing_errors("by_magnitude", False, self.has_mag, where=self.sources[0])
-        return replace(self, errors=errors)
+        return replace(self, errors=errors, factor=1.0)
+
+    def with_errors_times(self, factor: float) -> PartitionedMatches:
+        """The same stars with all errors multiplied by a factor.
+
+        Parameters
+        ----------
+        factor : float
+
+        Returns
+        -------
+        PartitionedMatches
+        """
+        return replace(self, factor=factor * self.factor)
 
     def with_sigma(self, sigma_u: float, sigma_v: float) -> PartitionedMatches:
         """The same stars with other errors.
@@ -324,7 +347,7 @@ class PartitionedMatches:
                 raise InputError(
                     f"{name} is {sigma:g}, and must be finite and positive", do="give another"
                 )
-        return replace(self, errors=(float(sigma_u), float(sigma_v)))
+        return replace(self, errors=(float(sigma_u), float(sigma_v)), factor=1.0)
 
 
 def _has_errors(part: MatchPart) -> bool:

@@ -1,12 +1,13 @@
 """From matches to knowledge: the linear fit, the outlier mixture, and its posterior."""
 
+from bayesdist.infer.by_magnitude import fit_by_magnitude
 from bayesdist.infer.catalogue_shear import CatalogueShear, catalogue_shear
 from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.labelled.convergence import Convergence, Limits
 from bayesdist.infer.labelled.fit_file import load_fit, save_fit
 from bayesdist.infer.labelled.posterior_file import load_posterior, save_posterior
-from bayesdist.infer.linear import LinearFit, build_model, fit_by_magnitude, fit_linear, residuals
+from bayesdist.infer.linear import LinearFit, build_model, fit_linear, residuals
 from bayesdist.infer.membership import Memberships, memberships, outlier_probability
 from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.nodes import (

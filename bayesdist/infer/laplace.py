@@ -79,10 +79,11 @@ def starting_point(target: Target, fit: LinearFit) -> Float:
     scale = target.hyper.scale
     excess = max(fit.chi2 / max(fit.dof, 1) - 1.0, 0.0)
     f = np.clip(fit.n_rejected / fit.n_rows, 0.5 / fit.n_rows, 0.9)
-    s_out = 5 * scale
+    j = scale * np.sqrt(max(excess, 0.1))
+    s_out = 5 * float(np.hypot(scale, j))
     if fit.n_rejected > 2:
         s_out = max(s_out, fit.rms_rejected)
-    natural = {"j": scale * np.sqrt(max(excess, 0.1)), "f": float(f), "s_out": s_out}
+    natural = {"j": j, "f": float(f), "s_out": s_out}
     return np.concatenate([fit.mean, target.hyper.point(natural)])
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logit
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import kernel
@@ -68,11 +67,9 @@ class Memberships:
 
 def sampled_points(posterior: Posterior) -> tuple[Float, Float]:
     """All draws as theta (n, D) and hyperparameters (n, h) in sampled coordinates."""
-    h = [
-        logit(posterior.hyper[k].ravel()) if k == "f" else np.log(posterior.hyper[k].ravel())
-        for k in posterior.mixture.hyper
-    ]
-    return posterior.flat, np.stack(h, axis=1) if h else np.zeros((len(posterior.flat), 0))
+    hyper = posterior.mixture.bind(posterior.reference_sigma)
+    h = hyper.point({k: posterior.hyper[k].ravel() for k in posterior.mixture.hyper})
+    return posterior.flat, h.reshape(len(posterior.flat), len(posterior.mixture.hyper))
 
 
 def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:

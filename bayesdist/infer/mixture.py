@@ -3,26 +3,31 @@
     p(r) = (1 - f) N(r_u; 0, s_u^2 + j^2) N(r_v; 0, s_v^2 + j^2) + f p_out(r)
 
 One membership for each star, shared by both axes.  p_out is a round Gaussian of scale s_out, or
-uniform on the match circle.  Where stars were matched within a circle about nominal positions that
-are known, both parts are normalised on it, and f is the fraction of false matches in it.  Sampled
-are log j, logit f and log s_out; the priors are proper:
+uniform on the match circle.  The Gaussian is never narrower than the core: with s the median quoted
+error, s_out^2 = s^2 + j^2 + w^2, and w is what is sampled.  Otherwise quoted errors that are far
+too small let the components change places, and most stars be "outliers" of the narrow one.
+
+Where stars were matched within a circle about nominal positions that are known, both parts are
+normalised on it, and f is the fraction of false matches in it.  Sampled are log j, logit f and
+log w; the priors are proper:
 
     f      Beta(a, b)
     j      half-Student-t, four degrees of freedom, scale: the median quoted error by default
-    s_out  inverse gamma on s_out^2, shape 1; log s_out is most probable at five such errors by
-           default
+    w      inverse gamma on w^2, shape 1; log w is most probable at five times the core's
+           sqrt(s^2 + j^2) by default: a second component that says nothing stays apart from it
 
 All three leave tails in the sampled coordinates that fall at least exponentially, so that the
-posterior stays proper where the data say nothing: j when the quoted errors are right, s_out when
-there are no outliers.
+posterior stays proper where the data say nothing: j when the quoted errors are right, w when there
+are no outliers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, gammaln, log_expit, logit
 
 from bayesdist.errors import InputError
@@ -38,9 +43,10 @@ KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": ker
 T_DOF = 4.0
 OUTLIER_SHAPE = 1.0
 OUTLIER_MODE = 5.0
+LEAST_EXCESS = 1e-9  # of w^2 over the core's variance: files round
 # of a in Beta(a, b): at 1/3 and below the posterior of f^(1/3) may have no mode
 LEAST_SHAPE = 0.5
-# where the data say nothing of log j or log s_out: the end, and the slope of the log prior there
+# where the data say nothing of log j or log w: the end, and the slope of the log prior there
 TAILS = {"j": ("left", 1.0), "s_out": ("right", -2.0 * OUTLIER_SHAPE)}
 
 
@@ -62,8 +68,8 @@ class OutlierMixture:
     jitter_scale : float, optional
         Scale of the prior of j in the unit of u, v; by default the median quoted error.
     outlier_scale : float, optional
-        Most probable s_out of 'gaussian' outliers beforehand, in the unit of u, v; by default five
-        median quoted errors.
+        Most probable w of 'gaussian' outliers beforehand, in the unit of u, v: their scale s_out
+        beyond that of the core; by default five times the core's.
 
     Raises
     ------
@@ -150,7 +156,7 @@ class OutlierMixture:
 class Hyper:
     """An `OutlierMixture` with the scale of the data: likelihood terms and priors.
 
-    A point is a dict-free vector h in the order of `mixture.hyper`: log j, logit f, log s_out.
+    A point is a dict-free vector h in the order of `mixture.hyper`: log j, logit f, log w.
 
     Parameters
     ----------
@@ -171,13 +177,63 @@ class Hyper:
         """j, f and s_out of points (..., n_hyper), in natural form."""
         out = {}
         for k, name in enumerate(self.mixture.hyper):
-            out[name] = expit(h[..., k]) if name == "f" else np.exp(h[..., k])
+            t = h[..., k]
+            if name == "s_out":
+                out[name] = np.sqrt(self.core(h) + np.exp(2 * t))
+            else:
+                out[name] = expit(t) if name == "f" else np.exp(t)
         return out
 
-    def point(self, values: dict[str, float]) -> Float:
-        """Sampled coordinates of natural values."""
-        pick = {"j": np.log, "f": logit, "s_out": np.log}
-        return np.array([pick[k](values[k]) for k in self.mixture.hyper], float)
+    def point(self, values: Mapping[str, ArrayLike]) -> Float:
+        """Sampled coordinates (..., n_hyper) of natural values (...)."""
+        natural = {k: np.asarray(values[k], float) for k in self.mixture.hyper}
+        core = self.scale**2 + natural.get("j", np.asarray(self.mixture.jitter or 0.0)) ** 2
+        columns = []
+        for name, value in natural.items():
+            if name == "s_out":
+                columns.append(0.5 * np.log(np.maximum(value**2 - core, LEAST_EXCESS * core)))
+            else:
+                columns.append(logit(value) if name == "f" else np.log(value))
+        return np.stack(columns, axis=-1) if columns else np.zeros(0)
+
+    def core(self, h: Float) -> Float:
+        """Variance (...) of true matches on an axis, with the median quoted error."""
+        if self.mixture.jitter is None:
+            return np.asarray(self.scale**2 + np.exp(2 * h[..., 0]))
+        return np.full(h.shape[:-1], self.scale**2 + self.mixture.jitter**2)
+
+    def chained(self, h: Float, gradient: Float, curvature: Float) -> tuple[Float, Float, Float]:
+        """Derivatives of a log-likelihood by log j, logit f and log s_out, brought to a point's.
+
+        Parameters
+        ----------
+        h : ndarray, shape (n_hyper,)
+        gradient : ndarray, shape (n_hyper,)
+        curvature : ndarray, shape (n_hyper, n_hyper)
+            Minus the Hessian.
+
+        Returns
+        -------
+        gradient, curvature
+            By h.
+        by : ndarray, shape (n_hyper, n_hyper)
+            Derivatives of log j, logit f and log s_out (rows) by h.
+        """
+        names = self.mixture.hyper
+        by = np.eye(len(h))
+        if "s_out" not in names:
+            return gradient, curvature, by
+        s = names.index("s_out")
+        core, excess = float(self.core(h)), float(np.exp(2 * h[s]))
+        bend = np.zeros((len(h), len(h)))
+        of_excess = excess / (core + excess)
+        by[s, s], bend[s, s] = of_excess, 2 * of_excess * (1 - of_excess)
+        if "j" in names:
+            j = names.index("j")
+            of_jitter = float(np.exp(2 * h[j])) / (core + excess)
+            by[s, j], bend[j, j] = of_jitter, 2 * of_jitter * (1 - of_jitter)
+            bend[s, j] = bend[j, s] = -2 * of_excess * of_jitter
+        return by.T @ gradient, by.T @ curvature @ by - gradient[s] * bend, by
 
     def constants(self, h: Float) -> Constants:
         """What the likelihood needs of points (n, n_hyper)."""
@@ -194,7 +250,7 @@ class Hyper:
             elif name == "f":
                 log_f, log_1_f = log_expit(h[:, k]), log_expit(-h[:, k])
             else:
-                out = np.exp(2 * h[:, k])
+                out = self.core(h) + np.exp(2 * h[:, k])
         kind, radius = KINDS[self.mixture.model], self.mixture.match_radius or 0.0
         return Constants(j2, log_f, log_1_f, out, kind, self.scale**2, radius)
 
@@ -215,36 +271,45 @@ class Hyper:
                 norm += np.log(2 / self._jitter_scale) - 0.5 * np.log(np.pi * T_DOF)
                 out = out + t + norm - (T_DOF + 1) / 2 * np.log1p(z2 / T_DOF)
             else:
-                a, b = OUTLIER_SHAPE, self._outlier_rate
-                norm = np.log(2.0) + a * np.log(b) - gammaln(a)
-                out = out + norm - 2 * a * t - b * np.exp(-2 * t)
+                a, rate = OUTLIER_SHAPE, self._outlier_rate(h)
+                norm = np.log(2.0) + a * np.log(rate) - gammaln(a)
+                out = out + norm - 2 * a * t - rate * np.exp(-2 * t)
         return out
 
     @property
     def _jitter_scale(self) -> float:
         return self.mixture.jitter_scale or self.scale
 
-    @property
-    def _outlier_rate(self) -> float:
-        return OUTLIER_SHAPE * (self.mixture.outlier_scale or OUTLIER_MODE * self.scale) ** 2
+    def _outlier_rate(self, h: Float) -> Float:
+        """Rate (...) of the inverse gamma of w^2."""
+        given = self.mixture.outlier_scale
+        square = np.full(h.shape[:-1], given**2) if given else OUTLIER_MODE**2 * self.core(h)
+        return np.asarray(OUTLIER_SHAPE * square)
 
     def prior_terms(self, h: Float) -> tuple[Float, Float]:
-        """Gradient and minus the (diagonal) Hessian of the log prior at one point."""
-        gradient, curvature = np.zeros(len(h)), np.zeros(len(h))
+        """Gradient (n_hyper,) and minus the Hessian (n_hyper, n_hyper) of the log prior."""
+        gradient, curvature = np.zeros(len(h)), np.zeros((len(h), len(h)))
         for k, name in enumerate(self.mixture.hyper):
             if name == "f":
                 a, b = self.mixture.fraction_prior
                 f = expit(h[k])
-                gradient[k] = a * (1 - f) - b * f
-                curvature[k] = (a + b) * f * (1 - f)
+                gradient[k] += a * (1 - f) - b * f
+                curvature[k, k] += (a + b) * f * (1 - f)
             elif name == "j":
                 z2 = np.exp(2 * (h[k] - np.log(self._jitter_scale)))
-                gradient[k] = 1 - (T_DOF + 1) * z2 / (T_DOF + z2)
-                curvature[k] = (T_DOF + 1) * 2 * T_DOF * z2 / (T_DOF + z2) ** 2
+                gradient[k] += 1 - (T_DOF + 1) * z2 / (T_DOF + z2)
+                curvature[k, k] += (T_DOF + 1) * 2 * T_DOF * z2 / (T_DOF + z2) ** 2
             else:
-                e = self._outlier_rate * np.exp(-2 * h[k])
-                gradient[k] = -2 * OUTLIER_SHAPE + 2 * e
-                curvature[k] = 4 * e
+                e = float(self._outlier_rate(h)) * np.exp(-2 * h[k])
+                gradient[k] += -2 * OUTLIER_SHAPE + 2 * e
+                curvature[k, k] += 4 * e
+                if "j" in self.mixture.hyper and not self.mixture.outlier_scale:
+                    # the rate goes with the core, and this with j: log rate by log j
+                    j = self.mixture.hyper.index("j")
+                    by_j = 2 * np.exp(2 * h[j]) / float(self.core(h))
+                    gradient[j] += by_j * (OUTLIER_SHAPE - e)
+                    curvature[j, j] += by_j**2 * e - by_j * (2 - by_j) * (OUTLIER_SHAPE - e)
+                    curvature[[j, k], [k, j]] -= 2 * e * by_j
         return gradient, curvature
 
     def draw_prior(self, n: int, rng: np.random.Generator) -> Float:
@@ -257,6 +322,7 @@ class Hyper:
             elif name == "j":
                 columns.append(np.log(self._jitter_scale * np.abs(rng.standard_t(T_DOF, size=n))))
             else:
-                precision = rng.gamma(OUTLIER_SHAPE, 1 / self._outlier_rate, size=n)
-                columns.append(-0.5 * np.log(precision))
+                unit = rng.gamma(OUTLIER_SHAPE, size=n)  # w^2 is the rate over this
+                so_far = np.column_stack(columns)
+                columns.append(0.5 * np.log(self._outlier_rate(so_far) / unit))
         return np.column_stack(columns) if columns else np.zeros((n, 0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -109,9 +109,12 @@ class Target:
         by_hyper = np.array([by_j, by_f, by_s])[which]
         curvature = np.array([[jj, jf, js], [jf, ff, fs], [js, fs, ss]])[np.ix_(which, which)]
 
+        by_hyper, curvature, chain = self.hyper.chained(h, by_hyper, curvature)
         prior_gradient, prior_curvature = self.hyper.prior_terms(h)
-        curvature += np.diag(prior_curvature)
-        matrix, right = sums.with_cross(which).assemble(model, theta)
+        curvature = curvature + prior_curvature
+        sums = sums.with_cross(which)
+        sums = replace(sums, cross=np.einsum("ghak,hi->giak", sums.cross, chain))
+        matrix, right = sums.assemble(model, theta)
         gradient = np.concatenate([right + self.priors.pull(theta), by_hyper + prior_gradient])
         matrix = matrix + self.priors.matrix(model, len(h))
         g = model.n_global

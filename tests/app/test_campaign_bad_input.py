@@ -407,7 +407,7 @@ def test_a_catalogue_without_motions_that_stars_outrun(campaign):
     campaign.catalog(lambda t: t.remove_columns(names)).matched()
     result = cli("fit", campaign.path.parent / "run", "-q")
     assert result.code == 1
-    words = ["catalog.ecsv: has no proper motions", "11.6 years", "did not settle", "pm_u and pm_v"]
+    words = ["catalog.ecsv: has no proper motions", "11.6 years", "scatter by", "pm_u and pm_v"]
     one_sentence(result.err, *words)
 
 

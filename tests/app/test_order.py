@@ -112,6 +112,22 @@ def test_errors_by_magnitude_are_found_on_the_way(tmp_path):
     assert out.meta["error_scale"] == pytest.approx(1.0, abs=0.05)
 
 
+def test_an_order_that_cannot_be_fitted_is_a_row_that_says_so(tmp_path):
+    """50 stars give 100 numbers: order 8 has 90 coefficients, order 9 has 110."""
+    rng = np.random.default_rng(11)
+    x, y = (rng.uniform(1, n, 50) for n in SIZE)
+    u, v = (z + rng.normal(0, 0.1, 50) for z in (x, y))
+    table = Table({"x": x, "y": y, "u": u, "v": v, "su": np.full(50, 0.1), "sv": np.full(50, 0.1)})
+    table["u"].unit = table["v"].unit = table["su"].unit = table["sv"].unit = "pix"
+    config = write_job(tmp_path, table, model={"order": 2})
+    out = good("order", config, "--orders", 1, 9, "-o", tmp_path / "o.ecsv").out
+    assert "order 9 is not fitted: " in out and "50 stars give 100 numbers" in out
+    found = Table.read(tmp_path / "o.ecsv")
+    assert list(found["order"]) == list(range(1, 10)) and found["terms"][-1] == 55
+    assert np.isnan(found["chi2_u"][-1]) and "fewer than the 110" in found["not_fitted"][-1]
+    assert found["not_fitted"].mask[0] and np.isfinite(found["chi2_u"][0])
+
+
 def test_wrong_requests_are_refused(job, tmp_path):
     _, folder, config, _ = job
     refused(folder, "order", config, "-o", folder / "o.ecsv", words=("this file exists", "--force"))

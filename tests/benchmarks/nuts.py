@@ -58,12 +58,13 @@ def log_density(problem: Problem) -> tuple[Any, tuple[Any, ...]]:
 
     def function(psi: Any, phi: Any, u: Any, v: Any, s2u: Any, s2v: Any) -> Any:
         log_j, logit_f, log_s = psi[2 * K :]
-        j, f, s_out = jnp.exp(log_j), jax.nn.sigmoid(logit_f), jnp.exp(log_s)
-        s2 = s_out**2
+        j, f, excess2 = jnp.exp(log_j), jax.nn.sigmoid(logit_f), jnp.exp(2 * log_s)
+        core2 = scale**2 + j**2
+        s2 = core2 + excess2
         # the documented priors, with the Jacobians of the three transformations
         prior = dist.StudentT(4.0, 0.0, scale).log_prob(j) + log_j
         prior += dist.Beta(1.0, 9.0).log_prob(f) + jnp.log(f) + jnp.log1p(-f)
-        prior += dist.InverseGamma(1.0, (5 * scale) ** 2).log_prob(s2) + jnp.log(2 * s2)
+        prior += dist.InverseGamma(1.0, 25 * core2).log_prob(excess2) + jnp.log(2 * excess2)
         ru, rv = u - phi @ psi[:K], v - phi @ psi[K : 2 * K]
         good = jnp.log1p(-f) + normal(ru, s2u + j**2) + normal(rv, s2v + j**2)
         bad = jnp.log(f) + normal(ru, s2) + normal(rv, s2)

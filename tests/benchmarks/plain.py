@@ -52,14 +52,16 @@ class PlainDensity:
     def __call__(self, psi: Float) -> float:
         K = self.design.shape[1]
         log_j, logit_f, log_s = psi[2 * K :]
-        j2, s2 = np.exp(2 * log_j), np.exp(2 * log_s)
+        j2, excess2 = np.exp(2 * log_j), np.exp(2 * log_s)
+        core2 = self.scale**2 + j2
+        s2 = core2 + excess2
         log_f, log_1f = -np.logaddexp(0, -logit_f), -np.logaddexp(0, logit_f)
         square = (self.data - self.design @ psi[: 2 * K].reshape(2, K).T) ** 2
         width = self.variance + j2
         good = log_1f - 0.5 * (square / width + np.log(width)).sum(axis=1)
         bad = log_f - 0.5 * square.sum(axis=1) / s2 - np.log(s2)
-        # half-Student-t(4), Beta(1, 9), inverse gamma on s_out^2; Jacobians of log, logit and log
+        # half-Student-t(4), Beta(1, 9), inverse gamma on the excess; Jacobians of log, logit, log
         prior = log_j - 2.5 * np.log1p(j2 / (4 * self.scale**2))
-        prior += log_f + 9 * log_1f - 2 * log_s - (5 * self.scale) ** 2 / s2
+        prior += log_f + 9 * log_1f + np.log(core2) - 2 * log_s - 25 * core2 / excess2
         value = float(np.logaddexp(good, bad).sum() + prior)
         return value if np.isfinite(value) else -np.inf

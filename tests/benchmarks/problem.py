@@ -165,11 +165,8 @@ class threads:
 
 def draws_of(posterior: bd.Posterior) -> Float:
     """Draws (chains, n, D) in sampled coordinates."""
-    h = posterior.hyper
-    logit = np.log(h["f"]) - np.log1p(-h["f"])
-    return np.concatenate(
-        [posterior.theta, np.stack([np.log(h["j"]), logit, np.log(h["s_out"])], axis=-1)], axis=-1
-    )
+    hyper = posterior.mixture.bind(posterior.reference_sigma)
+    return np.concatenate([posterior.theta, hyper.point(posterior.hyper)], axis=-1)
 
 
 # -- on disk, for runs in a process of their own --------------------------------------------------

@@ -132,13 +132,7 @@ def test_log_likelihood_of_the_stars_adds_up(written):
     difference = posterior.log_prob - total
     if posterior.mixture.hyper:
         hyper = posterior.mixture.bind(0.05)
-        h = np.stack(
-            [
-                np.log(v / (1 - v)) if k == "f" else np.log(v)
-                for k, v in ((k, posterior.hyper[k]) for k in posterior.mixture.hyper)
-            ],
-            axis=-1,
-        )
+        h = hyper.point(posterior.hyper)
         difference = difference - hyper.log_prior(h)
     np.testing.assert_allclose(difference, 0, atol=1e-6)
 

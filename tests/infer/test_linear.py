@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import least_squares
 
+from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, build_model, fit_linear, residuals
 from bayesdist.model import FRAME_KINDS, DistortionModel, TimeDependence
@@ -417,3 +418,38 @@ def test_build_model_takes_chips_exposures_and_unit_from_the_table():
     _, two, _ = simulated(19, 90, chips=TWO_CHIPS)
     with pytest.raises(InputError, match="chips 1, 2 and one chip"):
         build_model(two, order=4, size=(1000, 800))
+
+
+@pytest.mark.parametrize("radius", [2000.0, 1500.0, 1300.0])
+@pytest.mark.parametrize("frames", ["none", "affine"])
+def test_high_orders_on_a_round_field(radius, frames):
+    """Corners without stars: coefficients are known badly, positions of the stars well.
+
+    Against numpy's least squares by SVD with orthogonal columns, at the stars, in formal errors.
+    """
+    rng = np.random.default_rng(3)
+    n, size = 6000, 4096
+    r, phi = radius * np.sqrt(rng.random(n)), 2 * np.pi * rng.random(n)
+    x, y = (size + 1) / 2 + r * np.cos(phi), (size + 1) / 2 + r * np.sin(phi)
+    e = rng.integers(0, 3, n) if frames == "affine" else np.zeros(n, int)
+    X, Y = (2 * z / (size + 1) - 1 for z in (x, y))
+    u = x + 20 * X**3 + 5 * X * Y**2 + 100 * e + rng.normal(0, 0.01, n)
+    v = y + 20 * Y**3 - 5 * X**2 * Y - 50 * e + rng.normal(0, 0.01, n)
+    some = np.full(n, 0.01)
+    field = MatchTable(
+        x=x, y=y, u=u, v=v, sigma_u=some, sigma_v=some, unit="pix",
+        exposure=e, exposure_names=("a", "b", "c")[: e.max() + 1],
+    )  # fmt: skip
+    for order in (8, 9):
+        model = build_model(field, order=order, size=(size, size), frames=frames)
+        fit = fit_linear(field, model, **UNCLIPPED)
+        assert 0.95 < fit.chi2 / fit.dof < 1.05
+        if frames == "none":
+            X, Y = (z / np.abs(z).max() for z in (x - x.mean(), y - y.mean()))
+            A = np.stack(
+                [X**i * Y**j for i in range(order + 1) for j in range(order + 1 - i)], axis=1
+            )
+            Q = np.linalg.qr(A)[0]
+            predicted = model.predict(fit.mean, x, y)
+            for data, found in zip((u, v), predicted.T, strict=True):
+                assert np.abs(found - data.mean() - Q @ (Q.T @ (data - data.mean()))).max() < 1e-6

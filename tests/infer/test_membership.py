@@ -180,7 +180,7 @@ def test_the_scale_of_the_priors_does_not_touch_the_likelihood():
     theta = simulated(133, 100, fraction=0.1)[2].theta
     posterior = posterior_at(target, np.concatenate([theta, MIXTURES["gaussian"][1]])[None])
     found = memberships(posterior, matches)
-    object.__setattr__(posterior, "reference_sigma", 1e4 * posterior.reference_sigma)
+    object.__setattr__(posterior, "reference_sigma", 1e-4 * posterior.reference_sigma)
     again = memberships(posterior, matches)
     np.testing.assert_allclose(again.log_likelihood, found.log_likelihood, rtol=1e-12)
     np.testing.assert_allclose(

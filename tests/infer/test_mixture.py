@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import integrate, stats
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from bayesdist.errors import InputError
 from bayesdist.infer import OutlierMixture, kernel
@@ -69,6 +69,8 @@ def test_points_and_values_are_inverse(hyper):
     h = hyper.point(wanted)
     assert {k: float(v) for k, v in hyper.values(h).items()} == pytest.approx(wanted, rel=1e-12)
     for name, value, natural in zip(hyper.names, h, wanted.values(), strict=True):
+        if name == "log s_out":  # beyond the core
+            natural = np.sqrt(natural**2 - SCALE**2 - (hyper.mixture.jitter or wanted["j"]) ** 2)
         expected = np.log(natural / (1 - natural)) if name == "logit f" else np.log(natural)
         assert value == pytest.approx(expected, rel=1e-12)
 
@@ -129,10 +131,12 @@ def test_derivatives_of_the_reference_by_differences(hyper):
     variances = (sigma**2).T
     names = hyper.mixture.hyper
     which = [HYPER_ORDER.index(k) for k in names]
-    h0 = hyper.point({k: NATURAL[k] for k in names})
+    # the compiled sums are by log s_out itself, the sampled coordinate is its excess over the core
+    h0 = np.array([logit(NATURAL[k]) if k == "f" else np.log(NATURAL[k]) for k in names])
 
     def at(h, residual, var_u, var_v):
-        return terms_of(hyper.mixture, hyper.values(h), residual, var_u, var_v)
+        values = {k: expit(t) if k == "f" else np.exp(t) for k, t in zip(names, h, strict=True)}
+        return terms_of(hyper.mixture, values, residual, var_u, var_v)
 
     def per_star(k, point):
         """log p and its gradient of star k at (r_u, r_v, h...)."""
@@ -254,7 +258,7 @@ def s_out_prior(t):
 
 
 def test_prior_of_the_outlier_scale():
-    """s_out^2 is inverse gamma of shape 1; log s_out is most probable at five quoted errors."""
+    """w^2 is inverse gamma of shape 1; log w is most probable at five quoted errors."""
     total, _ = integrate.quad(lambda t: np.exp(s_out_prior(np.array([t]))[0]), -20, 40, points=[-1])
     assert total == pytest.approx(1, abs=1e-8)
     t = np.linspace(-4, 3, 7001)
@@ -277,7 +281,8 @@ def test_scales_of_priors_are_those_that_are_given():
     )
     drawn = hyper.values(hyper.draw_prior(20_000, np.random.default_rng(3)))
     assert stats.kstest(drawn["j"], lambda x: 2 * stats.t(4, scale=0.3).cdf(x) - 1).pvalue > 1e-3
-    assert np.median(drawn["s_out"]) == pytest.approx(4 / np.sqrt(np.log(2)), rel=0.05)
+    excess = np.sqrt(drawn["s_out"] ** 2 - SCALE**2 - drawn["j"] ** 2)
+    assert np.median(excess) == pytest.approx(4 / np.sqrt(np.log(2)), rel=0.05)
 
 
 def test_draws_follow_the_priors():
@@ -286,8 +291,11 @@ def test_draws_follow_the_priors():
     cdf = {
         "j": lambda x: 2 * DOCUMENTED["j"].cdf(x) - 1,
         "f": stats.beta(2, 30).cdf,
-        "s_out": lambda x: stats.invgamma(1, scale=25 * SCALE**2).cdf(x**2),
     }
+    # in units of the core, to which it is added
+    core2 = SCALE**2 + draws["j"] ** 2
+    ratio = draws.pop("s_out") ** 2 / core2 - 1
+    assert stats.kstest(ratio, stats.invgamma(1, scale=25).cdf).pvalue > 1e-3
     for name, values in draws.items():
         assert stats.kstest(values, cdf[name]).pvalue > 1e-3, name
     assert OutlierMixture("none", jitter=0.0).bind(SCALE).draw_prior(
@@ -307,7 +315,18 @@ def test_prior_derivatives_by_differences(hyper):
             gradient, numerical_gradient(hyper.log_prior, h, 1e-3), rtol=1e-7, atol=1e-8
         )
         numeric = numerical_gradient(lambda p: hyper.prior_terms(p)[0], h, 1e-3)
-        np.testing.assert_allclose(np.diag(curvature), -numeric, rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(curvature, -numeric, rtol=1e-7, atol=1e-8)
+
+
+def test_false_matches_are_never_narrower_than_true_ones():
+    """Whatever is sampled; and natural values lead back to it."""
+    hyper = OutlierMixture().bind(SCALE)
+    h = np.random.default_rng(5).uniform(-8, 8, (200, 3))
+    values = hyper.values(h)
+    assert (values["s_out"] ** 2 >= SCALE**2 + values["j"] ** 2).all()
+    np.testing.assert_allclose(hyper.constants(h).out, values["s_out"] ** 2, rtol=1e-12)
+    seen = h[:, 2] > h[:, 0] - 3  # an excess of which doubles keep enough digits
+    np.testing.assert_allclose(hyper.point(values)[seen], h[seen], atol=1e-6)
 
 
 @pytest.mark.parametrize(

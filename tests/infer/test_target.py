@@ -69,10 +69,10 @@ def test_value_is_likelihood_times_priors(kind):
             log_prior += stats.beta(1, 9).logpdf(f) + np.log(f * (1 - f))
             bad = np.full(len(r), -np.log(np.pi * 4))
             if kind == "gaussian":
-                bad = stats.norm(scale=np.exp(h[2])).logpdf(r).sum(axis=1)
-                variance = np.exp(2 * h[2])
-                log_prior += stats.invgamma(1, scale=0.25**2).logpdf(variance)
-                log_prior += np.log(2 * variance)
+                core, excess = 0.05**2 + j**2, np.exp(2 * h[2])
+                bad = stats.norm(scale=np.sqrt(core + excess)).logpdf(r).sum(axis=1)
+                log_prior += stats.invgamma(1, scale=25 * core).logpdf(excess)
+                log_prior += np.log(2 * excess)
             loglik = np.logaddexp(np.log1p(-f) + good, np.log(f) + bad)
         k = model.names.index("v_1_1")
         log_prior += -0.5 * ((theta[k] - 0.1) / 0.03) ** 2

@@ -260,7 +260,8 @@ def test_scores_are_the_gradient_of_each_star(kind):
 def test_memberships_have_both_truncations():
     target, _, matches, psi = target_at("gaussian")
     n = target.n_theta
-    j, f, s = np.exp(psi[n]), 1 / (1 + np.exp(-psi[n + 1])), np.exp(psi[n + 2])
+    j, f = np.exp(psi[n]), 1 / (1 + np.exp(-psi[n + 1]))
+    s = np.sqrt(target.hyper.scale**2 + j**2 + np.exp(2 * psi[n + 2]))
     found = memberships(posterior_at(target, psi[None]), matches)
     uv = target.model.predict(psi[:n], matches.x, matches.y, chip=matches.chip_number)
     r = np.column_stack([matches.u, matches.v]) - uv

@@ -56,10 +56,13 @@ def _nuts(matches, fit, start, radius: float, draws: int, seed: int):
         theta = start + root @ numpyro.sample("z", flat)
         log_j, logit_f = numpyro.sample("log_j", one), numpyro.sample("logit_f", one)
         log_s = numpyro.sample("log_s", one)
-        j, f, out2 = jnp.exp(log_j), jax.nn.sigmoid(logit_f), jnp.exp(2 * log_s)
+        j, f, excess2 = jnp.exp(log_j), jax.nn.sigmoid(logit_f), jnp.exp(2 * log_s)
         prior = dist.StudentT(4.0, 0.0, scale).log_prob(j) + log_j
         prior += dist.Beta(1.0, 9.0).log_prob(f) + jnp.log(f) + jnp.log1p(-f)
-        prior += dist.InverseGamma(1.0, (5 * scale) ** 2).log_prob(out2) + jnp.log(2 * out2)
+        core2 = scale**2 + j**2
+        prior += dist.InverseGamma(1.0, 25 * core2).log_prob(excess2) + jnp.log(2 * excess2)
+        out2 = core2 + excess2
+        numpyro.deterministic("log_s_out", 0.5 * jnp.log(out2))
         model = jnp.stack([phi @ theta[:K], phi @ theta[K:]])
         r, d = data - model, nominal - model
         good = jnp.log1p(-f) + normal(r, s2 + j**2) - log_mass(d, s2 + j**2)
@@ -86,7 +89,7 @@ def _nuts(matches, fit, start, radius: float, draws: int, seed: int):
         )
         mcmc.run(jax.random.PRNGKey(seed))
     got = mcmc.get_samples()
-    return np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"], got["log_s"]])
+    return np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"], got["log_s_out"]])
 
 
 def test_agrees_with_nuts(full, capsys):

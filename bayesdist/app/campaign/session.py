@@ -14,6 +14,7 @@ from bayesdist.app.campaign.config import CampaignBlock
 from bayesdist.app.campaign.holdout import predictive_of_campaign
 from bayesdist.app.campaign.inputs import Inputs, read_inputs
 from bayesdist.app.campaign.interpolation import interpolation_term
+from bayesdist.app.campaign.outrun import refuse_outrun_stars
 from bayesdist.app.campaign.reference import FREE, rate_priors
 from bayesdist.app.campaign.systematics import (
     errors_by_star,
@@ -30,7 +31,6 @@ from bayesdist.assess.between_nodes import BetweenNodes
 from bayesdist.assess.holdout_predictive import Predictive
 from bayesdist.assess.terms import GIVEN, MEASURED
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
-from bayesdist.errors import NotSettledError
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, fit_by_magnitude
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
@@ -196,20 +196,13 @@ class CampaignSession(Session):
 
         Raises
         ------
-        NotSettledError
-            Naming the catalogue: with its errors and motions right, residuals are those of the
-            centroids and settle.
+        InputError
+            Where stars have outrun a catalogue without proper motions.
         """
-        try:
-            return fit_by_magnitude(pairs, self.plain_model)
-        except NotSettledError as error:
-            catalog, cause = self.inputs.catalog, error.cause
-            do = "check its positions, its motions and their epoch, or lower campaign.radius"
-            if catalog.pm_u is None:
-                span = float(np.ptp(self.inputs.log.values("epoch")))
-                cause = f"has no proper motions, and the exposures span {span:.1f} years: {cause}"
-                do = "give it columns pm_u and pm_v, or calibrate exposures of one epoch"
-            raise NotSettledError(cause, where=catalog.source, do=do) from error
+        found = fit_by_magnitude(pairs, self.plain_model)
+        if isinstance(found[1], MatchTable):
+            refuse_outrun_stars(self.inputs, found[0], found[1])
+        return found
 
     @cached_property
     def magnitude_errors(self) -> MagnitudeErrors | None:

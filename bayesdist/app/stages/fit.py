@@ -38,6 +38,8 @@ def run_fit(session: Session) -> None:
     if shift is not None and shift.significant:
         log.warning("fit: WARNING: %s", shift.sentence)
     majority = majority_sentence(fit)
+    if session.error_scale_sentence:
+        log.warning("fit: WARNING: %s", session.error_scale_sentence)
     if majority:  # said before hours of sampling
         log.warning("fit: WARNING: %s", majority)
 
@@ -64,6 +66,7 @@ def summarise_fit(session: Session, fit: LinearFit) -> None:
             "unit": fit.unit,
             "condition": fit.condition,
             "n_parameters": fit.model.n_params,
+            **({} if session.error_scale == 1.0 else {"error_scale": session.error_scale}),
             **(_skew(fit) if session.config.fit.skew else {}),
         },
     )

@@ -1,0 +1,55 @@
+"""Quoted errors that are far too small: how many times, and what is said of it.
+
+Jitter takes up errors that are a few times too small.  Where they are far smaller, what they say of
+single stars would be lost beside it, so all of them are multiplied by what the residuals show.
+"""
+
+from __future__ import annotations
+
+from bayesdist.infer import LinearFit
+
+__all__ = ["error_scale", "error_scale_sentence"]
+
+FAR = 20.0  # times the quoted errors, beyond which jitter would be nearly all there is
+
+
+def error_scale(fit: LinearFit, clip_chi2: float) -> float:
+    """Factor on all errors that makes the median residual what they say; 1 where it is not large.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    clip_chi2 : float
+        That it was made with: `fit.clip` holds it times the median chi-square over its expectation.
+
+    Returns
+    -------
+    float
+    """
+    factor = float((fit.clip.chi2_limit / clip_chi2) ** 0.5)
+    return factor if factor > FAR else 1.0
+
+
+def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude: bool) -> str:
+    """What has been done to the errors, and what else may help, as a clause.
+
+    Parameters
+    ----------
+    factor : float
+    sigma : float
+        Median error after it.
+    unit : str
+    by_magnitude : bool
+        There are magnitudes to estimate errors by.
+
+    Returns
+    -------
+    str
+    """
+    do = "check their unit and the order of the model"
+    if by_magnitude:
+        do += ', or set data.sigma = "by_magnitude"'
+    return (
+        f"the residuals scatter {factor:.3g} times as widely as the quoted errors say (median "
+        f"{sigma / factor:.3g} {unit}), and all errors were multiplied by that: {do}"
+    )

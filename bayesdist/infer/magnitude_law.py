@@ -1,0 +1,154 @@
+"""A smooth law of the errors with magnitude, by penalised likelihood.
+
+ln sigma is linear between nodes in magnitude.  Its changes of slope have a normal prior (an
+integrated Wiener process), whose size comes from the scatter in the bins by restricted likelihood
+and is then held, so that all of what follows climbs one and the same function.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from bayesdist.data.magnitude_errors import MagnitudeErrors
+
+__all__ = ["MagnitudeLaw"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+CELLS = 1000  # cells of magnitude within which the law does not change to any purpose
+LOG_VARIANCE = 1.36  # variance of ln(scatter) times n, of the median absolute deviation
+BENDS = (1e-3, 1e2)  # changes of slope of ln sigma over the range of magnitudes: limits of the size
+ROOM = 2.0  # prior sigma of ln sigma about the scatter of the bins: a factor of 7, and no zero
+
+
+@dataclass(frozen=True, eq=False)
+class MagnitudeLaw:
+    """Design and prior of ln sigma at nodes, for cells of stars of about equal magnitude.
+
+    Parameters
+    ----------
+    cell : ndarray of int, shape (N,)
+        Cell of each star.
+    design : ndarray, shape (C, B)
+        Linear interpolation from the nodes to the cells.
+    start : ndarray, shape (2, B)
+        ln sigma of u and v at the nodes, from the scatter in bins; centre of a weak prior that
+        keeps it from zero.
+    penalty : ndarray, shape (B, B)
+        Inverse covariance of the prior of the shape.
+    """
+
+    cell: Int
+    design: Float
+    start: Float
+    penalty: Float
+
+    @classmethod
+    def of(cls, mag: Float, bins: MagnitudeErrors) -> MagnitudeLaw:
+        """The law for stars of some magnitudes, with nodes and start from bins.
+
+        Parameters
+        ----------
+        mag : ndarray, shape (N,)
+        bins : MagnitudeErrors
+
+        Returns
+        -------
+        MagnitudeLaw
+        """
+        count = min(len(mag), CELLS)
+        rank = np.argsort(np.argsort(mag, kind="stable"), kind="stable")
+        cell = rank * count // len(mag)
+        size = np.bincount(cell, minlength=count)
+        centre = np.bincount(cell, weights=mag, minlength=count) / size
+        nodes = np.eye(len(bins.mag))
+        design = np.stack([np.interp(centre, bins.mag, node) for node in nodes], axis=1)
+        start = np.log(np.stack([bins.scatter_u, bins.scatter_v]))
+        penalty = np.zeros_like(nodes)
+        if len(bins.mag) > 2:
+            bends = _bends(bins.mag)
+            tau = _size_of_bends(start @ bends.T, bends, bins.n)
+            penalty = bends.T @ bends / tau**2
+        return cls(cell, design, start, penalty)
+
+    def at_stars(self, nodes: Float) -> Float:
+        """Squared errors (2, N) of the stars, from ln sigma (2, B) at the nodes."""
+        return np.asarray(np.exp(2.0 * nodes @ self.design.T)[:, self.cell])
+
+    def climbed(self, nodes: Float, weight: Float, square: Float) -> Float:
+        """ln sigma (2, B) at the maximum of the penalised likelihood.
+
+        Parameters
+        ----------
+        nodes : ndarray, shape (2, B)
+            Where to begin.
+        weight : ndarray, shape (N,)
+            Probability of each star to be a good match.
+        square : ndarray, shape (2, N)
+            Expected squared error of each star on either axis.
+
+        Returns
+        -------
+        ndarray, shape (2, B)
+            The likelihood is concave: Newton's steps, halved where they do not climb, find its only
+            maximum.
+        """
+        n = self._of_cells(weight)
+        prior = self.penalty + np.eye(len(self.penalty)) / ROOM**2
+        out = nodes.copy()
+        for axis in (0, 1):
+            s = self._of_cells(weight * square[axis])
+            eta, here = out[axis], self._value(out[axis], axis, n, s)
+            for _ in range(100):
+                of_cells = s * np.exp(-2.0 * self.design @ eta)
+                pull = self.penalty @ eta + (eta - self.start[axis]) / ROOM**2
+                gradient = self.design.T @ (of_cells - n) - pull
+                hessian = 2.0 * (self.design.T * of_cells) @ self.design + prior
+                # far below the maximum the curvature is that of an exponential: no longer steps
+                step = np.linalg.solve(hessian, gradient)
+                step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-300))
+                there = self._value(eta + step, axis, n, s)
+                while there < here and np.abs(step).max() > 1e-8:
+                    step /= 2.0
+                    there = self._value(eta + step, axis, n, s)
+                if there >= here:
+                    eta, here = eta + step, there
+                if np.abs(step).max() < 1e-6:
+                    break
+            out[axis] = eta
+        return out
+
+    def _of_cells(self, values: Float) -> Float:
+        sums = np.bincount(self.cell, weights=values, minlength=len(self.design))
+        return np.asarray(sums, float)
+
+    def _value(self, eta: Float, axis: int, n: Float, s: Float) -> float:
+        of_cells, off = self.design @ eta, eta - self.start[axis]
+        likelihood = -(n @ of_cells) - 0.5 * (s @ np.exp(-2.0 * of_cells))
+        return float(likelihood - 0.5 * (eta @ self.penalty @ eta + off @ off / ROOM**2))
+
+
+def _bends(mag: Float) -> Float:
+    """Changes of slope (B - 2, B) at the inner nodes, each of unit variance for unit size."""
+    at = (mag - mag[0]) / (mag[-1] - mag[0])
+    gap = np.diff(at)
+    slopes = np.diff(np.eye(len(mag)), axis=0) / gap[:, None]
+    return np.asarray(np.diff(slopes, axis=0) / np.sqrt((gap[1:] + gap[:-1])[:, None] / 2.0))
+
+
+def _size_of_bends(found: Float, bends: Float, n: Int) -> float:
+    """Size of the changes of slope, by their likelihood beside the noise of the bins."""
+    noise = (bends * (LOG_VARIANCE / n)) @ bends.T
+
+    def misfit(log_tau: float) -> float:
+        cov = noise + np.exp(2.0 * log_tau) * np.eye(len(noise))
+        whitened = np.linalg.solve(np.linalg.cholesky(cov), found.T)
+        return float((whitened**2).sum() + len(found) * np.linalg.slogdet(cov)[1])
+
+    limits = np.log(BENDS)
+    return float(np.exp(minimize_scalar(misfit, bounds=limits, method="bounded").x))
