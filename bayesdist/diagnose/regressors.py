@@ -4,7 +4,7 @@ magnitude, colour and time."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,11 +15,12 @@ from bayesdist.diagnose.sample import ScoredSample
 from bayesdist.model.basis import MAX_ORDER, polynomial_terms
 from bayesdist.model.timedep import TimeDependence
 
-__all__ = ["Factor", "Functions", "Regressors", "functions_for"]
+__all__ = ["EDGES", "EDGES_BESIDE_ORDERS", "Factor", "Functions", "Regressors", "functions_for"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+EDGES, EDGES_BESIDE_ORDERS = "edges", "edges beside orders"
 LINEAR = 1  # order of the terms that go with magnitude, colour and time
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
@@ -182,7 +183,8 @@ def functions_for(sample: ScoredSample) -> Functions:
     if len(sample) >= FEWEST_AT_EDGES:
         factors += [Factor(one - one.mean(), 0) for one in edges]
         orders = np.concatenate([one.functions for one in regressors[:HIGHER]])
-        regressors.append(_at_edges(start + np.arange(len(edges)), orders))
+        alone = _at_edges(start + np.arange(len(edges)))
+        regressors += [alone, replace(alone, name=EDGES_BESIDE_ORDERS, beside=orders)]
         start += len(edges)
     time, epoch = sample.model.time, sample.epoch
     if epoch is not None and np.ptp(epoch) > SHORTEST:
@@ -227,15 +229,14 @@ def _higher(order: int, total: int) -> Regressors:
     )
 
 
-def _at_edges(functions: Int, orders: Int) -> Regressors:
+def _at_edges(functions: Int) -> Regressors:
     return Regressors(
-        "edges",
+        EDGES,
         functions,
         INDEPENDENT,
         "leave out the margins of the detector, or fit a look-up table",
         "the residuals rise towards the edges of the detector",
         "the residuals do not rise towards the edges of the detector",
-        orders,
     )
 
 

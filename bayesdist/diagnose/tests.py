@@ -11,7 +11,7 @@ from bayesdist.diagnose.exposures import exposure_test
 from bayesdist.diagnose.noise import noise_tests
 from bayesdist.diagnose.patterns import pattern_test
 from bayesdist.diagnose.projection import projection_of
-from bayesdist.diagnose.regressors import functions_for
+from bayesdist.diagnose.regressors import EDGES, EDGES_BESIDE_ORDERS, functions_for
 from bayesdist.diagnose.result import FAMILY_LEVEL, Outcome, ScoreTest, corrected
 from bayesdist.diagnose.sample import scored_sample
 from bayesdist.diagnose.score import regressor_tests
@@ -21,6 +21,7 @@ from bayesdist.infer.views import Solution
 
 __all__ = ["score_tests"]
 
+SAYS_NOTHING = 0.2  # probability by chance above which a second look has seen nothing
 OF_TIME = ("drift", "curvature in time")
 ORDERS, OF_PLACE = "order ", ("noise by position",)
 
@@ -64,7 +65,7 @@ def score_tests(
         priors or GaussianPriors.none(solution.model),
     )
     exposures = exposure_test(projection)
-    found = regressor_tests(projection)
+    found = _edges_or_orders(regressor_tests(projection))
     if exposures is not None and exposures.p_value < FAMILY_LEVEL:
         found = [_doubtful(one) if one.name in OF_TIME else one for one in found]
     orders = [one.p_value for one in found if one.name.startswith(ORDERS)]
@@ -74,6 +75,19 @@ def score_tests(
     if min(orders, default=1.0) < FAMILY_LEVEL:
         found = [_after_orders(one) if one.name in OF_PLACE else one for one in found]
     return corrected([*found, *(one for one in others if one is not None)])
+
+
+def _edges_or_orders(outcomes: list[Outcome]) -> list[Outcome]:
+    """Outcomes with one test of the edges: the weaker one beside the orders, if it says nothing.
+
+    A missing order rises towards the edges as well.  Beside the orders there is less to be seen of
+    what does so by itself, but something.
+    """
+    by_name = {one.name: one for one in outcomes}
+    beside = by_name.pop(EDGES_BESIDE_ORDERS, None)
+    if EDGES in by_name and beside is not None and beside.p_value > SAYS_NOTHING:
+        by_name[EDGES] = replace(beside, name=EDGES)
+    return list(by_name.values())
 
 
 def _after_orders(outcome: Outcome) -> Outcome:
