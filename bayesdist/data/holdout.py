@@ -128,7 +128,7 @@ class ChosenMatches(PartitionedMatches):
     def pieces(self) -> tuple[Piece, ...]:
         """The rows in consecutive pieces: those of the origin that have any."""
         assert self.origin is not None and self.aside is not None
-        pieces = replace(self.origin, errors=self.errors).pieces()
+        pieces = replace(self.origin, errors=self.errors, factor=self.factor).pieces()
         return tuple(
             _ChosenPiece(piece, self.aside, self.held, self.exposure_names, n)
             for piece, n in zip(pieces, self.counts, strict=True)
@@ -205,6 +205,7 @@ def split_matches(matches: Matches, aside: SetAside) -> Split:
             matches.parts,
             matches.errors,
             {**matches.dropped, **others},
+            matches.factor,
             matches,
             aside,
             held,

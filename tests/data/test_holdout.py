@@ -78,6 +78,10 @@ def test_data_on_disk_split_alike_whatever_their_pieces(tmp_path, monkeypatch):
         for part in ("kept", "held"):
             mine, theirs = getattr(here, part), getattr(there, part)
             assert len(mine) == len(theirs) == sum(len(p) for p in theirs.pieces())
+            # errors multiplied before and after
+            scaled = open_matches(tmp_path / "m").with_errors_times(2.0)
+            twice = getattr(split_matches(scaled, aside), part).with_errors_times(3.0)
+            assert all((p.read().sigma_u == 6.0).all() for p in twice.pieces())
             assert places(mine) == places(theirs)
             assert mine.exposure_names == theirs.exposure_names
             assert places(pickle.loads(pickle.dumps(theirs))) == places(mine)

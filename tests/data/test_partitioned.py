@@ -171,6 +171,10 @@ def test_where_errors_come_from(rng, tmp_path, monkeypatch):
     for ours, theirs in (
         (opened.with_errors_by_magnitude(errors), whole.with_sigma(*errors.at(whole.mag))),
         (opened.with_sigma(0.1, 0.2), whole.with_sigma(0.1, 0.2)),
+        (
+            opened.with_sigma(0.1, 0.2).with_errors_times(2.0).with_errors_times(4.0),
+            whole.with_sigma(0.1, 0.2).with_errors_times(8.0),
+        ),
     ):
         assert ours.has_sigma and not opened.has_sigma
         for name in ("sigma_u", "sigma_v"):

@@ -118,6 +118,11 @@ class Course:
         return self.kind
 
     @property
+    def drifts(self) -> bool:
+        """Whether it has a random part that follows whatever drift there is."""
+        return self.kind in ("spline", "wander")
+
+    @property
     def has_slope(self) -> bool:
         """Whether it claims a drift that goes on."""
         return self.kind in SLOPED

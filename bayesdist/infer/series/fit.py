@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.labelled.convergence import Limits
@@ -19,6 +20,7 @@ __all__ = ["fit_series"]
 CHAINS, WARMUP, SWEEPS = 32, 100, 200
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def fit_series(
     series: Series,
     course: Course,

@@ -43,6 +43,7 @@ __all__ = ["sweep"]
 Float = NDArray[np.float64]
 
 DRIFT_NU, DRIFT_SCALE = 2.0, 1.0
+LEAPS = 2  # amplitudes that a sweep moves with all else of the course integrated out
 
 
 def sweep(
@@ -89,6 +90,9 @@ def sweep(
         breaks = (moves.scan if scan else moves.move)(breaks, likelihood, rng)
     columns = problem.columns(breaks)
     matrix, right = course_equations(problem, seen, columns, state.drift)
+    if problem.design.drift is not None:
+        matrix, drift = _move_drift_alone(problem, matrix, right, state.drift, rng)
+        state = replace(state, drift=drift)
     # if the noise has the covariance of the matrix, its solution has that of the inverse
     noise = np.linalg.cholesky(matrix) @ rng.standard_normal((*right.shape, 1))
     b = np.asarray(np.linalg.solve(matrix, right[..., None] + noise), np.float64)
@@ -155,6 +159,41 @@ def _draw_sigma(
     by_chain = np.moveaxis(deviation, 0, 1)
     scatter = by_chain @ np.swapaxes(by_chain, 1, 2)
     return draw_scatter(sigma, scatter, kept.sum(axis=1), rng)
+
+
+def _move_drift_alone(
+    problem: Problem, matrix: Float, right: Float, drift: Float, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Amplitudes of the drift of some coefficients, with its parameters integrated out.
+
+    Given its parameters an amplitude that the data hardly know creeps; here it leaps.
+    """
+    n_chains, k = drift.shape
+    n, p = problem.design.n_fixed, matrix.shape[1] // k
+    chain, n_random = np.arange(n_chains), p - n
+
+    def value(m: Float, d: Float) -> Float:
+        root = np.linalg.cholesky(m)
+        white = np.linalg.solve(root, right[..., None])[..., 0]
+        log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        prior = np.log(d) - 1.5 * np.log1p((d / DRIFT_SCALE) ** 2 / 2)
+        return 0.5 * (white**2).sum(axis=1) - log_det + (prior - n_random * np.log(d)).sum(axis=1)
+
+    here = value(matrix, drift)
+    for _ in range(min(k, LEAPS)):
+        j = rng.integers(k, size=n_chains)
+        new = drift.copy()
+        new[chain, j] *= np.exp(rng.standard_normal(n_chains))
+        at = (j * p + n)[:, None] + np.arange(n_random)
+        trial = matrix.copy()
+        more = new[chain, j] ** -2 - drift[chain, j] ** -2
+        trial[chain[:, None], at, at] += more[:, None]
+        there = value(trial, new)
+        taken = np.log(rng.random(n_chains)) < there - here
+        matrix = np.where(taken[:, None, None], trial, matrix)
+        drift = np.where(taken[:, None], new, drift)
+        here = np.where(taken, there, here)
+    return matrix, drift
 
 
 def _move_drift(

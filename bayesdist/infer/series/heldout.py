@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
+from threadpoolctl import threadpool_limits
 
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
@@ -99,6 +100,7 @@ def block_folds(epoch: Float, breaks: tuple[float, ...], length: int) -> Int:
     return out
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut:
     """Predict each fold from the rest.
 

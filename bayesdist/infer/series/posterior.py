@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.errors import InputError
 from bayesdist.infer.labelled.convergence import Convergence
 from bayesdist.infer.series.chains import Draws, Engine
+from bayesdist.infer.series.correlated import Correlated, Shared
 from bayesdist.infer.series.course import Course
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.problem import State
@@ -167,7 +168,8 @@ class SeriesPosterior:
         group : str, optional
             The group with most exposures by default.
         extrapolate : bool
-            Allow epochs before the first and after the last exposure.
+            Allow epochs before the first and after the last exposure.  Deviations that successive
+            exposures share are part of what is said of these: see `Correlated`.
 
         Returns
         -------
@@ -190,7 +192,49 @@ class SeriesPosterior:
             k = self.series.n_coefficients
             power = (self.raw.drift.reshape(-1, k) ** 2).mean(axis=0) * self.series.spread**2
             cov = cov + unseen[:, None, None] * np.diag(power)
-        return Prediction(t, mean, cov, cov + self.scatter.mean(axis=0))
+        cov_new = cov + self.scatter.mean(axis=0)
+        beyond = self._beyond(t)
+        if beyond.any():
+            shared, unit = self._shared(t[beyond], group), self.series.spread
+            mean[beyond] = self.series.centre + np.stack([s.mean for s in shared], axis=1) * unit
+            sd = np.sqrt(np.stack([s.variance for s in shared], axis=1)) * unit
+            own = np.sqrt([float(s.weight @ s.own) for s in shared]) * unit
+            cov[beyond] = sd[:, :, None] * self._common * sd[:, None]
+            cov_new[beyond] = cov[beyond] + own[:, None] * self._common * own
+        return Prediction(t, mean, cov, cov_new)
+
+    def _beyond(self, t: Float) -> NDArray[np.bool_]:
+        """Epochs (M,) at which shared deviations count, and the course has none of its own."""
+        first, last = self.series.span
+        return ((t < first) | (t > last)) & (self.design.drift is None)
+
+    @property
+    def _common(self) -> Float:
+        """Correlation (k, k) of the coefficients, as their scatter has it."""
+        scatter = self.scatter.mean(axis=0)
+        sigma = np.sqrt(np.diag(scatter))
+        return np.asarray(scatter / (sigma[:, None] * sigma))
+
+    def _shared(self, t: Float, group: str | None) -> list[Shared]:
+        """Each coefficient at epochs (M,) with shared deviations, in units of the spread."""
+        series, design = self.series, self.design
+        breaks = np.median(self._breaks, axis=0, keepdims=True)
+        code = np.full(len(t), series.group_names.index(group) if group is not None else 0)
+        here = design.matrix(series.epoch, series.group_code, breaks)[0]
+        there = design.matrix(t, code, breaks)[0]
+        y = (series.values - series.centre) / series.spread
+        # an exposure that lies off alone says nothing: its error is as much wider as that is
+        # probable.  Where its neighbours do so too, the deviation is one that they share
+        order = np.argsort(series.epoch, kind="stable")
+        p = np.concatenate([[0.0], self.outlier_probability[order], [0.0]])
+        off = np.empty(len(series))
+        off[order] = np.minimum(p[1:-1] * (1 - np.maximum(p[:-2], p[2:])), 0.999)
+        out = []
+        for j in range(series.n_coefficients):
+            noise = series.cov[:, j, j] / series.spread[j] ** 2
+            noise = noise + off / (1 - off) * (1 + noise)
+            out.append(Correlated.of(series.epoch, y[:, j], noise, here).predict(t, there))
+        return out
 
     def new_exposures(
         self,
@@ -223,7 +267,19 @@ class SeriesPosterior:
             course = course + np.sqrt(unseen)[:, None] * amplitude[:, None] * rng.standard_normal(
                 course.shape
             )
-        total = self.scatter[:, None] + (0.0 if cov is None else np.asarray(cov, float))
+        total = np.broadcast_to(self.scatter[:, None], (n, m, k, k)).copy()
+        beyond = self._beyond(t)
+        if beyond.any():
+            root = np.linalg.cholesky(self._common)
+            white = rng.standard_normal((n, int(beyond.sum()), k)) @ root.T
+            own = np.empty((n, k))
+            for j, one in enumerate(self._shared(t[beyond], group)):
+                which = one.drawn(n, rng)
+                value = one.means[which] + np.sqrt(one.variances[which]) * white[..., j]
+                course[:, beyond, j] = self.series.centre[j] + value * self.series.spread[j]
+                own[:, j] = np.sqrt(one.own[which]) * self.series.spread[j]
+            total[:, beyond] = (own[:, :, None] * self._common * own[:, None])[:, None]
+        total = total + (0.0 if cov is None else np.asarray(cov, float))
         unit = self.series.spread
         factor = np.linalg.cholesky(total / (unit[:, None] * unit))
         noise = unit * (factor @ rng.standard_normal((n, m, k, 1)))[..., 0]

@@ -163,3 +163,15 @@ def test_default_candidates_have_what_is_asked():
     assert {c.kind for c in given} >= {"constant", "line", "step", "lines", "spline"}
     assert all(c.breaks == (2009.4,) for c in given if c.n_breaks)
     assert all(c.find == 1 for c in default_candidates() if c.n_breaks)
+
+
+def test_a_break_in_a_random_walk_is_not_believed():
+    """41 dates of sums of random steps: a break found there only follows the drift."""
+    broken = (Course("line"), Course("line+step", find=1), Course("spline"), Course("wander"))
+    for seed in range(3):
+        rng = np.random.default_rng([50, seed])
+        epoch = np.sort(rng.uniform(2013, 2019, 41))
+        values = np.cumsum(0.5 * rng.standard_normal((41, 2)), axis=0)
+        values += 0.3 * rng.standard_normal((41, 2))
+        series = Series.of(epoch, values, 0.1, coefficients=("a", "b"))
+        assert "break" not in describe(series, broken).claim

@@ -1,0 +1,158 @@
+"""Deviations that successive exposures share, for predictions beyond the series.
+
+Beside a course of few columns each coefficient deviates by a first-order (Ornstein-Uhlenbeck)
+process of variance a^2 and memory tau, and each exposure by a scatter of its own.  The course's
+parameters are integrated out; memory, total variance and the process's fraction of it are summed
+over a grid with the weight of their marginal likelihood.  A memory far longer than the series makes
+a random walk, a fraction of nothing the scatter alone.  Closed forms throughout: nothing to
+converge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Correlated", "Shared"]
+
+Float = NDArray[np.float64]
+
+VAGUE = 100.0  # prior standard deviation of the course's parameters, in units of the spread
+MEMORIES, TOTALS = 9, 9
+FRACTIONS = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 0.95])
+LONGEST = 10.0  # memory, in spans of the series
+RANGE = 0.2, 20.0  # total variance, in units of that about the course
+MOST = 300  # exposures, or means of successive ones
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """What is said of a coefficient at M epochs: normal distributions with weights.
+
+    Parameters
+    ----------
+    weight : ndarray, shape (P,)
+        Of each process.
+    means, variances : ndarray, shape (P, M)
+        Of course and shared deviation.
+    own : ndarray, shape (P,)
+        Variance that each exposure has for itself, beside its formal one.
+    """
+
+    weight: Float
+    means: Float
+    variances: Float
+    own: Float
+
+    @property
+    def mean(self) -> Float:
+        """Over all processes, (M,)."""
+        return self.weight @ self.means
+
+    @property
+    def variance(self) -> Float:
+        """Over all processes, (M,)."""
+        return self.weight @ (self.variances + (self.means - self.mean) ** 2)
+
+    def drawn(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Process of each of some draws (n,)."""
+        return rng.choice(len(self.weight), size=n, p=self.weight)
+
+
+@dataclass(frozen=True, eq=False)
+class Correlated:
+    """One coefficient's deviations: what a grid of processes says of them.
+
+    Parameters
+    ----------
+    epoch : ndarray, shape (E,)
+    y : ndarray, shape (E,)
+        In units of the spread.
+    noise : ndarray, shape (E,)
+        Formal variances.
+    columns : ndarray, shape (E, p)
+        Of the course.
+    count : ndarray, shape (E,)
+        Exposures that each of these is the mean of.
+    """
+
+    epoch: Float
+    y: Float
+    noise: Float
+    columns: Float
+    count: Float
+
+    @classmethod
+    def of(cls, epoch: Float, y: Float, noise: Float, columns: Float) -> Correlated:
+        """Of single exposures; where they are very many, means of successive ones stand for them.
+
+        Parameters
+        ----------
+        epoch, y, noise, columns
+            As for `Correlated`.
+        """
+        order = np.argsort(epoch, kind="stable")
+        lots = np.array_split(order, min(len(order), MOST))
+        mean = [np.stack([values[lot].mean(axis=0) for lot in lots]) for values in (epoch, y)]
+        count = np.array([float(len(lot)) for lot in lots])
+        of_mean = np.array([noise[lot].mean() for lot in lots]) / count
+        rows = np.stack([columns[lot].mean(axis=0) for lot in lots])
+        return cls(mean[0], mean[1], of_mean, rows, count)
+
+    def predict(self, epoch: Float, columns: Float) -> Shared:
+        """Course and shared deviation at other epochs.
+
+        Parameters
+        ----------
+        epoch : ndarray, shape (M,)
+        columns : ndarray, shape (M, p)
+
+        Returns
+        -------
+        Shared
+        """
+        points = self._grid()
+        solved = [self._at(*point, epoch, columns) for point in points]
+        log_weight = np.array([one[0] for one in solved])
+        weight = np.exp(log_weight - log_weight.max())
+        weight /= weight.sum()
+        means, variances = (np.stack([one[i] for one in solved]) for i in (1, 2))
+        own = np.array([total * (1.0 - fraction) for _, total, fraction in points])
+        return Shared(weight, means, variances, own)
+
+    def _grid(self) -> list[tuple[float, float, float]]:
+        """Memory, total variance and the process's fraction of it."""
+        order = np.sort(self.epoch)
+        gap = float(np.median(np.diff(order))) or float(np.ptp(order)) / len(order)
+        memories = np.geomspace(gap, LONGEST * float(np.ptp(order)), MEMORIES)
+        fit = np.linalg.lstsq(self.columns, self.y, rcond=None)[0]
+        left = self.y - self.columns @ fit
+        spread = float(np.median(np.abs(left)) * 1.4826) ** 2 or float(left.var()) or 1.0
+        totals = spread * np.geomspace(*RANGE, TOTALS)
+        out = []
+        for total in totals:
+            out += [(1.0, float(total), 0.0)] * MEMORIES  # as many, for the same prior weight
+            for memory in memories:
+                out += [(float(memory), float(total), float(f)) for f in FRACTIONS[1:]]
+        return list(dict.fromkeys(out))
+
+    def _at(
+        self, memory: float, total: float, fraction: float, epoch: Float, columns: Float
+    ) -> tuple[float, Float, Float]:
+        """Log marginal likelihood of one process, and its mean and variance at other epochs."""
+        process = fraction * total
+
+        def shared(a: Float, b: Float) -> Float:
+            return process * np.exp(-np.abs(a[:, None] - b) / memory)
+
+        cov = shared(self.epoch, self.epoch) + VAGUE**2 * self.columns @ self.columns.T
+        cov[np.diag_indices_from(cov)] += self.noise + (total - process) / self.count
+        factor = np.linalg.cholesky(cov)
+        white = np.linalg.solve(factor, self.y)
+        across = shared(self.epoch, epoch) + VAGUE**2 * self.columns @ columns.T
+        gain = np.linalg.solve(factor, across)
+        value = -0.5 * float(white @ white) - float(np.log(np.diag(factor)).sum())
+        own = process + VAGUE**2 * (columns**2).sum(axis=1)
+        return value, gain.T @ white, np.maximum(own - (gain**2).sum(axis=0), 0.0)
