@@ -41,12 +41,14 @@ from bayesdist.infer import GaussianPriors, Matches
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.selfcal import Gauge, ReferenceStars, SelfCalibration, Solution, gauge_free
-from bayesdist.infer.selfcal.calibrate import gauge_of, self_calibrate
+from bayesdist.infer.selfcal.calibrate import self_calibrate
 from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
 from bayesdist.infer.selfcal.following import taken_by_stars
+from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem, prepared
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.infer.selfcal.settled import gauge_of
 from bayesdist.model import DistortionModel
 
 __all__ = ["DETECTIONS", "SOLUTION", "SelfcalSession"]
@@ -54,6 +56,7 @@ __all__ = ["DETECTIONS", "SOLUTION", "SelfcalSession"]
 Float = NDArray[np.float64]
 
 DETECTIONS, SOLUTION = "detections.h5", "solution.h5"
+_OF_SOLUTION = ("theta", "stars", "mixture", "held", "n_free", "reference")
 RELINEARISED = 3  # times a problem is linearised anew about a solution that is read
 
 _MATCH_AGAIN, _FIT_AGAIN = "run the stage 'match' again", "run the stage 'fit' again"
@@ -256,13 +259,14 @@ class SelfcalSession(Session):
 
     def keep_solution(self, solution: Solution, reference: Float) -> None:
         """Write a solution; `reference` is where what is known beside it was linearised."""
-        m = solution.mixture
-        held = np.setdiff1d(np.arange(len(solution.theta)), solution.free)
+        m, decision = solution.mixture, solution.decision
+        assert decision is not None
         arrays = {
             "theta": solution.theta,
             "stars": solution.stars,
             "mixture": np.array([m.jitter, m.fraction]),
-            "held": held,
+            "held": decision.held,
+            "n_free": np.array([decision.n_null, decision.n_open]),
             "reference": reference,
         }
         write_arrays(self.run / SOLUTION, "", arrays)
@@ -271,17 +275,19 @@ class SelfcalSession(Session):
     @cached_property
     def solved(self) -> Solution:
         """The solution of an earlier stage, with its stars."""
-        kept, model = read_arrays(self.run / SOLUTION, "", do=_FIT_AGAIN), self.model
+        kept = read_arrays(self.run / SOLUTION, "", _OF_SOLUTION, do=_FIT_AGAIN)
+        model, held = self.model, kept["held"].astype(np.int64)
         theta, stars = kept["theta"], kept["stars"]
         jitter, fraction = (float(v) for v in kept["mixture"])
         problem, mixture = self.problem_at(model, theta), Mixture(jitter, fraction)
         for _ in range(RELINEARISED):
             problem = problem.at(theta, stars)
         found = expand(problem, theta, mixture, stars)
-        free = np.setdiff1d(np.arange(model.n_params), kept["held"].astype(np.int64))
+        free = np.setdiff1d(np.arange(model.n_params), held)
+        decision = Decision(*(int(n) for n in kept["n_free"]), held)
         information = self.known_for(model)(kept["reference"])
         stars = problem.found_again(theta, found.stars)
-        return Solution(problem, theta, stars, mixture, free, found, information)
+        return Solution(problem, theta, stars, mixture, free, found, information, decision)
 
     @cached_property
     def gauge(self) -> Gauge:
