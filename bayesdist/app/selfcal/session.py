@@ -49,6 +49,7 @@ from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem, prepared
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
 from bayesdist.infer.selfcal.settled import gauge_of
+from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import DistortionModel
 
 __all__ = ["DETECTIONS", "SOLUTION", "SelfcalSession"]
@@ -56,6 +57,7 @@ __all__ = ["DETECTIONS", "SOLUTION", "SelfcalSession"]
 Float = NDArray[np.float64]
 
 DETECTIONS, SOLUTION = "detections.h5", "solution.h5"
+_OF_DETECTIONS = ("x", "y", "star", "sigma", "theta", "stars", "mixture", "model")
 _OF_SOLUTION = ("theta", "stars", "mixture", "held", "n_free", "reference")
 RELINEARISED = 3  # times a problem is linearised anew about a solution that is read
 
@@ -147,6 +149,7 @@ class SelfcalSession(Session):
                 dilation=self.inputs.dilation,
                 jitter=self.jitter,
                 references=self.references,
+                plane=self.tangent_plane,
                 rounds=block.rounds,
                 log=log,
             )
@@ -173,6 +176,14 @@ class SelfcalSession(Session):
         """What the catalogue says of the stars."""
         catalog, block = self.reference_catalog, self.config.gauge.reference
         return None if catalog is None or block is None else ReferenceStars(catalog, block.radius)
+
+    @property
+    def tangent_plane(self) -> TangentPlane | None:
+        """That of the reference stars, or of the first exposure; None for pixels of no size."""
+        if self.unit_arcsec is None:
+            return None
+        point = None if self.config.gauge.reference is None else (0.0, 0.0)
+        return TangentPlane(self.unit_arcsec, point)
 
     @cached_property
     def parallax_factors(self) -> NDArray[np.float64] | None:
@@ -211,7 +222,8 @@ class SelfcalSession(Session):
         d, m = found.detections, found.solution.mixture
         assert d.sigma is not None
         s = found.solution
-        arrays = {"star": d.star, "sigma": d.sigma, "theta": s.theta, "stars": s.stars}
+        arrays = {"x": d.x, "y": d.y, "star": d.star, "sigma": d.sigma}
+        arrays |= {"theta": s.theta, "stars": s.stars}
         arrays["mixture"] = np.array([m.jitter, m.fraction])
         text = json.dumps(found.solution.problem.model.to_dict())
         arrays["model"] = np.frombuffer(text.encode(), np.uint8)
@@ -222,14 +234,18 @@ class SelfcalSession(Session):
 
     @cached_property
     def _kept(self) -> dict[str, NDArray[np.float64]]:
-        return read_arrays(self.run / DETECTIONS, "", do=_MATCH_AGAIN)
+        return read_arrays(self.run / DETECTIONS, "", _OF_DETECTIONS, do=_MATCH_AGAIN)
 
     @cached_property
     def detections(self) -> Detections:
-        """Detections with their stars and errors, as the match left them."""
+        """Detections with their stars and errors, on one tangent plane, as the match left them."""
         kept = self._kept
         return replace(
-            self.inputs.detections, star=kept["star"].astype(np.int64), sigma=kept["sigma"]
+            self.inputs.detections,
+            x=kept["x"],
+            y=kept["y"],
+            star=kept["star"].astype(np.int64),
+            sigma=kept["sigma"],
         )
 
     @property

@@ -18,9 +18,10 @@ from bayesdist.infer.selfcal.normal import Mixture
 from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepared
 from bayesdist.infer.selfcal.settled import Knowledge, gauge_of, solved_in_gauge
 from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.tangent import TangentPlane, places_of
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfCalibration", "places_of", "self_calibrate"]
+__all__ = ["SelfCalibration", "self_calibrate"]
 
 Float = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ class SelfCalibration:
     friends : Friends
         Of the last round; its `star` is of the detections given.
     detections : Detections
-        With star codes and errors.
+        With star codes and errors, on one tangent plane where that is asked for.
     magnitude_errors : tuple of ndarray, or None
         Magnitudes and errors in pixels, where these were measured.
     rounds : int
@@ -74,6 +75,7 @@ def self_calibrate(
     dilation: Float | None = None,
     jitter: float | None = None,
     references: References | None = None,
+    plane: TangentPlane | None = None,
     rounds: int = MOST_ROUNDS,
     log: Callable[[str], None] = lambda text: None,
 ) -> SelfCalibration:
@@ -102,6 +104,8 @@ def self_calibrate(
         Held at this, pixels.
     references : callable, optional
         What is known of the stars of a problem at parameters (D,) beforehand.
+    plane : TangentPlane, optional
+        To which the tangent planes of all exposures are taken; the sky counts as flat by default.
     rounds : int
         At most so many.
     log : callable, optional
@@ -129,10 +133,11 @@ def self_calibrate(
     before: Friends | None = None
     solution: Solution | None = None
     for turn in range(rounds):
+        flat = detections if plane is None else plane.onto_it(model, detections, theta)
         friends = friends_of_friends(
-            places_of(model, detections, theta, dilation), detections.exposure, radius * pixel
+            places_of(model, flat, theta, dilation), flat.exposure, radius * pixel
         )
-        found = replace(detections, star=friends.star)
+        found = replace(flat, star=friends.star)
         problem = prepared(
             model, found, theta, match_radius=radius, least=least, motion=motion,
             parallax_factors=parallax_factors, dilation=dilation,
@@ -161,9 +166,8 @@ def self_calibrate(
                     mixture=solution.mixture,
                 )  # fmt: skip
             gauge = gauge_of(solution.problem, solution.theta, knowledge(solution.theta), solution)
-            return SelfCalibration(
-                solution, gauge, friends, replace(detections, star=friends.star), errors, turn + 1
-            )
+            found = replace(found, sigma=detections.sigma)
+            return SelfCalibration(solution, gauge, friends, found, errors, turn + 1)
         before = friends
         scatter = float(np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2))
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
@@ -179,27 +183,6 @@ def self_calibrate(
         where="self-calibration",
         do="give a higher order, a better start, or a larger match radius",
     )
-
-
-def places_of(
-    model: DistortionModel, detections: Detections, theta: Float, dilation: Float | None = None
-) -> Float:
-    """Where on the sky the model has each detection, (N, 2)."""
-    when = None
-    if model.time is not None and detections.epoch is not None:
-        when = detections.epoch[detections.exposure]
-    out = model.predict(
-        theta,
-        detections.x,
-        detections.y,
-        exposure=detections.exposure,
-        chip=detections.chip,
-        epoch=when,
-    )
-    if dilation is None:
-        return out
-    o = np.asarray(model.origin)
-    return np.asarray(o + (out - o) * dilation[detections.exposure, None])
 
 
 def _still(problem: Problem, solution: Solution) -> Mixture | None:
