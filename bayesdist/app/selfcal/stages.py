@@ -54,6 +54,9 @@ def _match(session: SelfcalSession) -> None:
     for text in matching.summary["warnings"]:
         log.warning("match: WARNING: %s", text)
     log.info("match: %s", matching.sentence)
+    if session.tangent_plane is not None:
+        moved = matching.summary["tangent_planes_pix"]
+        log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
 
 
 def _fit(session: SelfcalSession) -> None:

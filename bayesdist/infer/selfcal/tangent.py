@@ -91,11 +91,9 @@ class TangentPlane:
             here = detections.exposure == e
             moved[here] = self.displacements(model, theta, flat[here], e)
         aim, out = flat + moved, detections
-        right, up = (
-            (places_of(model, replace(detections, **{axis: at + STEP}), theta) - flat) / STEP
-            for axis, at in (("x", detections.x), ("y", detections.y))
-        )
-        back = np.linalg.inv(np.stack([right, up], axis=2))
+        right = places_of(model, replace(detections, x=detections.x + STEP), theta)
+        up = places_of(model, replace(detections, y=detections.y + STEP), theta)
+        back = np.linalg.inv(np.stack([right - flat, up - flat], axis=2) / STEP)
         for _ in range(TURNS):
             step = np.einsum("nab,nb->na", back, aim - places_of(model, out, theta))
             out = replace(out, x=out.x + step[:, 0], y=out.y + step[:, 1])
