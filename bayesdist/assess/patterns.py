@@ -19,13 +19,13 @@ from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal.expected import ExpectedSolution, expected_solution
-from bayesdist.infer.selfcal.gauge import POINTS, functionals, moves
 from bayesdist.infer.selfcal.information import (
     Information,
     frame_information,
     pointing_information,
     tie,
 )
+from bayesdist.infer.selfcal.moves import POINTS, functionals, moves
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
 from bayesdist.simulate.patterns import DitherPattern

@@ -7,24 +7,22 @@ cannot be tested: directions in which known stars would say much more are left o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesdist.diagnose.dithered_columns import AddedColumns, pointing_terms
 from bayesdist.diagnose.noise import noise_tests
 from bayesdist.diagnose.result import Outcome, ScoreTest, corrected, noncentrality
 from bayesdist.diagnose.sample import Block, ScoredSample
 from bayesdist.diagnose.score import independent_directions
-from bayesdist.infer.discrepancy.functions import legendre_products
 from bayesdist.infer.discrepancy.linear import deviation_columns
 from bayesdist.infer.selfcal.discrepancy import MOST_EXPOSURES
 from bayesdist.infer.selfcal.eliminated import (
-    Columns,
     add_products,
     even_stars,
     pieces,
@@ -36,7 +34,7 @@ from bayesdist.infer.selfcal.normal import memberships
 from bayesdist.infer.selfcal.sandwich import star_scores
 from bayesdist.infer.selfcal.scores import scores_of_detections
 from bayesdist.infer.selfcal.solve import Solution
-from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["selfcal_score_tests"]
 
@@ -45,56 +43,9 @@ Int = NDArray[np.int64]
 
 MOST_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
-HIGHER = 2  # orders above the model's that are tested
 TOLD = 0.02  # of what known stars would say of a direction: less is not told from their places
 OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the others
 SHORTEST = 0.1  # years in which motions are looked for
-LINEAR = polynomial_terms(1)
-
-
-@dataclass(frozen=True, eq=False)
-class _Added(Columns):
-    """Terms of higher order, and linear terms times the magnitude, on both axes of every chip.
-
-    Parameters
-    ----------
-    mag : ndarray, shape (N,), or None
-        Of each detection, about the mean.
-    """
-
-    mag: Float | None = field(default=None)
-
-    @cached_property
-    def terms(self) -> tuple[tuple[int, int], ...]:
-        """Powers of the terms of higher order."""
-        order = self.problem.model.order
-        return polynomial_terms(order + HIGHER)[len(polynomial_terms(order)) :]
-
-    def n_functions(self, chip: int) -> int:
-        """Number of functions along one axis."""
-        return len(self.terms) + (0 if self.mag is None else len(LINEAR))
-
-    def values(self, chip: int, rows: Int) -> Float:
-        """Values (n, n_functions) of these."""
-        X, Y = self.problem.X[rows], self.problem.Y[rows]
-        out = legendre_products(X, Y, self.terms)
-        if self.mag is None:
-            return out
-        more = self.mag[rows, None] * legendre_products(X, Y, LINEAR)
-        return np.concatenate([out, more], axis=1)
-
-    def families(self) -> Iterator[tuple[str, Int]]:
-        """Name of each test, and which of the further columns it has."""
-        n, order = self.n_functions(0), self.problem.model.order
-        start = n * np.arange(2 * len(self.problem.model.chips))[:, None]
-        degree = np.array([sum(term) for term in self.terms])
-        for step in range(1, HIGHER + 1):
-            yield f"order {order + step}", np.ravel(start + np.flatnonzero(degree == order + step))
-        if self.mag is not None:
-            yield "magnitude", np.ravel(start + np.arange(len(self.terms), n))
-        if self.deviations is not None:
-            first = n * len(start)
-            yield "exposures", first + np.arange(self.deviations.n_of_exposures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +105,8 @@ def selfcal_score_tests(
     deviations = deviation_columns(
         model, solution.theta, problem.groups, counts, most=MOST_EXPOSURES
     )
-    columns = _Added(problem, solution.theta, {}, deviations, varied)
+    pointed = pointing_terms(problem, solution.theta)
+    columns = AddedColumns(problem, solution.theta, {}, deviations, varied, pointed)
     sums = _summed(solution, columns, rows, solution.stars[some])
     found = [_tested(sums, name, which, model.order) for name, which in columns.families()]
     if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
@@ -163,7 +115,9 @@ def selfcal_score_tests(
     return corrected([one for one in found if one is not None])
 
 
-def _summed(solution: Solution, columns: _Added, rows: NDArray[np.bool_], stars: Float) -> _Sums:
+def _summed(
+    solution: Solution, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
+) -> _Sums:
     """Sums over some of the detections of a solution."""
     p, scores = columns.problem, scores_of_detections(solution).at(rows)
     n, D = columns.sparse.stop, columns.n_params
@@ -246,6 +200,12 @@ def _words(name: str, order: int) -> tuple[str, str, str]:
             "cut the faint stars, or correct the charge-transfer efficiency",
             "the residuals go with the magnitude of the stars",
             "the residuals do not go with the magnitude of the stars",
+        )
+    if name == "pointing":
+        return (
+            "give the true detector.scale_mas, by which tangent planes are taken to one",
+            "the distortion goes with where exposures point, as if a curved sky were taken as flat",
+            "the distortion does not go with where exposures point",
         )
     return (
         "give selfcal.frames a scale where it has none, or leave out exposures",

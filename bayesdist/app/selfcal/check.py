@@ -33,6 +33,11 @@ def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
         f"{number(summary['per_star']['median'])} at the median; "
         f"{summary['n_ambiguous']} ambiguous groups"
     )
+    if session.tangent_plane is None:
+        yield "sky          taken as flat: detector.scale_mas, the size of a pixel, is not given"
+    else:
+        moved = number(summary["tangent_planes_pix"])
+        yield f"sky          tangent planes taken to one: detections move by up to {moved} pix"
     error = float(np.sqrt(np.median(s.problem.var) + s.mixture.jitter**2))
     yield f"errors       {number(error)} pix at the median, {number(s.mixture.fraction)} false"
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"

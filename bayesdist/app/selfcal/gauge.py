@@ -14,14 +14,15 @@ from bayesdist.app.config import Config
 from bayesdist.app.selfcal.inputs import Commanded
 from bayesdist.errors import InputError
 from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.selfcal.calibrate import curvatures
-from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge, functionals
+from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
 from bayesdist.infer.selfcal.information import (
     Information,
     frame_information,
     pointing_information,
     tie,
 )
+from bayesdist.infer.selfcal.moves import functionals
+from bayesdist.infer.selfcal.settled import curvatures
 from bayesdist.infer.selfcal.solve import Solution
 from bayesdist.model import DistortionModel
 

@@ -10,12 +10,12 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.selfcal.inputs import Inputs
-from bayesdist.data.detections import NO_STAR
+from bayesdist.data.detections import NO_STAR, Detections
 from bayesdist.data.pairs import hull_of, inside_hull
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import SelfCalibration
-from bayesdist.infer.selfcal.calibrate import places_of
 from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
 __all__ = ["TURN_BACK", "Matching", "half_turned", "matching_of"]
@@ -159,6 +159,7 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
         "n_chains": friends.n_chains,
         "rounds": found.rounds,
         "match_radius": p.match_radius,
+        "tangent_planes_pix": _moved(d, inputs),
         "detections": {
             "read": inputs.n_read,
             "cut": dict(inputs.rejected),
@@ -169,6 +170,12 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
         "warnings": warnings,
     }
     return Matching(table, summary)
+
+
+def _moved(detections: Detections, inputs: Inputs) -> float:
+    """How far a detection was moved at most to lie on the tangent plane of all, pixels."""
+    raw = inputs.detections
+    return float(np.hypot(detections.x - raw.x, detections.y - raw.y).max())
 
 
 def _seen_by_others(

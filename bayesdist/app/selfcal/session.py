@@ -41,12 +41,15 @@ from bayesdist.infer import GaussianPriors, Matches
 from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.selfcal import Gauge, ReferenceStars, SelfCalibration, Solution, gauge_free
-from bayesdist.infer.selfcal.calibrate import gauge_of, self_calibrate
+from bayesdist.infer.selfcal.calibrate import self_calibrate
 from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
 from bayesdist.infer.selfcal.following import taken_by_stars
+from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem, prepared
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.infer.selfcal.settled import gauge_of
+from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import DistortionModel
 
 __all__ = ["DETECTIONS", "SOLUTION", "SelfcalSession"]
@@ -54,6 +57,8 @@ __all__ = ["DETECTIONS", "SOLUTION", "SelfcalSession"]
 Float = NDArray[np.float64]
 
 DETECTIONS, SOLUTION = "detections.h5", "solution.h5"
+_OF_DETECTIONS = ("x", "y", "star", "sigma", "theta", "stars", "mixture", "model")
+_OF_SOLUTION = ("theta", "stars", "mixture", "held", "n_free", "reference")
 RELINEARISED = 3  # times a problem is linearised anew about a solution that is read
 
 _MATCH_AGAIN, _FIT_AGAIN = "run the stage 'match' again", "run the stage 'fit' again"
@@ -144,6 +149,7 @@ class SelfcalSession(Session):
                 dilation=self.inputs.dilation,
                 jitter=self.jitter,
                 references=self.references,
+                plane=self.tangent_plane,
                 rounds=block.rounds,
                 log=log,
             )
@@ -170,6 +176,14 @@ class SelfcalSession(Session):
         """What the catalogue says of the stars."""
         catalog, block = self.reference_catalog, self.config.gauge.reference
         return None if catalog is None or block is None else ReferenceStars(catalog, block.radius)
+
+    @property
+    def tangent_plane(self) -> TangentPlane | None:
+        """That of the reference stars, or of the first exposure; None for pixels of no size."""
+        if self.unit_arcsec is None:
+            return None
+        point = None if self.config.gauge.reference is None else (0.0, 0.0)
+        return TangentPlane(self.unit_arcsec, point)
 
     @cached_property
     def parallax_factors(self) -> NDArray[np.float64] | None:
@@ -208,7 +222,8 @@ class SelfcalSession(Session):
         d, m = found.detections, found.solution.mixture
         assert d.sigma is not None
         s = found.solution
-        arrays = {"star": d.star, "sigma": d.sigma, "theta": s.theta, "stars": s.stars}
+        arrays = {"x": d.x, "y": d.y, "star": d.star, "sigma": d.sigma}
+        arrays |= {"theta": s.theta, "stars": s.stars}
         arrays["mixture"] = np.array([m.jitter, m.fraction])
         text = json.dumps(found.solution.problem.model.to_dict())
         arrays["model"] = np.frombuffer(text.encode(), np.uint8)
@@ -219,14 +234,18 @@ class SelfcalSession(Session):
 
     @cached_property
     def _kept(self) -> dict[str, NDArray[np.float64]]:
-        return read_arrays(self.run / DETECTIONS, "", do=_MATCH_AGAIN)
+        return read_arrays(self.run / DETECTIONS, "", _OF_DETECTIONS, do=_MATCH_AGAIN)
 
     @cached_property
     def detections(self) -> Detections:
-        """Detections with their stars and errors, as the match left them."""
+        """Detections with their stars and errors, on one tangent plane, as the match left them."""
         kept = self._kept
         return replace(
-            self.inputs.detections, star=kept["star"].astype(np.int64), sigma=kept["sigma"]
+            self.inputs.detections,
+            x=kept["x"],
+            y=kept["y"],
+            star=kept["star"].astype(np.int64),
+            sigma=kept["sigma"],
         )
 
     @property
@@ -256,13 +275,14 @@ class SelfcalSession(Session):
 
     def keep_solution(self, solution: Solution, reference: Float) -> None:
         """Write a solution; `reference` is where what is known beside it was linearised."""
-        m = solution.mixture
-        held = np.setdiff1d(np.arange(len(solution.theta)), solution.free)
+        m, decision = solution.mixture, solution.decision
+        assert decision is not None
         arrays = {
             "theta": solution.theta,
             "stars": solution.stars,
             "mixture": np.array([m.jitter, m.fraction]),
-            "held": held,
+            "held": decision.held,
+            "n_free": np.array([decision.n_null, decision.n_open]),
             "reference": reference,
         }
         write_arrays(self.run / SOLUTION, "", arrays)
@@ -271,17 +291,19 @@ class SelfcalSession(Session):
     @cached_property
     def solved(self) -> Solution:
         """The solution of an earlier stage, with its stars."""
-        kept, model = read_arrays(self.run / SOLUTION, "", do=_FIT_AGAIN), self.model
+        kept = read_arrays(self.run / SOLUTION, "", _OF_SOLUTION, do=_FIT_AGAIN)
+        model, held = self.model, kept["held"].astype(np.int64)
         theta, stars = kept["theta"], kept["stars"]
         jitter, fraction = (float(v) for v in kept["mixture"])
         problem, mixture = self.problem_at(model, theta), Mixture(jitter, fraction)
         for _ in range(RELINEARISED):
             problem = problem.at(theta, stars)
         found = expand(problem, theta, mixture, stars)
-        free = np.setdiff1d(np.arange(model.n_params), kept["held"].astype(np.int64))
+        free = np.setdiff1d(np.arange(model.n_params), held)
+        decision = Decision(*(int(n) for n in kept["n_free"]), held)
         information = self.known_for(model)(kept["reference"])
         stars = problem.found_again(theta, found.stars)
-        return Solution(problem, theta, stars, mixture, free, found, information)
+        return Solution(problem, theta, stars, mixture, free, found, information, decision)
 
     @cached_property
     def gauge(self) -> Gauge:

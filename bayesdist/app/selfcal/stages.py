@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.selfcal.gauge import gauge_summary, gauge_table
@@ -22,8 +21,7 @@ from bayesdist.app.stages.fit import summarise_fit
 from bayesdist.app.stages.sample import keep_posterior
 from bayesdist.infer import Posterior, save_fit
 from bayesdist.infer.selfcal import sample_selfcal
-from bayesdist.infer.selfcal.calibrate import gauge_of
-from bayesdist.infer.selfcal.solve import solve
+from bayesdist.infer.selfcal.settled import solved_in_gauge
 from bayesdist.products import read_idctab
 
 __all__ = ["SELFCAL_STAGES", "rehearse_selfcal"]
@@ -56,16 +54,21 @@ def _match(session: SelfcalSession) -> None:
     for text in matching.summary["warnings"]:
         log.warning("match: WARNING: %s", text)
     log.info("match: %s", matching.sentence)
+    if session.tangent_plane is not None:
+        moved = matching.summary["tangent_planes_pix"]
+        log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
 
 
 def _fit(session: SelfcalSession) -> None:
     model, theta, stars, mixture = session.matched
     problem = session.problem_at(model, theta)
-    information = session.known_for(model)(theta)
-    gauge = gauge_of(problem, theta, information)
-    free = np.setdiff1d(np.arange(model.n_params), gauge.held)
-    solution = solve(
-        problem, theta, free, information, stars=stars, mixture=mixture, jitter=session.jitter
+    solution = solved_in_gauge(
+        problem,
+        theta,
+        session.known_for(model),
+        stars=stars,
+        mixture=mixture,
+        jitter=session.jitter,
     )
     session.keep_solution(solution, theta)
     fit = fit_of(solution)

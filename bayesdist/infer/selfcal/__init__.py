@@ -7,6 +7,8 @@ is left are the parameters of a `DistortionModel`.
     normal      one pass: normal equations with the stars eliminated, or log densities of draws
     solve       the mode of everything together
     gauge       what detections leave free, by name, and what fixes it
+    moves       of the whole sky, as changes of the parameters
+    settled     the mode, and what counts as free there: one decision
     information what is known beside them: commanded offsets, ties, priors
     references  stars whose places are known
     start       where the search begins

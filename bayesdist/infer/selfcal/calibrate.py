@@ -12,14 +12,16 @@ from bayesdist.data.detections import Detections
 from bayesdist.data.friends import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
 from bayesdist.infer.selfcal.errors import scatter_by_magnitude
-from bayesdist.infer.selfcal.gauge import Gauge, find_gauge
+from bayesdist.infer.selfcal.gauge import Gauge
 from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.normal import Mixture, expand
+from bayesdist.infer.selfcal.normal import Mixture
 from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepared
-from bayesdist.infer.selfcal.solve import Solution, solve, wide_mixture
+from bayesdist.infer.selfcal.settled import Knowledge, gauge_of, solved_in_gauge
+from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.tangent import TangentPlane, places_of
 from bayesdist.model import DistortionModel
 
-__all__ = ["SelfCalibration", "curvatures", "gauge_of", "places_of", "self_calibrate"]
+__all__ = ["SelfCalibration", "self_calibrate"]
 
 Float = NDArray[np.float64]
 
@@ -31,7 +33,6 @@ FEWEST = 4  # or so many: two at the edge of the linking length, each with its s
 ALIKE = 0.02  # change of the number of detections that leaves the errors as they were
 GUESS = 0.02  # pixels: error where none is quoted, until it is measured
 
-Knowledge = Callable[[Float], Information]
 References = Callable[[Problem, Float], StarPriors]
 
 
@@ -46,7 +47,7 @@ class SelfCalibration:
     friends : Friends
         Of the last round; its `star` is of the detections given.
     detections : Detections
-        With star codes and errors.
+        With star codes and errors, on one tangent plane where that is asked for.
     magnitude_errors : tuple of ndarray, or None
         Magnitudes and errors in pixels, where these were measured.
     rounds : int
@@ -74,6 +75,7 @@ def self_calibrate(
     dilation: Float | None = None,
     jitter: float | None = None,
     references: References | None = None,
+    plane: TangentPlane | None = None,
     rounds: int = MOST_ROUNDS,
     log: Callable[[str], None] = lambda text: None,
 ) -> SelfCalibration:
@@ -102,6 +104,8 @@ def self_calibrate(
         Held at this, pixels.
     references : callable, optional
         What is known of the stars of a problem at parameters (D,) beforehand.
+    plane : TangentPlane, optional
+        To which the tangent planes of all exposures are taken; the sky counts as flat by default.
     rounds : int
         At most so many.
     log : callable, optional
@@ -129,21 +133,19 @@ def self_calibrate(
     before: Friends | None = None
     solution: Solution | None = None
     for turn in range(rounds):
+        flat = detections if plane is None else plane.onto_it(model, detections, theta)
         friends = friends_of_friends(
-            places_of(model, detections, theta, dilation), detections.exposure, radius * pixel
+            places_of(model, flat, theta, dilation), flat.exposure, radius * pixel
         )
-        found = replace(detections, star=friends.star)
+        found = replace(flat, star=friends.star)
         problem = prepared(
             model, found, theta, match_radius=radius, least=least, motion=motion,
             parallax_factors=parallax_factors, dilation=dilation,
         )  # fmt: skip
         if references is not None:
             problem = replace(problem, priors=references(problem, theta))
-        information = knowledge(theta)
-        gauge = gauge_of(problem, theta, information)
-        free = np.setdiff1d(np.arange(model.n_params), gauge.held)
         known = None if solution is None else _still(problem, solution)
-        solution = solve(problem, theta, free, information, jitter=jitter, mixture=known)
+        solution = solved_in_gauge(problem, theta, knowledge, jitter=jitter, mixture=known)
         theta = solution.theta
         log(
             f"round {turn + 1}: linking length {radius:.3g} pix, {friends.n_stars} stars, "
@@ -159,16 +161,13 @@ def self_calibrate(
                 sigma = detections.sigma
                 assert sigma is not None
                 problem = solution.problem.with_sigma(sigma[solution.problem.rows])
-                solution = solve(
-                    problem, theta, free, information, stars=solution.stars, jitter=jitter,
+                solution = solved_in_gauge(
+                    problem, theta, knowledge, stars=solution.stars, jitter=jitter,
                     mixture=solution.mixture,
                 )  # fmt: skip
-            # what is known, linearised where the detections are: it must leave the same free
-            information = knowledge(solution.theta)
-            gauge = gauge_of(solution.problem, solution.theta, information, solution)
-            return SelfCalibration(
-                solution, gauge, friends, replace(detections, star=friends.star), errors, turn + 1
-            )
+            gauge = gauge_of(solution.problem, solution.theta, knowledge(solution.theta), solution)
+            found = replace(found, sigma=detections.sigma)
+            return SelfCalibration(solution, gauge, friends, found, errors, turn + 1)
         before = friends
         scatter = float(np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2))
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
@@ -184,61 +183,6 @@ def self_calibrate(
         where="self-calibration",
         do="give a higher order, a better start, or a larger match radius",
     )
-
-
-def places_of(
-    model: DistortionModel, detections: Detections, theta: Float, dilation: Float | None = None
-) -> Float:
-    """Where on the sky the model has each detection, (N, 2)."""
-    when = None
-    if model.time is not None and detections.epoch is not None:
-        when = detections.epoch[detections.exposure]
-    out = model.predict(
-        theta,
-        detections.x,
-        detections.y,
-        exposure=detections.exposure,
-        chip=detections.chip,
-        epoch=when,
-    )
-    if dilation is None:
-        return out
-    o = np.asarray(model.origin)
-    return np.asarray(o + (out - o) * dilation[detections.exposure, None])
-
-
-def gauge_of(
-    problem: Problem, theta: Float, information: Information, solution: Solution | None = None
-) -> Gauge:
-    """What the detections of a problem leave free, and what fixes it.
-
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (D,)
-    information : Information
-    solution : Solution, optional
-        Of the problem; before there is one, stars lie at the means of their detections.
-    """
-    if solution is None:
-        stars = problem.mean_places(theta)
-        problem = problem.at(theta, stars)
-        mixture = wide_mixture(problem, theta, stars)
-    else:
-        stars, mixture = solution.stars, solution.mixture
-    alone, known = curvatures(problem, theta, mixture, stars)
-    return find_gauge(problem, theta, alone, information, known=known)
-
-
-def curvatures(
-    problem: Problem, theta: Float, mixture: Mixture, stars: Float
-) -> tuple[Float, Float]:
-    """Curvature (D, D) of the detections alone, and with what is known of the stars beforehand."""
-    known = expand(problem, theta, mixture, stars, observed=False).curvature
-    if not problem.priors.informed.any():
-        return known, known
-    bare = replace(problem, priors=StarPriors.none(problem.n_stars, problem.n_star))
-    return expand(bare, theta, mixture, stars, observed=False).curvature, known
 
 
 def _still(problem: Problem, solution: Solution) -> Mixture | None:

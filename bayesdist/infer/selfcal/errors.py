@@ -44,7 +44,9 @@ def scatter_by_magnitude(
     left = 1.0 - np.minimum(precision / np.maximum(total, 1e-300) * problem.n_star / 2, MOST_TAKEN)
     square = problem.squares(theta, stars)
     n_bins = int(np.clip(len(mag) // LEAST, 1, MOST_BINS))
-    edges = np.quantile(mag, np.linspace(0, 1, n_bins + 1))
+    # equal magnitudes, as of lists without any, leave fewer bins
+    edges = np.unique(np.quantile(mag, np.linspace(0, 1, n_bins + 1)))
+    n_bins = max(len(edges) - 1, 1)
     bin_of = np.clip(np.searchsorted(edges, mag, side="right") - 1, 0, n_bins - 1)
     number = np.bincount(bin_of, w * left, n_bins)
     variance = np.bincount(bin_of, w * square, n_bins) / (2 * np.maximum(number, 1e-9))

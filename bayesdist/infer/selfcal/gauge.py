@@ -9,49 +9,39 @@ they are named by the moves that can be written down.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from bayesdist.infer.selfcal.information import Information, linear_part
+from bayesdist.infer.selfcal.information import Information
+from bayesdist.infer.selfcal.moves import (
+    GENERATORS,
+    PARALLAX,
+    POINTS,
+    functionals,
+    moves,
+    parameter_scale,
+    rates,
+    roll_spread,
+)
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
-__all__ = [
-    "FAR",
-    "GENERATORS",
-    "SAME_ROLL",
-    "Gauge",
-    "NamedDirection",
-    "find_gauge",
-    "functionals",
-    "moves",
-    "parameter_scale",
-    "roll_spread",
-]
+__all__ = ["FAR", "SAME_ROLL", "Decision", "Gauge", "NamedDirection", "find_gauge"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-# of the linear maps of the sky
-GENERATORS = {
-    "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
-    "rotation": np.array([[0.0, -1.0], [1.0, 0.0]]),
-    "skew_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
-    "skew_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
-}
-RATES = ("drift_u", "drift_v", "spin", "expansion")  # of the sky, where stars move
-PARALLAX = "parallax"  # of the whole sky, where stars have one
-POINTS = ("zero_point_u", "zero_point_v")
-NULL = 1e-10  # of the largest eigenvalue: no information but rounding
+NULL = 1e-10  # of the largest eigenvalue: no information
+ROUNDING = 1e-13  # of the largest eigenvalue: less is nothing but rounding
 FREE_PIX = 10.0  # error at the detector's edge above which a direction counts as free
 WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as nearly free
 FAR = 3.0  # times the final error: what knows a direction no better than this does not fix it
 EXPLAINED = 1e-2  # share of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
 LEAST_PIVOT = 0.02
+HIDDEN = 1e-5  # of a property that lies along directions of which nothing is known: it is free
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +86,28 @@ class NamedDirection:
 
 
 @dataclass(frozen=True, eq=False)
+class Decision:
+    """What counts as free and what is held by convention, as a solution carries it along.
+
+    How much is known of a direction depends on where it is asked, and near a limit two answers
+    would differ: then parameters would be held, and so have no error, that nothing calls free.
+
+    Parameters
+    ----------
+    n_null : int
+        Directions that the detections leave free.
+    n_open : int
+        Of those, what is free even with what is known beside the detections.
+    held : ndarray of int, shape (n_open,)
+        Parameters that are held.
+    """
+
+    n_null: int
+    n_open: int
+    held: Int
+
+
+@dataclass(frozen=True, eq=False)
 class Gauge:
     """The free directions of a problem, and what fixes them.
 
@@ -131,6 +143,11 @@ class Gauge:
     spread: float
     whole: tuple[str, ...] = ()
     rates: tuple[str, ...] = ()
+
+    @property
+    def decision(self) -> Decision:
+        """What counts as free, and what is held."""
+        return Decision(self.null.shape[1], self.open.shape[1], self.held)
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -192,145 +209,6 @@ def _fixed(one: NamedDirection) -> str:
     return "held by convention"
 
 
-def parameter_scale(model: DistortionModel, theta: Float, years: float = 1.0) -> Float:
-    """What a pixel at the edge of the detector is in each parameter, (D,)."""
-    pixel = model.pixel_size(theta)
-    half = max(max(c.size) for c in model.chips) / 2
-    out = np.empty(model.n_params)
-    for k, p in enumerate(model.parameters):
-        if p.kind == "polynomial" or "shift" in p.name.split(".")[-1]:
-            out[k] = pixel
-        elif p.kind == "tdd":
-            out[k] = pixel / years
-        else:
-            out[k] = 1.0 / half
-    return out
-
-
-def moves(model: DistortionModel, theta: Float) -> dict[str, Float]:
-    """Moves of the whole sky as changes of the parameters, each (D,).
-
-    For shift t and linear map 1 + L about the frames' origin: those changes of polynomials and
-    frames by which every detection moves as the sky does, exactly where L commutes with the
-    exposures' rotations, and nearly where it does not.
-    """
-    o = np.asarray(model.origin)
-    E = len(model.exposures)
-    linear = {name: np.zeros(model.n_params) for name in (*POINTS, *GENERATORS)}
-    for chip in model.chips:
-        u, v = (model.coefficient_slice(chip.number, axis) for axis in (0, 1))
-        poly = np.stack([theta[u], theta[v]])
-        poly[:, 0] -= o
-        for name, L in GENERATORS.items():
-            change = L @ poly
-            linear[name][u], linear[name][v] = change
-        for axis, name in enumerate(POINTS):
-            linear[name][(u, v)[axis].start] = 1.0
-    for e in range(1, E):
-        block = model.frame_slice(e)
-        if block.stop - block.start < 2:
-            continue
-        M, d = model.frame(theta, e)
-        shift = slice(block.start, block.start + 2)
-        for name, L in GENERATORS.items():
-            linear[name][shift] = L @ d
-        for axis, name in enumerate(POINTS):
-            linear[name][shift] = np.eye(2)[axis] - M[:, axis]
-    return linear
-
-
-def rates(model: DistortionModel, theta: Float, years: Float) -> dict[str, Float]:
-    """Moves of the whole sky that grow with time, as changes (D,) of the exposures' frames.
-
-    Stars follow them where they have motions.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-    years : ndarray, shape (E,)
-        Since the first exposure.
-    """
-    out = {name: np.zeros(model.n_params) for name in RATES}
-    for e in range(1, len(model.exposures)):
-        names, block = model.free_frame_names(e), model.frame_slice(e)
-        if len(names) < 2:
-            continue
-        M, d = model.frame(theta, e)
-        shift = slice(block.start, block.start + 2)
-        for axis, name in enumerate(("drift_u", "drift_v")):
-            out[name][shift] = years[e] * np.eye(2)[axis]
-        if "rotation" in names:
-            out["spin"][shift] = years[e] * GENERATORS["rotation"] @ d
-            out["spin"][block.start + names.index("rotation")] = years[e]
-        if "scale" in names:
-            out["expansion"][shift] = years[e] * d
-            out["expansion"][block.start + names.index("scale")] = years[e] * np.sqrt(
-                np.linalg.det(M)
-            )
-    return {name: row for name, row in out.items() if row.any()}
-
-
-def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
-    """Properties of a solution as rows (D,): their change is row @ change of theta."""
-    out: dict[str, Float] = {}
-    first = model.chips[0]
-    maps = {c.number: _sky_map(model, theta, c.number) for c in model.chips}
-    places = {c.number: _place(model, c.number) for c in model.chips}
-    for axis, name in enumerate(POINTS):
-        out[name] = places[first.number][axis]
-    out |= _parts(maps[first.number])
-    for chip in model.chips[1:]:
-        # where the other chip lies when the first one has been brought back
-        G = maps[first.number]
-        gap = np.array([places[chip.number][a] - places[first.number][a] for a in (0, 1)])
-        between = gap @ theta
-        moved = gap - np.einsum("abd,b->ad", G, between)
-        for axis, name in enumerate(("shift_u", "shift_v")):
-            out[f"{chip.name}.{name}"] = moved[axis]
-        parts = _parts(maps[chip.number] - G)
-        out |= {f"{chip.name}.{name}": row for name, row in parts.items()}
-    return out
-
-
-def _sky_map(model: DistortionModel, theta: Float, chip: int) -> Float:
-    """Rows (2, 2, D) of the linear map of the sky that a change of the chip's linear part is."""
-    G = linear_part(model, chip)
-    now = G @ theta
-    return np.asarray(np.einsum("abd,bc->acd", G, np.linalg.inv(now)))
-
-
-def _place(model: DistortionModel, chip: int) -> Float:
-    """Rows (2, D) of where a chip's reference pixel lies."""
-    at = model.basis(chip).monomial_matrix[0]
-    out = np.zeros((2, model.n_params))
-    for axis in range(2):
-        out[axis, model.coefficient_slice(chip, axis)] = at
-    return out
-
-
-def _parts(L: Float) -> dict[str, Float]:
-    return {
-        "scale": (L[0, 0] + L[1, 1]) / 2,
-        "rotation": (L[1, 0] - L[0, 1]) / 2,
-        "skew_plus": (L[0, 0] - L[1, 1]) / 2,
-        "skew_cross": (L[0, 1] + L[1, 0]) / 2,
-    }
-
-
-def roll_spread(model: DistortionModel, theta: Float) -> float:
-    """Largest difference of two roll angles, radians; a half turn counts as none."""
-    angles = []
-    for e in range(len(model.exposures)):
-        M, _ = model.frame(theta, e)
-        angles.append(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
-    worst = 0.0
-    for a, b in combinations(np.unique(np.round(angles, 6)), 2):
-        off = (a - b) % np.pi
-        worst = max(worst, min(off, np.pi - off))
-    return float(worst)
-
-
 def find_gauge(
     problem: Problem,
     theta: Float,
@@ -338,6 +216,7 @@ def find_gauge(
     information: Information,
     *,
     known: Float | None = None,
+    decision: Decision | None = None,
 ) -> Gauge:
     """Free directions of a problem at a solution.
 
@@ -350,25 +229,33 @@ def find_gauge(
     information : Information
     known : ndarray, shape (D, D), optional
         Curvature with what is known of the stars beforehand; the same by default.
+    decision : Decision, optional
+        What counts as free; decided here by default.
     """
     model = problem.model
     years = float(np.ptp(problem.groups.epoch)) or 1.0
     scale = parameter_scale(model, theta, years)
-    null, values, vectors = _null(curvature * np.outer(scale, scale))
     both = (curvature if known is None else known) + information.precision
-    open_, *_ = _null(both * np.outer(scale, scale))
-    held = _pivots(model, open_)
-    directions = _directions(model, theta, scale, null, curvature, open_, both)
+    alone, fixed = (
+        _Spectrum.of(H * np.outer(scale, scale), n)
+        for H, n in (
+            (curvature, None if decision is None else decision.n_null),
+            (both, None if decision is None else decision.n_open),
+        )
+    )
+    null, open_ = alone.free, fixed.free
+    held = _pivots(model, open_) if decision is None else decision.held
+    directions = _directions(model, theta, scale, alone, fixed)
     named = moves(model, theta)
     moving = _rates_of(problem, theta)
     known_moves = np.stack(  # in pixels at the edge
         [row / scale for row in (named | moving).values()], axis=1
     )
     # a spin bends the paths of stars that move, by next to nothing
-    loose = vectors[:, values < WEAK_PIX**-2]
-    weak = (values > _least(values)) & (values < WEAK_PIX**-2)
+    loose = alone.vectors[:, alone.values < WEAK_PIX**-2]
+    weak = np.flatnonzero(alone.values[alone.n :] < WEAK_PIX**-2) + alone.n
     weakest = np.array(
-        [[values[k] ** -0.5, np.argmax(np.abs(vectors[:, k]))] for k in np.flatnonzero(weak)]
+        [[alone.values[k] ** -0.5, np.argmax(np.abs(alone.vectors[:, k]))] for k in weak]
     ).reshape(-1, 2)
     return Gauge(
         null=null * scale[:, None],
@@ -407,14 +294,42 @@ def _within(row: Float, null: Float) -> bool:
     return bool(np.linalg.norm(left) < EXPLAINED * np.linalg.norm(row))
 
 
-def _null(scaled: Float) -> tuple[Float, Float, Float]:
-    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    return vectors[:, values < _least(values)], values, vectors
+@dataclass(frozen=True, eq=False)
+class _Spectrum:
+    """Information by its directions, in pixels at the edge; the first `n` of them count as free."""
 
+    values: Float
+    vectors: Float
+    n: int
 
-def _least(values: Float) -> float:
-    """Eigenvalue, in pixels^-2 at the edge, below which a direction is free."""
-    return max(NULL * float(values[-1]), FREE_PIX**-2)
+    @classmethod
+    def of(cls, scaled: Float, n: int | None) -> _Spectrum:
+        """Spectrum of an information (D, D); decides how many are free where that is not said."""
+        values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+        least = max(NULL * float(values[-1]), FREE_PIX**-2)
+        return cls(values, vectors, int((values < least).sum()) if n is None else n)
+
+    @property
+    def free(self) -> Float:
+        """Basis (D, n) of the free directions."""
+        return self.vectors[:, : self.n]
+
+    def sigma(self, row: Float, edge_pix: float) -> float:
+        """Error of a property, `row` (D,) times the parameters; infinite where it is free.
+
+        A direction that is free though something is known of it is not quite one move of the sky:
+        properties in which it has next to no part are known in spite of it.
+        """
+        along = self.vectors.T @ row
+        unknown = self.values < ROUNDING * self.values[-1]
+        unknown[self.n :] = False
+        if np.linalg.norm(along[unknown]) > HIDDEN * np.linalg.norm(row):
+            return np.inf
+        square = along[~unknown] ** 2 / self.values[~unknown]
+        by_free = float(square[: self.n - int(unknown.sum())].sum())
+        if np.sqrt(by_free) * edge_pix > WEAK_PIX:
+            return np.inf
+        return float(np.sqrt(square.sum()))
 
 
 def _pivots(model: DistortionModel, null: Float) -> Int:
@@ -448,43 +363,18 @@ def _pivots(model: DistortionModel, null: Float) -> Int:
 
 
 def _directions(
-    model: DistortionModel,
-    theta: Float,
-    scale: Float,
-    null: Float,
-    curvature: Float,
-    open_: Float,
-    both: Float,
+    model: DistortionModel, theta: Float, scale: Float, alone: _Spectrum, fixed: _Spectrum
 ) -> tuple[NamedDirection, ...]:
-    alone, fixed = (_inverse(H, scale) for H in (curvature, both))
     half = max(max(c.size) for c in model.chips) / 2
     pixel = model.pixel_size(theta)
     out = []
     for name, row in functionals(model, theta).items():
         length = "shift" in name or "zero_point" in name
-        sigmas = []
-        for cov, free in ((alone, null), (fixed, open_)):
-            scaled = row * scale
-            hidden = np.linalg.norm(free.T @ scaled) > 1e-5 * np.linalg.norm(scaled)
-            sigmas.append(np.inf if hidden else float(np.sqrt(row @ cov @ row)))
-        out.append(
-            NamedDirection(
-                name,
-                model.unit if length else "",
-                sigmas[0],
-                sigmas[1],
-                edge_pix=1.0 / pixel if length else half,
-            )
-        )
+        edge = 1.0 / pixel if length else half
+        sigma, sigma_fixed = (one.sigma(row * scale, edge) for one in (alone, fixed))
+        unit = model.unit if length else ""
+        out.append(NamedDirection(name, unit, sigma, sigma_fixed, edge))
     return tuple(out)
-
-
-def _inverse(H: Float, scale: Float) -> Float:
-    """Pseudo-inverse (D, D), without the free directions."""
-    values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    good = values >= _least(values)
-    root = (vectors[:, good] / np.sqrt(values[good])) * scale[:, None]
-    return np.asarray(root @ root.T)
 
 
 def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ...]:

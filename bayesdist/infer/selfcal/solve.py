@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, NotSettledError
+from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.information import Information
 from bayesdist.infer.selfcal.normal import Expansion, Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem
@@ -41,6 +42,8 @@ class Solution:
         Parameters that were fitted; the others are held by the gauge.
     expansion : Expansion
     information : Information
+    decision : Decision, optional
+        What counts as free; None where only `free` was said.
     """
 
     problem: Problem
@@ -50,6 +53,7 @@ class Solution:
     free: Int
     expansion: Expansion
     information: Information
+    decision: Decision | None = None
 
     @property
     def precision(self) -> Float:

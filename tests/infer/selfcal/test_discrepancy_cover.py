@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bayesdist.diagnose.dithered import selfcal_score_tests
-from bayesdist.infer.selfcal.calibrate import gauge_of
 from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
 from bayesdist.infer.selfcal.information import Information
 from bayesdist.infer.selfcal.problem import prepared
+from bayesdist.infer.selfcal.settled import gauge_of
 from bayesdist.infer.selfcal.solve import solve
 from tests.infer.selfcal.fields import SIZE, field
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from bayesdist.infer.selfcal import pointing_information, tie
-from bayesdist.infer.selfcal.gauge import POINTS, find_gauge, functionals, moves
+from bayesdist.infer.selfcal.gauge import find_gauge
 from bayesdist.infer.selfcal.information import Information
+from bayesdist.infer.selfcal.moves import POINTS, functionals, moves
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from tests.infer.selfcal.fields import field, problem_of
 

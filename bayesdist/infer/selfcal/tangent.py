@@ -1,0 +1,121 @@
+"""Exposures on the sky: each has its own tangent plane, and frames join these as if it were flat.
+
+A camera maps the plane that touches the sky where it points.  The planes of two exposures are not
+one shifted and turned: what differs grows with the square of the position and with the offset.
+Offsets are those of the solution at hand, so that the difference is known, and detections are moved
+by it to where they would have been seen on one plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.detections import Detections
+from bayesdist.data.tangent import ARCSEC
+from bayesdist.model import DistortionModel
+
+__all__ = ["TangentPlane", "places_of"]
+
+Float = NDArray[np.float64]
+
+STEP = 0.5  # pixels, over which positions are differenced
+TURNS = 3  # of Newton's method, each of which leaves a hundredth or less
+
+
+@dataclass(frozen=True, eq=False)
+class TangentPlane:
+    """The plane on which u and v are, common to all exposures.
+
+    Parameters
+    ----------
+    unit_arcsec : float
+        Size of the unit of u and v.
+    point : tuple of float, optional
+        Where it touches the sky, in u and v; the origin of the frames by default.
+    """
+
+    unit_arcsec: float
+    point: tuple[float, float] | None = None
+
+    def displacements(self, model: DistortionModel, theta: Float, flat: Float, e: int) -> Float:
+        """What takes positions of an exposure to this plane.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        theta : ndarray, shape (D,)
+        flat : ndarray, shape (N, 2)
+            Where the frame of the exposure has them: exact at the origin of the frames, which is
+            where the exposure's own plane touches the sky.
+        e : int
+            Code of the exposure.
+
+        Returns
+        -------
+        ndarray, shape (N, 2)
+        """
+        radian = ARCSEC / self.unit_arcsec
+        o = np.asarray(model.origin)
+        touches = o + model.frame(theta, e)[1]
+        p = (touches - (o if self.point is None else np.asarray(self.point))) / radian
+        q = (flat - touches) / radian
+        c = 1.0 / np.sqrt(1.0 + p @ p)
+        s = c * p
+        # the rotation that takes the one point of contact to the other, and turns nothing else
+        along = (q @ s)[:, None]
+        exact = (q - s * along / (1.0 + c) + s) / (c - along)
+        return np.asarray(radian * (exact - p - q))
+
+    def onto_it(self, model: DistortionModel, detections: Detections, theta: Float) -> Detections:
+        """Detections where they would have been seen, were all exposures' planes this one.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        detections : Detections
+            As they were seen.
+        theta : ndarray, shape (D,)
+            A solution: offsets and distortion.
+
+        Returns
+        -------
+        Detections
+            At the pixels that the frames alone take to the position on this plane.
+        """
+        flat = places_of(model, detections, theta)
+        moved = np.empty_like(flat)
+        for e in range(len(detections.exposure_names)):
+            here = detections.exposure == e
+            moved[here] = self.displacements(model, theta, flat[here], e)
+        aim, out = flat + moved, detections
+        right = places_of(model, replace(detections, x=detections.x + STEP), theta)
+        up = places_of(model, replace(detections, y=detections.y + STEP), theta)
+        back = np.linalg.inv(np.stack([right - flat, up - flat], axis=2) / STEP)
+        for _ in range(TURNS):
+            step = np.einsum("nab,nb->na", back, aim - places_of(model, out, theta))
+            out = replace(out, x=out.x + step[:, 0], y=out.y + step[:, 1])
+        return out
+
+
+def places_of(
+    model: DistortionModel, detections: Detections, theta: Float, dilation: Float | None = None
+) -> Float:
+    """Where on the sky the model has each detection, (N, 2)."""
+    when = None
+    if model.time is not None and detections.epoch is not None:
+        when = detections.epoch[detections.exposure]
+    out = model.predict(
+        theta,
+        detections.x,
+        detections.y,
+        exposure=detections.exposure,
+        chip=detections.chip,
+        epoch=when,
+    )
+    if dilation is None:
+        return out
+    o = np.asarray(model.origin)
+    return np.asarray(o + (out - o) * dilation[detections.exposure, None])
