@@ -36,8 +36,8 @@ def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
     if session.tangent_plane is None:
         yield "sky          taken as flat: detector.scale_mas, the size of a pixel, is not given"
     else:
-        moved = number(summary["tangent_planes_pix"])
-        yield f"sky          tangent planes taken to one: detections move by up to {moved} pix"
+        moved = summary["tangent_planes_pix"]
+        yield f"sky          tangent planes taken to one: detections move by up to {moved:.2g} pix"
     error = float(np.sqrt(np.median(s.problem.var) + s.mixture.jitter**2))
     yield f"errors       {number(error)} pix at the median, {number(s.mixture.fraction)} false"
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"

@@ -11,6 +11,7 @@ is left are the parameters of a `DistortionModel`.
     settled     the mode, and what counts as free there: one decision
     information what is known beside them: commanded offsets, ties, priors
     references  stars whose places are known
+    tangent     the exposures' tangent planes, taken to one
     start       where the search begins
     calibrate   grouping and solving in turn
     errors      of detections, by magnitude
@@ -27,6 +28,7 @@ from bayesdist.infer.selfcal.references import ReferenceStars
 from bayesdist.infer.selfcal.relative import gauge_free
 from bayesdist.infer.selfcal.sampling import sample_selfcal
 from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.selfcal.tangent import TangentPlane
 
 __all__ = [
     "Gauge",
@@ -36,6 +38,7 @@ __all__ = [
     "SelfCalibration",
     "Solution",
     "StarCatalogue",
+    "TangentPlane",
     "gauge_free",
     "pointing_information",
     "sample_selfcal",

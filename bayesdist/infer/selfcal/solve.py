@@ -64,8 +64,13 @@ class Solution:
     @property
     def cov(self) -> Float:
         """Covariance (D, D); zero for what is held."""
+        precision = self.precision
+        scale = 1.0 / np.sqrt(np.diag(precision))
+        # a square of roots stays positive where a nearly free direction dwarfs all others
+        factor = np.linalg.cholesky(precision * np.outer(scale, scale))
+        root = np.linalg.inv(factor).T * scale[:, None]
         out = np.zeros((len(self.theta),) * 2)
-        out[np.ix_(self.free, self.free)] = np.linalg.inv(self.precision)
+        out[np.ix_(self.free, self.free)] = root @ root.T
         return out
 
 

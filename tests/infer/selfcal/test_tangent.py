@@ -12,6 +12,7 @@ from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
 from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import Chip, DistortionModel
+from tests.infer.selfcal.fields import field
 from tests.infer.selfcal.wide import (
     ARCSEC,
     DEC,
@@ -112,3 +113,18 @@ def test_a_wide_field():
     low, high = stats.chi2.ppf([0.001, 0.999], dof)
     assert low < total < high
     assert min(p_values) > 0.001 / 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [{}, {"rolls": (0, 0, 0)}], ids=["rolls", "one roll"])
+def test_noise_does_not_go_with_where_exposures_point(more):
+    """p-values of small fields, on a sky that is flat, are those of chance."""
+    p_values = []
+    for seed in range(25):
+        simulated = field(500 + seed, 8, 900, disturbed=0.025, spurious=0.025, **more)
+        given = {"match_radius": 1.0, "start_radius": 2.0}
+        found = self_calibrate(simulated.model, simulated.unlabelled, simulated.theta, **given)
+        p_values.append(_pointing_test(found).p_value)
+    for level in (0.01, 0.1, 0.5):
+        low, high = stats.binom.ppf([0.001, 0.999], len(p_values), level)
+        assert low <= np.sum(np.array(p_values) < level) <= high
