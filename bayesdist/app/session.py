@@ -269,7 +269,7 @@ class Session:
             solution, _, errors = fit_by_magnitude(self.raw_matches, self.model, **options)
             return solution, errors
         solution = fit_linear(self.shards, self.model, **options)
-        factor = error_scale(solution, fit.clip_chi2)
+        factor = error_scale(solution, self._sample)
         if factor == 1.0:
             return solution, None
         self.error_scale *= factor

@@ -6,27 +6,38 @@ single stars would be lost beside it, so all of them are multiplied by what the 
 
 from __future__ import annotations
 
+import numpy as np
+from scipy.stats import chi2
+
+from bayesdist.data import MatchTable
 from bayesdist.infer import LinearFit
+from bayesdist.infer.stars import prepare
 
 __all__ = ["error_scale", "error_scale_sentence"]
 
+FEW = 0.1  # of the matches
 FAR = 20.0  # times the quoted errors, beyond which jitter would be nearly all there is
 
 
-def error_scale(fit: LinearFit, clip_chi2: float) -> float:
-    """Factor on all errors that makes the median residual what they say; 1 where it is not large.
+def error_scale(fit: LinearFit, table: MatchTable) -> float:
+    """Factor on all errors that makes small residuals what they say; 1 where it is not large.
+
+    A low quantile of chi-square is compared with its expectation: most matches may be false.
 
     Parameters
     ----------
     fit : LinearFit
-    clip_chi2 : float
-        That it was made with: `fit.clip` holds it times the median chi-square over its expectation.
+    table : MatchTable
+        The matches, or some of them.
 
     Returns
     -------
     float
     """
-    factor = float((fit.clip.chi2_limit / clip_chi2) ** 0.5)
+    stars, _ = prepare(fit.model, table)
+    r = stars.residuals(np.asarray(fit.mean))
+    found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, FEW)
+    factor = float(np.sqrt(found / chi2.ppf(FEW, 2)))
     return factor if factor > FAR else 1.0
 
 

@@ -53,13 +53,16 @@ def test_intervals_cover_or_verdicts_are_withheld(results, full):
     """Of one or two truths of a kind only the mean over all of them says something."""
     if full:
         assert [row.kind for row in rows_of(results) if not row.honest] == []
-    every = row_of("all", results)
+    # what is left of single truths: all that is not withheld for the right reason
+    claimed = [one for one in results if row_of(one["kind"], [one]).excused < 1.0]
+    every = row_of("all", claimed)
     assert every.within_68 > 0.55 and every.within_95 > 0.85
 
 
 def test_inside_the_family_verdicts_are_given(results, full):
     inside = [one for one in results if KINDS[one["kind"]].inside]
     row = row_of("inside_1500", inside)
-    assert row.decides
-    assert row.of_right_width or not full
+    assert row.met > 0
+    if full:
+        assert row.decides and row.of_right_width
     assert all(not one["warnings"] for one in inside) or full

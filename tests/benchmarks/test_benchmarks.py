@@ -38,8 +38,11 @@ def _points(problem, n: int = 6) -> np.ndarray:
 def test_numpy_density_is_the_library_s_but_for_a_constant(order):
     problem = simulated(700, order)
     points = _points(problem)
-    apart = np.array([PlainDensity(problem)(p) for p in points]) - problem.log_density(points)
-    np.testing.assert_allclose(apart, apart[0], rtol=0, atol=1e-7)
+    density = problem.log_density(points)
+    apart = np.array([PlainDensity(problem)(p) for p in points]) - density
+    # far from the mode residuals are hundreds of errors, and rounding of a position counts
+    room = 1e-7 + 1e-9 * (density.max() - density)
+    assert (np.abs(apart - apart[0]) < room).all(), apart
 
 
 def test_jax_density_is_the_library_s_but_for_a_constant():
