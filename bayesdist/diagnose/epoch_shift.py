@@ -36,9 +36,8 @@ FARTHEST = 60.0  # years that are scanned
 STEPS = 481  # of the scan, a quarter of a year each
 SIGNIFICANT = 5.0  # standard errors
 ROUNDS = 30
-WELL_KNOWN = (
-    0.2  # error of a motion over the scatter of motions, at most: larger ones are often too small
-)
+# error of a motion over the scatter of motions, at most: larger ones are often quoted too small
+WELL_KNOWN = 0.2
 BIWEIGHT = 4.685  # robust standard deviations, beyond which a star has no weight (Tukey)
 NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 

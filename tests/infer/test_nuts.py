@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 from numpy.polynomial.legendre import legvander2d
@@ -12,6 +10,7 @@ from bayesdist.data import match_table, read_matches, read_matchup
 from bayesdist.infer import OutlierMixture, build_model, fit_by_magnitude, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
+from tests.infer.by_nuts import nuts_draws
 
 pytestmark = pytest.mark.slow
 numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
@@ -68,19 +67,7 @@ def _nuts(matches, fit, draws: int, seed: int):
         "logit_f": -3.0,
         "log_s": np.log(10 * scale),
     }
-    kernel = numpyro.infer.NUTS(density, init_strategy=numpyro.infer.init_to_value(values=start))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        mcmc = numpyro.infer.MCMC(
-            kernel,
-            num_warmup=800,
-            num_samples=draws,
-            num_chains=4,
-            chain_method="vectorized",
-            progress_bar=False,
-        )
-        mcmc.run(jax.random.PRNGKey(seed))
-    got = mcmc.get_samples()
+    got = nuts_draws(density, start, draws, seed)
     return np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"], got["log_s_out"]])
 
 

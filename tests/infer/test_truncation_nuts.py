@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 from numpy.polynomial.legendre import leggauss, legvander2d
 
 from bayesdist.infer import OutlierMixture, fit_linear, sample
+from tests.infer.by_nuts import nuts_draws
 
 from .selected import SIDE, selected
 
@@ -76,19 +75,7 @@ def _nuts(matches, fit, start, radius: float, draws: int, seed: int):
         "logit_f": -3.0,
         "log_s": np.log(5 * scale),
     }
-    kernel = numpyro.infer.NUTS(density, init_strategy=numpyro.infer.init_to_value(values=first))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        mcmc = numpyro.infer.MCMC(
-            kernel,
-            num_warmup=800,
-            num_samples=draws,
-            num_chains=4,
-            chain_method="vectorized",
-            progress_bar=False,
-        )
-        mcmc.run(jax.random.PRNGKey(seed))
-    got = mcmc.get_samples()
+    got = nuts_draws(density, first, draws, seed)
     return np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"], got["log_s_out"]])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 
 import arviz
@@ -15,6 +14,7 @@ from bayesdist.infer.discrepancy import DiscrepancyPriors
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.linear import DeviationColumns, deviation_draws
 from bayesdist.infer.discrepancy.structure import LENGTHS, chip_structure
+from tests.infer.by_nuts import nuts_draws
 
 pytestmark = pytest.mark.slow
 numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
@@ -29,26 +29,9 @@ def polynomials(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
 
 
 def nuts(density: Callable[[], None], start: dict[str, object], draws: int, seed: int):
-    """Draws of what the density samples and names."""
-    import jax
-
-    kernel = numpyro.infer.NUTS(
-        density,
-        init_strategy=numpyro.infer.init_to_value(values=start),
-        target_accept_prob=0.9,
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        mcmc = numpyro.infer.MCMC(
-            kernel,
-            num_warmup=1000,
-            num_samples=draws,
-            num_chains=4,
-            chain_method="vectorized",
-            progress_bar=False,
-        )
-        mcmc.run(jax.random.PRNGKey(seed))
-    return {k: np.asarray(v) for k, v in mcmc.get_samples(group_by_chain=True).items()}
+    """Draws (4, n, ...) of what the density samples and names."""
+    settings = {"warmup": 1000, "target_accept": 0.9, "by_chain": True}
+    return nuts_draws(density, start, draws, seed, **settings)
 
 
 def agree(ours: np.ndarray, theirs: np.ndarray, what: str, capsys) -> None:
