@@ -69,6 +69,28 @@ class Draws:
     drift: Float
     outlier_probability: Float
 
+    def state(self, draws: slice) -> State:
+        """Some draws, of all chains one after another, as if chains stood there.
+
+        Memberships are not kept.
+        """
+
+        def some(values: Float) -> Float:
+            return values.reshape(self.fraction.size, *values.shape[2:])[draws]
+
+        fraction = some(self.fraction)
+        nothing = np.zeros((len(fraction), 0))
+        return State(
+            b=some(self.b),
+            sigma=np.moveaxis(some(self.sigma), 0, -1),
+            off=nothing.astype(bool),
+            probability=nothing,
+            fraction=fraction,
+            kappa2=some(self.kappa2),
+            breaks=some(self.breaks),
+            drift=some(self.drift),
+        )
+
     def judged(self, problem: Problem, limits: Limits) -> Convergence:
         """Convergence of everything that is reported."""
         n_chains, n_steps = self.fraction.shape

@@ -9,7 +9,7 @@ give it away, and an irregular drift would pass for a line.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.table import Table
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
 from bayesdist.errors import InputError
+from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.course import KINDS, Course
+from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.fit import fit_series
 from bayesdist.infer.series.heldout import LOTS, HeldOut, block_folds, exposure_folds, held_out
 from bayesdist.infer.series.posterior import SeriesPosterior
+from bayesdist.infer.series.problem import WIDE, Problem, normal_equations
 from bayesdist.infer.series.series import Series
+from bayesdist.infer.series.small import cholesky, precision_of
 
 __all__ = ["Comparison", "compare", "serial_correlation"]
 
@@ -149,9 +153,10 @@ def compare(
     Returns
     -------
     Comparison
+        Without courses whose one break, at whichever date, gains less likelihood from the very
+        exposures that it is fitted to than held-out ones would have to show.
     """
-    courses = _completed(candidates)
-    posteriors = tuple(fit_series(series, c, seed=seed) for c in courses)
+    courses, posteriors = _fitted(series, _completed(candidates), seed)
     found = [serial_correlation(p) for p in posteriors if p.course.kind not in ("spline", "wander")]
     correlation = min(found, key=abs)
     breaks = tuple(sorted({b for c in courses for b in c.breaks}))
@@ -177,6 +182,54 @@ def compare(
             )
     scores = tuple(held_out(p, fold, seed=seed) for p in posteriors)
     return Comparison(courses, posteriors, scores, scheme, correlation)
+
+
+def _fitted(
+    series: Series, candidates: tuple[Course, ...], seed: int
+) -> tuple[tuple[Course, ...], tuple[SeriesPosterior, ...]]:
+    """Courses, and the posterior of each, but for breaks that cannot be carried."""
+    fitted = {c: fit_series(series, c, seed=seed) for c in candidates if c.find != 1}
+    # no course of these, carried or not, can be beaten by a break that gains less over each
+    plain = [p for c, p in fitted.items() if not (c.n_breaks or c.drifts)]
+    for course in candidates:
+        if course.find == 1 and max(_gain(course, p) for p in plain) >= LEAST_DIFFERENCE:
+            fitted[course] = fit_series(series, course, seed=seed)
+    courses = tuple(c for c in candidates if c in fitted)
+    return courses, tuple(fitted[c] for c in courses)
+
+
+def _gain(course: Course, plain: SeriesPosterior) -> float:
+    """Log likelihood that a break gains over a course without one, at the best date of all.
+
+    With the scatter about the course without a break, or as much less as the chi-square is less,
+    and exposures that lie off it counted little or in full, whichever gains most.
+    """
+    problem = plain.engine.problem
+    design = Design(course, problem.series)
+    moves = BreakMoves(design)
+    dates = (moves.dates[:-1] + moves.width / 2)[:, None]
+    broken = replace(problem, design=design).columns(dates[moves.possible(dates)])
+    sigma = plain.raw.sigma.mean(axis=(0, 1))[..., None]
+    precision = precision_of(cholesky(problem.formal + sigma))[:, :, None]
+    lies_off = plain.outlier_probability
+    gains = []
+    for off in (np.zeros(len(lies_off)), lies_off):
+        weight = precision / (1 - off + off * plain.raw.kappa2.mean())
+        total = np.einsum("ie,ijce,je->", problem.y, weight, problem.y)
+        none, best = (
+            total - _explained(problem, weight, columns).max()
+            for columns in (problem.columns(plain.raw.breaks[:1, 0]), broken)
+        )
+        freedom = problem.y.size
+        gains += [0.5 * (none - best), 0.5 * freedom * np.log(none / best)]
+    return float(max(gains))
+
+
+def _explained(problem: Problem, precision: Float, columns: Float) -> Float:
+    """Part of the chi-square that columns (M, E, p) explain, each with its best parameters."""
+    matrix, right = normal_equations(precision, problem.y, columns[None])
+    matrix = matrix + WIDE**-2 * np.eye(matrix.shape[-1])
+    return (right * np.linalg.solve(matrix, right[..., None])[..., 0]).sum(axis=-1)[0]
 
 
 def _completed(candidates: Sequence[Course]) -> tuple[Course, ...]:

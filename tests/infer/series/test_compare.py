@@ -15,8 +15,10 @@ from bayesdist.infer.series import (
     describe,
     exposure_folds,
     fit_series,
+    heldout,
     serial_correlation,
 )
+from bayesdist.infer.series.heldout import held_out
 from tests.infer.calibration import over_seeds
 
 from .campaign import BREAK, campaign, drifting
@@ -175,3 +177,30 @@ def test_a_break_in_a_random_walk_is_not_believed():
         values += 0.3 * rng.standard_normal((41, 2))
         series = Series.of(epoch, values, 0.1, coefficients=("a", "b"))
         assert "break" not in describe(series, broken).claim
+
+
+@pytest.mark.parametrize("kind", ["line", "wander"])
+def test_weighted_draws_predict_as_refits_do(kind, monkeypatch):
+    series = white(6, slope=0.1)
+    posterior = fit_series(series, Course(kind))
+    fold = exposure_folds(series.epoch)
+    weighted = held_out(posterior, fold)
+    monkeypatch.setattr(heldout, "WORST_PARETO_K", -np.inf)
+    refitted = held_out(posterior, fold)
+    error = np.hypot(weighted.mc_error, refitted.mc_error)
+    assert error < 1.0
+    assert abs(weighted.total - refitted.total) < 4 * error
+    assert abs(weighted.rank - refitted.rank).max() < 0.1
+
+
+def test_breaks_without_gain_are_not_fitted():
+    def tried(step: float) -> set[str]:
+        rng = np.random.default_rng(51)
+        epoch = np.sort(rng.uniform(2002, 2014, 80))
+        values = rng.standard_normal(80) + step * (epoch > 2008)
+        series = Series.of(epoch, values, 0.1, coefficients=("a",))
+        comparison = compare(series, (Course("line"), Course("step", find=1)))
+        return {c.kind for c in comparison.courses}
+
+    assert tried(0.0) == {"constant", "line"}
+    assert tried(2.0) == {"constant", "line", "step"}
