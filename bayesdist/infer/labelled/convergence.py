@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Convergence", "Limits", "diagnose", "importance_efficiency", "pareto_k"]
+__all__ = [
+    "Convergence",
+    "Limits",
+    "diagnose",
+    "importance_efficiency",
+    "pareto_k",
+    "smoothed_weights",
+]
 
 Float = NDArray[np.float64]
 
@@ -240,3 +247,24 @@ def pareto_k(log_weights: Float) -> float:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return float(az.psislw(finite.copy())[1])
+
+
+def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, float]:
+    """Importance weights whose tail is that of a Pareto distribution, and the shape of that tail.
+
+    Parameters
+    ----------
+    log_weights : ndarray, shape (n,)
+    independent : float
+        Effective share of the draws.
+
+    Returns
+    -------
+    weights : ndarray, shape (n,)
+        Of sum 1.
+    k : float
+        Above 0.7 they cannot be trusted.
+    """
+    with np.errstate(over="ignore"):  # inside arviz, of draws whose weight is nothing
+        smoothed, k = _arviz().psislw(log_weights, reff=independent)
+    return np.exp(smoothed), float(k)

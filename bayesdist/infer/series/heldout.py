@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from arviz import psislw
 from numpy.typing import NDArray
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
+from bayesdist.infer.labelled.convergence import smoothed_weights
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
 from bayesdist.infer.series.small import cholesky, solve_factor
@@ -130,12 +130,10 @@ def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut
     refitted = []
     for code in np.unique(fold):
         rows = fold == code
-        with np.errstate(over="ignore"):  # inside arviz, of draws whose weight is nothing
-            log_weight, pareto_k = psislw(-density[:, rows].sum(axis=1), reff=independent)
+        weight, pareto_k = smoothed_weights(-density[:, rows].sum(axis=1), independent)
         if pareto_k > WORST_PARETO_K:
             refitted.append(code)
             continue
-        weight = np.exp(log_weight)
         top = density[:, rows].max(axis=0)
         each = np.exp(density[:, rows] - top)
         mean = weight @ each
