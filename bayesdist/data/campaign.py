@@ -338,7 +338,7 @@ def _matched(
     if len(errors) == 1:
         raise first
     cause = f"{first.cause}, and the mirror image does not match either"
-    raise InputError(cause, where=first.where, do=first.do)
+    raise InputError(cause, where=first.where, do=first.do.replace(", the parity and", " and"))
 
 
 def _started(start: Start, stars: StarList, epoch: float) -> Float:

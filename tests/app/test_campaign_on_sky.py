@@ -307,6 +307,7 @@ def test_another_field_is_refused_in_both_parities(tmp_path):
     result = cli("match", folder, "-q")
     assert result.code == 1
     one_sentence(result.err, "does not match", "the mirror image does not match either")
+    assert "parity" not in result.err  # both were tried
 
 
 def vizier(table):
