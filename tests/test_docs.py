@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import re
@@ -166,6 +167,53 @@ def test_every_key_of_the_configuration_is_documented_and_no_other():
     configured = _configured(Config)
     assert configured - keys - words == set()
     assert {(s, k) for s, k in keys if s} - configured == set()
+
+
+SECTIONS = "|".join(
+    sorted(k for k in Config.model_fields if _models(Config.model_fields[k].annotation))
+)
+KEY = re.compile(
+    rf"(?<![\w./\]])({SECTIONS})\.([a-z_0-9]+(?:\.[a-z_0-9]+)*)(?: = '(\w+)')?(?![\w(])"
+)
+
+
+def _advice():
+    """Texts of errors that say what to do: of every `do=` and every ValueError."""
+    for path in sorted(Path(bd.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call):
+                continue
+            said = [k.value for k in node.keywords if k.arg == "do"]
+            if getattr(node.func, "id", "") == "ValueError":
+                said += node.args
+            for one in said:
+                texts = [c.value for c in ast.walk(one) if isinstance(c, ast.Constant)]
+                yield path.name, " ".join(t for t in texts if isinstance(t, str))
+
+
+def test_keys_that_errors_advise_exist():
+    """And the values that they advise are among those that the key may have."""
+    configured = {f"{section}.{key}" for section, key in _configured(Config)}
+    found = 0
+    for name, text in _advice():
+        for section, key, value in KEY.findall(text):
+            assert f"{section}.{key}" in configured, f"{name}: {text}"
+            found += 1
+            if value:
+                kind = Config
+                for part in (section, *key.split(".")):
+                    annotation = kind.model_fields[part].annotation
+                    kind = next(iter(_models(annotation)), kind)
+                assert value in _values(annotation), f"{name}: {text}"
+    assert found > 20
+
+
+def _values(annotation: object) -> set[object]:
+    """Words that a key may have."""
+    parts = typing.get_args(annotation)
+    if typing.get_origin(annotation) is typing.Literal:
+        return set(parts)
+    return {value for part in parts for value in _values(part)}
 
 
 def _commands(parser: argparse.ArgumentParser, path: str = "bayesdist"):

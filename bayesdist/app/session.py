@@ -47,7 +47,7 @@ from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.data.holdout import Split
 from bayesdist.diagnose import ScoreTest, score_tests
 from bayesdist.diagnose.epoch_shift import EpochShift, epoch_shift
-from bayesdist.errors import ConfigError
+from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -62,6 +62,7 @@ from bayesdist.infer import (
     load_posterior,
 )
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
+from bayesdist.infer.frame_choice import FrameChoice, frames_that_help
 from bayesdist.model import DistortionModel
 
 Float = NDArray[np.float64]
@@ -256,7 +257,29 @@ class Session:
 
     @cached_property
     def linear(self) -> tuple[LinearFit, MagnitudeErrors | None]:
-        """The linear fit that the configuration asks for, made now; nothing is written."""
+        """The linear fit that the configuration asks for, made now; nothing is written.
+
+        Raises
+        ------
+        InputError
+            Where it cannot be made; with the frames of the exposures that would help.
+        """
+        try:
+            return self._linear()
+        except (DegenerateError, NotSettledError) as error:
+            if self.better_frames is None:
+                raise
+            do = self.better_frames.sentence
+            raise type(error)(error.cause, where=error.where, do=do) from error
+
+    @cached_property
+    def better_frames(self) -> FrameChoice | None:
+        """Frames with which matches of several exposures scatter far less; None where none do."""
+        if self.config.data is None:
+            return None
+        return frames_that_help(self.raw_matches.sample(SAMPLE), self.model)
+
+    def _linear(self) -> tuple[LinearFit, MagnitudeErrors | None]:
         fit = self.config.fit
         options: dict[str, Any] = {
             "clip_chi2": fit.clip_chi2,

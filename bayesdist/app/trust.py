@@ -9,7 +9,7 @@ from bayesdist.assess.units import pixel_doubt
 from bayesdist.assess.verdict import scatter_too_small
 from bayesdist.errors import InputError
 
-__all__ = ["labelled", "posterior_warnings", "trust", "warnings_of"]
+__all__ = ["frames_doubt", "labelled", "posterior_warnings", "trust", "warnings_of"]
 
 MOST_CHI2 = 1.5
 
@@ -24,6 +24,8 @@ def warnings_of(session: Session) -> list[str]:
         out.append(session.epoch_shift.sentence)
     if session.majority:
         out.append(session.majority)
+    if text := frames_doubt(session):
+        out.append(text)
     if session.misfit.significant:
         found = session.discrepancy
         held = None if found is None else found.structure_rms
@@ -63,6 +65,18 @@ def warnings_of(session: Session) -> list[str]:
             "small, which the jitter takes up, or the model does not fit"
         )
     return [text[0].upper() + text[1:] for text in out]
+
+
+def frames_doubt(session: Session) -> str:
+    """Frames of the exposures that would make residuals far smaller; empty where none would.
+
+    Asked where the residuals are larger than their errors.
+    """
+    fit = session.fit
+    large = session.majority or session.error_scale != 1.0 or fit.chi2 > MOST_CHI2 * fit.dof
+    if not large or session.better_frames is None:
+        return ""
+    return f"the exposures lie differently: {session.better_frames.sentence}"
 
 
 def trust(session: Session) -> dict[str, bool]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -126,11 +127,14 @@ class CampaignMatches:
         In the order of the lists.
     left_out : dict of str to str
         Exposures that did not match, and why.
+    mirrored : bool
+        Whether u has the sign that is opposite to the catalogue's.
     """
 
     table: MatchTable
     reports: tuple[ExposureReport, ...]
     left_out: Mapping[str, str] = field(default_factory=dict)
+    mirrored: bool = False
 
     def summary(self) -> Table:
         """The reports as a table, a row for each exposure; chips and reasons are columns."""
@@ -168,6 +172,7 @@ def match_campaign(
     radius: float | None = None,
     hint_rotation: float | Mapping[str, float] | None = None,
     scale: tuple[float, float] = (0.97, 1.03),
+    mirrored: Sequence[bool] = (False,),
     need_all_chips: bool = False,
     skip: bool = False,
 ) -> CampaignMatches:
@@ -180,7 +185,8 @@ def match_campaign(
     log : ExposureLog
         With their epochs and filters.
     catalog : ReferenceCatalog
-        Brought to the epoch of each exposure.  Its positions stay relative to its own origin.
+        Brought to the epoch of each exposure, where its parallaxes displace it, too.  Its positions
+        stay relative to its own origin.
     start : callable
         Known distortion: ``start(x, y, chip, epoch) -> (N, 2)`` from raw pixels and chip numbers to
         a plane in the catalogue's unit, any rotation and origin; all chips on one plane.
@@ -196,6 +202,11 @@ def match_campaign(
         their patterns.
     scale : tuple of float, optional
         Smallest and largest scale from the start's plane to the catalogue.
+    mirrored : sequence of bool, optional
+        Whether the catalogue is taken with the sign of u changed; of several, those that follow are
+        tried where the first matches no exposure.  East of a sky with north up is to the left: a
+        detector that is read out as the sky is seen has the parity that is opposite to (u, v) of a
+        tangent plane.
     need_all_chips : bool, optional
         Whether an exposure without detections on a chip that others have is an error.
     skip : bool, optional
@@ -219,8 +230,7 @@ def match_campaign(
     passed = [cuts.passed(one) for one in lists]
     chips = sorted({chip for one in lists for chip in one.chips})
     mean_epoch = float(np.mean([log[one.exposure].epoch for one in lists]))
-    index = _index(catalog, mean_epoch)
-    then: dict[float, ReferenceCatalog] = {}
+    views = [_View(catalog, one, mean_epoch) for one in mirrored]
     found: list[ExposureMatch] = []
     reports: list[ExposureReport] = []
     failed: dict[str, InputError] = {}
@@ -234,49 +244,101 @@ def match_campaign(
                 do="leave the exposure out or do not ask for all chips",
             )
         epoch = log[one.exposure].epoch
-        if epoch not in then:
-            then = {epoch: catalog.at(epoch) if catalog.pm_u is not None else catalog}
         hint = hint_rotation
-        if isinstance(hint_rotation, Mapping):
-            hint = hint_rotation.get(one.exposure)
+        if isinstance(hint, Mapping):
+            hint = hint.get(one.exposure)
         plane = _started(start, one, epoch)
         try:
             if not good.any():
                 raise all_cut(one, rejected, where)
-            match = match_exposure(
-                one,
-                good,
-                plane,
-                then[epoch],
-                index,
-                radius=radius,
-                hint=hint,  # type: ignore[arg-type]
-                scale=scale,
-                source=where,
+            match, view = _matched(
+                one, good, plane, views, epoch, radius=radius, hint=hint, scale=scale, where=where
             )
+            views = [view]
         except InputError as error:
             reason = ""
             if good.any() and not found and not failed:
-                reason = mismatch_reason(plane, one.mag, index)
+                reason = mismatch_reason(plane, one.mag, views[0].index)
             failed[one.exposure] = error
             if reason or not skip or too_many(len(failed), len(found), len(lists)):
-                raise failure(failed, reason, len(lists)) from error
+                raise failure(failed, reason, len(lists), mirrored) from error
             continue
         found.append(match)
         reports.append(_report(one, good, log, match, rejected, tuple(chips), missing))
     refuse_astray(reports, catalog)
     kept = [one for one in lists if one.exposure not in failed]
-    table = _table(kept, log, catalog, found, reports)
+    shown = catalog.mirrored() if views[0].mirrored else catalog
+    table = _table(kept, log, shown, found, reports)
     if failed:
         n = sum(len(one) for one in lists) - table.n_rows
         table = replace(table, n_rows=table.n_rows + n, rejected={**table.rejected, _LEFT_OUT: n})
-    return CampaignMatches(table, tuple(reports), {k: e.cause for k, e in failed.items()})
+    left_out = {k: e.cause for k, e in failed.items()}
+    return CampaignMatches(table, tuple(reports), left_out, views[0].mirrored)
 
 
-def _index(catalog: ReferenceCatalog, epoch: float) -> PatternIndex:
-    """Patterns at the mean epoch: motions over some years do not change the shapes of triangles."""
-    mean = catalog.at(epoch) if catalog.pm_u is not None else catalog
-    return pattern_index(np.column_stack([mean.u, mean.v]), mean.mag)
+class _View:
+    """A catalogue in one of its parities, at any epoch."""
+
+    def __init__(self, catalog: ReferenceCatalog, mirrored: bool, mean_epoch: float) -> None:
+        self.mirrored = mirrored
+        self._catalog, self._mean_epoch = catalog, mean_epoch
+        self._last: tuple[float, ReferenceCatalog] | None = None
+
+    def at(self, epoch: float) -> ReferenceCatalog:
+        """As it is seen at an epoch."""
+        if self._last is None or self._last[0] != epoch:
+            then = self._catalog if self._catalog.pm_u is None else self._catalog.as_seen(epoch)
+            self._last = epoch, then.mirrored() if self.mirrored else then
+        return self._last[1]
+
+    @cached_property
+    def index(self) -> PatternIndex:
+        """Patterns at the mean epoch: motions of some years do not change shapes of triangles."""
+        mean = self.at(self._mean_epoch)
+        return pattern_index(np.column_stack([mean.u, mean.v]), mean.mag)
+
+
+def _matched(
+    stars: StarList,
+    good: NDArray[np.bool_],
+    plane: Float,
+    views: Sequence[_View],
+    epoch: float,
+    *,
+    radius: float | None,
+    hint: float | None,
+    scale: tuple[float, float],
+    where: str,
+) -> tuple[ExposureMatch, _View]:
+    """The match with the first of these views that gives one.
+
+    Raises
+    ------
+    InputError
+        That of the first view.
+    """
+    errors = []
+    for view in views:
+        try:
+            found = match_exposure(
+                stars,
+                good,
+                plane,
+                view.at(epoch),
+                view.index,
+                radius=radius,
+                hint=hint,
+                scale=scale,
+                source=where,
+            )
+            return found, view
+        except InputError as error:
+            errors.append(error)
+    first = errors[0]
+    if len(errors) == 1:
+        raise first
+    cause = f"{first.cause}, and the mirror image does not match either"
+    raise InputError(cause, where=first.where, do=first.do.replace(", the parity and", " and"))
 
 
 def _started(start: Start, stars: StarList, epoch: float) -> Float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposure_log import ExposureLog
+from bayesdist.data.mismatch import MIRRORED
 from bayesdist.data.starlists import StarList
 from bayesdist.errors import InputError
 
@@ -81,13 +82,29 @@ def too_many(failed: int, matched: int, n: int) -> bool:
     return failed > _MOST_LEFT_OUT * n or (not matched and failed >= _AT_FIRST)
 
 
-def failure(failed: Mapping[str, InputError], reason: str, n: int) -> InputError:
-    """The first failure, with what is known of the others."""
+def failure(
+    failed: Mapping[str, InputError], reason: str, n: int, tried: Sequence[bool] = (False,)
+) -> InputError:
+    """The first failure, with what is known of the others.
+
+    Parameters
+    ----------
+    failed : mapping of str to InputError
+        By exposure.
+    reason : str
+        As `mismatch_reason`.
+    n : int
+        Exposures.
+    tried : sequence of bool
+        Whether the catalogue was taken mirrored.
+    """
     first = next(iter(failed.values()))
     cause, do = first.cause, first.do
     if reason:
         cause = f"{cause} ({reason})"
         do = "correct the catalogue's unit or axes, the columns x and y, or the known distortion"
+        if MIRRORED in reason and len(tried) == 1:
+            do += f", or set campaign.parity = '{'direct' if tried[0] else 'mirrored'}'"
     elif len(failed) > 1:
         cause += f", and {len(failed) - 1} more of {n} exposures fail likewise"
     return InputError(cause, where=first.where, do=do)

@@ -11,13 +11,18 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import position_unit
+from bayesdist.data.columns import is_on_sky, plane_unit, position_unit
+from bayesdist.data.from_table import with_sky_columns
+from bayesdist.data.missing import without_missing
 from bayesdist.data.naming import find_columns
+from bayesdist.data.parallax import parallax_factors
+from bayesdist.data.quantities import Quantities
+from bayesdist.data.sky import sky_columns
 from bayesdist.data.tables import read_table
 from bayesdist.data.tangent import mean_direction, tangent_jacobian, tangent_plane
 from bayesdist.data.units import check_unit, conversion
-from bayesdist.data.usual_names import known_unit
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.usual_names import ALIASES
+from bayesdist.data.values import SourceColumn, row_number
 from bayesdist.errors import InputError
 
 __all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]
@@ -26,6 +31,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
+_PARALLAX = ("parallax", "sigma_parallax")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +54,16 @@ class ReferenceCatalog:
     unit : str
         'pix', 'arcsec', 'mas' or 'deg'.
     tangent_point : tuple of float, optional
-        RA and Dec in degrees of the plane that u, v lie on.
+        RA and Dec in degrees of the plane that u, v lie on: u grows to the east, v to the north.
     source : str
         File.
     star : ndarray of int, optional
         Code of each star, 0 or more, by which it is known in tables of matches; by default the row,
         from 0.  It stays with the star in every selection.
+    parallax, sigma_parallax : ndarray, optional
+        In `unit`, of a catalogue with a tangent point; 0 where it is not known.
+    notes : tuple of str
+        What was done to the file's stars, as clauses.
 
     Raises
     ------
@@ -76,6 +86,9 @@ class ReferenceCatalog:
     tangent_point: tuple[float, float] | None = None
     source: str = "catalogue"
     star: Int = None  # type: ignore[assignment]
+    parallax: Float | None = None
+    sigma_parallax: Float | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_unit(self.unit, where=self.source)
@@ -89,7 +102,7 @@ class ReferenceCatalog:
                     where=self.source,
                     do="give both or neither",
                 )
-        names = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair))
+        names = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
         for name in names:
             if getattr(self, name) is None:
                 continue
@@ -136,7 +149,7 @@ class ReferenceCatalog:
         """Some of the stars, by mask or indices."""
         arrays = {
             name: getattr(self, name)[which]
-            for name in ("u", "v", "mag", *(name for pair in _PAIRS for name in pair))
+            for name in ("u", "v", "mag", *(n for pair in _PAIRS for n in pair), *_PARALLAX)
             if getattr(self, name) is not None
         }
         if isinstance(self.epoch, np.ndarray):
@@ -145,7 +158,7 @@ class ReferenceCatalog:
 
     def rescaled(self, factor: float, unit: str) -> ReferenceCatalog:
         """The same in another unit, of which the present one is `factor`."""
-        lengths = ("u", "v", *(name for pair in _PAIRS for name in pair))
+        lengths = ("u", "v", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
         known = {k: getattr(self, k) for k in lengths if getattr(self, k) is not None}
         return replace(self, **{k: factor * values for k, values in known.items()}, unit=unit)
 
@@ -193,22 +206,80 @@ class ReferenceCatalog:
             epoch=float(epoch),
         )
 
+    def as_seen(self, epoch: float) -> ReferenceCatalog:
+        """The catalogue as the Earth sees it: that of `at`, displaced by the parallaxes.
+
+        Parameters
+        ----------
+        epoch : float
+            Decimal years.
+
+        Returns
+        -------
+        ReferenceCatalog
+            Without parallaxes; they are in its positions, and their errors in its errors.
+
+        Raises
+        ------
+        InputError
+            As `at`.
+        """
+        then = self.at(epoch)
+        if self.parallax is None or self.tangent_point is None:
+            return then
+        # those of the middle of the field stand for all of it
+        east, north = parallax_factors(epoch, *self.tangent_point)[0]
+        sigmas = {}
+        if self.sigma_parallax is not None and then.sigma_u is not None:
+            assert then.sigma_v is not None
+            sigmas = {
+                "sigma_u": np.hypot(then.sigma_u, east * self.sigma_parallax),
+                "sigma_v": np.hypot(then.sigma_v, north * self.sigma_parallax),
+            }
+        return replace(
+            then,
+            u=then.u + east * self.parallax,
+            v=then.v + north * self.parallax,
+            **sigmas,
+            parallax=None,
+            sigma_parallax=None,
+        )
+
+    def mirrored(self) -> ReferenceCatalog:
+        """The same with the sign of u changed, by which it leaves the tangent plane's own axes."""
+        return replace(
+            self,
+            u=-self.u,
+            pm_u=None if self.pm_u is None else -self.pm_u,
+            tangent_point=None,
+            parallax=None,
+            sigma_parallax=None,
+        )
+
 
 _ALIASES: dict[str, tuple[str, ...]] = {
     "u": ("u", "x0", "xi"),
     "v": ("v", "y0", "eta"),
-    "ra": ("ra",),
-    "dec": ("dec",),
-    "sigma_u": ("sigma_u", "su", "u_error", "x0e", "ra_error"),
-    "sigma_v": ("sigma_v", "sv", "v_error", "y0e", "dec_error"),
-    "pm_u": ("pm_u", "vx", "pmra"),
-    "pm_v": ("pm_v", "vy", "pmdec"),
-    "sigma_pm_u": ("sigma_pm_u", "vxe", "pmra_error"),
-    "sigma_pm_v": ("sigma_pm_v", "vye", "pmdec_error"),
-    "epoch": ("epoch", "t0", "ref_epoch"),
-    "mag": ("mag", "magnitude", "phot_g_mean_mag", "g", "m"),
-    "star": ("star",),
+    "ra": ALIASES["ra"],
+    "dec": ALIASES["dec"],
+    "sigma_u": ("sigma_u", "su", "u_error", "x0e", *ALIASES["sigma_ra"]),
+    "sigma_v": ("sigma_v", "sv", "v_error", "y0e", *ALIASES["sigma_dec"]),
+    "pm_u": ("pm_u", "vx", *ALIASES["pm_ra"]),
+    "pm_v": ("pm_v", "vy", *ALIASES["pm_dec"]),
+    "sigma_pm_u": ("sigma_pm_u", "vxe", *ALIASES["sigma_pm_ra"]),
+    "sigma_pm_v": ("sigma_pm_v", "vye", *ALIASES["sigma_pm_dec"]),
+    "parallax": ALIASES["parallax"],
+    "sigma_parallax": ALIASES["sigma_parallax"],
+    "epoch": ("epoch", "t0", *ALIASES["catalogue_epoch"]),
+    "mag": (*ALIASES["mag"], "g", "m"),
+    "star": ALIASES["star"],
 }
+_NAME_PAIRS = (("u", "v"), ("ra", "dec"), *_PAIRS)
+# as tables of matches call these quantities
+_ALSO = {"sigma_ra": "sigma_u", "sigma_dec": "sigma_v", "pm_ra": "pm_u", "pm_dec": "pm_v"}
+_ALSO |= {"sigma_pm_ra": "sigma_pm_u", "sigma_pm_dec": "sigma_pm_v", "catalogue_epoch": "epoch"}
+_MOTIONS = frozenset(("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"))
+_SPARED = frozenset(_PARALLAX)  # which a star may lack: it then has none that counts
 
 
 def read_catalog(
@@ -263,10 +334,11 @@ def catalog_from_table(
     ----------
     table : astropy Table
     columns : mapping of str to str, optional
-        Column of each quantity: u v ra dec sigma_u sigma_v pm_u pm_v sigma_pm_u sigma_pm_v epoch
-        mag star.  With ra and dec, positions are projected to the tangent plane in arcsec; pm_u is
-        then the motion to the east with its factor cos(dec), and all errors and motions turn with
-        the plane.
+        Column of each quantity: u v ra dec sigma_u sigma_v pm_u pm_v sigma_pm_u sigma_pm_v
+        parallax sigma_parallax epoch mag star; an empty name leaves one out.  With ra and dec,
+        positions are projected to the tangent plane in arcsec; pm_u (pm_ra) is then the motion to
+        the east with its factor cos(dec), all errors and motions turn with the plane, and stars
+        without a value, a motion above all, are left out.
     source : str, optional
         File, for errors.
     unit : str, optional
@@ -288,8 +360,10 @@ def catalog_from_table(
         For missing columns, values that are missing or no numbers, and units missing or
         contradictory.
     """
-    found = find_columns(table.colnames, columns, _ALIASES, source=source)
-    on_sky = {"ra", "dec"} <= set(found) and not {"u", "v"} <= set(found)
+    table = with_sky_columns(table)
+    named = {_ALSO.get(key, key): name for key, name in (columns or {}).items()}
+    found = find_columns(table.colnames, named, _ALIASES, source=source, pairs=_NAME_PAIRS)
+    on_sky = is_on_sky(table.colnames, found, named, source)
     first, second = ("ra", "dec") if on_sky else ("u", "v")
     if first not in found or second not in found:
         raise InputError(
@@ -297,34 +371,59 @@ def catalog_from_table(
             where=source,
             do="rename the columns, or name them in the option 'columns'",
         )
-
-    def column(key: str) -> SourceColumn:
-        unit = known_unit(found[key], table.colnames)
-        return SourceColumn(table[found[key]], source, found[key], usual_unit=unit)
-
+    unread = {"u", "v"} if on_sky else {"ra", "dec", *_PARALLAX}
+    unread |= {one for pair in _PAIRS for one in pair if not set(pair) <= set(found)}
+    if on_sky and "pm_u" in unread:
+        unread |= _MOTIONS
+    found = {key: name for key, name in found.items() if key not in unread}
+    notes: tuple[str, ...] = ()
+    rows = np.arange(len(table))
+    if on_sky and len(table):
+        stay, counts = without_missing(
+            table, found, source=source, reject=False, spared=_SPARED, motions=_MOTIONS
+        )
+        table, rows = table[stay], rows[stay]
+        notes = tuple(f"{n} stars are left out: {reason}" for reason, n in counts.items())
+    quantities = Quantities(table, found, source, lambda index: row_number(int(rows[index])))
+    column = quantities.__getitem__
+    if on_sky:
+        plane_unit(unit, source=source)
     base = "deg" if on_sky else position_unit((column("u"), column("v")), unit)
 
     def values(key: str, per_year: str = "") -> Float:
         own, where = column(key).unit, column(key).where
-        if own is None and on_sky and key not in ("ra", "dec"):
+        if own is None and on_sky:
             # catalogues write degrees for positions and mas for the rest: no guess is safe
-            raise InputError("has no unit", where=where, do="write mas or mas / yr into the file")
+            raise InputError(
+                "has no unit",
+                where=where,
+                do="write mas or mas / yr into the file, or leave the column out by an empty name "
+                "in the option 'columns'",
+            )
         factor = 1.0 if own is None else conversion(own, base + per_year, where=where)
-        return column(key).numbers() * factor
+        numbers = column(key).numbers_or(0.0) if key in _SPARED else column(key).numbers()
+        return numbers * factor
 
-    out: dict[str, Any] = {"u": values(first), "v": values(second)}
+    out: dict[str, Any] = {}
+    if on_sky:
+        out["u"], out["v"] = sky_columns(quantities)
+    else:
+        out |= {key: values(key) for key in ("u", "v")}
     for pair in _PAIRS:
-        if pair[0] in found and pair[1] in found:
+        if pair[0] in found:
             out |= {key: values(key, " / yr" if "pm" in key else "") for key in pair}
+    out |= {key: values(key) for key in _PARALLAX if key in found}
     if "mag" in found:
         out["mag"] = column("mag").numbers()
     if "star" in found:
         out["star"] = _identities(column("star"))
+    elif notes:
+        out["star"] = rows
     out["epoch"] = column("epoch").years() if "epoch" in found else epoch
     if on_sky:
         out |= _on_plane(out, tangent_point, source)
         base = "arcsec"
-    return ReferenceCatalog(**out, unit=base, source=source)
+    return ReferenceCatalog(**out, unit=base, source=source, notes=notes)
 
 
 def _identities(column: SourceColumn) -> Int:
@@ -353,4 +452,5 @@ def _on_plane(
         if pair[0] in sky:
             variance = np.stack([sky[key] for key in pair], axis=-1) ** 2
             out[pair[0]], out[pair[1]] = np.sqrt(np.einsum("nij,nj->in", J**2, variance))
+    out |= {key: 3600.0 * sky[key] for key in _PARALLAX if key in sky}
     return out

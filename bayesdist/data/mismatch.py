@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from bayesdist.data.patterns import PatternIndex, find_similarity
 from bayesdist.errors import InputError
 
-__all__ = ["mismatch_reason"]
+__all__ = ["MIRRORED", "mismatch_reason"]
 
 Float = NDArray[np.float64]
 
@@ -18,6 +18,8 @@ _WITHIN = 1.1  # of such a ratio; pixels have other sizes, too
 _NEAR = 1.4  # a scale that is only badly known
 _SAME = 0.03  # what the matching allows for
 _AGREEING = 5.0  # stars that have a neighbour, for each whose triangles agree
+_SURE = 16.0  # standard deviations of chance: of many tries one may well have half of it
+MIRRORED = "its mirror image"
 
 
 def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) -> str:
@@ -37,6 +39,7 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
     """
     ratios = [factor for one in _RATIOS for factor in (one, 1.0 / one)]
     tries = [(1.0, _NEAR, False), *((one, _WITHIN, False) for one in ratios), (1.0, _NEAR, True)]
+    best, reason = 0.0, ""
     # a wrong unit is found or dismissed in no time, a mirror image is not: it comes last
     for ratio, within, mirrored in tries:
         try:
@@ -56,9 +59,15 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
         as_it_is = abs(scale - 1.0) < _SAME
         if as_it_is and not mirrored:  # then neither scale nor image is what is wrong
             continue
-        image = "its mirror image" if mirrored else "it"
+        sigmas = (found.found - found.expected) / np.sqrt(found.expected)
+        if sigmas <= best:
+            continue
+        image = MIRRORED if mirrored else "it"
         at = "" if as_it_is else f" at {scale:.4g} times the scale"
-        return (
+        best = sigmas
+        reason = (
             f"{image} does match{at}: {found.found} stars, where chance gives {found.expected:.1f}"
         )
-    return ""
+        if best > _SURE:
+            break
+    return reason

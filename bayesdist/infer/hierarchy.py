@@ -328,7 +328,7 @@ def fit_hierarchical(
             np.zeros(len(index), bool),
             np.where(of_gap, CAUTION, 1.0),
         )
-        _require_determined(scatter)
+        _require_determined(scatter, model)
         outlying = _outlying(scatter, member)
         scatter = scatter.loosened(outlying[member])
         tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
@@ -382,7 +382,7 @@ def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> No
         )
 
 
-def _require_determined(scatter: Scatter) -> None:
+def _require_determined(scatter: Scatter, model: DistortionModel) -> None:
     """Refuse data that hardly say more of a kind of deviation than its prior does."""
     _, factor = scatter.posterior(scatter.scale / scatter.caution)
     # of E deviations of a kind, so many are known from the data rather than from the prior
@@ -391,9 +391,16 @@ def _require_determined(scatter: Scatter) -> None:
     if (determined < LEAST_DETERMINED).any():
         worst = scatter.kinds[int(np.argmin(determined))]
         n = len(scatter.kind) // len(scatter.kinds)
+        drifts = model.time is not None
         raise DegenerateError(
             f"the scatter of {worst!r} is not determined: {n} exposures are no more than the "
-            "linear terms and their drift absorb",
-            where="model.frames",
-            do="give more exposures, drop the drift, or name fewer deviations",
+            f"linear terms{' and their drift' if drifts else ''} absorb",
+            where="exposures",
+            do="give more exposures, or "
+            + (
+                "drop the drift (model.tdd)"
+                if drifts
+                else "calibrate matched stars ([data] in place of [campaign], model.frames = "
+                "'shift_rotation_scale')"
+            ),
         )

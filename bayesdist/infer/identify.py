@@ -15,7 +15,7 @@ from bayesdist.errors import DegenerateError
 from bayesdist.infer.arrow import Arrow
 from bayesdist.infer.survey import Survey
 from bayesdist.model import DistortionModel, Groups
-from bayesdist.model.frames import DEVIATIONS, frame_names
+from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS, frame_names
 
 __all__ = ["NullSpace", "check_coverage", "null_space"]
 
@@ -95,13 +95,35 @@ def require_full_rank(matrix: Arrow, model: DistortionModel, groups: Groups) -> 
     first = space.directions[0]
     listed = ", ".join(first[:-1]) + f" and {first[-1]}" if len(first) > 1 else first[0]
     verb = "are degenerate" if len(first) > 1 else "is not determined by the data"
-    reason, do = _reason(first, model, groups)
+    reason, do = _reason(first, model, groups, _simpler_frames(matrix, model))
     raise DegenerateError(
         f"{listed} {verb} (rank {space.rank} of {space.n_params}){reason}", where="model", do=do
     )
 
 
-def _reason(direction: tuple[str, ...], model: DistortionModel, groups: Groups) -> tuple[str, str]:
+def _simpler_frames(matrix: Arrow, model: DistortionModel) -> str:
+    """The setting of the richest frames with which nothing is degenerate; empty where none are."""
+    dense = matrix.dense()
+    for kind in reversed(FRAME_KINDS[: FRAME_KINDS.index(model.frames)]):
+        names = frame_names(kind)
+        kept = [
+            k
+            for k, p in enumerate(model.parameters)
+            if p.kind != "frame" or p.name.rpartition(".")[2] in names
+        ]
+        part = dense[np.ix_(kept, kept)]
+        scale = np.sqrt(part.diagonal())
+        if (scale == 0).any():
+            continue
+        values = np.linalg.eigvalsh(part / np.outer(scale, scale))
+        if values[0] >= RANK_TOLERANCE * max(values[-1], 1.0):
+            return f", or set model.frames = '{kind}'"
+    return ""
+
+
+def _reason(
+    direction: tuple[str, ...], model: DistortionModel, groups: Groups, simpler: str
+) -> tuple[str, str]:
     kinds = {p.name: p for p in model.parameters}
     parts = [kinds[name] for name in direction]
     deviations = any(p.kind == "frame" and p.name.endswith(DEVIATIONS) for p in parts)
@@ -119,14 +141,17 @@ def _reason(direction: tuple[str, ...], model: DistortionModel, groups: Groups) 
         if any(p.kind == "frame" for p in parts):
             return (
                 f": the frame '{model.frames}' of each exposure absorbs the drift",
-                "choose model.frames = 'shift_rotation' or drop the time-dependent term",
+                f"drop the time-dependent term (model.tdd){simpler}",
             )
         return (
             ": the epochs of a segment do not fix its terms",
             "drop the term or the break, or add exposures in that segment",
         )
     if any(p.kind == "frame" for p in parts):
-        return (": too little joins the exposures", "choose a simpler model.frames")
+        return (
+            ": too little joins the exposures",
+            f"give more stars that exposures have on the same chips{simpler}",
+        )
     return (
         f": the stars do not fill the detector well enough for order {model.order}",
         "lower model.order or add stars",
@@ -160,10 +185,12 @@ def check_coverage(model: DistortionModel, survey: Survey, n_priors: int = 0) ->
     if q:
         for name, count in zip(model.exposures, survey.exposures, strict=True):
             if 2 * count < q:
+                kinds = [kind for kind in FRAME_KINDS if 2 * count >= len(frame_names(kind))]
+                stars = "1 star" if count == 1 else f"{count} stars"
                 raise DegenerateError(
-                    f"exposure {name!r} has {count} stars, too few for frame '{model.frames}'",
+                    f"exposure {name!r} has {stars}, too few for frame '{model.frames}'",
                     where=survey.where,
-                    do="drop the exposure or choose a simpler model.frames",
+                    do=f"leave the exposure out, or set model.frames = '{kinds[-1]}'",
                 )
     for chip, found in zip(model.chips, survey.chips, strict=True):
         where = f"chip {chip.name}" if len(model.chips) > 1 else survey.where

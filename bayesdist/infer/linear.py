@@ -481,7 +481,7 @@ def _gauss_newton(
             return theta
     raise DegenerateError(
         f"the exposure frames did not settle in {TURNS} iterations",
-        where="model.frames",
+        where="fit",
         do="check that the exposures overlap and are not mirrored, lower model.order"
-        + ("" if model.frames == "affine" else ", or choose 'affine'"),
+        + ("" if model.frames == "affine" else ", or set model.frames = 'affine'"),
     )

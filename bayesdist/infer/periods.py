@@ -169,7 +169,7 @@ def _check_model(model: DistortionModel) -> None:
             "periods are compared by polynomials alone, and the model has "
             + ("frames of exposures" if model.n_frame else "time-dependent terms"),
             where="model",
-            do="set frames to 'none' (refer the pairs to common solutions first) and drop the "
+            do="set model.frames = 'none' (refer the pairs to common solutions first) and drop the "
             "time-dependent terms",
         )
 

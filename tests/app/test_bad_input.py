@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,8 @@ from astropy.table import MaskedColumn, Table, vstack
 
 from bayesdist.infer import load_posterior
 from tests.app.support import (
+    CENTRE,
+    SIGMA,
     as_table,
     begin_stagewise,
     cli,
@@ -24,6 +27,7 @@ from tests.app.support import (
     write_config,
     write_job,
 )
+from tests.infer.test_frame_choice import exposures
 
 
 @pytest.fixture
@@ -550,3 +554,43 @@ def test_the_same_from_a_shell(tmp_path, stars):
 
     done = process("run", cwd=tmp_path)
     assert done.returncode == 2 and done.stderr.startswith("usage")
+
+
+# -- frames of the exposures ----------------------------------------------------------------------
+
+
+def of_exposures(*kinds, sigma=SIGMA):
+    """Exposures that differ by these, as a table with errors."""
+    m = exposures(np.random.default_rng(4), *kinds)
+    names = np.array(m.exposure_names)[m.exposure]
+    table = Table({"x": m.x, "y": m.y, "u": m.u, "v": m.v, "exp": names})
+    table["su"] = table["sv"] = np.full(len(m), sigma)
+    for name in ("u", "v", "su", "sv"):
+        table[name].unit = "pix"
+    return table
+
+
+@pytest.mark.parametrize(
+    ("kinds", "needed"),
+    [(("shift",), "shift"), (("shift", "rotation", "scale"), "shift_rotation_scale")],
+)
+def test_exposures_that_lie_differently_are_refused_with_the_key_that_helps(
+    tmp_path, kinds, needed
+):
+    """With that key the same run goes through."""
+    job = write_job(tmp_path / "job", of_exposures(*kinds))
+    text = refused(tmp_path, "check", job, words=["rejection limits", "model.frames"])
+    said = re.search(r"set (model)\.frames = '(\w+)'", text)
+    assert said.group(2) == needed
+    model = {"order": 2, "reference_pixel": CENTRE, "frames": needed}
+    good_job = write_job(tmp_path / "other", of_exposures(*kinds), model=model)
+    assert "model.frames" not in good("check", good_job).out
+
+
+def test_exposures_that_differ_by_little_are_said_with_the_key(tmp_path):
+    """Errors are not said to be too small without it."""
+    job = write_job(tmp_path / "job", of_exposures("rotation"))
+    text = good("check", job).out
+    assert "set model.frames = 'shift_rotation'" in text
+    alike = good("check", write_job(tmp_path / "alike", of_exposures(sigma=SIGMA / 3))).out
+    assert "model.frames" not in alike

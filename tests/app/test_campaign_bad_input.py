@@ -11,11 +11,14 @@ from astropy.table import Table, vstack
 from astropy.time import Time
 
 from bayesdist.app import stages
-from bayesdist.app.campaign.soundness import shear_doubts
+from bayesdist.app.campaign.soundness import frames_not_set, shear_doubts
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
+from bayesdist.data import MatchTable
 from bayesdist.data.tables import read_table
-from bayesdist.infer import load_fit
+from bayesdist.errors import DegenerateError
+from bayesdist.infer import fit_linear, load_fit
+from bayesdist.model import Chip, DistortionModel
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 
@@ -409,6 +412,30 @@ def test_a_catalogue_without_motions_that_stars_outrun(campaign):
     assert result.code == 1
     words = ["catalog.ecsv: has no proper motions", "11.6 years", "scatter by", "pm_u and pm_v"]
     one_sentence(result.err, *words)
+
+
+def test_refusals_of_a_campaign_do_not_advise_frames_that_it_cannot_set():
+    """What the fit says to others is left out, and the rest stays."""
+    x = np.linspace(1, 4000, 60)
+    table = MatchTable(
+        x=x,
+        y=x[::-1] / 2,
+        u=x,
+        v=x,
+        sigma_u=np.full(60, 0.1),
+        sigma_v=np.full(60, 0.1),
+        unit="pix",
+        exposure=np.repeat([0, 1], [58, 2]),
+        exposure_names=("a", "b"),
+    )
+    chip = Chip(1, "WFC2", (4096.0, 2048.0), (2048.0, 1024.0))
+    model = DistortionModel(2, (chip,), unit="pix", frames="affine", exposures=("a", "b"))
+    with pytest.raises(DegenerateError, match=r"exposure out, or set model\.frames") as before:
+        fit_linear(table, model)
+    with pytest.raises(DegenerateError) as after, frames_not_set():
+        fit_linear(table, model)
+    assert after.value.cause == before.value.cause
+    assert after.value.do == "leave the exposure out"
 
 
 def test_lists_that_the_log_does_not_have_are_named(campaign):

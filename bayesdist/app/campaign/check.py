@@ -29,6 +29,8 @@ def campaign_lines(session: CampaignSession) -> Iterator[str]:
     yield f"exposures    {len(log.names)} in {', '.join(log.filters)}"
     yield f"detections   {_detections(session)}"
     yield f"catalogue    {len(catalog)} of {inputs.n_catalog} stars, in {catalog.unit}"
+    for text in (*([inputs.plane] if inputs.plane else []), *catalog.notes):
+        yield f"             {text}"
     yield f"epochs       {epochs.min():.2f} to {epochs.max():.2f}"
     factors = log.values("vafactor")
     how = ", of the Earth alone" if session.block.aberration == "earth" else ""

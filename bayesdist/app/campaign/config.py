@@ -17,6 +17,7 @@ class StarListsBlock(Section):
     """Star lists, and which of their detections are used."""
 
     lists: str | list[str]
+    columns: dict[str, str] | None = None
     mag: Between | None = None
     saturation: float | None = None
     q_max: PositiveFloat | None = None
@@ -28,6 +29,10 @@ class CampaignBlock(StarListsBlock):
     catalog: str
     exposures: str
     start: str
+    catalog_columns: dict[str, str] | None = None
+    unit: Literal["pix", "arcsec", "mas", "deg"] | None = None
+    catalogue_epoch: float | None = None
+    parity: Literal["auto", "direct", "mirrored"] = "auto"
     filter: str | None = None
     radius: PositiveFloat | None = None
     motions: Literal["reliable", "all"] = "reliable"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,16 +15,26 @@ from bayesdist.data import (
     ReferenceCatalog,
     StarCuts,
     StarList,
-    read_catalog,
+    catalog_from_table,
     read_exposures,
     read_star_lists,
     select_motions,
 )
+from bayesdist.data.tables import read_table
+from bayesdist.data.tangent import mean_direction, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.parity import parity_of
 
-__all__ = ["Inputs", "cuts_of", "lists_of", "read_inputs", "start_of"]
+__all__ = [
+    "Inputs",
+    "cuts_of",
+    "lists_of",
+    "parities_of",
+    "read_campaign_catalog",
+    "read_inputs",
+    "start_of",
+]
 
 Float = NDArray[np.float64]
 
@@ -45,6 +55,8 @@ class Inputs:
         Of these exposures.
     strangers : tuple of str
         Exposures that have a list and no entry in the log file, of whatever filter: not used.
+    plane : str
+        What the catalogue's u and v are, where they come from the sky.
     """
 
     catalog: ReferenceCatalog
@@ -52,6 +64,7 @@ class Inputs:
     log: ExposureLog
     lists: tuple[StarList, ...]
     strangers: tuple[str, ...] = ()
+    plane: str = ""
 
     @property
     def filter(self) -> str:
@@ -68,8 +81,8 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
         For files that cannot be read, lists without an entry in the log, a filter without
         exposures, and exposures without VAFACTOR.
     """
-    catalog = read_catalog(base / block.catalog)
     log = read_exposures(base / block.exposures)
+    catalog, plane = read_campaign_catalog(block, base, log)
     logged = set(log.names)
     if block.filter is not None and block.filter not in log.filters:
         raise InputError(
@@ -103,18 +116,103 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
     n = len(catalog)
     if block.motions == "reliable" and catalog.sigma_pm_u is not None:
         catalog = select_motions(catalog)
-    return Inputs(catalog, n, log, wanted, tuple(strangers))
+    return Inputs(catalog, n, log, wanted, tuple(strangers), plane)
 
 
-def lists_of(
-    block: StarListsBlock, base: Path, columns: Mapping[str, str] | None = None
-) -> tuple[StarList, ...]:
+def read_campaign_catalog(
+    block: CampaignBlock, base: Path, log: ExposureLog
+) -> tuple[ReferenceCatalog, str]:
+    """The catalogue, and what its plane is where it has right ascension and declination.
+
+    The plane touches the sky in the middle of the exposures of all filters, where the log says
+    where they point and that lies among the stars; else in the middle of these.
+
+    Raises
+    ------
+    InputError
+        As `catalog_from_table`, and for proper motions without an epoch, in the configuration's
+        words.
+    """
+    path = base / block.catalog
+    table = read_table(path)
+
+    def read(point: tuple[float, float] | None) -> ReferenceCatalog:
+        return catalog_from_table(
+            table,
+            block.catalog_columns,
+            source=str(path),
+            unit=block.unit,
+            epoch=block.catalogue_epoch,
+            tangent_point=point,
+        )
+
+    try:
+        catalog = read(None)
+    except InputError as error:
+        do = error.do.replace("the option 'columns'", "campaign.catalog_columns")
+        do = do.replace("the unit option", "campaign.unit")
+        raise type(error)(error.cause, where=error.where, do=do) from error
+    if catalog.pm_u is not None and catalog.epoch is None:
+        raise InputError(
+            "has proper motions but no epoch",
+            where=catalog.source,
+            do="set campaign.catalogue_epoch, or give the column epoch or ref_epoch",
+        )
+    if catalog.tangent_point is None:
+        return catalog, ""
+    point, middle = _middle_of(log, catalog), "stars"
+    if point is not None:
+        catalog, middle = read(point), "exposures"
+    assert catalog.tangent_point is not None
+    ra, dec = catalog.tangent_point
+    return catalog, (
+        f"tangent plane at RA {ra:.5f}, Dec {dec:+.5f} (the middle of the {middle}), arcsec"
+    )
+
+
+def _middle_of(log: ExposureLog, catalog: ReferenceCatalog) -> tuple[float, float] | None:
+    """Mean direction of the exposures; None where the log lacks it, or it is not in the field."""
+    ra, dec = log.values("ra"), log.values("dec")
+    if not np.isfinite([ra, dec]).all() or catalog.tangent_point is None:
+        return None
+    point = mean_direction(ra, dec)
+    try:
+        u, v = tangent_plane([point[0]], [point[1]], catalog.tangent_point)
+    except InputError:  # on the other side of the sky
+        return None
+    inside = catalog.u.min() <= u[0] <= catalog.u.max()
+    inside &= catalog.v.min() <= v[0] <= catalog.v.max()
+    return point if inside else None
+
+
+def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) -> tuple[bool, ...]:
+    """Whether the catalogue is taken mirrored, the more probable first.
+
+    V2 and V3 lie on the sky as east and north do but for a rotation, and the table says how its
+    axes lie along V2 and V3.
+
+    Parameters
+    ----------
+    block : CampaignBlock
+    catalog : ReferenceCatalog
+    tab : IdcTab
+        The known distortion.
+    """
+    if block.parity != "auto":
+        return (block.parity == "mirrored",)
+    if catalog.tangent_point is None:
+        return (False,)
+    expected = bool(np.prod(parity_of(tab.instrument, tab.detector)) < 0)
+    return (expected, not expected)
+
+
+def lists_of(block: StarListsBlock, base: Path) -> tuple[StarList, ...]:
     """All star lists that the configuration names.
 
     Each place is read alone: a list whose name stands in two is an exposure given twice, not two.
     """
     names = block.lists if isinstance(block.lists, list) else [block.lists]
-    return tuple(one for name in names for one in read_star_lists(base / name, columns))
+    return tuple(one for name in names for one in read_star_lists(base / name, block.columns))
 
 
 def cuts_of(block: StarListsBlock) -> StarCuts:

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from bayesdist.app.campaign.inputs import cuts_of, start_of
+from bayesdist.app.campaign.inputs import cuts_of, parities_of, start_of
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.campaign.soundness import input_doubts, refuse_few, shear_doubts
 from bayesdist.app.session import write_table
@@ -22,6 +22,7 @@ from bayesdist.data import (
 from bayesdist.data.match_doubts import match_doubts
 from bayesdist.errors import InputError
 from bayesdist.model import Chip
+from bayesdist.products import read_idctab
 
 __all__ = ["run_match"]
 
@@ -31,13 +32,18 @@ log = logging.getLogger("bayesdist")
 def run_match(session: CampaignSession) -> None:
     block, run, inputs = session.block, session.run, session.inputs
     cuts = cuts_of(block)
+    tab = read_idctab(session.base / block.start)
+    parities = parities_of(block, inputs.catalog, tab)
+    for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
+        log.info("match: catalogue: %s", text)
     found = match_campaign(
         _gauge_first(inputs.lists, cuts, session.reference_chip),
         inputs.log,
         inputs.catalog,
-        start_of(session.base / block.start, session.unit_arcsec, block.filter),
+        start_of(tab, session.unit_arcsec, block.filter),
         cuts=cuts,
         radius=block.radius,
+        mirrored=parities,
         skip=True,
     )
     _refuse_bare(found.table, session.config.chips(), inputs.catalog.source)
@@ -49,6 +55,7 @@ def run_match(session: CampaignSession) -> None:
     for name in ("vafactor", "pa_v3"):
         summary[name] = inputs.log.values(name)[order]
     warnings = [
+        *_doubtful_parity(found.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
         *match_doubts(found, inputs.log),
         *input_doubts(session),
         # as the stars show them, for the log need not have them
@@ -77,6 +84,8 @@ def run_match(session: CampaignSession) -> None:
                 "least": float(np.min(summary["completeness"])),
             },
             "false_share": false,
+            "parity": "mirrored" if found.mirrored else "direct",
+            "tangent_point": inputs.catalog.tangent_point,
             "radius": [float(summary["radius_min"].min()), float(summary["radius_max"].max())],
             "warnings": warnings,
         }
@@ -89,8 +98,25 @@ def run_match(session: CampaignSession) -> None:
         float(np.median(summary["completeness"])),
         false,
     )
+    if found.mirrored:
+        log.info(
+            "match: the catalogue is mirrored against the detector's axes: u is taken with the "
+            "opposite sign%s",
+            "" if inputs.catalog.tangent_point is None else " and grows to the west",
+        )
     for text in warnings:
         log.warning("match: WARNING: %s", text)
+
+
+def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) -> list[str]:
+    """Whether the stars have another parity than the known distortion says, as a clause."""
+    if mirrored == parities[0]:
+        return []
+    return [
+        f"the stars lie mirrored against what the detector of the known distortion, {detector}, "
+        "sees of the sky: x and y of the lists may be swapped, or the axes of the detector are not "
+        "those of this detector"
+    ]
 
 
 def _gauge_first(lists: tuple[StarList, ...], cuts: StarCuts, chip: int) -> tuple[StarList, ...]:

@@ -9,13 +9,13 @@ from astropy.table import Table
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from bayesdist.app.campaign.inputs import cuts_of
+from bayesdist.app.campaign.inputs import cuts_of, read_campaign_catalog
 from bayesdist.app.campaign.overlap import overlap_test
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import as_json
 from bayesdist.assess.grid import outline_pixels
 from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
-from bayesdist.data import MatchTable, read_catalog, with_centroid_errors
+from bayesdist.data import MatchTable, with_centroid_errors
 from bayesdist.data.motions import motion_error_line
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.infer.nodes import pixel_shifts
@@ -111,7 +111,7 @@ def _some(n: int, most: int) -> slice:
 def _catalog_stars(session: CampaignSession, matching: Table) -> CatalogStars | None:
     from bayesdist.report.campaign import CatalogStars
 
-    catalog = read_catalog(session.base / session.block.catalog)
+    catalog, _ = read_campaign_catalog(session.block, session.base, session.inputs.log)
     if catalog.mag is None or (catalog.sigma_u is None and catalog.sigma_pm_u is None):
         return None
     shift = float(np.nan_to_num(np.nanmedian(np.asarray(matching["zero_point"], float))))
@@ -174,9 +174,8 @@ def _footprints(session: CampaignSession) -> Footprints:
             outlines.append(model.predict(theta, x, y, epoch=when, **place))
             epochs.append(exposure.epoch)
     rows = _some(len(catalog), DRAWN // 2)
-    return Footprints(
-        catalog.u[rows], catalog.v[rows], tuple(outlines), np.array(epochs), catalog.unit
-    )
+    u = -catalog.u if session.mirrored else catalog.u
+    return Footprints(u[rows], catalog.v[rows], tuple(outlines), np.array(epochs), catalog.unit)
 
 
 # matrices here are small: more BLAS threads only get in each other's way

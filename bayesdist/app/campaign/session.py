@@ -78,6 +78,11 @@ class CampaignSession(Session):
         """Catalogue, exposures and star lists."""
         return read_inputs(self.block, self.base)
 
+    @property
+    def mirrored(self) -> bool:
+        """Whether the pairs' u has the sign that is opposite to the catalogue's."""
+        return bool(self.run.summary.get("matching", {}).get("parity") == "mirrored")
+
     @cached_property
     def _all_matches(self) -> MatchTable:  # type: ignore[override]
         """All pairs as matched, those that are held out among them."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from bayesdist.app.campaign.session import CampaignSession
 
 __all__ = [
+    "frames_not_set",
     "input_doubts",
     "refuse_few",
     "refuse_unsound",
@@ -121,6 +125,16 @@ def shear_doubts(rolls: Float, of: str) -> list[str]:
         f"all exposures have one roll angle, or angles half a turn apart ({of}): a shear of the "
         "catalogue is degenerate with one of the detector (A_2 - B_3, A_3 + B_2)"
     ]
+
+
+@contextmanager
+def frames_not_set() -> Iterator[None]:
+    """Refusals of a fit without the advice to set model.frames, which a campaign has by itself."""
+    try:
+        yield
+    except DegenerateError as error:
+        do = re.sub(r",? or set model\.frames = '\w+'", "", error.do)
+        raise DegenerateError(error.cause, where=error.where, do=do) from error
 
 
 def segment_counts(epochs: Float, time: TimeDependence) -> list[int]:

@@ -13,12 +13,17 @@ from bayesdist.app.campaign.reference import rehearse_references
 from bayesdist.app.campaign.release import release
 from bayesdist.app.campaign.series import run_series
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.campaign.soundness import refuse_unsound
+from bayesdist.app.campaign.soundness import frames_not_set, refuse_unsound
 from bayesdist.app.stages.assess import run_assess
 from bayesdist.app.stages.export import run_export
 from bayesdist.products import read_idctab
 
 __all__ = ["CAMPAIGN_STAGES", "rehearse_campaign"]
+
+
+def _fit(session: CampaignSession) -> None:
+    with frames_not_set():
+        run_campaign_fit(session)
 
 
 def _assess(session: CampaignSession) -> None:
@@ -34,7 +39,7 @@ def _export(session: CampaignSession) -> None:
 
 CAMPAIGN_STAGES: dict[str, Callable[[Any], None]] = {
     "match": run_match,
-    "fit": run_campaign_fit,
+    "fit": _fit,
     "assess": _assess,
     "export": _export,
 }

@@ -16,7 +16,6 @@ class SelfcalBlock(StarListsBlock):
     """Star lists of dithered exposures, and how their detections become stars."""
 
     exposures: str | None = None
-    columns: dict[str, str] | None = None
     sigma: Literal["measured"] | PositiveFloat = "measured"
     start: str | None = None
     unit: Literal["pix", "arcsec", "mas"] = "pix"
@@ -50,6 +49,7 @@ class ReferenceBlock(Section):
 
     catalog: str
     columns: dict[str, str] | None = None
+    unit: Literal["pix", "arcsec", "mas", "deg"] | None = None
     epoch: float | None = None
     tangent_point: tuple[float, float] | None = None
     radius: PositiveFloat = 2.0

@@ -97,7 +97,7 @@ def read_inputs(config: Config, base: Path) -> Inputs:
     block = config.selfcal
     assert block is not None
     cuts, rejected, kept = cuts_of(block), dict[str, int](), list[StarList]()
-    lists = lists_of(block, base, block.columns)
+    lists = lists_of(block, base)
     for one in lists:
         good, reasons = cuts.passed(one)
         for reason, count in reasons.items():
@@ -257,6 +257,7 @@ def read_references(
     catalog = read_catalog(
         base / block.catalog,
         block.columns,
+        unit=block.unit,
         epoch=block.epoch,
         tangent_point=block.tangent_point,
     )

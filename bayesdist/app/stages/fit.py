@@ -8,6 +8,7 @@ from typing import Any
 from astropy.table import Table
 
 from bayesdist.app.session import ERROR_COLUMNS, Session, write_table
+from bayesdist.app.trust import frames_doubt
 from bayesdist.assess.majority import majority_sentence
 from bayesdist.infer import LinearFit, save_fit
 from bayesdist.infer.skew import Skew, skew_of
@@ -40,6 +41,8 @@ def run_fit(session: Session) -> None:
     majority = majority_sentence(fit)
     if session.error_scale_sentence:
         log.warning("fit: WARNING: %s", session.error_scale_sentence)
+    if text := frames_doubt(session):
+        log.warning("fit: WARNING: %s", text)
     if majority:  # said before hours of sampling
         log.warning("fit: WARNING: %s", majority)
 

@@ -1,0 +1,98 @@
+"""Which frames bring the stars of several exposures together, where those of a model do not?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesdist.data import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer.linear import fit_linear, residuals
+from bayesdist.model import DistortionModel
+from bayesdist.model.frames import FRAME_KINDS
+
+__all__ = ["FrameChoice", "frames_that_help"]
+
+GAIN = 2.0  # by which the scatter must shrink
+FITS = 3
+MEDIAN_LENGTH = 1.1774  # standard deviations, of the length of two normal numbers
+ALIKE = 1.1  # scatter of the frames that are taken, over the least of any
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """Frames that help.
+
+    Parameters
+    ----------
+    frames : str
+    scatter, before : float
+        Median length of the residuals with these frames and with the model's, in the unit of u, v,
+        for the degrees of freedom that each leaves.
+    unit : str
+    instead_of : str
+    """
+
+    frames: str
+    scatter: float
+    before: float
+    unit: str
+    instead_of: str
+
+    @property
+    def sentence(self) -> str:
+        """What to do, and why."""
+        return (
+            f"set model.frames = '{self.frames}', with which the residuals of the exposures scatter"
+            f" by {self.scatter:.2g} {self.unit} in place of {self.before:.2g} with "
+            f"'{self.instead_of}'"
+        )
+
+
+def frames_that_help(matches: MatchTable, model: DistortionModel) -> FrameChoice | None:
+    """The simplest frames with which stars scatter as little as with any, if that is far less.
+
+    Parameters
+    ----------
+    matches : MatchTable
+        Errors are not used: all stars count alike.
+    model : DistortionModel
+
+    Returns
+    -------
+    FrameChoice or None
+        None for one exposure, and where no richer frames make the scatter half as large.
+    """
+    names = matches.exposure_names
+    richer = FRAME_KINDS[FRAME_KINDS.index(model.frames) + 1 :]
+    if len(names) < 2 or not richer:
+        return None
+    found = {}
+    for frames in (model.frames, *richer):
+        one = replace(model, frames=frames, exposures=names)
+        if one.n_params > len(matches):  # what the frames take up would look like agreement
+            continue
+        try:
+            found[frames] = _scatter(matches, one)
+        except InputError:  # a drift that they absorb, or too few stars
+            continue
+    before = found.pop(model.frames, np.inf)
+    if not found or before < GAIN * min(found.values()):
+        return None
+    best = next(name for name, size in found.items() if size <= ALIKE * min(found.values()))
+    return FrameChoice(best, found[best], before, model.unit, model.frames)
+
+
+def _scatter(matches: MatchTable, model: DistortionModel) -> float:
+    """Median length of the residuals, for the degrees of freedom that the model leaves.
+
+    The first fit takes all pairs alike; in those that follow its scatter tells which are false.
+    """
+    median = 1.0
+    for _ in range(FITS):
+        sigma = np.full(len(matches), max(median / MEDIAN_LENGTH, np.finfo(float).tiny))
+        table = replace(matches, sigma_u=sigma, sigma_v=sigma)
+        fit = fit_linear(table, model, clip_abs=None)
+        median = float(np.median(np.hypot(*residuals(fit, table).T)))
+    return median * float(np.sqrt(2 * len(matches) / (2 * len(matches) - model.n_params)))

@@ -1,0 +1,401 @@
+"""A campaign whose catalogue has right ascension and declination, seen by astropy's own WCS.
+
+The stars move and have parallaxes; each exposure is a TAN-SIP header at its own direction and roll,
+of a detector that sees the sky as it is or mirrored.  Nothing of the package makes these data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units as apu
+from astropy.coordinates import SkyCoord, get_body_barycentric
+from astropy.io import fits
+from astropy.table import Table
+from astropy.time import Time
+from astropy.wcs import WCS
+from scipy import stats
+
+from bayesdist.data import read_matches
+from bayesdist.infer import load_fit
+from bayesdist.infer.views import without_frames
+from tests.app.support import cli, good, one_sentence, refused, summary_of, write_config
+
+SIDE, PIXEL = 1024, 0.05  # pixels, arcsec
+MIDDLE = (SIDE + 1) / 2
+FIELD = (150.3, -47.2)
+DATES = (2009.2, 2011.7, 2013.5, 2014.9, 2016.4)
+CATALOGUE = 2016.0
+CENTROID = 0.02  # px
+ERROR, MOTION = 0.3, 0.1  # mas, mas a year, which the catalogue states
+# of the SIP polynomials, at half a side in pixels
+TERMS = {(2, 0): (3.1, -1.4), (1, 1): (-2.2, 2.6), (0, 2): (1.2, 3.4), (3, 0): (0.4, -0.2),
+         (1, 2): (-0.3, 0.5), (2, 1): (0.2, 0.3), (0, 3): (-0.1, 0.4)}  # fmt: skip
+
+
+def bent(x, y, left=0.0):
+    """Pixels from the middle after the SIP polynomials, in error by a part of these."""
+    x, y = np.asarray(x, float) - MIDDLE, np.asarray(y, float) - MIDDLE
+    half = SIDE / 2
+    powers = {k: (x / half) ** k[0] * (y / half) ** k[1] for k in TERMS}
+    return tuple(
+        (1 - left) * sum(c[axis] * powers[k] for k, c in TERMS.items()) + at
+        for axis, at in enumerate((x, y))
+    )
+
+
+def header(direction, roll, parity, factor):
+    """The WCS of an exposure; parity -1 as the sky is seen, with east to the left of north."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
+    wcs.wcs.crpix, wcs.wcs.crval = [MIDDLE, MIDDLE], direction
+    a = np.radians(roll)
+    turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    # positions over VAFACTOR are those of the catalogue
+    wcs.wcs.cd = factor * PIXEL / 3600 * turn @ np.diag([parity, 1.0])
+    A, B = np.zeros((4, 4)), np.zeros((4, 4))
+    for (i, j), (a, b) in TERMS.items():
+        A[i, j], B[i, j] = np.array([a, b]) / (SIDE / 2) ** (i + j)
+    cards = fits.Header(wcs.to_header())
+    for name, matrix in (("A", A), ("B", B)):
+        cards[f"{name}_ORDER"] = 3
+        for i, j in TERMS:
+            cards[f"{name}_{i}_{j}"] = matrix[i, j]
+    cards["CTYPE1"], cards["CTYPE2"] = "RA---TAN-SIP", "DEC--TAN-SIP"
+    return WCS(cards)
+
+
+@dataclass
+class Sky:
+    """Stars as they are."""
+
+    ra: np.ndarray
+    dec: np.ndarray
+    pm: np.ndarray  # mas a year, with the factor cos(dec)
+    parallax: np.ndarray  # mas
+    mag: np.ndarray
+
+    def seen(self, year):
+        """Directions (N, 2) at a date, from the Earth: vectors from the one to the other."""
+        stars = SkyCoord(
+            self.ra * apu.deg,
+            self.dec * apu.deg,
+            distance=1000 / self.parallax * apu.pc,
+            pm_ra_cosdec=self.pm[0] * apu.mas / apu.yr,
+            pm_dec=self.pm[1] * apu.mas / apu.yr,
+            radial_velocity=np.zeros(len(self.ra)) * apu.km / apu.s,
+            obstime=Time(CATALOGUE, format="jyear", scale="tdb"),
+        )
+        now = Time(year, format="jyear", scale="tdb")
+        there = stars.apply_space_motion(new_obstime=now).cartesian.xyz.to_value("au")
+        earth = get_body_barycentric("earth", now).xyz.to_value("au")
+        x, y, z = there - earth[:, None]
+        return np.column_stack(
+            [np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))]
+        )
+
+
+def sky(rng, n=900):
+    reach = 0.9 * SIDE * PIXEL / 3600
+    east, north = rng.uniform(-reach, reach, (2, n))
+    return Sky(
+        FIELD[0] + east / np.cos(np.radians(FIELD[1])),
+        FIELD[1] + north,
+        rng.normal([[-6.0], [4.0]], 3.0, (2, n)),
+        rng.uniform(0.2, 4.0, n),
+        rng.uniform(15, 20, n),
+    )
+
+
+def gaia(rng, stars):
+    """The catalogue as the archive writes it: no units in the file."""
+    n = len(stars.ra)
+    off = ERROR / 3.6e6 * rng.standard_normal((2, n))
+    pm = stars.pm + MOTION * rng.standard_normal((2, n))
+    table = Table({"source_id": 4_000_000_000_000_000_000 + 7 * np.arange(n)})
+    table["ra"] = stars.ra + off[0] / np.cos(np.radians(stars.dec))
+    table["ra_error"] = np.full(n, ERROR)
+    table["dec"] = stars.dec + off[1]
+    table["dec_error"] = np.full(n, ERROR)
+    table["parallax"] = stars.parallax + 0.1 * rng.standard_normal(n)
+    table["parallax_error"] = np.full(n, 0.1)
+    table["pmra"], table["pmdec"] = pm
+    table["pmra_error"] = table["pmdec_error"] = np.full(n, MOTION)
+    table["ref_epoch"] = np.full(n, CATALOGUE)
+    table["phot_g_mean_mag"] = stars.mag
+    return table
+
+
+def write(folder: Path, sense: int, *, seed=1, change=None, **campaign) -> Path:
+    """Catalogue, log, lists, known distortion and configuration; the path of the last."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True)
+    stars = sky(rng)
+    table = gaia(rng, stars)
+    table = table if change is None else change(table)
+    table.write(folder / "catalog.csv")
+    log = Table(
+        names=("exposure", "epoch", "vafactor", "ra", "dec"), dtype=("U8", *"f8 f8 f8 f8".split())
+    )
+    (folder / "lists").mkdir()
+    for k, date in enumerate(DATES):
+        ra, dec = FIELD + rng.uniform(-8, 8, 2) / 3600
+        factor = 1 + 5e-5 * np.sin(2 * np.pi * date)
+        wcs = header((ra, dec), 70.0 * k + 11, sense, factor)
+        x, y = wcs.all_world2pix(stars.seen(date), 1).T
+        on = (x > 1) & (x < SIDE) & (y > 1) & (y < SIDE)
+        x, y = np.stack([x[on], y[on]]) + CENTROID * rng.standard_normal((2, on.sum()))
+        mag = stars.mag[on] - 27.0 + 0.02 * rng.standard_normal(on.sum())
+        false = rng.uniform(1, SIDE, (2, 15))
+        Table(
+            {
+                "x": np.append(x, false[0]),
+                "y": np.append(y, false[1]),
+                "mag": np.append(mag, rng.uniform(-12, -7, 15)),
+            }
+        ).write(folder / "lists" / f"e{k}.parquet")
+        log.add_row((f"e{k}", date, factor, ra, dec))
+    log["filter"] = "F606W"
+    log.write(folder / "exposures.ecsv")
+    _start(folder / "start_idc.fits")
+    files = {"catalog": "catalog.csv", "exposures": "exposures.ecsv", "lists": "lists"}
+    return write_config(
+        folder / "config.toml",
+        data=None,
+        campaign=files | {"start": "start_idc.fits"} | campaign,
+        tables={"method": "none"},
+        detector={"scale_mas": 1000 * PIXEL},
+        chip=[
+            {"number": 1, "name": "WFC", "size": (SIDE, SIDE), "reference_pixel": (MIDDLE, MIDDLE)}
+        ],
+        model={"order": 3},
+        assess={"grid": (9, 9), "draws": 400, "epoch": 2012.0},
+    )
+
+
+def _start(path: Path) -> None:
+    """The known distortion, in error by a twentieth."""
+    powers = [(i, j) for i in range(1, 4) for j in range(i + 1)]  # x^j y^(i-j)
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(1, SIDE, 20)] * 2))
+    design = np.stack([(x - MIDDLE) ** j * (y - MIDDLE) ** (i - j) for i, j in powers], axis=1)
+    size = np.abs(design).max(axis=0)
+    row = {"DETCHIP": [1], "DIRECTION": ["FORWARD"], "XSIZE": [SIDE], "YSIZE": [SIDE]}
+    row |= {"XREF": [MIDDLE], "YREF": [MIDDLE], "V2REF": [0.0], "V3REF": [0.0], "SCALE": [PIXEL]}
+    for name, values in zip(("CX", "CY"), bent(x, y, left=0.05), strict=True):
+        c = np.linalg.lstsq(design / size, PIXEL * values, rcond=None)[0] / size
+        row |= {f"{name}{i}{j}": [c[k]] for k, (i, j) in enumerate(powers)}
+    primary = fits.PrimaryHDU()
+    primary.header.update({"INSTRUME": "ACS", "DETECTOR": "WFC", "NORDER": 3, "PARITY": -1})
+    fits.HDUList([primary, fits.BinTableHDU(Table(row))]).writeto(path)
+
+
+def in_place(config: Path) -> str:
+    """A configuration whose files are named from anywhere."""
+    text = config.read_text(encoding="utf-8")
+    for name in ("catalog.csv", "exposures.ecsv", "start_idc.fits", "lists"):
+        text = text.replace(f'"{name}"', f'"{config.parent / name}"')
+    return text
+
+
+def staged(config: Path, *stages: str) -> Path:
+    """A run of which these stages are made."""
+    run = config.parent / "run"
+    run.mkdir()
+    (run / "config.toml").write_text(in_place(config), encoding="utf-8")
+    for stage in stages:
+        good(stage, run, "-q")
+    return run
+
+
+def off_truth(run: Path) -> tuple[float, int]:
+    """Chi-square of predicted less true positions over the detector, and its degrees of freedom.
+
+    Shift, roll and scale are the frames', and are taken out of both; a mirror image is not.
+    """
+    fit = without_frames(load_fit(run / "fit.nc"))
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(30, SIDE - 30, 15)] * 2))
+    true = np.array([1, 1j]) @ bent(x, y)
+    design = np.column_stack([true, np.ones(len(true))])
+
+    def left(theta):
+        z = fit.model.predict(theta, x, y) @ [1, 1j]
+        z = z - (design @ np.linalg.lstsq(design, z.T, rcond=None)[0]).T
+        return np.concatenate([z.real, z.imag], axis=-1)
+
+    # predictions are linear in the parameters: the columns are their derivatives
+    moved = left(fit.mean + np.diag(np.sqrt(np.diag(fit.cov)))) - left(fit.mean)
+    cov = (moved / np.sqrt(np.diag(fit.cov))[:, None]).T
+    cov = cov @ fit.cov @ cov.T
+    value, axes = np.linalg.eigh(cov)
+    free = value > 1e-6 * value.max()
+    off = axes.T[free] @ left(fit.mean)
+    return float((off**2 / value[free]).sum()), int(free.sum())
+
+
+def pulls_of_pairs(run: Path, parity: int) -> np.ndarray:
+    """Pairs' positions less those that the Earth saw, over the stated errors (2, n); no false ones.
+
+    On the plane that the run says, by astropy's TAN; u to the west where it is mirrored.
+    """
+    matching = summary_of(run)["matching"]
+    pairs = read_matches(run / "pairs", unit="arcsec")
+    plane = WCS(naxis=2)
+    plane.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    plane.wcs.crval, plane.wcs.cdelt = matching["tangent_point"], [1 / 3600, 1 / 3600]
+    stars = sky(np.random.default_rng(1))  # the first that the seed of `write` makes
+    log = Table.read(run.parent / "exposures.ecsv")
+    out = []
+    for row in log:
+        code = pairs.exposure_names.index(row["exposure"])
+        some = pairs.select(pairs.exposure == code)
+        xi, eta = plane.all_world2pix(stars.seen(row["epoch"])[some.star], 1).T
+        u = (-xi if parity < 0 else xi) / row["vafactor"]
+        off = np.stack([some.u - u, some.v - eta / row["vafactor"]])
+        out.append(off / np.stack([some.sigma_u, some.sigma_v]))
+    return np.concatenate(out, axis=1)
+
+
+BOTH = pytest.mark.parametrize("parity", [-1, 1], ids=["as the sky is seen", "mirrored"])
+
+
+@BOTH
+def test_both_parities_match_and_agree_with_the_truth(tmp_path, parity):
+    """A normal detector needs no word; one of the other parity than ACS/WFC is doubted."""
+    config = write(tmp_path / "in", parity)
+    assert "the middle of the exposures" in good("check", config).out
+    run = staged(config, "match", "fit")
+    found = summary_of(run)["matching"]
+    assert found["parity"] == ("mirrored" if parity < 0 else "direct")
+    assert found["n_exposures"] == len(DATES) and found["completeness"]["median"] > 0.98
+    assert [("mirrored against" in w) for w in found["warnings"]] == [True] * (parity > 0)
+    told = (run / "bayesdist.log").read_text(encoding="utf-8")
+    assert ("u is taken with the opposite sign and grows to the west" in told) == (parity < 0)
+    # motions over seven years and parallaxes are many times the errors
+    pulls = pulls_of_pairs(run, parity)
+    assert np.mean(pulls**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 * len(DATES) / pulls.size))
+    value, free = off_truth(run)
+    assert 1e-4 < stats.chi2.sf(value, free) < 1 - 1e-4
+
+
+def test_a_parity_that_is_given_is_the_only_one(tmp_path):
+    config = write(tmp_path / "in", 1, parity="direct")
+    found = summary_of(staged(config, "match"))["matching"]
+    assert found["parity"] == "direct" and not found["warnings"]
+    config = write(tmp_path / "other", 1, parity="mirrored")
+    folder = config.parent / "run"
+    folder.mkdir()
+    (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
+    result = cli("match", folder, "-q")
+    assert result.code == 1
+    one_sentence(result.err, "its mirror image does match", "campaign.parity = 'direct'")
+
+
+def test_another_field_is_refused_in_both_parities(tmp_path):
+    def elsewhere(table):
+        rng = np.random.default_rng(5)
+        for name in ("ra", "dec"):
+            table[name] = rng.permutation(np.asarray(table[name]))
+        return table
+
+    config = write(tmp_path / "in", -1, change=elsewhere)
+    folder = config.parent / "run"
+    folder.mkdir()
+    (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
+    result = cli("match", folder, "-q")
+    assert result.code == 1
+    one_sentence(result.err, "does not match", "the mirror image does not match either")
+    assert "parity" not in result.err  # both were tried
+
+
+def vizier(table):
+    """The same as VizieR names it; positions are those of an epoch that the table does not have."""
+    names = {"ra": "RA_ICRS", "dec": "DE_ICRS", "ra_error": "e_RA_ICRS", "dec_error": "e_DE_ICRS",
+             "parallax": "Plx", "parallax_error": "e_Plx", "pmra": "pmRA", "pmdec": "pmDE",
+             "pmra_error": "e_pmRA", "pmdec_error": "e_pmDE", "phot_g_mean_mag": "Gmag",
+             "source_id": "Source"}  # fmt: skip
+    for old, new in names.items():
+        table.rename_column(old, new)
+    table.remove_column("ref_epoch")
+    return table
+
+
+def test_usual_names_and_an_epoch_from_the_configuration(tmp_path):
+    config = write(tmp_path / "in", -1, change=vizier)
+    refused(tmp_path, "check", config, words=["no epoch", "campaign.catalogue_epoch"])
+    config = write(tmp_path / "given", -1, change=vizier, catalogue_epoch=CATALOGUE)
+    run = staged(config, "match")
+    pulls = pulls_of_pairs(run, -1)
+    assert np.mean(pulls**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 * len(DATES) / pulls.size))
+
+
+def test_stars_without_a_motion_are_left_out_and_counted(tmp_path):
+    def change(table):
+        for name in ("pmra", "pmdec", "pmra_error", "pmdec_error", "parallax", "parallax_error"):
+            table[name] = np.ma.masked_array(table[name], np.arange(len(table)) < 30)
+        table["parallax"][40:50] = np.ma.masked  # a parallax that is not known is none
+        return table
+
+    config = write(tmp_path / "in", -1, change=change)
+    text = good("check", config).out
+    assert "870 of 870 stars" in text and "30 stars are left out: no proper motion" in text
+    run = staged(config, "match")
+    star = read_matches(run / "pairs", unit="arcsec").star
+    assert star.min() >= 30 and np.isin(np.arange(40, 50), star).any()
+
+
+def on_a_plane(unit):
+    """The catalogue as xi, eta by astropy's TAN, in a file without units."""
+
+    def change(table):
+        plane = WCS(naxis=2)
+        plane.wcs.ctype, plane.wcs.crval = ["RA---TAN", "DEC--TAN"], FIELD
+        plane.wcs.cdelt = [1 / 3600, 1 / 3600] if unit == "arcsec" else [1 / 3.6e6, 1 / 3.6e6]
+        xi, eta = plane.all_world2pix(table["ra"], table["dec"], 1)
+        per = 1e-3 if unit == "arcsec" else 1.0  # the errors are in mas
+        out = Table({"xi": xi, "eta": eta, "ref_epoch": table["ref_epoch"]})
+        for axis, name in (("u", "ra"), ("v", "dec")):
+            out[f"s{axis}"] = per * np.asarray(table[f"{name}_error"])
+            out[f"pm_{axis}"] = per * np.asarray(table[f"pm{name}"])
+            out[f"sigma_pm_{axis}"] = per * np.asarray(table[f"pm{name}_error"])
+        out["mag"] = table["phot_g_mean_mag"]
+        return out
+
+    return change
+
+
+@pytest.mark.parametrize("unit", ["arcsec", "mas"])
+def test_a_catalogue_without_units_gets_its_unit_from_the_configuration(tmp_path, unit):
+    """The message names the key, and so does the one that says that axes are mirrored."""
+    config = write(tmp_path / "bare", -1, change=on_a_plane(unit))
+    refused(tmp_path, "check", config, words=["has no unit", "campaign.unit"])
+    config = write(tmp_path / "in", -1, change=on_a_plane(unit), unit=unit)
+    assert f"900 of 900 stars, in {unit}" in good("check", config).out
+    folder = config.parent / "run"
+    folder.mkdir()
+    (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
+    result = cli("match", folder, "-q")
+    assert result.code == 1
+    one_sentence(result.err, "its mirror image does match", "campaign.parity = 'mirrored'")
+    config = write(tmp_path / "all", -1, change=on_a_plane(unit), unit=unit, parity="mirrored")
+    found = summary_of(staged(config, "match"))["matching"]
+    assert found["parity"] == "mirrored" and found["completeness"]["median"] > 0.95
+
+
+def test_columns_of_catalogue_and_lists_have_keys_of_their_own(tmp_path):
+    def change(table):
+        table.rename_column("ra", "lon")
+        return table
+
+    config = write(tmp_path / "in", -1, change=change)
+    refused(tmp_path, "check", config, words=["no columns", "campaign.catalog_columns"])
+    config = write(
+        tmp_path / "named",
+        -1,
+        change=change,
+        catalog_columns={"ra": "lon", "parallax": "", "sigma_ra": "ra_error"},
+        columns={"q": "", "mag": "mag"},
+    )
+    assert "tangent plane" in good("check", config).out
