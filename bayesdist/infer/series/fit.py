@@ -17,7 +17,7 @@ from bayesdist.infer.series.series import Series
 
 __all__ = ["fit_series"]
 
-CHAINS, WARMUP, SWEEPS = 32, 100, 200
+CHAINS, WARMUP, SWEEPS = 32, 100, 100
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -46,7 +46,7 @@ def fit_series(
     target_ess, target_rhat : float
         Limits of convergence, for every parameter.
     max_sweeps : int
-        Draws of each chain at most; 200 are made before convergence is first judged.
+        Draws of each chain at most; 100 are made before convergence is first judged.
 
     Returns
     -------
