@@ -206,8 +206,7 @@ def grouped_errors(
     spread = np.ptp(climbs[best].variance) / typical
     if evidence[best] < DECISIVE or np.sqrt(1.0 + spread) < 1.0 + MATERIAL:
         best = ONE
-    common, chosen = float(climbs[ONE].variance[0]), climbs[best]
-    return _result(best, by, labels, chosen, common, quoted, codes[best], evidence, dispersion)
+    return _result(best, by, labels, climbs[best], quoted, codes[best], evidence, dispersion)
 
 
 def _quoted(table: MatchTable) -> Float:
@@ -316,31 +315,31 @@ def _result(
     by: str,
     labels: tuple[str, ...],
     climb: _Climb,
-    common: float,
     quoted: Float,
     code: Int,
     evidence: dict[str, float],
     dispersion: float,
 ) -> GroupedErrors:
-    """The chosen groups as a table of labels and axes; `common` is the one variance for all."""
-    weight = np.concatenate([climb.good, climb.good])
-
-    def noise(variance: Float) -> Float:  # of the estimates, where these are true
-        var = (quoted + variance).ravel()
-        return 2.0 * dispersion / np.bincount(code.ravel(), weight / var**2)
-
+    """The chosen groups as a table of labels and axes."""
     columns = 2 if grouping.endswith(AXIS) else 1
-    variance = climb.variance.reshape(-1, columns)
-    own = noise(climb.variance[code])
-    n = _counts(climb.good, code).reshape(-1, columns) / (3 - columns)  # stars, not axes of stars
-    if len(variance) >= SHRUNK:
-        chance = noise(np.full(code.shape, common)).reshape(-1, columns)
-        pairs = zip(variance.T, chance.T, strict=True)
-        variance = np.stack([_drawn_together(*pair) for pair in pairs], axis=1)
+    flat, weight = code.ravel(), np.concatenate([climb.good, climb.good])
+    weight = weight / (quoted + climb.variance[code]).ravel() ** 2
+    total = np.maximum(np.bincount(flat, weight), 1e-300)
+    error = np.sqrt(2.0 * dispersion / total)
+    n = _counts(climb.good, code) / (3 - columns)  # stars, not axes of stars
+    variance = climb.variance
+    if len(variance) >= SHRUNK * columns:
+        whole = np.bincount(flat, weight * climb.square.ravel()) / total
+        own = np.bincount(flat, weight * quoted.ravel()) / total
+        variance = variance.copy()
+        for k in range(columns):
+            rows = slice(k, None, columns)
+            drawn = _drawn_together(whole[rows], (error[rows] / whole[rows]) ** 2)
+            variance[rows] = np.maximum(drawn - own[rows], 0.0)
     several = grouping.startswith(by) if by else False
     n, variance, error = (
-        np.broadcast_to(values.reshape(-1, columns), (len(variance), 2))
-        for values in (n, variance, np.sqrt(own))
+        np.broadcast_to(values.reshape(-1, columns), (len(values) // columns, 2))
+        for values in (n, variance, error)
     )
     return GroupedErrors(
         grouping,
@@ -355,14 +354,15 @@ def _result(
 
 
 def _drawn_together(variance: Float, noise: Float) -> Float:
-    """Variances (G,) drawn to their mean by how much chance, of this variance (G,), explains.
+    """Variances (G,) whose logarithms are drawn to their mean by how much chance explains.
 
-    After DerSimonian and Laird 1986; chance is that of equal groups.
+    After DerSimonian and Laird 1986; `noise` (G,) is the variance of each logarithm by chance, half
+    of which its mean falls short of that of the variance.
     """
+    log = np.log(variance) + 0.5 * noise
     weight = 1.0 / noise
-    mean = float(np.average(variance, weights=weight))
-    q = float((weight * (variance - mean) ** 2).sum())
-    spare = weight.sum() - (weight**2).sum() / weight.sum()
-    between = max(0.0, (q - (len(variance) - 1)) / spare)
-    mean = float(np.average(variance, weights=1.0 / (between + noise)))
-    return mean + between / (between + noise) * (variance - mean)
+    q = float((weight * (log - np.average(log, weights=weight)) ** 2).sum())
+    spare = float(weight.sum() - (weight**2).sum() / weight.sum())
+    between = max(0.0, (q - (len(log) - 1)) / spare)
+    mean = np.average(log, weights=1.0 / (between + noise))
+    return np.asarray(np.exp(mean + between / (between + noise) * (log - mean)))
