@@ -116,7 +116,7 @@ def grouping_sentence(found: GroupedErrors, unit: str) -> str:
         Of u and v.
     """
     evidence = ", ".join(f"{name} {gain:.3g}" for name, gain in found.evidence.items())
-    head = f"ln evidence over one jitter for all stars: {evidence}"
+    head = f"ln evidence gained by groups: {evidence}"
     if found.grouping == ONE:
         return f"one jitter for both axes ({head})"
     each, joint = list(_each(found)), ", "

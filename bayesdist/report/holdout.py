@@ -86,7 +86,7 @@ def _coverage_tables(found: HeldOutTruth) -> tuple[TextTable, ...]:
     rows = tuple(
         (
             c.axis,
-            f"{number(c.level)} σ",
+            f"{c.level:g} σ",
             count(c.n),
             f"{c.value:.3f}",
             f"{c.interval[0]:.3f} to {c.interval[1]:.3f}",

@@ -11,6 +11,7 @@ from astropy.table import Table
 from tests.app.support import (
     SIZE,
     begin_stagewise,
+    cli,
     good,
     one_sentence,
     refused,
@@ -210,8 +211,6 @@ def test_errors_that_come_from_residuals_have_no_jitter_of_groups(tmp_path, kind
     text = "\n".join(f"{k} = {json.dumps(v)}" for k, v in block.items())
     path = tmp_path / "config.toml"
     path.write_text(f'[{kind}]\n{text}\n[model]\norder = 3\n[outliers]\njitter_by = "chip"\n')
-    from tests.app.support import cli
-
     result = cli("check", path)
     assert result.code == 1
     one_sentence(result.err)
