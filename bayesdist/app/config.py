@@ -530,9 +530,7 @@ class Config(Section):
         head = f"outliers.jitter_by is {by!r}, which is of quoted errors, and"
         if self.data is None:
             kind = "campaign" if self.campaign is not None else "selfcal"
-            raise ValueError(
-                f"{head} those of a [{kind}] are estimated from its residuals; leave it out"
-            )
+            raise ValueError(f"{head} a [{kind}] has a model of errors of its own; leave it out")
         if self.data.sigma == "by_magnitude":
             raise ValueError(
                 f"{head} data.sigma = 'by_magnitude' takes errors of both axes from the "
