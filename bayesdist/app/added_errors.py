@@ -48,7 +48,7 @@ def compared_errors(session: Session, fit: LinearFit) -> GroupedErrors | None:
     by = config.outliers.jitter_by
     try:
         return grouped_errors(
-            session.matches,
+            session.sampled_matches,
             fit,
             by="" if by == "auto" else by,
             outliers=config.outliers.model != "none",

@@ -541,6 +541,11 @@ class Session:
         """Some of the matches, or all."""
         return self.matches.sample(SAMPLE)
 
+    @property
+    def sampled_matches(self) -> MatchTable:
+        """The same: what is estimated from single residuals before anything is sampled."""
+        return self._sample
+
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""
         return np.random.default_rng([self.config.sampler.seed, STAGES.index(stage) - 1])

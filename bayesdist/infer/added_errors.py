@@ -37,7 +37,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.by_magnitude import LEAST_WEIGHT, memberships_of, residuals_of, variances_of
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.shards import Matches
 from bayesdist.model import DistortionModel
 
 __all__ = ["ONE", "GroupedErrors", "grouped_errors"]
@@ -139,7 +138,7 @@ class _Climb:
 
 
 def grouped_errors(
-    matches: Matches,
+    matches: MatchTable,
     fit: LinearFit,
     *,
     by: str = "",
@@ -150,10 +149,10 @@ def grouped_errors(
 
     Parameters
     ----------
-    matches : MatchTable or PartitionedMatches
+    matches : MatchTable
         With the quoted errors; of very many a sample is used.
     fit : LinearFit
-        Of these matches: where the climb begins.
+        Of these matches, or of those that they are a sample of: where the climb begins.
     by : str
         'chip', 'exposure' or 'filter': groups that are compared beside the axes.
     outliers : bool
