@@ -125,6 +125,11 @@ class ClusterSums:
             sums.place_cov += np.kron(extra, np.eye(2))
 
     @property
+    def stars_repeat(self) -> bool:
+        """Whether matches of one star share its error: else each match is by itself."""
+        return self.n_stars < len(self._star)
+
+    @property
     def n_stars(self) -> int:
         """Stars, each once."""
         return int(self._star.max()) + 1
@@ -138,7 +143,10 @@ class ClusterSums:
         """
         m = self._n_bins // merge
         code = self._all["pit"][:, k] // merge
-        out = _outer(code, self._star, m)
+        if self.stars_repeat:
+            out = _outer(code, self._star, m)
+        else:
+            out = len(code) * (np.eye(m) / m - 1 / m**2)
         if self._cell is not None:
             for score in (self._all["place"] * self._all["local_size"][:, None]).T:
                 by = _by_bin(code, self._cell, m, score)

@@ -291,7 +291,7 @@ def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
         rest = (counts - sums.n / m)[:-1]
         t = float(rest @ np.linalg.solve(cov[:-1, :-1], rest))
         p = float(chi2.sf(t, m - 1))
-        if shared is not None:
+        if shared is not None and shared.stars_repeat:
             p = _of_clusters(t, m - 1, n)
         size = float(np.abs(np.cumsum(sums.pit[k]) / sums.n - np.arange(1, 21) / PIT_BINS).max())
         out.append(HeldTest("distribution", ALL, what, k, sums.n, size, 0.0, p, wider=wider))
