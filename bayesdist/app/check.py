@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from bayesdist.app.added_errors import grouping_sentence
 from bayesdist.app.config import load_config
 from bayesdist.app.dates import idle_dates
 from bayesdist.app.rundir import RunDirectory
@@ -75,6 +76,8 @@ def _lines(session: Session) -> Iterator[str]:
         f"errors       median {number(sigma)} {matches.unit}"
         + (" (by magnitude)" if errors is not None else "")
     )
+    if session.grouped_errors is not None:
+        yield f"jitter       {grouping_sentence(session.grouped_errors, fit.unit)}"
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
     if len(model.chips) > 1:
         found = zip(model.chips, session.shards.survey.chips, strict=True)

@@ -206,9 +206,19 @@ class Outliers(Section):
     model: Literal["gaussian", "uniform", "none"] = "gaussian"
     match_radius: PositiveFloat | None = None
     jitter: Literal["fit"] | Annotated[float, Field(ge=0)] = "fit"
+    jitter_by: Literal["auto", "one", "chip", "exposure", "filter"] = "auto"
     fraction_prior: Pair = (1.0, 9.0)
     jitter_scale: PositiveFloat | None = None
     outlier_scale: PositiveFloat | None = None
+
+    @model_validator(mode="after")
+    def _groups_of_what_is_fitted(self) -> Outliers:
+        if self.jitter_by not in ("auto", "one") and self.jitter != "fit":
+            raise ValueError(
+                f"outliers.jitter_by is {self.jitter_by!r}, and outliers.jitter gives the one "
+                "jitter of all stars; leave one of the two out"
+            )
+        return self
 
 
 class Sampler(Section):
@@ -513,6 +523,33 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _jitter_beyond_quoted_errors(self) -> Config:
+        by = self.outliers.jitter_by
+        if by == "auto":
+            return self
+        head = f"outliers.jitter_by is {by!r}, which is of quoted errors, and"
+        if self.data is None:
+            kind = "campaign" if self.campaign is not None else "selfcal"
+            raise ValueError(f"{head} a [{kind}] has a model of errors of its own; leave it out")
+        if self.data.sigma == "by_magnitude":
+            raise ValueError(
+                f"{head} data.sigma = 'by_magnitude' takes errors of both axes from the "
+                "residuals; leave it out, or give columns of errors or a number"
+            )
+        if by == "chip" and not self.chip:
+            raise ValueError(
+                "outliers.jitter_by is 'chip', and there is one chip; leave it out, or give "
+                "[[chip]] blocks"
+            )
+        return self
+
+    @property
+    def compares_jitters(self) -> bool:
+        """Whether groups of stars may have jitters of their own, if the data ask for it."""
+        of_quoted = self.data is not None and self.data.sigma != "by_magnitude"
+        return of_quoted and self.outliers.jitter == "fit" and self.outliers.jitter_by != "one"
+
+    @model_validator(mode="after")
     def _matched_in_a_circle(self) -> Config:
         if self.selfcal is not None and _names_nominal(self.selfcal.columns):
             raise ValueError(
@@ -543,6 +580,11 @@ class Config(Section):
             raise ValueError(
                 f"{head} cut by the match circle, and so are residuals, from which data.sigma = "
                 "'by_magnitude' takes the errors; give columns of errors, or a number"
+            )
+        if self.outliers.jitter_by not in ("auto", "one"):
+            raise ValueError(
+                f"{head} cut by the match circle, and so are residuals, from which "
+                "outliers.jitter_by takes the jitters of groups; leave it out"
             )
         if self.holdout is not None:
             raise ValueError(

@@ -170,6 +170,17 @@ def holdout_summary(found: HeldOutTruth) -> dict[str, Any]:
         "p_value": found.p_value,
         "verdict": found.verdict,
         "level": found.level,
+        "coverage": [
+            {
+                "axis": c.axis,
+                "sigma": c.level,
+                "n": c.n,
+                "value": c.value,
+                "expected": c.expected,
+                "interval": list(c.interval),
+            }
+            for c in found.coverage
+        ],
         "tests": [
             {
                 "name": t.name,

@@ -12,6 +12,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bayesdist.app.added_errors import compared_errors, kept_grouped_errors
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import CATALOGUE_WORDS, Config
 from bayesdist.app.discrepancy import RunDiscrepancy, keep_discrepancy, kept_discrepancy
@@ -61,6 +62,7 @@ from bayesdist.infer import (
     load_fit,
     load_posterior,
 )
+from bayesdist.infer.added_errors import GroupedErrors
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.infer.frame_choice import FrameChoice, frames_that_help
 from bayesdist.model import DistortionModel
@@ -117,7 +119,9 @@ class Session:
         if self._split is None:
             return None
         held, errors = self._split.held, self.magnitude_errors
-        return held if errors is None else held.with_errors_by_magnitude(errors)
+        return self.with_added_errors(
+            held if errors is None else held.with_errors_by_magnitude(errors)
+        )
 
     @property
     def in_circle(self) -> bool:
@@ -142,6 +146,16 @@ class Session:
             self.model.unit,
             by_magnitude=self.raw_matches.has_mag,
         )
+
+    @cached_property
+    def grouped_errors(self) -> GroupedErrors | None:
+        """Errors beyond the quoted ones by groups of stars; None where these are not compared."""
+        return kept_grouped_errors(self.run.summary.get("fit", {}).get("added_errors"))
+
+    def with_added_errors(self, matches: Matches) -> Matches:
+        """Matches with what their group has beyond the quoted errors and the jitter."""
+        added = None if self.grouped_errors is None else self.grouped_errors.added
+        return matches if added is None else matches.with_added_errors(added)
 
     @cached_property
     def _all_matches(self) -> Matches:
@@ -195,7 +209,9 @@ class Session:
     def matches(self) -> Matches:
         """Matches with their errors."""
         raw, errors = self.raw_matches, self.magnitude_errors
-        return raw if errors is None else raw.with_errors_by_magnitude(errors)
+        return self.with_added_errors(
+            raw if errors is None else raw.with_errors_by_magnitude(errors)
+        )
 
     @cached_property
     def shards(self) -> Shards:
@@ -291,13 +307,20 @@ class Session:
             options["compute"] = self.config.resources()
             solution, _, errors = fit_by_magnitude(self.raw_matches, self.model, **options)
             return solution, errors
+        if self.grouped_errors is not None:  # of a fit that was made before this one
+            self.grouped_errors = None
+            self.errors_changed()
         solution = fit_linear(self.shards, self.model, **options)
         factor = error_scale(solution, self._sample)
-        if factor == 1.0:
+        if factor != 1.0:
+            self.error_scale *= factor
+            self.__dict__["_all_matches"] = self._all_matches.with_errors_times(factor)
+            self.__dict__.pop("_split", None)
+            self.errors_changed()
+            solution = fit_linear(self.shards, self.model, **options)
+        found = self.grouped_errors = compared_errors(self, solution)
+        if found is None or found.added is None:
             return solution, None
-        self.error_scale *= factor
-        self.__dict__["_all_matches"] = self._all_matches.with_errors_times(factor)
-        self.__dict__.pop("_split", None)
         self.errors_changed()
         return fit_linear(self.shards, self.model, **options), None
 
@@ -540,6 +563,11 @@ class Session:
     def _sample(self) -> MatchTable:
         """Some of the matches, or all."""
         return self.matches.sample(SAMPLE)
+
+    @property
+    def sampled_matches(self) -> MatchTable:
+        """The same: what is estimated from single residuals before anything is sampled."""
+        return self._sample
 
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""

@@ -14,7 +14,7 @@ from bayesdist.assess.holdout_frames import frames_for
 from bayesdist.assess.holdout_predictive import Predictive, predictive_of
 from bayesdist.assess.holdout_spread import scale_of
 from bayesdist.assess.holdout_sums import held_sums
-from bayesdist.assess.holdout_tests import HeldTest, all_tests, holm
+from bayesdist.assess.holdout_tests import AxisCoverage, HeldTest, all_tests, coverage_of, holm
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.shards import Matches
@@ -53,6 +53,8 @@ class HeldOutTruth:
         Factor on the predicted errors in each region; NaN where there are too few stars.
     region_offset : ndarray, shape (B, 2)
         Mean offset from the prediction, in units of its own predicted error.
+    coverage : tuple of AxisCoverage
+        Along each axis.
     """
 
     unit: str
@@ -65,6 +67,16 @@ class HeldOutTruth:
     region_n: Float
     region_scale: Float
     region_offset: Float
+    coverage: tuple[AxisCoverage, ...] = ()
+
+    @property
+    def coverage_words(self) -> str:
+        """Fractions within one sigma along both axes, as a clause."""
+        found = [one for one in self.coverage if one.level == 1.0]
+        return " and ".join(f"{one.value:.3f} along {one.axis}" for one in found) + (
+            f" of held-out stars lie within 1 sigma of their prediction, {found[0].expected:.3f} "
+            "are predicted"
+        )
 
     @property
     def p_value(self) -> float:
@@ -199,4 +211,5 @@ def held_out_truth(
         region_offset=np.divide(
             found.place, error, out=np.full_like(error, np.nan), where=error > 0
         ),
+        coverage=coverage_of(sums),
     )

@@ -23,6 +23,7 @@ __all__ = [
     "ExposureDeviations",
     "Predictive",
     "Scores",
+    "marginals_of",
     "predictive_of",
     "scores_of",
     "uniforms_of",
@@ -172,6 +173,10 @@ class Scores:
         By the logarithm of a factor on the errors of true matches, at each of several factors.
     one : ndarray, shape (n,)
         The same at the factor 1.
+    axes : ndarray, shape (n, 2)
+        By the logarithm of a factor on the errors along one axis alone.
+    axes_spread : ndarray, shape (n, 2, SCALES)
+        The same at each of several factors.
     free : ndarray, shape (n, h)
         By what is not known exactly of the mixture.
     """
@@ -179,6 +184,8 @@ class Scores:
     place: Float
     spread: Float
     one: Float
+    axes: Float
+    axes_spread: Float
     free: Float
 
 
@@ -209,6 +216,7 @@ def scores_of(predictive: Predictive, residual: Float, cov: Float) -> Scores:
     w = member(np.ones(1))[:, 0]
     w = np.where(far > 0, w, 1.0)
     several = np.where(far[:, None] > 0, member(SCALES), 1.0)
+    of_axis = residual**2 / cov[:, :2]
     gaussian = predictive.outliers == "gaussian"
     outer = (1 - w) / scale**2 if gaussian else np.zeros_like(w)
     by = {
@@ -220,10 +228,42 @@ def scores_of(predictive: Predictive, residual: Float, cov: Float) -> Scores:
         place=w[:, None] * white + outer[:, None] * residual,
         spread=several * (np.outer(q, SCALES**-2.0) - 2),
         one=w * (q - 2),
+        axes=w[:, None] * (of_axis - 1),
+        axes_spread=_along_each(np.log(np.maximum(height, NEVER)) - 0.5 * q, of_axis, far),
         free=np.stack([by[k] for k in predictive.free], axis=1)
         if predictive.free
         else np.zeros((len(q), 0)),
     )
+
+
+def _along_each(log_core: Float, of_axis: Float, far: Float) -> Float:
+    """Scores (n, 2, SCALES) of factors on the errors of true matches along one axis alone."""
+    q = of_axis[:, :, None] * SCALES**-2.0
+    here = np.exp(log_core[:, None, None] + 0.5 * (of_axis[:, :, None] - q)) / SCALES
+    far = far[:, None, None]
+    w = np.where(far > 0, here / np.maximum(here + far, NEVER), 1.0)
+    return np.asarray(w * (q - 1))
+
+
+def marginals_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
+    """Predictive probabilities (2, n) of less in u and in v, whatever the other is.
+
+    Parameters
+    ----------
+    predictive, residual, cov
+        As of `scores_of`.
+    """
+    f, s = predictive.fraction, predictive.scale
+    out = []
+    for r, var in zip(residual.T, cov[:, :2].T, strict=True):
+        far = np.zeros_like(r)
+        if predictive.outliers == "gaussian":
+            far = ndtr(r / s)
+        elif predictive.outliers == "uniform":
+            x = np.clip(r / s, -1.0, 1.0)
+            far = 0.5 + (x * np.sqrt(1 - x * x) + np.arcsin(x)) / np.pi
+        out.append((1 - f) * ndtr(r / np.sqrt(var)) + f * far)
+    return np.stack(out)
 
 
 def uniforms_of(predictive: Predictive, residual: Float, cov: Float) -> Float:

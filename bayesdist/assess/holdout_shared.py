@@ -87,6 +87,7 @@ class ClusterSums:
             x, y = table.x[index], table.y[index]
             local = self._predictive.local_variance(x, y, chip)
             part["local"] = (1 - self._predictive.fraction) * np.sqrt(local) / whole
+            part["local_size"] = np.sqrt(local)
             part["local_share"] = np.minimum(local / whole, 1.0)
             across, up = (
                 np.maximum(a // s, 0).astype(np.int64)
@@ -124,18 +125,32 @@ class ClusterSums:
             sums.place_cov += np.kron(extra, np.eye(2))
 
     @property
+    def stars_repeat(self) -> bool:
+        """Whether matches of one star share its error: else each match is by itself."""
+        return self.n_stars < len(self._star)
+
+    @property
     def n_stars(self) -> int:
         """Stars, each once."""
         return int(self._star.max()) + 1
 
     def pit_covariance(self, k: int, merge: int) -> Float:
-        """Covariance (m, m) of the counts of predictive probabilities, in merged bins."""
+        """Covariance (m, m) of the counts of predictive probabilities, in merged bins.
+
+        By an error that a cell shares a count changes as by one of the solution's parameters: by
+        the sum of score times error.  Squares of the counts of some tens of cells would not have
+        the rank of a covariance.
+        """
         m = self._n_bins // merge
         code = self._all["pit"][:, k] // merge
-        out = _outer(code, self._star, m)
+        if self.stars_repeat:
+            out = _outer(code, self._star, m)
+        else:
+            out = len(code) * (np.eye(m) / m - 1 / m**2)
         if self._cell is not None:
-            n = len(code)
-            out += _outer(code, self._cell, m) - n * (np.eye(m) / m - 1 / m**2)
+            for score in (self._all["place"] * self._all["local_size"][:, None]).T:
+                by = _by_bin(code, self._cell, m, score)
+                out += by.T @ by
         return out
 
     def overdispersion(self, limit: float) -> float:
@@ -185,7 +200,12 @@ def _sums(of: Int, values: Float) -> Float:
 
 def _outer(code: Int, cluster: Int, m: int) -> Float:
     """Sum of squares (m, m) of counts in m bins less their expectation, cluster by cluster."""
-    n = int(cluster.max()) + 1
-    counts = np.bincount(cluster * m + code, minlength=n * m).reshape(n, m).astype(float)
-    counts -= counts.sum(axis=1, keepdims=True) / m
+    counts = _by_bin(code, cluster, m, np.ones(len(code)))
     return np.asarray(counts.T @ counts)
+
+
+def _by_bin(code: Int, cluster: Int, m: int, values: Float) -> Float:
+    """Sums (clusters, m) of values by bin less the mean over bins."""
+    n = int(cluster.max()) + 1
+    sums = np.bincount(cluster * m + code, values, n * m).reshape(n, m)
+    return np.asarray(sums - sums.sum(axis=1, keepdims=True) / m)

@@ -17,7 +17,7 @@ LEAST_SKEW = 1e-4
 
 
 class SpreadMoments:
-    """Second and third moments of the score w (q - 2) of one star.
+    """Second and third moments of the score w (q - 2) of one star, and of one axis, w (q_u - 1).
 
     w is the probability of a true match and q its chi-square.  They are integrals over t = q / 2,
     in which true matches fall as exp(-t) and false ones as k exp(-k t) or not at all, tabulated in
@@ -46,16 +46,32 @@ class SpreadMoments:
         density = core + far
         self._second = np.trapezoid(score**2 * density, t, axis=1)
         self._third = np.trapezoid(score**3 * density, t, axis=1)
+        # q_u = 2 t cos^2 of an angle of which nothing is known: means of its powers
+        square, cube = 1.5 * t**2 - 2 * t + 1, 2.5 * t**3 - 4.5 * t**2 + 3 * t - 1
+        self._axis_second = np.trapezoid(w**2 * square * density, t, axis=1)
+        self._axis_third = np.trapezoid(w**3 * cube * density, t, axis=1)
 
     def of(self, cov: Float) -> tuple[Float, Float]:
         """Moments (n,) of stars with covariances uu, vv, uv (n, 3)."""
-        var = np.sqrt(cov[:, 0] * cov[:, 1] - cov[:, 2] ** 2)
-        factor = 2.0 if self._predictive.outliers == "uniform" else 1.0
-        log_k = np.log(factor * var / self._predictive.scale**2)
+        log_k = self._ratio(cov)
         return (
             np.interp(log_k, self._log_k, self._second),
             np.interp(log_k, self._log_k, self._third),
         )
+
+    def of_axis(self, cov: Float) -> tuple[Float, Float]:
+        """The same of the score of an axis: both axes have the same."""
+        log_k = self._ratio(cov)
+        return (
+            np.interp(log_k, self._log_k, self._axis_second),
+            np.interp(log_k, self._log_k, self._axis_third),
+        )
+
+    def _ratio(self, cov: Float) -> Float:
+        """Logarithm of k (n,)."""
+        var = np.sqrt(cov[:, 0] * cov[:, 1] - cov[:, 2] ** 2)
+        factor = 2.0 if self._predictive.outliers == "uniform" else 1.0
+        return np.log(factor * var / self._predictive.scale**2)
 
 
 def sum_tails(value: float, variance: float, third: float) -> float:

@@ -11,11 +11,13 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
-from bayesdist.assess.holdout_bins import Partition
+from bayesdist.assess.holdout_bins import ALL, Partition
 from bayesdist.assess.holdout_frames import Frame
 from bayesdist.assess.holdout_predictive import (
     SCALES,
     Predictive,
+    Scores,
+    marginals_of,
     scores_of,
     uniforms_of,
 )
@@ -25,12 +27,13 @@ from bayesdist.assess.holdout_spread import SpreadMoments
 from bayesdist.data import MatchTable
 from bayesdist.data.pieces import Piece
 
-__all__ = ["PIT_BINS", "TAILS", "BinSums", "HeldSums", "held_sums"]
+__all__ = ["LEVELS", "PIT_BINS", "TAILS", "AxisSums", "BinSums", "HeldSums", "held_sums"]
 
 Float = NDArray[np.float64]
 
 PIT_BINS = 20
 TAILS = (3.0, 4.0, 5.0)  # sigma
+LEVELS = (1.0, 2.0)  # sigma, within which stars are counted along each axis
 STEP = 0.5  # of a standard deviation of the mixture's parameters: for derivatives
 
 
@@ -95,6 +98,36 @@ class BinSums:
 
 
 @dataclass(eq=False)
+class AxisSums:
+    """Sums over all stars along u and along v.
+
+    Attributes
+    ----------
+    score, second, third : ndarray, shape (2,)
+        Scores of the scale of the errors along the axis, and their expected moments.
+    by_free : ndarray, shape (2, h)
+    scales : ndarray, shape (2, SCALES)
+        Those scores for other errors.
+    within : ndarray, shape (2, LEVELS)
+        Stars in the middle of their predictive distribution along the axis: in so much of it as a
+        normal variable has within so many sigma.
+    """
+
+    score: Float
+    second: Float
+    third: Float
+    by_free: Float
+    scales: Float
+    within: Float
+
+    @classmethod
+    def empty(cls, n_free: int) -> AxisSums:
+        """Sums over nothing."""
+        shapes = ((), (), (), (n_free,), (SCALES.size,), (len(LEVELS),))
+        return cls(*(np.zeros((2, *shape)) for shape in shapes))
+
+
+@dataclass(eq=False)
 class HeldSums:
     """Sums over all held-out stars.
 
@@ -104,6 +137,7 @@ class HeldSums:
         Stars that were predicted, and those of exposures with too few for a frame.
     bins : dict of str to BinSums
         By the name of the partition.
+    axes : AxisSums
     pit : ndarray, shape (3, PIT_BINS)
         Counts of the predictive probabilities of u, of v given u, and of the distance.
     pit_by : ndarray, shape (3, PIT_BINS, D)
@@ -120,6 +154,7 @@ class HeldSums:
     """
 
     bins: dict[str, BinSums]
+    axes: AxisSums
     pit: Float
     pit_by: Float
     pit_free: Float
@@ -154,6 +189,7 @@ def held_sums(
     D, h = predictive.model.n_params, len(predictive.free)
     out = HeldSums(
         {p.kind: BinSums.empty(len(p.bins), D, h) for p in partitions},
+        AxisSums.empty(h),
         np.zeros((3, PIT_BINS)),
         np.zeros((3, PIT_BINS, D)),
         np.zeros((3, PIT_BINS, h)),
@@ -176,7 +212,12 @@ def held_sums(
     for sums in out.bins.values():
         sums.independent[:] = sums.n
     if out.shared is not None:
+        whole = out.bins[ALL]
+        alone = whole.spread_2[0], whole.spread_3[0]
         out.shared.settle(out.bins)
+        # what stars scatter together they do alike along both axes
+        out.axes.second += (whole.spread_2[0] - alone[0]) / 2
+        out.axes.third += (whole.spread_3[0] - alone[1]) / 2
     return out
 
 
@@ -245,6 +286,7 @@ def _add(
             shared = lost.among(sums.lost, len(partition.bins), 2)
             for axis in (0, 1):
                 shared[:, axis] += member @ (scores.place[:, axis, None] * lost.along)
+    _add_axes(out.axes, predictive, moments, scores, rows)
     uniforms = uniforms_of(predictive, rows.residual, rows.cov)
     for k, values in enumerate(uniforms):
         code = np.clip((values * PIT_BINS).astype(np.int64), 0, PIT_BINS - 1)
@@ -263,6 +305,20 @@ def _add(
         for m, one in enumerate(around):
             extra = one.jitter2 - predictive.jitter2
             out.expected[k, m] += _beyond(one, limit * np.sqrt(rows.cov[:, :2]), extra, rows.cov)
+
+
+def _add_axes(
+    axes: AxisSums, predictive: Predictive, moments: SpreadMoments, scores: Scores, rows: Rows
+) -> None:
+    second, third = moments.of_axis(rows.cov)
+    axes.score += scores.axes.sum(axis=0)
+    axes.second += second.sum()
+    axes.third += third.sum()
+    axes.by_free += scores.axes.T @ scores.free
+    axes.scales += scores.axes_spread.sum(axis=0)
+    aside = np.abs(2 * marginals_of(predictive, rows.residual, rows.cov) - 1)
+    for k, level in enumerate(LEVELS):
+        axes.within[:, k] += (aside < erf(level / np.sqrt(2))).sum(axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,17 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc
+from scipy.special import betainc, erf
 from scipy.stats import beta, chi2
 
 from bayesdist.assess.holdout_bins import ALL, Partition
 from bayesdist.assess.holdout_predictive import Predictive
 from bayesdist.assess.holdout_spread import scale_of, sum_tails
-from bayesdist.assess.holdout_sums import PIT_BINS, STEP, TAILS, BinSums, HeldSums
+from bayesdist.assess.holdout_sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
 
-__all__ = ["HeldTest", "all_tests", "holm"]
+__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of", "holm"]
 
 Float = NDArray[np.float64]
+
+AXIS = "axis"  # a part: the stars along one axis
 
 LEAST_STARS = 20  # of a bin that is judged by itself
 STARS_PER_PIT_BIN = 20
@@ -41,7 +43,7 @@ class HeldTest:
     name : str
         'offset', 'spread', 'distribution', 'tails' or 'deviation'.
     part : str
-        'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
+        'all', 'axis', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
     where : str
         In words.
     index : int
@@ -93,6 +95,48 @@ class HeldTest:
         return self.name in ("offset", "deviation") or self.value > EXCESS * self.expected
 
 
+@dataclass(frozen=True)
+class AxisCoverage:
+    """How many held-out stars lie in the middle of what is predicted of them along an axis.
+
+    Parameters
+    ----------
+    axis : str
+        'u' or 'v'.
+    level : float
+        In sigma of a normal variable.
+    n : int
+        Stars.
+    value, expected : float
+        Fraction of them, and the predicted one.
+    interval : tuple of float
+        Of the fraction, 95 %.
+    """
+
+    axis: str
+    level: float
+    n: int
+    value: float
+    expected: float
+    interval: tuple[float, float]
+
+
+def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
+    """Coverage along u and v at each level."""
+    return tuple(
+        AxisCoverage(
+            axis,
+            level,
+            sums.n,
+            float(sums.axes.within[a, k]) / sums.n,
+            float(erf(level / np.sqrt(2))),
+            _interval(int(sums.axes.within[a, k]), sums.n),
+        )
+        for a, axis in enumerate("uv")
+        for k, level in enumerate(LEVELS)
+    )
+
+
 def all_tests(
     sums: HeldSums, predictive: Predictive, partitions: Sequence[Partition]
 ) -> list[HeldTest]:
@@ -113,6 +157,7 @@ def all_tests(
         found = sums.bins[partition.kind]
         out += _offsets(found, sums, predictive, partition)
         out += _spreads(found, predictive, partition)
+    out += _axes(sums, predictive)
     return [*out, *_distributions(sums, predictive), *_tails(sums, predictive)]
 
 
@@ -211,6 +256,18 @@ def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> li
     return out
 
 
+def _axes(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
+    """Whether true matches scatter as predicted along each axis by itself."""
+    out, axes = [], sums.axes
+    for a, axis in enumerate("uv"):
+        g = axes.by_free[a]
+        variance = float(axes.second[a] + g @ predictive.free_cov @ g)
+        p = sum_tails(float(axes.score[a]), variance, float(axes.third[a]))
+        scale = scale_of(axes.scales[a])
+        out.append(HeldTest("spread", AXIS, f"along {axis}", a, sums.n, scale, 1.0, p))
+    return out
+
+
 def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
     """Whether the predictive probabilities are uniform."""
     merge, shared = 1, sums.shared
@@ -234,7 +291,7 @@ def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
         rest = (counts - sums.n / m)[:-1]
         t = float(rest @ np.linalg.solve(cov[:-1, :-1], rest))
         p = float(chi2.sf(t, m - 1))
-        if shared is not None:
+        if shared is not None and shared.stars_repeat:
             p = _of_clusters(t, m - 1, n)
         size = float(np.abs(np.cumsum(sums.pit[k]) / sums.n - np.arange(1, 21) / PIT_BINS).max())
         out.append(HeldTest("distribution", ALL, what, k, sums.n, size, 0.0, p, wider=wider))
@@ -257,10 +314,7 @@ def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
         more = 1.0 if sums.shared is None else sums.shared.overdispersion(limit)
         below = float(weights @ _at_most(seen / more, sums.n / more, share))
         above = float(weights @ _at_least(seen / more, sums.n / more, share))
-        interval = (
-            float(beta.ppf(0.025, seen, sums.n - seen + 1)) if seen else 0.0,
-            float(beta.ppf(0.975, seen + 1, sums.n - seen)) if seen < sums.n else 1.0,
-        )
+        interval = _interval(seen, sums.n)
         p = float(min(1.0, 2 * min(below, above)))
         out.append(
             HeldTest(
@@ -277,6 +331,14 @@ def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
             )
         )
     return out
+
+
+def _interval(seen: int, n: int) -> tuple[float, float]:
+    """Of a fraction, 95 % (Clopper and Pearson 1934)."""
+    return (
+        float(beta.ppf(0.025, seen, n - seen + 1)) if seen else 0.0,
+        float(beta.ppf(0.975, seen + 1, n - seen)) if seen < n else 1.0,
+    )
 
 
 def _at_least(k: float, n: float, share: Float) -> Float:

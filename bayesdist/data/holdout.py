@@ -128,7 +128,8 @@ class ChosenMatches(PartitionedMatches):
     def pieces(self) -> tuple[Piece, ...]:
         """The rows in consecutive pieces: those of the origin that have any."""
         assert self.origin is not None and self.aside is not None
-        pieces = replace(self.origin, errors=self.errors, factor=self.factor).pieces()
+        errors = {"errors": self.errors, "factor": self.factor, "added": self.added}
+        pieces = replace(self.origin, **errors).pieces()
         return tuple(
             _ChosenPiece(piece, self.aside, self.held, self.exposure_names, n)
             for piece, n in zip(pieces, self.counts, strict=True)
@@ -206,6 +207,7 @@ def split_matches(matches: Matches, aside: SetAside) -> Split:
             matches.errors,
             {**matches.dropped, **others},
             matches.factor,
+            matches.added,
             matches,
             aside,
             held,

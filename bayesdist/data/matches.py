@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.duplicates import first_duplicate
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
 from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
@@ -439,6 +440,21 @@ class MatchTable:
         if self.sigma_u is None or self.sigma_v is None:
             return self
         return self.with_sigma(factor * self.sigma_u, factor * self.sigma_v)
+
+    def with_added_errors(self, added: AddedErrors) -> MatchTable:
+        """The same stars with errors added in quadrature.
+
+        Parameters
+        ----------
+        added : AddedErrors
+
+        Returns
+        -------
+        MatchTable
+        """
+        if self.sigma_u is None or self.sigma_v is None:
+            return self
+        return self.with_sigma(*added.beside(self, self.sigma_u, self.sigma_v))
 
     def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> MatchTable:
         """The same stars with errors by magnitude.

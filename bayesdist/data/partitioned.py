@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.parquet_files import describe_part
@@ -57,6 +58,8 @@ class PartPiece:
         Errors in place of those in the files.
     factor : float
         On all errors.
+    added : tuple of AddedErrors
+        Beside what the factor makes of them.
     """
 
     whole: Whole
@@ -64,6 +67,7 @@ class PartPiece:
     segments: tuple[Segment, ...]
     errors: Errors | None = None
     factor: float = 1.0
+    added: tuple[AddedErrors, ...] = ()
 
     def __len__(self) -> int:
         return sum(stop - start for _, start, stop in self.segments)
@@ -87,7 +91,10 @@ class PartPiece:
             name: several[0] if len(several) == 1 else np.concatenate(several)
             for name, several in arrays.items()
         }
-        return MatchTable.of_distinct_rows(**joined, **_shared(self.whole, len(self)))
+        table = MatchTable.of_distinct_rows(**joined, **_shared(self.whole, len(self)))
+        for one in self.added:
+            table = table.with_added_errors(one)
+        return table
 
     def _segment(self, part: MatchPart, segment: Segment) -> dict[str, Any]:
         """Arrays of the rows in one file."""
@@ -132,6 +139,8 @@ class PartitionedMatches:
         Rows that were left out when the files were made, by reason.
     factor : float
         On all errors.
+    added : tuple of AddedErrors
+        Beside what the factor makes of them.
 
     Attributes
     ----------
@@ -153,6 +162,7 @@ class PartitionedMatches:
     errors: Errors | None = None
     dropped: Mapping[str, int] = field(default_factory=dict)
     factor: float = 1.0
+    added: tuple[AddedErrors, ...] = ()
 
     def __len__(self) -> int:
         return self.whole.n_rows
@@ -256,6 +266,7 @@ class PartitionedMatches:
                 tuple(segments),
                 self.errors,
                 self.factor,
+                self.added,
             )
             for segments in out
         )
@@ -310,7 +321,7 @@ class PartitionedMatches:
             Without magnitudes.
         """
         refuse_missing_errors("by_magnitude", False, self.has_mag, where=self.sources[0])
-        return replace(self, errors=errors, factor=1.0)
+        return replace(self, errors=errors, factor=1.0, added=())
 
     def with_errors_times(self, factor: float) -> PartitionedMatches:
         """The same stars with all errors multiplied by a factor.
@@ -323,7 +334,21 @@ class PartitionedMatches:
         -------
         PartitionedMatches
         """
-        return replace(self, factor=factor * self.factor)
+        added = tuple(one.times(factor) for one in self.added)
+        return replace(self, factor=factor * self.factor, added=added)
+
+    def with_added_errors(self, added: AddedErrors) -> PartitionedMatches:
+        """The same stars with errors added in quadrature.
+
+        Parameters
+        ----------
+        added : AddedErrors
+
+        Returns
+        -------
+        PartitionedMatches
+        """
+        return replace(self, added=(*self.added, added))
 
     def with_sigma(self, sigma_u: float, sigma_v: float) -> PartitionedMatches:
         """The same stars with other errors.
@@ -347,7 +372,7 @@ class PartitionedMatches:
                 raise InputError(
                     f"{name} is {sigma:g}, and must be finite and positive", do="give another"
                 )
-        return replace(self, errors=(float(sigma_u), float(sigma_v)), factor=1.0)
+        return replace(self, errors=(float(sigma_u), float(sigma_v)), factor=1.0, added=())
 
 
 def _has_errors(part: MatchPart) -> bool:

@@ -24,7 +24,7 @@ from bayesdist.infer.shards import Matches
 from bayesdist.infer.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
-__all__ = ["fit_by_magnitude"]
+__all__ = ["LEAST_WEIGHT", "fit_by_magnitude", "memberships_of", "residuals_of", "variances_of"]
 
 Float = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def _law(
     assert stars.mag is not None
     options = {name: value for name, value in options.items() if name != "compute"}
     fit = fit_linear(stars.with_sigma(1.0, 1.0), model, priors=priors, **options)
-    residual = _residuals(fit, stars)
+    residual = residuals_of(fit, stars)
     bins = estimate(stars.mag, *residual, n_params=model.n_params)
     law = MagnitudeLaw.of(stars.mag, bins)
     nodes, square = law.start, residual**2
@@ -99,11 +99,11 @@ def _law(
     f, wide = FALSE[0], max(narrowest, float((square.sum(axis=0)).max()) / 8.0)
     for _ in range(TURNS):
         var = law.at_stars(nodes)
-        good = _memberships(square, var, f, wide)
+        good = memberships_of(square, var, f, wide)
         weight = np.sqrt(np.maximum(good, LEAST_WEIGHT))
         weighted = stars.with_sigma(*(np.sqrt(var) / weight))
         fit = fit_linear(weighted, model, clip_chi2=np.inf, clip_abs=None, priors=priors)
-        square = _residuals(fit, stars) ** 2 + _variances(fit, stars)
+        square = residuals_of(fit, stars) ** 2 + variances_of(fit, stars)
         bad = 1.0 - good
         f = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
         wide = max(narrowest, float((bad * square).sum() / max(2.0 * bad.sum(), 1e-300)))
@@ -115,7 +115,7 @@ def _law(
     return MagnitudeErrors(bins.mag, sigma_u, sigma_v, bins.n, scatter_u, scatter_v)
 
 
-def _memberships(square: Float, var: Float, f: float, wide: float) -> Float:
+def memberships_of(square: Float, var: Float, f: float, wide: float) -> Float:
     """Probability (N,) of each star to be a good match."""
     log_good = np.log1p(-f) - 0.5 * (square / var + np.log(var)).sum(axis=0)
     log_bad = np.log(f) - 0.5 * (square / wide).sum(axis=0) - np.log(wide)
@@ -131,13 +131,13 @@ def _scatter(bins: MagnitudeErrors, mag: Float, good: Float, square: Float) -> F
     return np.sqrt(np.array(sums) / np.maximum(n, 1e-300))
 
 
-def _residuals(fit: LinearFit, stars: MatchTable) -> Float:
+def residuals_of(fit: LinearFit, stars: MatchTable) -> Float:
     """Data minus model (2, N)."""
     some, order = prepare(fit.model, stars.with_sigma(1.0, 1.0))
     return in_table_order(some.residuals(fit.mean), order).T
 
 
-def _variances(fit: LinearFit, stars: MatchTable) -> Float:
+def variances_of(fit: LinearFit, stars: MatchTable) -> Float:
     """Variances (2, N) of the fitted positions of stars."""
     model = fit.model
     groups = groups_of(model, stars)

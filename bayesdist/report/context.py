@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
     from bayesdist.infer import LinearFit, Posterior
+    from bayesdist.infer.added_errors import GroupedErrors
     from bayesdist.model import Chip
     from bayesdist.report.campaign.context import CampaignResults
     from bayesdist.report.selfcal import SelfcalResults
@@ -166,6 +167,8 @@ class ReportInput:
         What the residuals were asked, and what they say.
     magnitude_errors : MagnitudeErrors or None
         Errors by magnitude, where the stars carried none.
+    added_errors : GroupedErrors or None
+        Errors beyond the quoted ones by groups of stars, where these were compared.
     flagged : ndarray of int, shape (E,), or None
         Stars of each exposure that are more likely false matches than not.
     provenance : mapping
@@ -197,6 +200,7 @@ class ReportInput:
     misfits: tuple[Misfit, ...] = ()
     score_tests: tuple[ScoreTest, ...] = ()
     magnitude_errors: MagnitudeErrors | None = None
+    added_errors: GroupedErrors | None = None
     flagged: NDArray[np.int64] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
     campaign: CampaignResults | None = None

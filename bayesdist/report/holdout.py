@@ -57,7 +57,7 @@ def holdout_checks(found: HeldOutTruth | None) -> tuple[Check, ...]:
 
 
 def holdout_tables(found: HeldOutTruth | None) -> tuple[TextTable, ...]:
-    """The tests that tell most; none where no stars were held out."""
+    """Coverage along each axis, and the tests that tell most; none where no stars were held out."""
     if found is None:
         return ()
     shown = found.tests[:_MOST_TESTS]
@@ -78,7 +78,27 @@ def holdout_tables(found: HeldOutTruth | None) -> tuple[TextTable, ...]:
         f"The {len(shown)} most telling of {len(found.tests)} tests, all in holdout.ecsv; corrected"
         " for their number after Holm (1979)."
     )
-    return (TextTable("Tests of the held-out stars", heads, rows, words=(0, 1), note=note),)
+    tests = TextTable("Tests of the held-out stars", heads, rows, words=(0, 1), note=note)
+    return (*_coverage_tables(found), tests)
+
+
+def _coverage_tables(found: HeldOutTruth) -> tuple[TextTable, ...]:
+    rows = tuple(
+        (
+            c.axis,
+            f"{c.level:g} σ",
+            count(c.n),
+            f"{c.value:.3f}",
+            f"{c.interval[0]:.3f} to {c.interval[1]:.3f}",
+            f"{c.expected:.3f}",
+        )
+        for c in found.coverage
+    )
+    if not rows:
+        return ()
+    heads = ("Axis", "Within", "Stars", "Fraction", "95 % interval", "Predicted")
+    note = "False matches are part of the prediction; the interval is that of independent stars."
+    return (TextTable("Coverage of the held-out stars", heads, rows, words=(0, 1), note=note),)
 
 
 def _question(test: HeldTest, unit: str) -> str:

@@ -193,7 +193,7 @@ def _contents(inputs: ReportInput, images: Mapping[str, bytes]) -> dict[str, Any
             "data": tables.data_tables(inputs),
             "selfcal": selfcal_tables(inputs),
             "fit": (*tables.fit_tables(inputs), *_present(tables.score_test_table(inputs))),
-            "outliers": _present(tables.outlier_table(inputs)),
+            "outliers": _present(tables.outlier_table(inputs), tables.added_errors_table(inputs)),
             "coefficients": tables.coefficient_tables(inputs),
             "maps": (tables.map_table(inputs),),
             "periods": period_tables(inputs),
@@ -222,8 +222,8 @@ def _chips(inputs: ReportInput) -> str:
     )
 
 
-def _present(table: tables.TextTable | None) -> tuple[tables.TextTable, ...]:
-    return () if table is None else (table,)
+def _present(*found: tables.TextTable | None) -> tuple[tables.TextTable, ...]:
+    return tuple(table for table in found if table is not None)
 
 
 def _campaign_parts(

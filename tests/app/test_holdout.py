@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from pyarrow.parquet import read_metadata
+from scipy.stats import binom
 
 from bayesdist.app import matches as app_matches
 from bayesdist.simulate import simulate_matches
@@ -56,10 +57,17 @@ def test_verdict_and_tests_are_written_and_shown(run):
     assert found["verdict"].startswith("held-out stars agree with the prediction (p = ")
     assert len(table) == len(found["tests"])
     assert table.meta["verdict"] == found["verdict"]
-    assert set(table["part"]) == {"all", "region", "magnitude"}
+    assert set(table["part"]) == {"all", "axis", "region", "magnitude"}
     assert (np.diff(table["p_value"]) >= 0).all()
     assert found["p_value"] == pytest.approx(min(1.0, len(table) * table["p_value"][0]))
+    assert [(c["axis"], c["sigma"]) for c in found["coverage"]] == [
+        (axis, sigma) for axis in "uv" for sigma in (1, 2)
+    ]
+    for one in found["coverage"]:
+        low, high = binom.ppf([1e-4, 1 - 1e-4], found["n"], one["expected"]) / found["n"]
+        assert low <= one["value"] <= high and one["n"] == found["n"]
     html = (run[1] / "report.html").read_text(encoding="utf-8")
+    assert "Coverage of the held-out stars" in html
     status = html.index("Held-out truth")
     assert status < html.index(">Sampling<") and 'id="holdout"' in html
     assert (run[1] / "figures" / "holdout.png").exists()

@@ -14,7 +14,13 @@ import pytest
 from scipy.stats import binom, chi2, kstest, norm
 
 from bayesdist.assess.holdout import DOUBTFUL, held_out_truth
-from bayesdist.assess.holdout_predictive import Predictive, scores_of, uniforms_of
+from bayesdist.assess.holdout_predictive import (
+    SCALES,
+    Predictive,
+    marginals_of,
+    scores_of,
+    uniforms_of,
+)
 from bayesdist.assess.holdout_spread import SpreadMoments, sum_tails
 from bayesdist.assess.holdout_sums import _beyond
 from bayesdist.assess.holdout_tests import holm
@@ -174,6 +180,23 @@ def test_errors_that_are_too_small_are_measured():
     assert abs(whole.value / 1.3 - 1) < 4 / np.sqrt(4 * found.n)
 
 
+def test_errors_that_are_too_small_along_one_axis_are_named():
+    """As large as predicted for both axes together: 1.22 and 0.71 times."""
+    sizes = np.array([np.sqrt(1.5), np.sqrt(0.5)])
+    found = judged(8, 6000, change=lambda m, r: r * sizes)
+    assert found.level == "fail"
+    assert found.verdict.startswith("along u the residuals of held-out stars are 1.")
+    along = {t.where: t.value for t in found.tests if t.part == "axis"}
+    for axis, size in zip("uv", sizes, strict=True):
+        assert abs(along[f"along {axis}"] / size - 1) < 4 / np.sqrt(2 * found.n)
+    first = {c.axis: c for c in found.coverage if c.level == 1.0}
+    for axis, size in zip("uv", sizes, strict=True):
+        true = norm.cdf(1 / size) - norm.cdf(-1 / size)
+        # 5 % are false matches, a few of which are within
+        assert first[axis].value == pytest.approx(0.97 * true, abs=0.03 * true + 0.04)
+        assert not first[axis].interval[0] < first[axis].expected < first[axis].interval[1]
+
+
 def test_the_corner_where_errors_are_too_small_is_named():
     def worse(m, r):
         return r * np.where((m.x > 750) & (m.y < 200), 1.8, 1.0)[:, None]
@@ -242,7 +265,7 @@ def drawn(one: Predictive, n: int, seed: int = 1) -> np.ndarray:
 def test_predictive_probabilities_are_uniform_and_independent(kind):
     r = drawn(MIXTURES[kind], 20_000)
     p = uniforms_of(MIXTURES[kind], r, np.repeat(COV, len(r), axis=0))
-    for values in p:
+    for values in (*p, *marginals_of(MIXTURES[kind], r, np.repeat(COV, len(r), axis=0))):
         assert kstest(values, "uniform").pvalue > 1e-3
     counts = np.histogram2d(p[0], p[1], bins=8, range=[[0, 1], [0, 1]])[0]
     assert chi2.sf(((counts - 312.5) ** 2 / 312.5).sum(), 63) > 1e-3
@@ -285,6 +308,19 @@ def test_scores_are_derivatives_of_the_log_density(kind):
         np.testing.assert_allclose(found.place[:, axis], slope, atol=1e-6)
     slope = (log_p(r, factor=1 + h) - log_p(r, factor=1 - h)) / (2 * h)
     np.testing.assert_allclose(found.one, slope, atol=1e-6)
+    free = cov * [1, 1, 0]  # of independent axes a factor on one of them is no correlation's
+    found_free = scores_of(one, r, free)
+    for axis in (0, 1):
+        step = np.eye(3)[axis] * free
+        slope = (log_p(r, cov=free + 2 * h * step) - log_p(r, cov=free - 2 * h * step)) / (2 * h)
+        np.testing.assert_allclose(found_free.axes[:, axis], slope, atol=1e-6)
+        for k in (0, 6, 12):
+            wider = free + (SCALES[k] ** 2 - 1) * step
+            np.testing.assert_allclose(
+                found_free.axes_spread[:, axis, k],
+                scores_of(one, r, wider).axes[:, axis],
+                atol=1e-9,
+            )
     extra = np.array([h, h, 0])
     slope = (log_p(r, cov=cov + extra) - log_p(r, cov=cov - extra)) / (2 * h)
     np.testing.assert_allclose(found.free[:, 0], slope, atol=1e-6)
@@ -303,6 +339,10 @@ def test_scores_of_the_spread_scatter_as_expected():
     second, third = SpreadMoments(MIXTURES["none"]).of(COV)
     assert second[0] == pytest.approx(4.0, rel=1e-3)
     assert third[0] == pytest.approx(16.0, rel=1e-3)
+    # of one axis they are those of chi-square with one degree of freedom
+    second, third = SpreadMoments(MIXTURES["none"]).of_axis(COV)
+    assert second[0] == pytest.approx(2.0, rel=1e-3)
+    assert third[0] == pytest.approx(8.0, rel=1e-3)
     one = MIXTURES["gaussian"]
     n = 400_000
     cov = COV * [1, 1, 0]
@@ -312,11 +352,15 @@ def test_scores_of_the_spread_scatter_as_expected():
         np.random.default_rng(3).normal(size=(n, 2)) * np.sqrt(cov[0, 0]),
     )
     same = np.repeat(cov[:, [0, 0, 2]], n, axis=0)
-    score = scores_of(one, r, same).one
-    second, third = SpreadMoments(one).of(same[:1])
-    for power, value in ((1, 0.0), (2, second[0]), (3, third[0])):
-        error = np.std(score**power) / np.sqrt(n)
-        assert abs(np.mean(score**power) - value) < 4.5 * error
+    scores, moments = scores_of(one, r, same), SpreadMoments(one)
+    for score, (second, third) in (
+        (scores.one, moments.of(same[:1])),
+        (scores.axes[:, 0], moments.of_axis(same[:1])),
+        (scores.axes[:, 1], moments.of_axis(same[:1])),
+    ):
+        for power, value in ((1, 0.0), (2, second[0]), (3, third[0])):
+            error = np.std(score**power) / np.sqrt(n)
+            assert abs(np.mean(score**power) - value) < 4.5 * error
 
 
 def test_sums_of_squares_have_their_exact_probability():

@@ -52,3 +52,28 @@ def test_stars_that_are_taken_for_independent_would_be_alarms() -> None:
     alone = replace(predictive(), cell=None)
     for seed in range(3):
         assert held_out_truth(alone, held(seed)).p_value < 1e-6
+
+
+def test_few_large_cells_raise_no_alarm_about_distributions() -> None:
+    """63 cells, fewer than three for each bin of probabilities: what a run of 900 stars has."""
+    side, local = (120.0, 120.0), 0.002
+
+    def one(seed: int) -> list[float]:
+        rng = np.random.default_rng(seed)
+        n = 900
+        x, y = rng.uniform(1, SIZE[0], n), rng.uniform(1, SIZE[1], n)
+        cell = local * rng.standard_normal((7, 9, 2))
+        data = MODEL.predict(THETA, x, y) + OWN * rng.standard_normal((n, 2))
+        data += cell[(y // side[1]).astype(int), (x // side[0]).astype(int)]
+        sigma = np.full(n, OWN)
+        stars = MatchTable(
+            x=x, y=y, u=data[:, 0], v=data[:, 1], sigma_u=sigma, sigma_v=sigma, unit="pix"
+        )
+        table = LookupTable(1, np.full((2, 7, 9), local), first=(1.0, 1.0), step=side)
+        cov = np.zeros((MODEL.n_params,) * 2)
+        found = held_out_truth(Predictive(MODEL, THETA, cov, local=(table,), cell=side), stars)
+        return [t.p_value for t in found.tests if t.name == "distribution"]
+
+    p = np.array([one(seed) for seed in range(60)])
+    assert kstest(p.ravel(), "uniform").pvalue > 1e-3
+    assert p.min() > 1e-5

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from bayesdist.data import MagnitudeErrors, MatchTable, open_matches, pieces, read_matches
 from bayesdist.data import duplicates as duplicates_module
+from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.partitioned import PartPiece
 from bayesdist.data.writing import write_partitioned
 from bayesdist.errors import FormatError, InputError
@@ -168,12 +169,21 @@ def test_where_errors_come_from(rng, tmp_path, monkeypatch):
     bins = np.array([11.0, 14.0, 19.0])
     errors = MagnitudeErrors(bins, bins / 100, bins / 50, bins.astype(int), bins, bins)
     whole = read_matches(path, sigma="by_magnitude")
+    added = AddedErrors("", ("",), np.array([[0.0, 0.3]]), np.zeros(2))
     for ours, theirs in (
         (opened.with_errors_by_magnitude(errors), whole.with_sigma(*errors.at(whole.mag))),
         (opened.with_sigma(0.1, 0.2), whole.with_sigma(0.1, 0.2)),
         (
             opened.with_sigma(0.1, 0.2).with_errors_times(2.0).with_errors_times(4.0),
             whole.with_sigma(0.1, 0.2).with_errors_times(8.0),
+        ),
+        (
+            opened.with_sigma(0.1, 0.2).with_errors_times(2.0).with_added_errors(added),
+            whole.with_sigma(0.2, 0.4).with_added_errors(added),
+        ),
+        (
+            opened.with_sigma(0.1, 0.2).with_added_errors(added).with_errors_times(2.0),
+            whole.with_sigma(0.2, 0.4).with_added_errors(added.times(2.0)),
         ),
     ):
         assert ours.has_sigma and not opened.has_sigma

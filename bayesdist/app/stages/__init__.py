@@ -97,7 +97,9 @@ def _check_residuals(session: Session, fit: LinearFit, errors: MagnitudeErrors |
     held = session.config.held_in_residuals(fit.model.unit)
     if held:
         raw = session.raw_matches
-        matches = raw if errors is None else raw.with_errors_by_magnitude(errors)
+        matches = session.with_added_errors(
+            raw if errors is None else raw.with_errors_by_magnitude(errors)
+        )
         stars = star_sample(matches.sample(SAMPLE), len(matches), fit)
         centroid_scatter(stars, held, n_params=fit.model.n_params)
 

@@ -86,6 +86,7 @@ def _assess_holdout(session: Session) -> None:
     write_table(holdout_table(found), session.run / "holdout.ecsv")
     session.run.summarise(holdout=holdout_summary(found))
     log.info("assess: %s", found.verdict)
+    log.info("assess: %s", found.coverage_words)
 
 
 def _assess_periods(session: Session) -> None:

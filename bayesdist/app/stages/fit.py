@@ -7,6 +7,7 @@ from typing import Any
 
 from astropy.table import Table
 
+from bayesdist.app.added_errors import added_errors_rows, grouping_sentence
 from bayesdist.app.session import ERROR_COLUMNS, Session, write_table
 from bayesdist.app.trust import frames_doubt
 from bayesdist.assess.majority import majority_sentence
@@ -43,13 +44,15 @@ def run_fit(session: Session) -> None:
         log.warning("fit: WARNING: %s", session.error_scale_sentence)
     if text := frames_doubt(session):
         log.warning("fit: WARNING: %s", text)
+    if session.grouped_errors is not None:
+        log.info("fit: %s", grouping_sentence(session.grouped_errors, fit.unit))
     if majority:  # said before hours of sampling
         log.warning("fit: WARNING: %s", majority)
 
 
 def summarise_fit(session: Session, fit: LinearFit) -> None:
     """Sections 'data' and 'fit' of summary.json, and a line of the log."""
-    matches = session.raw_matches
+    matches, grouped = session.raw_matches, session.grouped_errors
     session.run.summarise(
         data={
             "n_rows": matches.n_rows,
@@ -70,6 +73,7 @@ def summarise_fit(session: Session, fit: LinearFit) -> None:
             "condition": fit.condition,
             "n_parameters": fit.model.n_params,
             **({} if session.error_scale == 1.0 else {"error_scale": session.error_scale}),
+            **({} if grouped is None else {"added_errors": added_errors_rows(grouped)}),
             **(_skew(fit) if session.config.fit.skew else {}),
         },
     )

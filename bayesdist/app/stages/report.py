@@ -102,6 +102,7 @@ def _inputs(session: Session, hand: Hand | None) -> ReportInput:
         periods=periods_of(session),
         held_out=held_out_of(session),
         magnitude_errors=session.magnitude_errors,
+        added_errors=session.grouped_errors,
         flagged=flagged_by_exposure(session.shards, posterior) if several else None,
         campaign=campaign,
         provenance={"folder": folder}

@@ -8,12 +8,18 @@ from bayesdist.report.tables.assessment import (
 )
 from bayesdist.report.tables.coefficients import coefficient_tables
 from bayesdist.report.tables.data import data_tables
-from bayesdist.report.tables.fit import fit_tables, outlier_table, score_test_table
+from bayesdist.report.tables.fit import (
+    added_errors_table,
+    fit_tables,
+    outlier_table,
+    score_test_table,
+)
 from bayesdist.report.tables.provenance import config_table, provenance_tables
 from bayesdist.report.tables.text import TextTable
 
 __all__ = [
     "TextTable",
+    "added_errors_table",
     "budget_table",
     "coefficient_tables",
     "config_table",

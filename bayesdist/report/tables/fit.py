@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 
 from bayesdist.assess import residual_statistics
 from bayesdist.diagnose.result import FAMILY_LEVEL, POWER
+from bayesdist.infer.added_errors import DECISIVE
 from bayesdist.infer.skew import skew_of
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numerals import MISSING, count, interval, number, rounded
 from bayesdist.report.scales import Scale, display_scale, with_mas
 from bayesdist.report.tables.text import TextTable, listing, marked
 
-__all__ = ["fit_tables", "outlier_table", "score_test_table"]
+__all__ = ["added_errors_table", "fit_tables", "outlier_table", "score_test_table"]
 
 
 def fit_tables(inputs: ReportInput) -> tuple[TextTable, ...]:
@@ -170,6 +171,37 @@ def _chips_of_stars(inputs: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
     return [("all, ", used), *each]
 
 
+def added_errors_table(inputs: ReportInput) -> TextTable | None:
+    """Errors beyond the quoted ones, by the groups that the evidence asks for; None without."""
+    found = inputs.added_errors
+    if found is None:
+        return None
+    scale = display_scale(inputs.unit, found.sigma)
+    rows = []
+    for g, label in enumerate(found.labels):
+        for a, axis in enumerate("uv" if found.by_axis else ("u and v",)):
+            size, error = scale.factor * found.sigma[g, a], scale.factor * found.sigma_error[g, a]
+            rows.append(
+                (
+                    f"{found.by} {label}" if found.by else "all",
+                    axis,
+                    count(found.n[g, a]),
+                    rounded(size, error),
+                    number(error, 2),
+                    number(scale.factor * found.excess[g, a], 3),
+                )
+            )
+    gains = ", ".join(f"by {name} {number(gain, 3)}" for name, gain in found.evidence.items())
+    note = (
+        "Restricted likelihood of the residuals, false matches allowed for. ln evidence over one"
+        f" error for both axes: {gains}; groups are formed from {number(DECISIVE)} on."
+    )
+    if found.added is not None:
+        note += " What is beyond the least was added to the quoted errors, and j is the least."
+    heads = ("Stars", "Axis", "Number", f"Error [{scale.unit}]", "σ", "Added to the quoted errors")
+    return TextTable("Errors beyond the quoted ones", heads, tuple(rows), words=(0, 1), note=note)
+
+
 def outlier_table(inputs: ReportInput) -> TextTable | None:
     """The mixture's own parameters, and how many stars or detections it flags."""
     post, words = inputs.posterior, inputs.words
@@ -205,7 +237,7 @@ def outlier_table(inputs: ReportInput) -> TextTable | None:
             things,
         )
     )
-    mixture = post.mixture
+    mixture, grouped = post.mixture, inputs.added_errors
     note = f"Outlier component: {mixture.model}"
     if mixture.match_radius is not None:
         note += f", match radius {number(mixture.match_radius)} {inputs.unit}"
@@ -217,6 +249,8 @@ def outlier_table(inputs: ReportInput) -> TextTable | None:
     if mixture.outlier_scale is not None:
         note += f"; prior of s_out: about {number(mixture.outlier_scale)} {inputs.unit}"
     note += "." if mixture.model == "none" else f"; prior of f: Beta({a:g}, {b:g})."
+    if grouped is not None and grouped.added is not None:
+        note += f" Errors differ by {grouped.grouping}: j is the least of those beyond the quoted."
     return TextTable(
         "Outlier mixture",
         ("Quantity", "Mean", "sd", "95 % interval", "Unit"),
