@@ -106,6 +106,17 @@ def ridges(rng: np.random.Generator, period: float, size: float) -> Field:
     return field
 
 
+def sawtooth(rng: np.random.Generator, period: float, size: float) -> Field:
+    """Columns displaced along x by ramps that fall off at sharp edges; size is half the step."""
+    phase = rng.uniform(0, period)
+
+    def field(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        ramp = size * (2 * (((np.asarray(x, float) + phase) / period) % 1.0) - 1)
+        return np.stack([ramp, np.zeros_like(ramp)], axis=-1)
+
+    return field
+
+
 def tree_rings(rng: np.random.Generator, rms: float) -> Field:
     """Radial displacements about a point beyond a corner, closer and closer outwards."""
     centre = np.array([-200.0, -300.0]) + rng.uniform(-50, 50, 2)
