@@ -124,7 +124,7 @@ def _true_coefficients(model: DistortionModel, truth: CampaignTruth) -> np.ndarr
         for axis in (0, 1):
             value, later = (np.linalg.lstsq(design, one[:, axis])[0] for one in at)
             theta[model.coefficient_slice(chip.number, axis)] = value
-            for t, (name, i, j) in enumerate(time.terms):
+            for t, (name, *_) in enumerate(time.terms):
                 if name == "uv"[axis]:
                     of = model.drift_terms(chip.number)[t]
                     rate = np.linalg.lstsq(of[:, None], later - value)[0]

@@ -233,6 +233,19 @@ class CampaignSession(Session):
         )
 
     @property
+    def tested_matches(self) -> MatchTable:
+        """Matches with what the catalogue states of the motions of their stars."""
+        table, catalog = super().tested_matches, self.inputs.catalog
+        if table.star is None or catalog.pm_u is None or catalog.sigma_pm_u is None:
+            return table
+        columns = {}
+        for name in ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"):
+            by_code = np.zeros(int(catalog.star.max()) + 1)
+            by_code[catalog.star] = getattr(catalog, name)
+            columns[name] = by_code[table.star]
+        return with_columns(table, **columns)
+
+    @property
     def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
         """The same: the catalogue's errors have been taken off, and what is left out at a place."""
         found = self.discrepancy
