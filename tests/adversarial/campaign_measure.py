@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.campaign.interpolation import INTERPOLATION as BETWEEN
+from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
 from bayesdist.app.judging import budget_of
 from bayesdist.app.rundir import RunDirectory
@@ -130,6 +132,32 @@ def _true_coefficients(model: DistortionModel, truth: CampaignTruth) -> np.ndarr
                     rate = np.linalg.lstsq(of[:, None], later - value)[0]
                     theta[model.tdd_slice(chip.number).start + t * time.n_values] = rate[0]
     return theta
+
+
+def table_errors(session: CampaignSession, truth: CampaignTruth) -> np.ndarray:
+    """Of the look-up tables over the grid of the assessment (chips, N, 3, 2).
+
+    Error, and its sigmas by the nodes alone and with what lies between them.  The best polynomial
+    is taken off the error, as polynomials follow the tables.
+    """
+    out = []
+    local = {term.name: term for term in session.local_terms}
+    for table in session.tables:
+        chip = next(one for one in truth.chips if one.number == table.chip)
+        fine = mesh(*(np.arange(1.0, n, 3.0) for n in (chip.columns, chip.rows)))
+        grid = mesh(*grid_pixels((chip.columns, chip.rows), session.config.assess.grid))
+        basis = session.solution.model.basis(chip.number)
+
+        def left(x: np.ndarray, y: np.ndarray, table=table, chip=chip) -> np.ndarray:
+            return table.evaluate(x, y) - truth.beside(*chip.mosaic(x, y))
+
+        follows = np.linalg.lstsq(basis.evaluate(*fine), left(*fine))[0]
+        error = left(*grid) - basis.evaluate(*grid) @ follows
+        nodes, between = (
+            local[name].sigma[chip.number].reshape(-1, 2) for name in ("look-up tables", BETWEEN)
+        )
+        out.append(np.stack([error, nodes, np.hypot(nodes, between)], axis=1))
+    return np.array(out)
 
 
 def stated_sigma(session: Session) -> np.ndarray:

@@ -64,6 +64,8 @@ class CampaignTruth:
         exposures shows that deviates from the others as they do from each other.
     common : callable
         Mosaic x, y and epoch to the (u, v) (N, 2) from which all exposures deviate.
+    beside : callable
+        x, y of the mosaic to the displacement (N, 2) that the polynomials do not have.
     known : callable
         The known distortion that matching begins with, in the same way.
     config : dict
@@ -78,6 +80,7 @@ class CampaignTruth:
     chips: tuple[Piece, ...]
     true_map: Callable[..., np.ndarray]
     common: Map
+    beside: Field
     known: Map
     config: dict[str, Any]
     epoch: float
@@ -190,6 +193,7 @@ def made(rng: np.random.Generator, recipe: Recipe) -> CampaignTruth:
         chips=recipe.chips,
         true_map=lambda x, y, epoch, k=0: deviating(common(x, y, epoch), own[k]),
         common=common,
+        beside=total(*recipe.beside),
         known=lambda x, y, epoch: common(x, y, EPOCH0) + nearly(x, y),
         config=dict(recipe.config),
         epoch=LAST + recipe.beyond,

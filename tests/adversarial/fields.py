@@ -35,7 +35,7 @@ def of_rms(field: Field, rms: float) -> Field:
 
 def total(*fields: Field) -> Field:
     """The sum of fields."""
-    return lambda x, y: np.sum([field(x, y) for field in fields], axis=0)
+    return lambda x, y: np.sum([np.zeros((*np.shape(x), 2)), *(f(x, y) for f in fields)], axis=0)
 
 
 def polynomial(coefficients: np.ndarray) -> Field:

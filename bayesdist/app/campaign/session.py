@@ -132,6 +132,22 @@ class CampaignSession(Session):
         """What the tables leave between their nodes, by chip, where it has been measured."""
         return self._kept_tables.between
 
+    @property
+    def published_tables(self) -> tuple[LookupTable, ...]:
+        """The tables with the errors that a user meets: of the nodes, and of what lies between.
+
+        What is between the nodes of a pattern is at the nodes too: the value of a table there is
+        that of the area around.  It counts in the tables that were fitted in this run.
+        """
+        out, held = [], self.config.tables.detector is not None
+        for table in self.tables:
+            between = self.between_nodes.get(table.chip)
+            if table.sigma is not None and between is not None and bool(table.filter) == held:
+                whole = np.sqrt(table.sigma**2 + between.left.mean[:, None, None])
+                table = replace(table, sigma=whole)
+            out.append(table)
+        return tuple(out)
+
     def keep_tables(
         self,
         tables: tuple[LookupTable, ...],
