@@ -259,13 +259,13 @@ def _exposure(projection: Projection, blocks: list[Block]) -> _Exposure | None:
     if not (np.diag(A) > 0).all() or np.linalg.eigvalsh(A).min() < 1e-8:
         return None
     inverse = np.linalg.inv(A) / np.outer(scale, scale)
-    g = projection.whole_score[:, at]
-    psi = F[0] * g[0][:, None] + F[1] * g[1][:, None]
-    own = slice(-3 * len(chips), None)
+    g, own = sample.score[:, at], slice(-3 * len(chips), None)
+    step = inverse @ (F[0].T @ g[0] + F[1].T @ g[1])
+    value = step[own].reshape(len(chips), 3)
+    value = value + _fitted(projection, blocks[0].frame_exposure, chips)
+    # what stars have in common beyond what the exposures have
+    psi = sum(F[axis] * (g[axis] - HF[axis] @ step)[:, None] for axis in (0, 1))
     by_star = (psi @ inverse[:, own]).reshape(len(at), len(chips), 3)
-    # the score itself, not what was given back to it, is what the exposure moves by
-    step = inverse[own] @ (F[0].T @ sample.score[0, at] + F[1].T @ sample.score[1, at])
-    value = step.reshape(len(chips), 3) + _fitted(projection, blocks[0].frame_exposure, chips)
     assert sample.epoch is not None
     return _Exposure(
         float(sample.epoch[at[0]]),

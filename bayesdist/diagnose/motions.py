@@ -161,7 +161,7 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     # motions of mean square m^2, both axes together, add m^2 tr(S_s) / 4 to each
     unit_square = 4 / float(np.trace(left, axis1=1, axis2=2).sum())
     statistic, p = _above_zero(difference)
-    noise = float(np.std(difference)) * np.sqrt(len(many))
+    noise = float(each.sum()) / (2 * len(many)), float(np.var(difference)), len(many)
     return Outcome(
         name="motions",
         statistic=max(statistic, 0.0) ** 2,
@@ -170,7 +170,7 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
         p_value=p,
         # of a motion in a year, rms over the stars and both axes together
         size=float(np.sqrt(max(unit_square * difference.sum(), 0.0))),
-        smallest=partial(_smallest, float(np.sqrt(unit_square * noise))),
+        smallest=partial(_smallest, unit_square, *noise),
         unit=f"{unit}/yr",
         remedy=remedy,
         present=present,
@@ -190,5 +190,14 @@ def _above_zero(values: Float) -> tuple[float, float]:
     return t, float(stats.t.sf(t, n - 1))
 
 
-def _smallest(noise: float, level: float) -> float:
-    return float(noise * np.sqrt(np.sqrt(noncentrality(2 * level, 1))))
+def _smallest(unit_square: float, own: float, variance: float, n: int, level: float) -> float:
+    """Rms of motions that all of n stars have, in a year.
+
+    They add a multiple of an exponential number to each D_s, whose mean is found with the scatter
+    that it makes itself.
+    """
+    k = noncentrality(2 * level, 1) / n
+    if k >= 1:
+        return float("inf")
+    mean = (k * own + np.sqrt((k * own) ** 2 + (1 - k) * k * variance)) / (1 - k)
+    return float(np.sqrt(unit_square * n * mean))

@@ -108,8 +108,6 @@ class Dated:
 
     def _second(self, rng, theta, model, matches, uv, years) -> np.ndarray:
         """What the second chip's own motion does to positions (N, 2)."""
-        if not (self.gap or self.turn or self.restless):
-            return np.zeros((len(years), 2))
         own = self.restless * rng.standard_normal((self.exposures, 2))[matches.exposure]
         own[:, 1] += self.gap * years
         half = max(TWO_CHIPS[1].size) / 2
