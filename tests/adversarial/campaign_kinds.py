@@ -159,20 +159,28 @@ INGREDIENTS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
     "trails": lambda rng: {"displaced": trailing},
     "sawtooth": lambda rng: {
         "beside": (fields.sawtooth(rng, PERIOD, RAMP),),
-        "config": {"tables": {"method": "field", "step": [64, 64]}},
+        "config": {"tables": {"method": "field", "step": [128, 128]}},
     },
 }
 
 
 @kind("campaign_together", *OF_GAP, *STRUCTURE, "motion", n=300, names=tuple(INGREDIENTS))
 @kind("campaign_centroids_t", n=300, names=("centroids",))
-@kind("campaign_sawtooth_in_tables", *STRUCTURE, n=600, names=("sawtooth",))
 def together(rng: np.random.Generator, n: int, names: tuple[str, ...]) -> CampaignTruth:
     """Some of the ingredients on two chips that drift, each about its middle."""
     options: dict[str, Any] = {"chips": TWO, "rate": _chips_drift(rng), "stars": n}
     for name in names:
         options |= INGREDIENTS[name](rng)
     return usual(rng, **options)
+
+
+@kind("campaign_sawtooth_in_tables", *STRUCTURE, n=600)
+def sawtooth_in_tables(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Ramps of 68 pixels with sharp edges under tables of 64, as those of ACS/WFC have."""
+    pattern = fields.sawtooth(rng, PERIOD, RAMP)
+    tables = {"tables": {"method": "field", "step": [64, 64]}}
+    rate = _chips_drift(rng)
+    return usual(rng, chips=TWO, rate=rate, stars=n, beside=(pattern,), config=tables)
 
 
 @kind("campaign_curved", *OF_TIME, *STRUCTURE, n=300)
