@@ -173,7 +173,8 @@ def rests_on(session: Session, epoch: float | None) -> tuple[str, ...]:
     tests = session.score_tests
     passed = [t for t in tests if not t.significant]
     if tests:
-        least = max((t.smallest for t in passed if np.isfinite(t.smallest)), default=None)
+        sizes = (t.smallest for t in passed if np.isfinite(t.smallest) and t.unit == model.unit)
+        least = max(sizes, default=None)
         text = f"{len(passed)} of {len(tests)} tests of the residuals that found nothing"
         if least is not None:
             text += f", and would have seen {least:.2g} {model.unit} rms"

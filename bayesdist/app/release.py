@@ -208,8 +208,8 @@ def _solutions(sessions: Mapping[str, CampaignSession]) -> dict[str, Solution]:
 def _tables(sessions: Mapping[str, CampaignSession]) -> list[LookupTable]:
     """The detector's tables, once, and those of the filters."""
     first = next(iter(sessions.values()))
-    out = [table for table in first.tables if not table.filter]
-    return out + [t for session in sessions.values() for t in session.tables if t.filter]
+    out = [table for table in first.published_tables if not table.filter]
+    return out + [t for one in sessions.values() for t in one.published_tables if t.filter]
 
 
 def _compared(sessions: Mapping[str, CampaignSession]) -> tuple[FilterComparison | None, str]:

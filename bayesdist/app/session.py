@@ -368,10 +368,15 @@ class Session:
         for name in ("discrepancy", *rest):
             self.__dict__.pop(name, None)
 
+    @property
+    def tested_matches(self) -> MatchTable:
+        """Matches that the score tests look at: all, or every k-th."""
+        return self._sample
+
     def made_score_tests(self) -> tuple[ScoreTest, ...]:
         """Targeted tests of the residuals for what the model lacks."""
         return score_tests(
-            self._sample,
+            self.tested_matches,
             self.posterior,
             priors=self.priors,
             match_radius=self.config.outliers.match_radius,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bayesdist.diagnose.dithered_columns import AddedColumns, pointing_terms
+from bayesdist.diagnose.motions import SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.noise import noise_tests
 from bayesdist.diagnose.result import Outcome, ScoreTest, corrected, noncentrality
 from bayesdist.diagnose.sample import Block, ScoredSample
@@ -45,7 +46,6 @@ MOST_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
 TOLD = 0.02  # of what known stars would say of a direction: less is not told from their places
 OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the others
-SHORTEST = 0.1  # years in which motions are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,66 +215,14 @@ def _words(name: str, order: int) -> tuple[str, str, str]:
 
 
 def _motions(solution: Solution, epoch: Float) -> Outcome | None:
-    """Test for stars that move: do the residuals of single stars go with time?
-
-    Of each star the square of the slope's score is compared with the squares of all that is left of
-    its residuals, so that nothing is assumed of the size of the errors.
-    """
+    """Test for stars that move."""
     p, scores = solution.problem, scores_of_detections(solution)
-    S = p.n_stars
-    g, H = scores.gradient, scores.curvature
-
-    def summed(values: Float) -> Float:
-        out = np.zeros((S, *values.shape[1:]))
-        np.add.at(out, p.star, values)
-        return out
-
-    members = summed((H[:, 0, 0] > 0).astype(float))
-    A = summed(H) + p.priors.precision
-    many = np.flatnonzero(members >= 4)  # of fewer nothing is left
-    if len(many) < 100:
-        return None
-    mean = summed(epoch[:, None]) / p.counts[:, None]
-    t = epoch - mean[p.star, 0]
-    cross, square = summed(t[:, None, None] * H)[many], summed(t[:, None, None] ** 2 * H)[many]
-    slope = summed(t[:, None] * g)[many]
-    left = square - cross @ np.linalg.solve(A[many], cross)
-    moving = np.linalg.det(left) > 1e-6 * np.linalg.det(square)
-    many, left, slope = many[moving], left[moving], slope[moving]
-    if len(many) < 100:
-        return None
-    step = np.linalg.solve(left, slope[..., None])[..., 0]
-    explained = np.einsum("na,na->n", slope, step)
-    inverse = np.zeros_like(H)
-    good = H[:, 0, 0] > 0
-    inverse[good] = np.linalg.inv(H[good])
-    chi2 = summed(np.einsum("na,nab,nb->n", g, inverse, g))[many]
-    rest = (chi2 - explained) / (2 * members[many] - 4)
-    difference = explained / 2 - rest
-    n = len(many)
-    spread = float(np.std(difference) / np.sqrt(n))
-    T = float(difference.mean() / spread)
-    # of a motion in a year, rms over the stars and both axes together
-    noise2 = float(np.mean(np.trace(np.linalg.inv(left), axis1=1, axis2=2) * rest))
-    size2 = float(np.mean((step**2).sum(axis=1))) - noise2
-    years = float(np.std(epoch))
-    return Outcome(
-        name="motions",
-        statistic=T**2,
-        dof=1,
-        dof_residual=None,
-        p_value=float(stats.norm.sf(T)),
-        size=years * float(np.sqrt(max(size2, 0.0))),
-        smallest=partial(_smallest_motion, years * np.sqrt(noise2) / n**0.25),
-        unit=p.model.unit,
+    return motion_outcome(
+        StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision),
+        p.model.unit,
         remedy="set selfcal.motion to 'proper_motion'",
         present="stars move between the dates of the exposures, and are taken to stand still",
-        absent="no motions of the stars are left in the residuals",
     )
-
-
-def _smallest_motion(noise: float, level: float) -> float:
-    return float(noise * np.sqrt(np.sqrt(noncentrality(2 * level, 1))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,6 +72,8 @@ class Projection:
     score : ndarray, shape (G + q,)
     precision : ndarray, shape (D,)
         Of the priors.
+    theta : ndarray, shape (D,)
+        Where the scores were taken.
     """
 
     functions: Functions
@@ -79,6 +81,7 @@ class Projection:
     information: Float
     score: Float
     precision: Float
+    theta: Float
 
     @property
     def sample(self) -> ScoredSample:
@@ -303,7 +306,7 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
             exposures[blocks[0].frame_exposure] = Eliminated(
                 index, inverse, gain, own, priors.precision[index]
             )
-    out = Projection(functions, exposures, information, score, priors.precision)
+    out = Projection(functions, exposures, information, score, priors.precision, theta)
     out.root  # noqa: B018 - raises here, where there is another way
     return out
 

@@ -8,6 +8,8 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.exposures import exposure_test
+from bayesdist.diagnose.gap import gap_test
+from bayesdist.diagnose.motions import motion_test
 from bayesdist.diagnose.noise import noise_tests
 from bayesdist.diagnose.patterns import pattern_test
 from bayesdist.diagnose.projection import projection_of
@@ -22,7 +24,7 @@ from bayesdist.infer.views import Solution
 __all__ = ["score_tests"]
 
 SAYS_NOTHING = 0.2  # probability by chance above which a second look has seen nothing
-OF_TIME = ("drift", "curvature in time")
+OF_TIME = ("drift", "curvature in time", "motions")
 ORDERS, OF_PLACE = "order ", ("noise by position",)
 
 
@@ -66,6 +68,7 @@ def score_tests(
     )
     exposures = exposure_test(projection)
     found = _edges_or_orders(regressor_tests(projection))
+    found += [one for one in (gap_test(projection), motion_test(projection)) if one is not None]
     if exposures is not None and exposures.p_value < FAMILY_LEVEL:
         found = [_doubtful(one) if one.name in OF_TIME else one for one in found]
     orders = [one.p_value for one in found if one.name.startswith(ORDERS)]

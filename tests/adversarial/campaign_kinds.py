@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from . import fields
@@ -14,6 +17,10 @@ from .truth import kind
 QUIET = 3e-6  # scatter of scale and shears, where breathing is not what is asked about
 RATE = 0.004  # px a year at half a side: of each of the linear terms that drift
 BEGIN = 2008.5  # trails of charge are noticed from then on
+TRAIL = 0.008  # px a magnitude, at the end and far from the amplifier
+OPENING = 0.006  # px a year
+PERIOD, RAMP = 68.27, 0.008  # px: of the lithographic pattern of ACS/WFC
+OF_GAP = ("gap", "drifts with time")
 MAS = 0.02  # px a year: 1 mas a year of a detector with 50 mas a pixel
 
 
@@ -43,13 +50,33 @@ def usual(rng: np.random.Generator, **other: object) -> CampaignTruth:
     return made(rng, Recipe(**options))  # type: ignore[arg-type]
 
 
+def trailing(x: np.ndarray, y: np.ndarray, mag: np.ndarray, epoch: float) -> np.ndarray:
+    """Displacements (N, 2) by trails of charge, which grow from `BEGIN` on."""
+    size = TRAIL * max(epoch - BEGIN, 0.0) / (LAST - BEGIN)
+    trail = size * (mag - BRIGHT) * (fields.SIDE - y) / fields.SIDE
+    return np.stack([np.zeros_like(trail), trail], axis=-1)
+
+
+def wrong_motions(rng: np.random.Generator) -> Callable[..., np.ndarray]:
+    """Motions of a fifth of the stars that the catalogue does not have."""
+    angle = rng.uniform(0, 2 * np.pi)
+
+    def moving(rng: np.random.Generator, n: int) -> np.ndarray:
+        some = rng.uniform(size=n) < 0.2
+        way = np.where(rng.uniform(size=n) < 0.5, angle, rng.uniform(0, 2 * np.pi, n))
+        size = some * MAS * rng.uniform(1.0, 5.0, n)
+        return size[:, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
+
+    return moving
+
+
 @kind("campaign_inside_chips", inside=True, n=300)
 def inside_chips(rng: np.random.Generator, n: int) -> CampaignTruth:
     """The same on two chips, each of which drifts about its middle."""
     return usual(rng, stars=n, chips=TWO, rate=chip_by_chip(drift(rng)))
 
 
-@kind("campaign_gap", "gap", "drifts with time", n=300)
+@kind("campaign_gap", *OF_GAP, n=300)
 def gap(rng: np.random.Generator, n: int) -> CampaignTruth:
     """Two chips drift as one detector: the distance between them changes, which is not fitted."""
     return usual(rng, stars=n, chips=TWO)
@@ -92,27 +119,68 @@ def trails(rng: np.random.Generator, n: int) -> CampaignTruth:
     """Trails draw stars along y in the last years, 0.008 px per magnitude fainter than the
     brightest, at full distance from the amplifier and at the end; the true map is without them."""
 
-    def displaced(x: np.ndarray, y: np.ndarray, mag: np.ndarray, epoch: float) -> np.ndarray:
-        size = 0.008 * max(epoch - BEGIN, 0.0) / (LAST - BEGIN)
-        trail = size * (mag - BRIGHT) * (fields.SIDE - y) / fields.SIDE
-        return np.stack([np.zeros_like(trail), trail], axis=-1)
-
-    return usual(rng, stars=n, displaced=displaced)
+    return usual(rng, stars=n, displaced=trailing)
 
 
 @kind("campaign_motions", *CATALOGUE_WORDS, "motion", n=300)
 def motions(rng: np.random.Generator, n: int) -> CampaignTruth:
     """A fifth of the stars move by 1 to 5 mas a year that the catalogue does not have, half of
     them all in one direction."""
+    return usual(rng, stars=n, moving=wrong_motions(rng))
+
+
+@kind("campaign_gap_step", *OF_GAP, n=300)
+def gap_opening(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """The gap between two chips, each of which drifts about its middle, opens and shears."""
+    return usual(rng, stars=n, chips=TWO, rate=fields.total(_chips_drift(rng), _opening(rng)))
+
+
+def _chips_drift(rng: np.random.Generator) -> fields.Field:
+    return chip_by_chip(drift(rng))
+
+
+def _opening(rng: np.random.Generator) -> fields.Field:
+    """The upper chip moves by `OPENING` a year in any direction."""
     angle = rng.uniform(0, 2 * np.pi)
+    step = OPENING * np.array([np.cos(angle), np.sin(angle)])
+    return lambda x, y: (np.asarray(y) > fields.MIDDLE)[..., None] * step
 
-    def moving(rng: np.random.Generator, n: int) -> np.ndarray:
-        some = rng.uniform(size=n) < 0.2
-        way = np.where(rng.uniform(size=n) < 0.5, angle, rng.uniform(0, 2 * np.pi, n))
-        size = some * MAS * rng.uniform(1.0, 5.0, n)
-        return size[:, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
 
-    return usual(rng, stars=n, moving=moving)
+def long_tails(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Errors of unit variance with the tails of Student's t of 5 degrees of freedom."""
+    return rng.standard_t(5, shape) / np.sqrt(5 / 3)
+
+
+# what other campaigns may have together, each by itself
+INGREDIENTS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
+    "breathing": lambda rng: {"deviations": heavy_deviations},
+    "centroids": lambda rng: {"centroids": long_tails},
+    "motions": lambda rng: {"moving": wrong_motions(rng)},
+    "trails": lambda rng: {"displaced": trailing},
+    "sawtooth": lambda rng: {
+        "beside": (fields.sawtooth(rng, PERIOD, RAMP),),
+        "config": {"tables": {"method": "field", "step": [128, 128]}},
+    },
+}
+
+
+@kind("campaign_together", *OF_GAP, *STRUCTURE, "motion", n=300, names=tuple(INGREDIENTS))
+@kind("campaign_centroids_t", n=300, names=("centroids",))
+def together(rng: np.random.Generator, n: int, names: tuple[str, ...]) -> CampaignTruth:
+    """Some of the ingredients on two chips that drift, each about its middle."""
+    options: dict[str, Any] = {"chips": TWO, "rate": _chips_drift(rng), "stars": n}
+    for name in names:
+        options |= INGREDIENTS[name](rng)
+    return usual(rng, **options)
+
+
+@kind("campaign_sawtooth_in_tables", *STRUCTURE, n=600)
+def sawtooth_in_tables(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Ramps of 68 pixels with sharp edges under tables of 64, as those of ACS/WFC have."""
+    pattern = fields.sawtooth(rng, PERIOD, RAMP)
+    tables = {"tables": {"method": "field", "step": [64, 64]}}
+    rate = _chips_drift(rng)
+    return usual(rng, chips=TWO, rate=rate, stars=n, beside=(pattern,), config=tables)
 
 
 @kind("campaign_curved", *OF_TIME, *STRUCTURE, n=300)

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.campaign.interpolation import INTERPOLATION as BETWEEN
+from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
 from bayesdist.app.judging import budget_of
 from bayesdist.app.rundir import RunDirectory
@@ -15,6 +17,8 @@ from bayesdist.app.sessions import own_stages, rehearse_run, session_of
 from bayesdist.app.stages import run_stage
 from bayesdist.app.stages.assess import run_assess
 from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.infer.views import reference_gauge, without_frames
+from bayesdist.model import DistortionModel
 
 from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth
 from .written import toml_text
@@ -90,6 +94,70 @@ def _aligned(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
     a, b = predicted - predicted.mean(axis=0), true - true.mean(axis=0)
     left, _, right = np.linalg.svd(b.T @ a)
     return a - b @ (left @ right)
+
+
+def coefficient_errors(
+    session: Session, truth: CampaignTruth
+) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Names, errors (n,) and covariance (n, n) of the coefficients, in the gauge of the first chip.
+
+    True are those of the least-squares polynomials through the true map and through its drift.
+    """
+    bare = without_frames(session.solution)
+    first = truth.chips[0].number
+    view = reference_gauge(bare, first)
+    true = view.transform(_true_coefficients(bare.model, truth))
+    u, v = (bare.model.coefficient_slice(first, axis).start for axis in (0, 1))
+    fixed = {bare.model.names[k] for k in (u, v, u + 2)}  # they follow from the others
+    names = [name for name in bare.model.names if name not in fixed]
+    some = [view.model.names.index(name) for name in names]
+    return names, (view.mean - true)[some], view.cov[np.ix_(some, some)]
+
+
+def _true_coefficients(model: DistortionModel, truth: CampaignTruth) -> np.ndarray:
+    """Parameters of a model without frames that are nearest to the true map."""
+    theta = np.zeros(model.n_params)
+    time = model.time
+    assert time is not None
+    for chip in truth.chips:
+        x, y = mesh(*(np.arange(0.5, n, 4.0) + 0.5 for n in (chip.columns, chip.rows)))
+        design = model.basis(chip.number).evaluate(x, y)
+        at = [truth.common(*chip.mosaic(x, y), EPOCH0 + years) for years in (0.0, 1.0)]
+        for axis in (0, 1):
+            value, later = (np.linalg.lstsq(design, one[:, axis])[0] for one in at)
+            theta[model.coefficient_slice(chip.number, axis)] = value
+            for t, (name, *_) in enumerate(time.terms):
+                if name == "uv"[axis]:
+                    of = model.drift_terms(chip.number)[t]
+                    rate = np.linalg.lstsq(of[:, None], later - value)[0]
+                    theta[model.tdd_slice(chip.number).start + t * time.n_values] = rate[0]
+    return theta
+
+
+def table_errors(session: CampaignSession, truth: CampaignTruth) -> np.ndarray:
+    """Of the look-up tables over the grid of the assessment (chips, N, 3, 2).
+
+    Error, and its sigmas by the nodes alone and with what lies between them.  The best polynomial
+    is taken off the error, as polynomials follow the tables.
+    """
+    out = []
+    local = {term.name: term for term in session.local_terms}
+    for table in session.tables:
+        chip = next(one for one in truth.chips if one.number == table.chip)
+        fine = mesh(*(np.arange(1.0, n, 3.0) for n in (chip.columns, chip.rows)))
+        grid = mesh(*grid_pixels((chip.columns, chip.rows), session.config.assess.grid))
+        basis = session.solution.model.basis(chip.number)
+
+        def left(x: np.ndarray, y: np.ndarray, table=table, chip=chip) -> np.ndarray:
+            return table.evaluate(x, y) - truth.beside(*chip.mosaic(x, y))
+
+        follows = np.linalg.lstsq(basis.evaluate(*fine), left(*fine))[0]
+        error = left(*grid) - basis.evaluate(*grid) @ follows
+        nodes, between = (
+            local[name].sigma[chip.number].reshape(-1, 2) for name in ("look-up tables", BETWEEN)
+        )
+        out.append(np.stack([error, nodes, np.hypot(nodes, between)], axis=1))
+    return np.array(out)
 
 
 def stated_sigma(session: Session) -> np.ndarray:

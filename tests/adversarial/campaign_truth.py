@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,10 @@ class CampaignTruth:
     true_map : callable
         Mosaic x, y, epoch and number to true (u, v) (N, 2), without frames: what one of `NEW`
         exposures shows that deviates from the others as they do from each other.
+    common : callable
+        Mosaic x, y and epoch to the (u, v) (N, 2) from which all exposures deviate.
+    beside : callable
+        x, y of the mosaic to the displacement (N, 2) that the polynomials do not have.
     known : callable
         The known distortion that matching begins with, in the same way.
     config : dict
@@ -75,6 +79,8 @@ class CampaignTruth:
     lists: dict[str, dict[str, np.ndarray]]
     chips: tuple[Piece, ...]
     true_map: Callable[..., np.ndarray]
+    common: Map
+    beside: Field
     known: Map
     config: dict[str, Any]
     epoch: float
@@ -89,6 +95,11 @@ class CampaignTruth:
         for name, columns in self.lists.items():
             Table(columns).write(folder / "lists" / f"{name}.parquet")
         _write_start(self, folder / "start_idc.fits")
+
+
+def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Normal errors of unit variance."""
+    return rng.standard_normal(shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +126,10 @@ class Recipe:
         Random generator and number to motions (n, 2) that the catalogue does not have.
     astray : callable, optional
         Sky position (N, 2) to errors (N, 2) of the catalogue.
+    centroids : callable
+        Random generator and shape to errors of detections, of unit variance.
+    config : dict
+        As of `CampaignTruth`.
     """
 
     chips: tuple[Piece, ...] = ONE
@@ -128,6 +143,8 @@ class Recipe:
     displaced: Callable[..., np.ndarray] | None = None
     moving: Callable[..., np.ndarray] | None = None
     astray: Callable[[np.ndarray], np.ndarray] | None = None
+    centroids: Callable[[np.random.Generator, tuple[int, ...]], np.ndarray] = normal
+    config: Mapping[str, Any] = field(default_factory=dict)
 
 
 def deviating(w: np.ndarray, deviation: np.ndarray) -> np.ndarray:
@@ -148,9 +165,9 @@ def made(rng: np.random.Generator, recipe: Recipe) -> CampaignTruth:
 
     def common(x: np.ndarray, y: np.ndarray, epoch: float) -> np.ndarray:
         out = np.stack([x - MIDDLE, y - MIDDLE], axis=-1) + static(x, y)
-        for power, field in ((1, recipe.rate), (2, recipe.bend)):
-            if field is not None:
-                out = out + (epoch - EPOCH0) ** power * field(x, y)
+        for power, change in ((1, recipe.rate), (2, recipe.bend)):
+            if change is not None:
+                out = out + (epoch - EPOCH0) ** power * change(x, y)
         return out
 
     n = recipe.exposures
@@ -175,8 +192,10 @@ def made(rng: np.random.Generator, recipe: Recipe) -> CampaignTruth:
         lists=lists,
         chips=recipe.chips,
         true_map=lambda x, y, epoch, k=0: deviating(common(x, y, epoch), own[k]),
+        common=common,
+        beside=total(*recipe.beside),
         known=lambda x, y, epoch: common(x, y, EPOCH0) + nearly(x, y),
-        config={},
+        config=dict(recipe.config),
         epoch=LAST + recipe.beyond,
     )
 
@@ -235,7 +254,7 @@ def _detected(
         at, m = np.stack([x[here], y[here]], axis=1), mag[here]
         if recipe.displaced is not None:
             at = at + recipe.displaced(at[:, 0], at[:, 1], m, epoch)
-        at = at + centroid_sigma(m)[:, None] * rng.standard_normal(at.shape)
+        at = at + centroid_sigma(m)[:, None] * recipe.centroids(rng, at.shape)
         blended = rng.uniform(size=len(at)) < BLENDED
         at = at + blended[:, None] * BLEND * rng.standard_normal(at.shape)
         n_false = rng.poisson(FALSE * len(at))

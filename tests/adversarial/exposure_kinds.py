@@ -196,9 +196,14 @@ def motions_sheared(rng: np.random.Generator, n: int) -> Truth:
     return campaign(rng, n, true_map, exposures=12, dates=(2002.0, 2012.0), catalogue=catalogue)
 
 
+@kind("stars_that_move", "motion", "stars move", n=3000, moving=0.2)
 @kind("same_stars", *CATALOGUE_WORDS, "same star", "each star", "err together", n=3000)
-def same_stars(rng: np.random.Generator, n: int) -> Truth:
-    """The same stars in ten dithered exposures: they share the catalogue's errors, 0.01 px."""
+def same_stars(rng: np.random.Generator, n: int, moving: float = 0.0) -> Truth:
+    """The same stars in ten dithered exposures: they share the catalogue's errors, 0.01 px.
+
+    With a fraction of them that moves, the exposures have dates over ten years, and motions of
+    0.01 px a year are not in the catalogue.
+    """
     exposures, quoted = 10, np.hypot(SIGMA, 0.01)
     true_map = mapped(fields.distortion(rng))
     sky = rng.uniform(-1100, 1100, (int(1.16 * n / exposures), 2))
@@ -219,16 +224,24 @@ def same_stars(rng: np.random.Generator, n: int) -> Truth:
     inside = (np.minimum(of["x"], of["y"]) > 0.5) & (np.maximum(of["x"], of["y"]) < 2048.5)
     of = {key: values[inside] for key, values in of.items()}
     star = of["star"]
+    seen_at, config, assessed = sky[star] + error[star], order_config(3), None
+    if moving:
+        dates = dict(zip(frames, np.linspace(2002.0, 2012.0, exposures), strict=True))
+        of["epoch"] = np.array([dates[name] for name in of["exposure"]])
+        move = (rng.uniform(size=(len(sky), 1)) < moving) * rng.standard_normal(sky.shape)
+        seen_at = seen_at + (of["epoch"] - EPOCH0)[:, None] * 0.01 * move[star]
+        config["model"]["tdd"], assessed = TDD, 2012.0
+    config["model"]["frames"] = "shift_rotation"
     stars = observed(
         rng,
         of.pop("x"),
         of.pop("y"),
-        sky[star] + error[star],
+        seen_at,
         noise=np.zeros((star.size, 2)),  # the centroids have it
         sigma=quoted,
         **of,
     )
-    return Truth(stars, true_map, order_config(3, frames="shift_rotation"), None, frames)
+    return Truth(stars, true_map, config, assessed, frames)
 
 
 def pixels_of(true_map: Map, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,7 +35,7 @@ def of_rms(field: Field, rms: float) -> Field:
 
 def total(*fields: Field) -> Field:
     """The sum of fields."""
-    return lambda x, y: np.sum([field(x, y) for field in fields], axis=0)
+    return lambda x, y: np.sum([np.zeros((*np.shape(x), 2)), *(f(x, y) for f in fields)], axis=0)
 
 
 def polynomial(coefficients: np.ndarray) -> Field:
@@ -102,6 +102,17 @@ def ridges(rng: np.random.Generator, period: float, size: float) -> Field:
     def field(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         angle = 2 * np.pi / period * np.stack([x, y], axis=-1) + phase
         return size * np.sin(angle)
+
+    return field
+
+
+def sawtooth(rng: np.random.Generator, period: float, size: float) -> Field:
+    """Columns displaced along x by ramps that fall off at sharp edges; size is half the step."""
+    phase = rng.uniform(0, period)
+
+    def field(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        ramp = size * (2 * (((np.asarray(x, float) + phase) / period) % 1.0) - 1)
+        return np.stack([ramp, np.zeros_like(ramp)], axis=-1)
 
     return field
 

@@ -7,6 +7,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.app.campaign import series
+from bayesdist.app.campaign.table_file import read_tables
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.data.tables import read_table
 from bayesdist.infer import load_posterior
@@ -198,6 +199,15 @@ def test_what_lies_between_nodes_is_what_the_truth_has_there(run, folder):
         off = (np.array(one["square"]) - true) / one["square_error"]
         assert np.abs(off).max() < 4
         assert np.array(one["square_error"]).max() < 0.2 * true.max()  # it tells something
+
+
+def test_published_errors_of_tables_hold_what_lies_between_nodes(run):
+    own = {table.chip: table for table in read_tables(run / "tables.h5", do="").tables}
+    rows = {row["chip"]: row for row in summary_of(run)["tables"]["between_nodes"]}
+    for table in read_d2im(run / "acs_wfc_d2i.fits"):
+        between = np.array([rows[table.chip][f"rms_{axis}"] for axis in "xy"])
+        whole = np.hypot(own[table.chip].sigma, between[:, None, None])
+        np.testing.assert_allclose(table.sigma, whole, rtol=1e-6)
 
 
 def test_check_says_what_there_is(folder):

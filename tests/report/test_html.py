@@ -363,6 +363,8 @@ def test_what_residuals_were_asked_and_verdicts_rest_on_stands_on_the_page(conve
                   remedy="raise model.order to 5", finding="The residuals hold it", **common),
         ScoreTest("edges", 9.1, p_value=0.52, size=0.0, smallest=np.inf, significant=False,
                   remedy="leave out the margins", finding="Nothing rises", **common),
+        ScoreTest("gap", 0.4, p_value=0.52, size=0.0, smallest=0.003, significant=False,
+                  remedy="add terms", finding="No drift", **common | {"unit": "pix/yr"}),
     )  # fmt: skip
     first, *rest = converged.margins
     margins = (
@@ -375,6 +377,7 @@ def test_what_residuals_were_asked_and_verdicts_rest_on_stands_on_the_page(conve
     found = tree.xpath("//section[@id='fit']//tr[th='order 5']")[0].text_content()
     assert "2.0 × 10⁻⁹" in found.replace("\u202f", " ") and "found: raise model.order to 5" in found
     assert "nothing found" in tree.xpath("//section[@id='fit']//tr[th='edges']")[0].text_content()
+    assert tree.xpath("//section[@id='fit']//tr[th='gap, per year']")
     of_all, of_one = (
         tree.xpath(f"//section[@id='margins']//tr[th='{clause}']/td")[0].text_content()
         for clause in margins[0].rests_on

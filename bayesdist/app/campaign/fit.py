@@ -24,6 +24,7 @@ from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.series import Series
 from bayesdist.model import Chip
+from bayesdist.model.frames import RIGID
 
 __all__ = ["run_campaign_fit"]
 
@@ -109,7 +110,11 @@ def _series(alone: ExposureSolutions, reference: Chip) -> Series:
 
 
 def _trends(joint: HierarchicalFit, matches: MatchTable) -> list[str]:
-    """Deviations that go with time although they are taken to scatter, each as a clause."""
+    """Deviations that go with time although they are taken to scatter, each as a clause.
+
+    Those of scale and shears: how the chips move against each other has a test of its own
+    (`bayesdist.diagnose.gap`).
+    """
     model = joint.model
     assert matches.epoch is not None
     names = np.array(model.exposures)
@@ -120,15 +125,12 @@ def _trends(joint: HierarchicalFit, matches: MatchTable) -> list[str]:
     values = joint.fit.mean[joint.index].reshape(len(joint.scatter.kinds), -1).T[kept]
     breaks = () if model.time is None else model.time.breaks
     p = trend_p_values(values, epoch, breaks)
-    out = []
-    for kind, one in zip(joint.scatter.kinds, p, strict=True):
-        if one * len(p) < TREND:
-            term = f'["{kind[-1]}", 0, 0]'
-            do = f"add {term} to model.tdd.terms" if "shift" in kind else "extend model.tdd.terms"
-            out.append(
-                f"the {kind} of the exposures drifts with time (p = {one:.1g}), and is taken to "
-                f"scatter between exposures: {do}"
-            )
+    out = [
+        f"the {kind} of the exposures drifts with time (p = {one:.1g}), and is taken to scatter "
+        "between exposures: extend model.tdd.terms"
+        for kind, one in zip(joint.scatter.kinds, p, strict=True)
+        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND
+    ]
     for text in out:
         log.warning("fit: WARNING: %s", text)
     return out

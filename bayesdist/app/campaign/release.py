@@ -37,7 +37,8 @@ def release(session: CampaignSession, solution: Solution) -> list[dict[str, Any]
     list of dict
         Entries of summary.json.
     """
-    return write_files(session, session.run.path, {session.inputs.filter: solution}, session.tables)
+    own = {session.inputs.filter: solution}
+    return write_files(session, session.run.path, own, session.published_tables)
 
 
 def write_files(

@@ -137,6 +137,22 @@ class CampaignSession(Session):
         """What the tables leave between their nodes, by chip, where it has been measured."""
         return self._kept_tables.between
 
+    @property
+    def published_tables(self) -> tuple[LookupTable, ...]:
+        """The tables with the errors that a user meets: of the nodes, and of what lies between.
+
+        What is between the nodes of a pattern is at the nodes too: the value of a table there is
+        that of the area around.  It counts in the tables that were fitted in this run.
+        """
+        out, held = [], self.config.tables.detector is not None
+        for table in self.tables:
+            between = self.between_nodes.get(table.chip)
+            if table.sigma is not None and between is not None and bool(table.filter) == held:
+                whole = np.sqrt(table.sigma**2 + between.left.mean[:, None, None])
+                table = replace(table, sigma=whole)
+            out.append(table)
+        return tuple(out)
+
     def keep_tables(
         self,
         tables: tuple[LookupTable, ...],
@@ -236,6 +252,19 @@ class CampaignSession(Session):
             exposures=False,
             settling=self.settling,
         )
+
+    @property
+    def tested_matches(self) -> MatchTable:
+        """Matches with what the catalogue states of the motions of their stars."""
+        table, catalog = super().tested_matches, self.inputs.catalog
+        if table.star is None or catalog.pm_u is None or catalog.sigma_pm_u is None:
+            return table
+        columns = {}
+        for name in ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"):
+            by_code = np.zeros(int(catalog.star.max()) + 1)
+            by_code[catalog.star] = getattr(catalog, name)
+            columns[name] = by_code[table.star]
+        return with_columns(table, **columns)
 
     @property
     def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]

@@ -62,12 +62,11 @@ def score_test_table(inputs: ReportInput) -> TextTable | None:
     """What the residuals were asked, and what they say; None where they were not."""
     if not inputs.score_tests:
         return None
-    scale = display_scale(
-        inputs.unit, [t.smallest for t in inputs.score_tests if np.isfinite(t.smallest)] or [1.0]
-    )
+    told = [t.smallest for t in inputs.score_tests if np.isfinite(t.smallest)]
+    scale = display_scale(inputs.unit, told or [1.0])
     rows = tuple(
         (
-            t.name,
+            t.name if t.unit == inputs.unit else f"{t.name}, per year",
             f"{number(t.statistic, 3)} ({number(t.dof, 3)})",
             "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
             number(t.size * scale.factor, 2),
@@ -90,7 +89,8 @@ def score_test_table(inputs: ReportInput) -> TextTable | None:
         words=(0, 5),
         stacked=(5,),
         note=f"Found: more than chance at {FAMILY_LEVEL:g} over all these tests together (Holm)."
-        " Size: rms over the detector, of the noise rms difference of its standard deviations;"
+        " Size: rms over the detector; of the noise rms difference of its standard deviations; of"
+        " the gap its drift, and of motions their rms, in a year;"
         f" beside it the smallest that would have been seen with probability {POWER:g}.",
     )
 

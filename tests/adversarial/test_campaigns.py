@@ -1,0 +1,92 @@
+"""Campaigns with several things that no model has: coefficients, tables, and what is noticed."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from . import KINDS
+from .campaign_kinds import OPENING
+from .campaign_measure import assessed, coefficient_errors, table_errors
+from .measure import measured
+
+pytestmark = pytest.mark.slow
+
+SEEDS, FEW = 20, 150  # campaigns of a kind, and stars of an exposure where one is enough
+CHANCE = 1e-3
+
+
+@cache
+def outcome(kind: str, seed: int, n: int | None = None) -> dict[str, Any]:
+    """Errors of coefficients and tables, and score tests, of one campaign."""
+    truth = KINDS[kind].truth(seed, n)
+    with TemporaryDirectory() as folder, closing(assessed(truth, Path(folder), seed)) as session:
+        _, error, cov = coefficient_errors(session, truth)
+        return {
+            "chi2": float(error @ np.linalg.solve(cov, error)),
+            "pull": error / np.sqrt(np.diag(cov)),
+            "tables": table_errors(session, truth) if session.tables else None,
+            "tests": {one.name: one for one in session.score_tests},
+        }
+
+
+@pytest.mark.parametrize(
+    "kind", ["campaign_inside_chips", "campaign_centroids_t", "campaign_together"]
+)
+def test_coefficients_have_the_errors_that_they_claim(kind, full, capsys):
+    if not full and kind != "campaign_together":
+        pytest.skip("one of them is made: set BAYESDIST_FULL=1")
+    runs = [outcome(kind, k) for k in range(SEEDS)] if full else [outcome(kind, 0, FEW)]
+    n = len(runs[0]["pull"])
+    chi2 = np.array([run["chi2"] for run in runs])
+    with capsys.disabled():
+        error = chi2.std() / n / np.sqrt(len(runs))
+        print(f"\n{kind}: chi2/dof {chi2.mean() / n:.2f} +- {error:.2f} of {len(runs)} campaigns")
+    # none is alone too far off, and all together are not narrower than the errors that are stated
+    assert chi2.max() < stats.chi2.isf(CHANCE / len(runs), n)
+    if full:
+        assert chi2.mean() / n == pytest.approx(1.0, abs=0.2)
+
+
+def test_tables_under_a_sharp_pattern_say_how_far_off_they_are(full, capsys):
+    """Steps of 64 or 128 pixels under ramps of 68 leave what is between nodes, and at them."""
+    if full:
+        runs = [outcome("campaign_sawtooth_in_tables", k) for k in range(SEEDS)]
+    else:
+        runs = [outcome("campaign_together", 0, FEW)]
+    found = np.array([one["tables"] for one in runs])
+    error, nodes, both = np.moveaxis(found, -2, 0)
+    inside = [(np.abs(error) < k * both).mean(axis=(0, 1, 2)) for k in (1.0, 1.96)]
+    with capsys.disabled():
+        alone = (np.abs(error) < nodes).mean(axis=(0, 1, 2))
+        print(f"\ncover of tables in x and y: {inside[0].round(2)}, {inside[1].round(2)}; by the")
+        print(f"errors of the nodes alone {alone.round(2)}")
+    assert inside[1].min() > 0.88
+    if full:
+        assert inside[0][0] > 0.55
+
+
+def test_a_gap_that_opens_is_noticed(full):
+    runs = [outcome("campaign_gap_step", seed)["tests"] for seed in range(SEEDS if full else 1)]
+    size = [one["gap"].size for one in runs if one["gap"].significant]
+    assert len(size) >= 0.9 * len(runs)
+    # along one axis, of a motion in any direction
+    assert all(OPENING / np.sqrt(2) * 0.8 < one < OPENING * 1.2 for one in size)
+    assert not any(one["motions"].significant for one in runs)
+
+
+@pytest.mark.parametrize("kind", ["campaign_gap_step", "campaign_motions", "stars_that_move"])
+def test_verdicts_are_withheld_for_the_right_reason(kind, full):
+    if not full and kind != "stars_that_move":
+        pytest.skip("one of them is made: set BAYESDIST_FULL=1")
+    runs = [measured(kind, seed) for seed in range(SEEDS if full else 1)]
+    assert np.mean([one["right_reason"] for one in runs]) >= 0.9
+    verdicts = [m["verdict"] for one in runs if one["right_reason"] for m in one["margins"]]
+    assert "met" not in verdicts
