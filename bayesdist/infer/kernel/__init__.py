@@ -10,7 +10,6 @@ from bayesdist.infer.kernel.cache import kept_by_content
 with kept_by_content():
     from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
     from bayesdist.infer.kernel.circle import circle_terms
-    from bayesdist.infer.kernel.clusters import cluster_moments, products_of
     from bayesdist.infer.kernel.likelihood import log_likelihood
     from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
     from bayesdist.infer.kernel.moments import (
@@ -48,7 +47,6 @@ __all__ = [
     "Constants",
     "Moments",
     "circle_terms",
-    "cluster_moments",
     "eliminate_stars",
     "least_squares_moments",
     "linearised",
@@ -58,7 +56,6 @@ __all__ = [
     "mixture_moments",
     "pieces_of",
     "positions",
-    "products_of",
     "residuals",
     "set_threads",
     "truncated_log_likelihood",
