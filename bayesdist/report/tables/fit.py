@@ -9,8 +9,16 @@ from bayesdist.assess import residual_statistics
 from bayesdist.diagnose.result import FAMILY_LEVEL, POWER
 from bayesdist.infer.skew import skew_of
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numerals import MISSING, count, interval, number, rounded
-from bayesdist.report.scales import Scale, display_scale, with_mas
+from bayesdist.report.numbers import (
+    MISSING,
+    Scale,
+    count,
+    display_scale,
+    interval,
+    number,
+    rounded,
+    with_mas,
+)
 from bayesdist.report.tables.text import TextTable, listing, marked
 
 __all__ = ["fit_tables", "outlier_table", "score_test_table"]
