@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 
 from bayesdist.assess.product_terms import PRODUCT
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import (
     CYCLE,
     INK,

@@ -22,7 +22,7 @@ from bayesdist.report.map_captions import (
     non_linear_caption,
     radius_caption,
 )
-from bayesdist.report.numerals import count, percent
+from bayesdist.report.numbers import count, percent
 from bayesdist.report.periods import period_caption
 from bayesdist.report.selfcal import selfcal_caption
 

@@ -12,7 +12,7 @@ from scipy.stats import chi2 as chi_square
 from scipy.stats import norm
 
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import (
     PALETTE,
     WIDTH,

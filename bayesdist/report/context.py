@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.report.numerals import count
-from bayesdist.report.scales import with_mas
+from bayesdist.report.numbers import count, with_mas
 from bayesdist.report.words import DETECTED, MATCHED, Words
 
 if TYPE_CHECKING:

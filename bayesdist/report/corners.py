@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from bayesdist.report.numerals import broken_name
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import broken_name, display_scale
 from bayesdist.report.style import HYPER_LABELS, PALETTE, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from bayesdist.data.files import atomic_path, made_folder
-from bayesdist.report.style import figure_style
-from bayesdist.report.ticks import plain_ticks
+from bayesdist.report.style import figure_style, plain_ticks
 
 __all__ = [
     "DPI",

@@ -18,7 +18,7 @@ from bayesdist.assess.position_errors import CENTROID
 from bayesdist.assess.product_terms import PRODUCT
 from bayesdist.assess.terms import LOCAL, MEASURED
 from bayesdist.report.context import ReportInput
-from bayesdist.report.scales import ladder
+from bayesdist.report.numbers import ladder
 from bayesdist.report.style import CYCLE, SEQUENTIAL
 
 __all__ = ["budget_data", "embedded", "map_data"]

@@ -6,7 +6,7 @@ import numpy as np
 
 from bayesdist.report.caption import Caption
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numerals import number, percent
+from bayesdist.report.numbers import number, percent
 from bayesdist.report.vectors import CHANCE, significant_cells
 
 __all__ = [

@@ -16,7 +16,7 @@ from bayesdist.assess.holdout import DOUBTFUL, HeldOutTruth
 from bayesdist.report.caption import Caption
 from bayesdist.report.context import Check
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.numerals import count, number, probability
+from bayesdist.report.numbers import count, number, probability
 from bayesdist.report.style import CYCLE, INK, WIDTH, detector_axes, figure_style, new_figure
 from bayesdist.report.tables.text import TextTable
 

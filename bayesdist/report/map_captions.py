@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.report.caption import Caption
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numerals import number
+from bayesdist.report.numbers import number
 
 if TYPE_CHECKING:
     from bayesdist.assess import VectorMap

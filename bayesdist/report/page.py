@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from bayesdist.report.caption import Caption
 from bayesdist.report.drawing import DPI
-from bayesdist.report.numerals import number
+from bayesdist.report.numbers import number
 
 __all__ = ["Picture", "picture_of", "template"]
 

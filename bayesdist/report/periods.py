@@ -9,8 +9,15 @@ from matplotlib.figure import Figure
 
 from bayesdist.report.caption import Caption
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.numerals import MISSING, count, number, probability, rounded
-from bayesdist.report.scales import display_scale, with_mas
+from bayesdist.report.numbers import (
+    MISSING,
+    count,
+    display_scale,
+    number,
+    probability,
+    rounded,
+    with_mas,
+)
 from bayesdist.report.style import INK, draw_vectors, figure_style, nice_below, vector_key
 from bayesdist.report.tables.text import TextTable, listing
 from bayesdist.report.vectors import CHANCE, spacing

@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.report.caption import Caption
-from bayesdist.report.numerals import MISSING, count, number, percent
-from bayesdist.report.scales import display_scale, with_mas
+from bayesdist.report.numbers import MISSING, count, display_scale, number, percent, with_mas
 from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
 from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, listing
 

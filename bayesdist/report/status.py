@@ -11,8 +11,7 @@ from bayesdist.report.campaign.status import campaign_checks
 from bayesdist.report.context import Check, ReportInput
 from bayesdist.report.holdout import holdout_checks
 from bayesdist.report.margins import VERDICT_LEVELS
-from bayesdist.report.numerals import count, number, percent, rounded
-from bayesdist.report.scales import with_mas
+from bayesdist.report.numbers import count, number, percent, rounded, with_mas
 from bayesdist.report.structure import structure_check
 
 __all__ = ["Verdict", "status_checks", "verdict"]

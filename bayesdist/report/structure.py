@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from bayesdist.assess.misfit import SIGNIFICANT, Misfit, worst_misfit
 from bayesdist.report.context import Check
-from bayesdist.report.numerals import number, percent, probability
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale, number, percent, probability
 
 __all__ = ["structure_check"]
 

@@ -1,4 +1,4 @@
-"""The look of every figure: one palette, one size, one way to state a vector's scale.
+"""The look of every figure: one palette, one width, plain numbers at ticks.
 
 Figures are made by objects, never through pyplot, and the caller's rcParams are left alone.
 """
@@ -6,6 +6,7 @@ Figures are made by objects, never through pyplot, and the caller's rcParams are
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -17,9 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.quiver import Quiver
 from matplotlib.text import Annotation
+from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 from numpy.typing import NDArray
 
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 
 __all__ = [
     "CYCLE",
@@ -35,6 +37,7 @@ __all__ = [
     "figure_style",
     "new_figure",
     "nice_below",
+    "plain_ticks",
     "vector_key",
 ]
 
@@ -74,7 +77,7 @@ _RC = {
     "axes.labelcolor": INK,
     "axes.prop_cycle": matplotlib.cycler(color=CYCLE),
     "axes.formatter.useoffset": False,
-    "axes.formatter.use_mathtext": False,  # see `ticks`
+    "axes.formatter.use_mathtext": False,  # see `plain_ticks`
     "axes.formatter.limits": (-4, 5),
     "text.color": INK,
     "xtick.color": INK,
@@ -268,3 +271,54 @@ def vector_key(ax: Axes, length: float, *, magnification: float, unit: str) -> A
     )
     ax.text(start, 1.035, text, transform=transform, ha="right", va="center", fontsize=7.5)
     return arrow
+
+
+# -- ticks: mathematical text takes most of the time of drawing ------------------------------------
+
+_RAISED = str.maketrans("0123456789-−", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁻")
+
+
+class _Powers(LogFormatterSciNotation):
+    """Powers of ten in raised digits."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        text = super().__call__(x, pos)
+        text = text.removeprefix(r"$\mathdefault{").removesuffix("}$")
+        return re.sub(r"\^\{(.*?)\}", lambda m: m[1].translate(_RAISED), _signs(text))
+
+
+class _Plain(ScalarFormatter):
+    """Decimal numbers, a power of ten that they share in raised digits."""
+
+    def get_offset(self) -> str:
+        text = super().get_offset()
+        number, e, power = text.partition("e")
+        if not e:
+            return text
+        times = f"{number}×" if number not in ("", "1") else "×"
+        return f"{times}10{power.removeprefix('+').translate(_RAISED)}"
+
+
+def _signs(text: str) -> str:
+    return text.replace(r"\times", "×").replace("-", "−")
+
+
+def plain_ticks(figure: Figure) -> None:
+    """Give every axis that has matplotlib's own numbers such without mathematical text."""
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            for now, put in (
+                (axis.get_major_formatter(), axis.set_major_formatter),
+                (axis.get_minor_formatter(), axis.set_minor_formatter),
+            ):
+                if type(now) is ScalarFormatter:
+                    put(_Plain(useOffset=now.get_useOffset(), useMathText=False))
+                elif type(now) is LogFormatterSciNotation:
+                    put(
+                        _Powers(
+                            now._base,
+                            labelOnlyBase=now.labelOnlyBase,
+                            minor_thresholds=now.minor_thresholds,
+                            linthresh=now._linthresh,
+                        )
+                    )

@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from bayesdist.report.numerals import broken_name
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import broken_name, display_scale
 from bayesdist.report.style import CYCLE, HYPER_LABELS, INK, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:

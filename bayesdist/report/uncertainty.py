@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import (
     CYCLE,
     INK,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import (
     INK,
     PALETTE,

@@ -13,8 +13,7 @@ from PIL import Image
 from bayesdist.report import drawing, two_hands
 from bayesdist.report.drawing import DPI, PAD, drawing_of, png_of
 from bayesdist.report.figures import plan_of_figures
-from bayesdist.report.style import figure_style, new_figure
-from bayesdist.report.ticks import plain_ticks
+from bayesdist.report.style import figure_style, new_figure, plain_ticks
 
 
 def pixels(png: bytes) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bayesdist.assess.residual_correlation import DRAWS
-from bayesdist.report.numerals import probability
+from bayesdist.report.numbers import probability
 from bayesdist.report.style import INK, PALETTE, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:

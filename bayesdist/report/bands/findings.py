@@ -9,8 +9,7 @@ import numpy as np
 from bayesdist.assess.wise.account import LONGEST_DIFFERENCES
 from bayesdist.report.bands.context import BandResult, BandsInput
 from bayesdist.report.bands.curves import CASES, chance_of
-from bayesdist.report.numerals import MISSING, count, number, percent, probability
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import MISSING, count, display_scale, number, percent, probability
 from bayesdist.report.tables.text import TextTable
 
 __all__ = [

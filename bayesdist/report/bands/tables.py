@@ -10,7 +10,7 @@ from bayesdist.assess.wise import STATISTICS
 from bayesdist.assess.wise.account import RowAccount
 from bayesdist.assess.wise.published import PrintedRow
 from bayesdist.report.bands.context import BandsInput
-from bayesdist.report.numerals import MISSING, number, rounded
+from bayesdist.report.numbers import MISSING, number, rounded
 from bayesdist.report.tables.text import TextTable
 
 __all__ = ["account_table", "as_printed", "contradiction_table", "statistics_table", "tables_of"]

@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from bayesdist.report.bands.panels import band_axes, band_panels
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import CYCLE, figure_style, nice_below, vector_key
 from bayesdist.report.uncertainty import crosses
 from bayesdist.report.vectors import VectorFlow, spacing

@@ -9,9 +9,8 @@ import numpy as np
 
 from bayesdist.report.campaign.context import CampaignResults
 from bayesdist.report.campaign.residuals import binned_of, largest_cell, rms_of_cells
-from bayesdist.report.campaign.words import size_of
 from bayesdist.report.caption import Caption
-from bayesdist.report.numerals import count, number, percent
+from bayesdist.report.numbers import count, number, percent, size_of
 
 if TYPE_CHECKING:
     from bayesdist.model import LookupTable

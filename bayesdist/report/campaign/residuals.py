@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
 from bayesdist.report.vectors import residual_vectors, spacing
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bayesdist.report.campaign.context import CampaignResults
 from bayesdist.report.context import Check
-from bayesdist.report.numerals import count, percent
+from bayesdist.report.numbers import count, percent
 from bayesdist.report.structure import structure_check
 
 __all__ = ["campaign_checks"]

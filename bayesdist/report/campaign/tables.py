@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from bayesdist.model import Chip, LookupTable
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import INK, draw_vectors, figure_style, nice_below, vector_key
 
 __all__ = ["node_errors", "node_vectors"]

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from bayesdist.report.campaign.context import CampaignResults
 from bayesdist.report.campaign.timetables import time_tables
-from bayesdist.report.numerals import MISSING, count, number, percent
+from bayesdist.report.numbers import MISSING, count, number, percent
 from bayesdist.report.tables.text import TextTable, listing
 
 __all__ = ["campaign_tables"]

@@ -9,9 +9,9 @@ import numpy as np
 from bayesdist.report.campaign.alignment import IN_CELL, largest_vector
 from bayesdist.report.campaign.context import CampaignResults
 from bayesdist.report.campaign.series import TermCourse
-from bayesdist.report.campaign.words import name_of_term, size_of
+from bayesdist.report.campaign.words import name_of_term
 from bayesdist.report.caption import Caption
-from bayesdist.report.numerals import count, number
+from bayesdist.report.numbers import count, number, size_of
 
 __all__ = ["caption_of_overlap", "caption_of_series"]
 

@@ -14,8 +14,7 @@ from bayesdist.report.campaign.published import (
     published_lines,
 )
 from bayesdist.report.campaign.words import name_of_scatter, name_of_term
-from bayesdist.report.numerals import MISSING, count, interval, number, rounded
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import MISSING, count, display_scale, interval, number, rounded
 from bayesdist.report.tables.text import TextTable, listing
 
 __all__ = ["time_tables"]

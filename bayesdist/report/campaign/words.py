@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from bayesdist.report.scales import display_scale
-
-__all__ = ["name_of_scatter", "name_of_term", "size_of"]
+__all__ = ["name_of_scatter", "name_of_term"]
 
 _TERMS = {
     "A_1": "A_1 (constant of u)",
@@ -33,8 +31,3 @@ def name_of_scatter(kind: str) -> str:
     chip, _, bare = kind.rpartition(".")
     text = _SCATTER.get(bare, bare.replace("_", " "))
     return f"{chip} against the others: {text}" if chip else f"all chips together: {text}"
-
-
-def size_of(value: float, unit: str = "pix", digits: int = 3) -> str:
-    """A length in the unit that needs few zeros."""
-    return display_scale(unit, value).text(value, digits)

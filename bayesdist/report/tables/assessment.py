@@ -11,8 +11,7 @@ from bayesdist.assess import Margin
 from bayesdist.assess.product_terms import PRODUCT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.gauge import gauge_mark, gauge_of_maps, gauge_of_new_exposure
-from bayesdist.report.numerals import MISSING, interval, number, percent, rounded
-from bayesdist.report.scales import with_mas
+from bayesdist.report.numbers import MISSING, interval, number, percent, rounded, with_mas
 from bayesdist.report.tables.text import TextTable, marked
 
 AS_ABOVE = "as above"  # of the rows of single chips

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.report.context import ReportInput
 from bayesdist.report.gauge import gauge_mark, gauge_note
-from bayesdist.report.numerals import MISSING, interval, number, rounded
+from bayesdist.report.numbers import MISSING, interval, number, rounded
 from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, marked
 
 __all__ = ["coefficient_tables"]

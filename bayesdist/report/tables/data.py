@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numerals import MISSING, count, number
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import MISSING, count, display_scale, number
 from bayesdist.report.tables.text import MOST_ROWS, TextTable, further, listing, marked, short_paths
 
 __all__ = ["data_tables"]

@@ -10,8 +10,16 @@ from bayesdist.diagnose.result import FAMILY_LEVEL, POWER
 from bayesdist.infer.added_errors import DECISIVE
 from bayesdist.infer.skew import skew_of
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numerals import MISSING, count, interval, number, rounded
-from bayesdist.report.scales import Scale, display_scale, with_mas
+from bayesdist.report.numbers import (
+    MISSING,
+    Scale,
+    count,
+    display_scale,
+    interval,
+    number,
+    rounded,
+    with_mas,
+)
 from bayesdist.report.tables.text import TextTable, listing, marked
 
 __all__ = ["added_errors_table", "fit_tables", "outlier_table", "score_test_table"]

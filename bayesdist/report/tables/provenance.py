@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numerals import MISSING, count, number, percent
+from bayesdist.report.numbers import MISSING, count, number, percent
 from bayesdist.report.tables.text import TextTable, listing, short_paths
 
 __all__ = ["config_table", "provenance_tables"]

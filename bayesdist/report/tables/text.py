@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import PurePath
 
 from bayesdist.report.context import ReportInput
-from bayesdist.report.numerals import MISSING
+from bayesdist.report.numbers import MISSING
 
 __all__ = ["MOST_ROWS", "TextTable", "further", "listing", "marked", "short_paths"]
 

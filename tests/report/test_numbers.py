@@ -8,16 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bayesdist.report.numerals import (
+from bayesdist.report.numbers import (
     MISSING,
     count,
+    display_scale,
     interval,
     number,
     percent,
     probability,
     rounded,
+    with_mas,
 )
-from bayesdist.report.scales import display_scale, with_mas
 
 ANGLES = {"deg": u.deg, "arcsec": u.arcsec, "mas": u.mas, "µas": u.uas}
 
