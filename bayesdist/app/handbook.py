@@ -62,7 +62,7 @@ def handbook(
     """
     # figures take seconds to import
     from bayesdist.products.detectors import acs_detector
-    from bayesdist.report import drawn, save_images
+    from bayesdist.report.drawing import save_figures
     from bayesdist.report.handbook_numbers import handbook_rows
     from bayesdist.report.whole_detector import area_figure, non_linear_figure, residual_figure
 
@@ -90,7 +90,7 @@ def handbook(
         rows = handbook_rows(
             detector_numbers(whole), scale=found.scale, unit=found.unit, detector=detector or ""
         )
-        save_images(drawn(figures), folder)
+        save_figures(figures, folder)
         write_table(Table(rows), folder / "numbers.ecsv")
     shown = [row | {"published": row["published"] or "-"} for row in rows]
     return f"{output}: {', '.join(figures)}{missing}\n{table_text(shown, 5)}"

@@ -11,7 +11,7 @@ from astropy.table import Table
 
 from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.comparison_files import joined, mosaic_of
+from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.folder import whole_folder
 from bayesdist.app.matches import load_matches, reading_options
@@ -29,8 +29,8 @@ from bayesdist.infer import Matches, Posterior
 from bayesdist.infer.change_date import PeriodScore, period_scores, scan_dates
 from bayesdist.infer.membership import count_outliers
 from bayesdist.infer.monitoring import NewFit, change_of, fit_new
-from bayesdist.report import drawn, save_images
 from bayesdist.report.comparison import change_over_time, difference_vectors
+from bayesdist.report.drawing import save_figures
 
 __all__ = ["monitor"]
 
@@ -260,9 +260,7 @@ def _write(
     with whole_folder(output) as folder:
         write_table(joined(maps, comparison_table), folder / "change.ecsv")
         write_table(joined(maps, difference_table), folder / "difference.ecsv")
-        figures = {
-            "change": difference_vectors(*maps, mosaic=mosaic_of(maps), names=("new", "release"))
-        }
+        figures = {"change": difference_vectors(maps, names=("new", "release"))}
         if date is not None:
             table = Table(
                 {
@@ -277,7 +275,7 @@ def _write(
                 figures["dates"] = change_over_time(
                     table["first"], date.gain, date.dof, found.p_since
                 )
-        save_images(drawn(figures), folder / "figures")
+        save_figures(figures, folder / "figures")
         write_json(folder / "monitor.json", _summary(found, facts, command))
 
 

@@ -197,9 +197,9 @@ def _with_error(value: float | None, error: float | None) -> str:
 
 
 def _draw(found: OrderSelection, path: Path) -> None:
-    from bayesdist.report import drawn  # figures take seconds to import
+    from bayesdist.report.drawing import png_of  # figures take seconds to import
     from bayesdist.report.order import order_comparison
 
-    png = drawn({"orders": order_comparison(found)})["orders"]
+    png = png_of(order_comparison(found))
     with atomic_path(path) as temporary:
         temporary.write_bytes(png)

@@ -552,8 +552,7 @@ def test_figures_are_listed_once_they_are_there(copy, monkeypatch):
     def full(drawings, folder):
         raise InputError("No space left on device", where=str(folder), do="make room")
 
-    monkeypatch.setattr("bayesdist.report.drawn_report", lambda inputs, hand: {"one": None})
-    monkeypatch.setattr("bayesdist.report.save_drawings", full)
+    monkeypatch.setattr("bayesdist.report.drawing.save_drawings", full)
     before = summary_of(copy)["figures"]
     assert cli("report", copy).code == 1
     assert summary_of(copy)["figures"] == before

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from bayesdist.data.holdout import SetAside, split_matches
 from bayesdist.errors import InputError
 from bayesdist.infer.star_errors import star_covariance
 from bayesdist.infer.star_influence import star_influence
-from bayesdist.report.holdout import holdout_tables
+from bayesdist.report.sections.run.holdout import holdout_coverage, holdout_table
 from tests.assess.held_campaign import field, judged, solved
 
 RUNS = 60 if os.environ.get("BAYESDIST_FULL") else 6
@@ -101,7 +102,8 @@ def test_a_chip_that_is_displaced_is_named() -> None:
     assert found.tests[0].name == "deviation"
     assert found.verdict.startswith("the WFC1.shift u of exposure j004, held out whole, deviates")
     assert abs(found.tests[0].value) == pytest.approx(0.08, abs=0.03)
-    coverage, table = holdout_tables(found)
+    shown = SimpleNamespace(held_out=found)
+    coverage, table = holdout_coverage(shown), holdout_table(shown)
     assert [row[:2] for row in coverage.rows] == [(a, f"{k} σ") for a in "uv" for k in (1, 2)]
     assert table.rows[0][0] == "deviation from other exposures"
 

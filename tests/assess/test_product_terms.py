@@ -74,7 +74,7 @@ def test_at_a_place_it_is_the_field_and_between_two_the_difference(solution):
 
 
 def test_the_page_carries_it(solution):
-    from bayesdist.report.explorer import _product
+    from bayesdist.report.sections.explorer import _product
 
     errors = position_errors(solution, grid=GRID, n_draws=100, rng=np.random.default_rng(3))
     surface = budget_surface(errors, products=(TERM,))

@@ -34,8 +34,7 @@ from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.shards import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.report import Check, Product, ReportInput
-from bayesdist.report.context import ChipResults
+from bayesdist.report.context import Check, ChipResults, Product, ReportInput
 
 SIZE = (1016.0, 1016.0)
 CENTRE = (508.5, 508.5)

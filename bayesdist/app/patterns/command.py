@@ -109,12 +109,12 @@ def _sentences(one: PlannedPattern) -> list[str]:
 
 
 def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:
-    from bayesdist.report import drawn, save_images  # figures take seconds to import
+    from bayesdist.report.drawing import save_figures  # figures take seconds to import
     from bayesdist.report.patterns import pattern_maps
 
     with whole_folder(output) as folder:
         write_table(_table(found), folder / "patterns.ecsv")
-        save_images(drawn({"patterns": pattern_maps(found)}), folder / "figures")
+        save_figures({"patterns": pattern_maps(found)}, folder / "figures")
         record = {
             "schema": SCHEMA,
             "command": command,

@@ -11,7 +11,7 @@ from bayesdist.app.selfcal.session import SelfcalSession
 from bayesdist.assess.grid import outline_pixels
 
 if TYPE_CHECKING:
-    from bayesdist.report.selfcal import SelfcalResults
+    from bayesdist.report.context import SelfcalResults
 
 __all__ = ["selfcal_results"]
 
@@ -24,7 +24,7 @@ def selfcal_results(session: SelfcalSession) -> SelfcalResults:
     session : SelfcalSession
         Of a run that has been assessed.
     """
-    from bayesdist.report.selfcal import SelfcalResults  # figures take seconds to import
+    from bayesdist.report.context import SelfcalResults  # figures take seconds to import
 
     run, model, theta = session.run, session.model, session.posterior.mean
     outlines = []

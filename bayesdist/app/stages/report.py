@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bayesdist.app.campaign.report import campaign_results
@@ -33,9 +36,7 @@ from bayesdist.assess.mosaic import chip_places
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
-    from bayesdist.report.campaign import CampaignResults
     from bayesdist.report.context import ChipResults, ReportInput
-    from bayesdist.report.two_hands import Hand
 
 __all__ = ["run_report", "title_of"]
 
@@ -47,25 +48,29 @@ VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide 
 
 def run_report(session: Session) -> None:
     # figures take seconds to import
-    from bayesdist.report import drawn_report, save_drawings, second_hand, write_report
+    from bayesdist.report.drawing import save_drawings
+    from bayesdist.report.run_report import draw_report, write_report
 
-    run = session.run
-    with second_hand(isinstance(session, CampaignSession)) as hand:  # they have most figures
-        inputs = _inputs(session, hand)
-        drawings = drawn_report(inputs, hand)
+    run, inputs = session.run, _inputs(session)
+    drawings = draw_report(inputs, processes=2 if _is_command_line() else 1)
     names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
     save_drawings(drawings, run / "figures")
     for stale in set(run.summary.get("figures", [])) - set(names):
         (run / "figures" / stale).unlink(missing_ok=True)
     run.summarise(figures=names)  # what is there, should the disk be full
-    images = {name: one.png for name, one in drawings.items()}
-    write_report(run / "report.html", inputs, images)
+    write_report(run / "report.html", inputs, drawings)
     log.info("report: %s", run / "report.html")
 
 
-def _inputs(session: Session, hand: Hand | None) -> ReportInput:
-    """All that the report shows; another process may begin to draw what is found first."""
-    from bayesdist.report import Check, Product, ReportInput
+def _is_command_line() -> bool:
+    """Whether other processes may import the main module: a user's own may not be guarded."""
+    path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+    return (os.cpu_count() or 1) > 1 and "bayesdist" in (path.stem, path.parent.name)
+
+
+def _inputs(session: Session) -> ReportInput:
+    """All that the report shows."""
+    from bayesdist.report.context import Check, Product, ReportInput
 
     run, config = session.run, session.config
     fit, posterior = session.fit, session.posterior
@@ -80,7 +85,7 @@ def _inputs(session: Session, hand: Hand | None) -> ReportInput:
         for p in run.summary.get("products", [])
     )
     judged = judged_requirements(run)
-    campaign = _campaign(session, hand) if isinstance(session, CampaignSession) else None
+    campaign = campaign_results(session) if isinstance(session, CampaignSession) else None
     inputs = ReportInput(
         name=title_of(config) or folder,
         config=as_json(config.model_dump(exclude_none=True)),
@@ -111,18 +116,6 @@ def _inputs(session: Session, hand: Hand | None) -> ReportInput:
     if isinstance(session, SelfcalSession):
         inputs = replace(inputs, selfcal=selfcal_results(session))
     return inputs
-
-
-def _campaign(session: CampaignSession, hand: Hand | None) -> CampaignResults:
-    from bayesdist.report.campaign import campaign_draws
-    from bayesdist.report.mosaic import Mosaic
-
-    results = campaign_results(session)
-    if hand is not None:  # half of all figures
-        posterior = session.posterior
-        places = chip_places(posterior, epoch=session.epoch)
-        hand.give(campaign_draws, results, Mosaic.of_chips(posterior.model.chips, places))
-    return results
 
 
 def title_of(config: Config) -> str:
