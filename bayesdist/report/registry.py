@@ -89,8 +89,8 @@ class Entry:
         Condition that no attribute states.
     each : callable, optional
         Of the results: name and argument of every figure that the function makes.
-    printed : bool or callable
-        Whether the figure is on paper; of several, the first.
+    printed : bool, callable or 'first'
+        Whether the figure is on paper, or the first of several.
     """
 
     name: str
@@ -100,7 +100,7 @@ class Entry:
     needs: tuple[str, ...] = ()
     when: When | None = None
     each: Callable[[Any], Mapping[str, Any]] | None = None
-    printed: bool | When = False
+    printed: bool | When | Literal["first"] = False
 
     def applies(self, results: Any) -> bool:
         """Whether it can be made of these results."""
@@ -155,7 +155,7 @@ class Registry:
         needs: tuple[str, ...] = (),
         when: When | None = None,
         each: Callable[[Any], Mapping[str, Any]] | None = None,
-        printed: bool | When = False,
+        printed: bool | When | Literal["first"] = False,
     ) -> Callable[[Make], Make]:
         """Decorator of a function that makes a `Plot`; parameters as of `Entry`."""
         options = {"needs": needs, "when": when, "each": each, "printed": printed}
@@ -206,13 +206,13 @@ class Registry:
         for entry in self.entries:
             if entry.kind != kind or not entry.applies(results):
                 continue
-            printed = entry.printed(results) if callable(entry.printed) else entry.printed
+            printed = entry.printed(results) if callable(entry.printed) else bool(entry.printed)
             if entry.each is None:
                 out.append(Item(entry.name, entry.section, entry.make, printed=printed))
                 continue
             for name, argument in entry.each(results).items():
                 out.append(Item(name, entry.section, entry.make, (argument,), printed))
-                printed = False
+                printed = printed and entry.printed != "first"
         return tuple(out)
 
 
@@ -221,4 +221,4 @@ def _present(results: Any, path: str) -> bool:
     value = reduce(
         lambda of, name: None if of is None else getattr(of, name), path.split("."), results
     )
-    return value is not None and (not isinstance(value, tuple) or bool(value))
+    return value is not None and (not isinstance(value, tuple | Mapping) or bool(value))

@@ -140,7 +140,7 @@ def residual_figure(
     chips = [Arrows.of_cells(b) for b in binned.values()]
     length = np.concatenate([one.length for one in chips])
     typical = float(np.quantile(length, 0.95)) if length.size else 0.0
-    step = min(one.step for one in chips)
+    step = min(float(b.x[1] - b.x[0]) for b in binned.values())
     sizes = {n: _sizes(detector)[n] for n in binned}
     panels = OneArray(sizes, detector.places, margin=0.6 * step)
     lines = [

@@ -188,6 +188,14 @@ def test_a_copy_on_paper_can_be_traced(converged, drawings):
     assert "Made by bayesdist. " in render_report(replace(converged, provenance={}), drawings)
 
 
+def test_files_are_named_without_the_folder_that_all_are_in(converged):
+    paths = {"/data/a/x.ecsv": "0", "/data/a/lists/y.ecsv": "1"}
+    run = replace(converged, provenance={"inputs": paths})
+    tree = lxml_html.fromstring(render_report(run, {}))
+    rows = tree.xpath("//section[@id='provenance']//table[caption='Inputs']//th")
+    assert [row.text_content() for row in rows] == ["x.ecsv", "lists/y.ecsv"]
+
+
 def test_negative_numbers_have_a_minus(page, converged):
     tree = lxml_html.fromstring(page)
     cells = [c.text_content() for c in tree.xpath("//table//td[contains(@class, 'n')]")]

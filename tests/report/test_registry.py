@@ -96,7 +96,7 @@ def test_a_page_of_its_own_needs_no_change_elsewhere():
     def table(r):
         return TextTable("Numbers", ("n",), tuple((str(n),) for n in r.numbers))
 
-    @registry.figure("part", each=lambda r: {f"figure_{n}": n for n in r.numbers}, printed=True)
+    @registry.figure("part", each=lambda r: {f"figure_{n}": n for n in r.numbers}, printed="first")
     def figure(r, n):
         return Plot(None, f"Number {n}", "", "")
 

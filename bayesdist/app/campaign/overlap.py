@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from astropy.wcs import WCS
 from numpy.typing import NDArray
@@ -17,9 +15,7 @@ from bayesdist.infer.views import without_frames
 from bayesdist.model import corrected
 from bayesdist.products import read_idctab
 from bayesdist.products.parity import parity_of
-
-if TYPE_CHECKING:
-    from bayesdist.report.campaign import OverlapTest
+from bayesdist.report.campaign import OverlapTest
 
 __all__ = ["chosen_exposures", "overlap_test"]
 
@@ -44,8 +40,6 @@ def overlap_test(session: CampaignSession) -> OverlapTest | None:
     OverlapTest or None
         None where no two exposures share enough stars.
     """
-    from bayesdist.report.campaign import OverlapTest  # figures take seconds to import
-
     pairs = session.pairs
     chosen = chosen_exposures(pairs)
     if chosen is None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bayesdist.app.campaign.report import campaign_results
 from bayesdist.app.campaign.session import CampaignSession
@@ -34,9 +33,7 @@ from bayesdist.assess.budget_surface import BudgetSurface, budget_surface
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.errors import InputError
-
-if TYPE_CHECKING:
-    from bayesdist.report.context import ChipResults, ReportInput
+from bayesdist.report.context import Check, ChipResults, Product, ReportInput
 
 __all__ = ["run_report", "title_of"]
 
@@ -65,13 +62,12 @@ def run_report(session: Session) -> None:
 def _is_command_line() -> bool:
     """Whether other processes may import the main module: a user's own may not be guarded."""
     path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
-    return (os.cpu_count() or 1) > 1 and "bayesdist" in (path.stem, path.parent.name)
+    name = path.parent.stem if path.name == "__main__.py" else path.stem
+    return name == "bayesdist" and (os.cpu_count() or 1) > 1
 
 
 def _inputs(session: Session) -> ReportInput:
     """All that the report shows."""
-    from bayesdist.report.context import Check, Product, ReportInput
-
     run, config = session.run, session.config
     fit, posterior = session.fit, session.posterior
     several = len(fit.model.exposures) > 1
@@ -80,7 +76,7 @@ def _inputs(session: Session) -> ReportInput:
         Product(
             path=p["path"],
             what=p["kind"],
-            checks=tuple(_product_checks(p, Check)),
+            checks=_product_checks(p),
         )
         for p in run.summary.get("products", [])
     )
@@ -147,8 +143,6 @@ def _surface(session: Session) -> BudgetSurface | None:
 
 
 def _chip_results(session: Session) -> tuple[ChipResults, ...]:
-    from bayesdist.report.context import ChipResults
-
     fit, posterior, epoch = session.fit, session.solution, session.epoch
     out = []
     places = [
@@ -182,22 +176,23 @@ def _chip_results(session: Session) -> tuple[ChipResults, ...]:
     return tuple(out)
 
 
-def _product_checks(product: dict[str, Any], check: Callable[..., Any]) -> list[Any]:
+def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
+    """What was verified on a file as written."""
     out = []
     if product.get("closure_pix") is not None:
-        out.append(check("worst closure of the inverse (pix)", product["closure_pix"]))
-        out.append(check("A_DMAX (pix)", product["a_dmax"]))
-        out.append(check("B_DMAX (pix)", product["b_dmax"]))
+        out.append(Check("worst closure of the inverse (pix)", product["closure_pix"]))
+        out.append(Check("A_DMAX (pix)", product["a_dmax"]))
+        out.append(Check("B_DMAX (pix)", product["b_dmax"]))
     if product.get("sky"):
         sky = product["sky"]
         name = f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"
-        out.append(check(name, sky["rms_arcsec"]))
-        out.append(check("largest distance from the solution (arcsec)", sky["solution_arcsec"]))
+        out.append(Check(name, sky["rms_arcsec"]))
+        out.append(Check("largest distance from the solution (arcsec)", sky["solution_arcsec"]))
     levels = {"error": "fail", "warning": "warn", "note": "note"}
     for finding in product["findings"]:
         level, _, text = finding.partition(": ")
-        out.append(check(text, level, "", levels.get(level, "note")))
-    return out
+        out.append(Check(text, level, "", levels.get(level, "note")))
+    return tuple(out)
 
 
 def _vector_grid(size: tuple[float, float]) -> tuple[int, int]:

@@ -25,7 +25,7 @@ CASES = {
 }
 
 
-@BANDS.figure("histograms")
+@BANDS.figure("histograms", printed=True)
 def histograms(inputs: BandsInput) -> Plot:
     """Residuals along x and y of all pairs, on a logarithmic scale of counts."""
     with figure_style():
@@ -63,7 +63,7 @@ def histograms(inputs: BandsInput) -> Plot:
     )
 
 
-@BANDS.figure("structure")
+@BANDS.figure("structure", printed=True)
 def correlation(inputs: BandsInput) -> Plot:
     """Correlation of mean residuals of bins against their separation, with what noise gives."""
     bands = inputs.bands

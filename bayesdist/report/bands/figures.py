@@ -43,7 +43,7 @@ DIVERGING = "RdBu_r"  # red and blue are told apart in every common colour blind
 AXES = "xy"
 
 
-@BANDS.figure("vectors")
+@BANDS.figure("vectors", printed=True)
 def vectors(inputs: BandsInput) -> Plot:
     """The distortion of each band without its constant."""
     bands = inputs.bands
@@ -58,7 +58,7 @@ def vectors(inputs: BandsInput) -> Plot:
     )
 
 
-@BANDS.figure("vectors", needs=("differences",))
+@BANDS.figure("vectors", needs=("differences",), printed=True)
 def differences(inputs: BandsInput) -> Plot:
     """Later bands minus the first one."""
     first = inputs.names[0]
@@ -73,7 +73,9 @@ def differences(inputs: BandsInput) -> Plot:
     )
 
 
-@BANDS.figure("vectors", when=lambda inputs: any(b.minus_optical for b in inputs.bands))
+@BANDS.figure(
+    "vectors", when=lambda inputs: any(b.minus_optical for b in inputs.bands), printed=True
+)
 def minus_optical(inputs: BandsInput) -> Plot:
     """What an optical model leaves of the distortion of each band."""
     found = {b.name: (b.minus_optical, b.arcsec) for b in inputs.bands}
@@ -124,7 +126,9 @@ def _flows(
     return panels.figure
 
 
-@BANDS.figure("structure", each=lambda inputs: {f"residuals_{axis}": axis for axis in AXES})
+@BANDS.figure(
+    "structure", each=lambda inputs: {f"residuals_{axis}": axis for axis in AXES}, printed=True
+)
 def residuals(inputs: BandsInput, axis: str) -> Plot:
     """Mean residuals in bins, along x or along y."""
     images = {b.name: b.sums.bins.values(axis.upper()).mean for b in inputs.bands}
@@ -142,6 +146,7 @@ def residuals(inputs: BandsInput, axis: str) -> Plot:
     "structure",
     needs=("differences",),
     each=lambda inputs: {f"alignment_{axis}": axis for axis in AXES},
+    printed=True,
 )
 def alignment(inputs: BandsInput, axis: str) -> Plot:
     """Mean residuals of each pair of bands, one minus the other."""
@@ -214,7 +219,7 @@ def _cells(
     return panels.figure
 
 
-@BANDS.figure("formal")
+@BANDS.figure("formal", printed=True)
 def formal_uncertainty(inputs: BandsInput) -> Plot:
     """Four vectors from each position of the array, as section 6 of WSDC D-T033.
 
@@ -253,7 +258,7 @@ def _magnification(m: UncertaintyMap) -> float:
     return nice_below(0.5 * step / widest)
 
 
-@BANDS.figure("coverage")
+@BANDS.figure("coverage", printed=True)
 def coverage(inputs: BandsInput) -> Plot:
     """Pairs used in each bin over the mean of all bins."""
     images, titles = {}, []

@@ -255,7 +255,7 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
     """What the tables of a filter add to the pixels, an arrow at each node."""
     c = campaign_of(r)
     chips = _by_chip(c, filter)
-    tables = [t for t in chips if t is not None]
+    tables = [t for t in c.tables if t.filter == filter]
     length = np.concatenate([np.hypot(*t.values).ravel() for t in tables])
     panels = ChipPanels(r.mosaic)
     panels.frame(0.03 * r.mosaic.longest_side)
@@ -306,7 +306,7 @@ def table_errors(r: ReportInput, filter: str) -> Plot:
     """Standard errors of the nodes along x and y, in one scale of colours."""
     c = campaign_of(r)
     chips = _by_chip(c, filter)
-    tables = [t for t in chips if t is not None]
+    tables = [t for t in c.tables if t.filter == filter]
     every = np.concatenate([t.sigma.ravel() for t in tables if t.sigma is not None])
     # a few nodes without stars must not flatten all others
     low, high = float(every.min()), float(np.quantile(every, 0.995))

@@ -161,7 +161,23 @@ def course_of(series: LinearSeries, lines: Sequence[Mapping[str, Any]], label: s
 
 
 def line_error(series: LinearSeries, column: str, s: int, t: Float) -> Float | None:
-    """An error at any date of a segment: of a line, its square is a parabola in time."""
+    """Error of a line, or of a new exposure about it, at any date: its square is a parabola.
+
+    Parameters
+    ----------
+    series : LinearSeries
+    column : str
+        Of drift.ecsv, which has it at some dates.
+    s : int
+        Segment, from 0.
+    t : ndarray
+        Dates in the segment.
+
+    Returns
+    -------
+    ndarray, same shape, or None
+        None where too few dates lie in the segment.
+    """
     epoch = np.asarray(series.drift["epoch"], float)
     here = np.searchsorted(np.asarray(series.breaks, float), epoch, side="right") == s
     if here.sum() < _FEWEST:

@@ -54,7 +54,7 @@ def provenance_tables(r: ReportInput) -> tuple[TextTable, ...]:
     for key, value in r.provenance.items():
         if isinstance(value, Mapping):
             unit = " [s]" if key == "timings" else ""
-            names = short_paths(value) if key == "r" else map(str, value)
+            names = short_paths(value) if key == "inputs" else map(str, value)
             out.append(
                 listing(
                     f"{key.capitalize()}{unit}",

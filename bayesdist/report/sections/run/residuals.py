@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MixtureCurve",
-    "mixture_curves",
     "residual_histogram",
     "residual_panels",
     "residual_vectors",
@@ -113,7 +112,7 @@ class MixtureCurve:
         return np.zeros_like(edges)
 
 
-def mixture_curves(r: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
+def _mixture_curves(r: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
     """What the results say of the distribution of the residuals in u and in v.
 
     Without quoted errors the rms of the fit stands in for them.
@@ -159,7 +158,7 @@ def residual_histogram(r: ReportInput) -> Plot:
     return Plot(
         _histograms(
             r.stars.residual,
-            mixture_curves(r),
+            _mixture_curves(r),
             unit=r.unit,
             sampled=r.stars.partial,
             things=words.things,
