@@ -156,6 +156,11 @@ class Arrows:
         """Lengths of the vectors that are drawn."""
         return np.hypot(self.du, self.dv)
 
+    @property
+    def n_clear(self) -> int:
+        """Number of vectors that noise alone hardly makes."""
+        return self.x.size if self.clear is None else int(self.clear.sum())
+
     def reach(self, magnification: float, size: tuple[float, float]) -> float:
         """How far the vectors stand out beyond a chip of that size, in pixels."""
         over = [
