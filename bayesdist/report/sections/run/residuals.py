@@ -305,8 +305,7 @@ def residual_panels(
     titles = [
         panels.title(
             k,
-            f"{c.n_clear} of {c.x.size} cells significant,\n"
-            f"{CHANCE * c.x.size:.0f} by chance",
+            f"{c.n_clear} of {c.x.size} cells significant,\n{CHANCE * c.x.size:.0f} by chance",
         )
         for k, c in enumerate(chips)
     ]
