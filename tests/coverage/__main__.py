@@ -25,7 +25,7 @@ def kept(path: Path, make: Callable[[], Any]) -> Any:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tests.calibration", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.coverage", description=__doc__)
     parser.add_argument("results", type=Path, help="folder in which finished pieces are kept")
     parser.add_argument("--only", help="make this piece and stop, as 'coverage drift'")
     parser.add_argument("--figure", type=Path, help="file to draw reliability to")
