@@ -14,13 +14,13 @@ from bayesdist.assess.area import pixel_areas
 from bayesdist.assess.calibration import Calibration
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products import IdcTab
-from bayesdist.products.blocks import read_blocks
 from bayesdist.products.calibration_file import read_calibrations
 from bayesdist.products.chips_in_frame import (
     chips_of_idctab,
     chips_of_solution,
     scale_of_idctab,
 )
+from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.sip_build import ARCSEC
 from bayesdist.products.subarray import Subarray, subarray_at_corner, subarrays_of_image
 
@@ -131,12 +131,12 @@ def applied(
 def _idctab(path: Path) -> IdcTab | None:
     """The IDCTAB that a file is; None for others."""
     try:
-        blocks = read_blocks(path)
+        hdus = read_hdus(path)
     except FormatError:
         return None
-    if len(blocks) < 2 or "XREF" not in blocks[1].header.values():
+    if len(hdus) < 2 or "XREF" not in hdus[1].header.values():
         return None
-    return IdcTab(blocks, str(path))
+    return IdcTab(hdus, str(path))
 
 
 def _scale_of_run(path: Path, first: Calibration) -> tuple[float, str]:

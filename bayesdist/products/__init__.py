@@ -9,11 +9,11 @@ from bayesdist.products.application import (
 from bayesdist.products.application_inverse import InversePolynomial, fitted_inverse
 from bayesdist.products.chips_in_frame import chips_of_idctab, chips_of_solution
 from bayesdist.products.d2im import read_d2im, write_d2im
+from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.idctab import IdcTab, read_idctab, write_idctab
 from bayesdist.products.idctab_build import idctab_from_solution
 from bayesdist.products.idctab_lint import lint_idctab
 from bayesdist.products.inspect import describe, describe_idctab, describe_lookup_file
-from bayesdist.products.lint import Finding
 from bayesdist.products.lookup_file import LookupFile, read_lookup_file, write_lookup_file
 from bayesdist.products.lookup_lint import lint_lookup_file
 from bayesdist.products.npol import read_npol, write_npol

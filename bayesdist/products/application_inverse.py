@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.errors import InputError
 from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.application import Application
-from bayesdist.products.bivariate import evaluate
+from bayesdist.products.formats.common.coefficients import evaluate
 from bayesdist.products.sip_inverse import detector_grid, fit_inverse
 
 __all__ = ["InversePolynomial", "fitted_inverse"]

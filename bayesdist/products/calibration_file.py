@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.calibration import Calibration, calibration_of_map
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
-from bayesdist.products.blocks import read_blocks
+from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.idctab import IdcTab
 from bayesdist.products.idctab_row_covariance import covariance_of_row
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
@@ -56,11 +56,11 @@ def read_calibrations(
     """
     name = str(path)
     try:
-        blocks = read_blocks(path)
+        hdus = read_hdus(path)
     except FormatError:
-        blocks = ()
-    if len(blocks) > 1 and "XREF" in blocks[1].header.values():
-        return calibrations_of_idctab(IdcTab(blocks, name), filter=filter, epoch=epoch)
+        hdus = ()
+    if len(hdus) > 1 and "XREF" in hdus[1].header.values():
+        return calibrations_of_idctab(IdcTab(hdus, name), filter=filter, epoch=epoch)
     if holds_sip(path):
         return {None: _of_sip(read_sip(path), name, size)}
     if holds_wise_meta(path):

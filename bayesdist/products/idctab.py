@@ -30,9 +30,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
-from bayesdist.products.bivariate import evaluate
-from bayesdist.products.blocks import Block, read_blocks, write_blocks
-from bayesdist.products.indices import idctab_column
+from bayesdist.products.formats.common.coefficients import evaluate, idctab_column
+from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.tdd import drift, scheme_of
 
 __all__ = ["FILTER_COLUMNS", "IdcTab", "read_idctab", "write_idctab"]
@@ -49,7 +48,7 @@ class IdcTab:
 
     Parameters
     ----------
-    blocks : tuple of Block
+    hdus : tuple of Hdu
         All HDUs; the first table is HDU 1.
     name : str
         What to call the file in errors.
@@ -60,7 +59,7 @@ class IdcTab:
         When a keyword or column is missing that stwcs cannot do without.
     """
 
-    blocks: tuple[Block, ...]
+    hdus: tuple[Hdu, ...]
     name: str = "IDCTAB"
 
     def __post_init__(self) -> None:
@@ -75,7 +74,7 @@ class IdcTab:
             raise FormatError(
                 f"is {order!r}", where=f"{self.name}, keyword NORDER", do="give an order of 1 to 9"
             )
-        if len(self.blocks) < 2:
+        if len(self.hdus) < 2:
             raise FormatError("has no table in HDU 1", where=self.name, do="check the file")
         x, y = self.prefixes
         needed = [
@@ -95,12 +94,12 @@ class IdcTab:
     @property
     def header(self) -> fits.Header:
         """The primary header; a new one at each call."""
-        return self.blocks[0].header
+        return self.hdus[0].header
 
     @property
     def rows(self) -> NDArray[np.void]:
         """The coefficient table as a structured array."""
-        return self.blocks[1].rows
+        return self.hdus[1].rows
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -154,17 +153,15 @@ class IdcTab:
     @property
     def sigma(self) -> NDArray[np.void] | None:
         """Rows of the HDU SIGMA; None where there is none."""
-        block = self._block("SIGMA")
-        return None if block is None else block.rows
+        return self._rows_of("SIGMA")
 
     @property
     def covariance(self) -> NDArray[np.void] | None:
         """Rows of the HDU COVAR; None where there is none."""
-        block = self._block("COVAR")
-        return None if block is None else block.rows
+        return self._rows_of("COVAR")
 
-    def _block(self, name: str) -> Block | None:
-        return next((b for b in self.blocks[2:] if b.name == name), None)
+    def _rows_of(self, name: str) -> NDArray[np.void] | None:
+        return next((hdu.rows for hdu in self.hdus[2:] if hdu.name == name), None)
 
     # -- one row ---------------------------------------------------------------------------------
 
@@ -408,7 +405,7 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
     FormatError
         When it is no FITS file, is truncated, or lacks what an IDCTAB must have.
     """
-    return IdcTab(read_blocks(path), str(path))
+    return IdcTab(read_hdus(path), str(path))
 
 
 def write_idctab(tab: IdcTab, path: str | os.PathLike[str]) -> None:
@@ -425,4 +422,4 @@ def write_idctab(tab: IdcTab, path: str | os.PathLike[str]) -> None:
     InputError
         When the file cannot be written.
     """
-    write_blocks(tab.blocks, path)
+    write_hdus(tab.hdus, path)

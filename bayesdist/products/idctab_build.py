@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
-from bayesdist.products.blocks import blocks_of
-from bayesdist.products.cards import convergence_cards, number_card, text_card
+from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
+from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.idctab import IdcTab
 from bayesdist.products.idctab_cards import closure_cards, provenance_cards, tdd_cards
 from bayesdist.products.idctab_covariance import joint_covariance
@@ -163,7 +163,7 @@ def idctab_from_solution(
         sigma_hdu(pieces, cov),
         covariance_hdu(pieces, cov),
     ]
-    return IdcTab(blocks_of(hdus), "new IDCTAB")
+    return IdcTab(hdus_of(hdus), "new IDCTAB")
 
 
 def _entries(

@@ -18,7 +18,7 @@ from textwrap import wrap
 import numpy as np
 
 from bayesdist.assess.solution import Solution
-from bayesdist.products.cards import number_card, text_card
+from bayesdist.products.formats.common.cards import number_card, text_card
 from bayesdist.products.idctab_hdus import Piece
 from bayesdist.products.idctab_numbers import ChipNumbers
 from bayesdist.products.orientation import Orientation

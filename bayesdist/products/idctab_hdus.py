@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.products.cards import number_card
+from bayesdist.products.formats.common.cards import number_card
 from bayesdist.products.idctab_inverse import ChipInverse
 from bayesdist.products.idctab_numbers import ChipNumbers
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from bayesdist.errors import InputError
+from bayesdist.products.formats.common.coefficients import idctab_powers
 from bayesdist.products.idctab_numbers import ChipNumbers
-from bayesdist.products.indices import idctab_powers
 from bayesdist.products.sip_inverse import detector_grid
 
 __all__ = ["ChipInverse", "inverse_of"]

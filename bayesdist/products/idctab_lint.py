@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.products.formats.common.coefficients import idctab_column, idctab_powers
+from bayesdist.products.formats.common.document import Finding, repeated_values
 from bayesdist.products.idctab import FILTER_COLUMNS, IdcTab
-from bayesdist.products.indices import idctab_column, idctab_powers
-from bayesdist.products.lint import Finding, repeated_values
 from bayesdist.products.parity import parity_of
 
 __all__ = ["lint_idctab"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.products.indices import idctab_column
+from bayesdist.products.formats.common.coefficients import idctab_column
 from bayesdist.products.monomials import ChipPolynomial, chip_polynomial
 from bayesdist.products.tdd import RATES
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.products.formats.common.coefficients import idctab_column
 from bayesdist.products.idctab import FILTER_COLUMNS, IdcTab
-from bayesdist.products.indices import idctab_column
 from bayesdist.products.parity import parity_of
 from bayesdist.products.tdd import RATES
 

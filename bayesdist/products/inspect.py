@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 
-from bayesdist.errors import FormatError, InputError
-from bayesdist.products.bivariate import largest_magnitude
-from bayesdist.products.blocks import read_blocks
+from bayesdist.errors import InputError
+from bayesdist.products.formats.common.coefficients import idctab_column, largest_magnitude
+from bayesdist.products.formats.common.content import read_content
+from bayesdist.products.formats.common.document import finding_lines
 from bayesdist.products.idctab import FILTER_COLUMNS, IdcTab
 from bayesdist.products.idctab_lint import lint_idctab
-from bayesdist.products.indices import idctab_column
-from bayesdist.products.lint import finding_lines
 from bayesdist.products.lookup_file import AXES, LookupFile
 from bayesdist.products.lookup_lint import lint_lookup_file
 from bayesdist.products.sip_text import describe_wise_meta
-from bayesdist.products.wcs_file import header_file, holds_wcs
-from bayesdist.products.wcs_text import describe_wcs
+from bayesdist.products.wcs_text import describe_wcs, holds_wcs
 from bayesdist.products.wise_meta import holds_wise_meta, read_wise_meta
 
 __all__ = [
@@ -65,21 +62,18 @@ def describe(path: str | os.PathLike[str]) -> str:
         When the file cannot be read or is of none of these kinds.
     """
     name = str(path)
-    blocks, damaged = (), None
-    try:
-        blocks = read_blocks(path)
-    except FormatError as error:
-        damaged = error
-    if len(blocks) > 1 and _is_idctab(blocks[1].header.values()):
-        return describe_idctab(IdcTab(blocks, name))
-    if any(block.name in AXES for block in blocks[1:]):
-        return describe_lookup_file(LookupFile(blocks, name))
-    file = header_file(path)  # also of headers without their data, which are no whole FITS file
-    if any(holds_wcs(hdu.header) for hdu in file.hdus):
-        return describe_wcs(file)
+    content = read_content(path)
+    damaged = content.damage
+    hdus = () if damaged or not content.is_fits else content.whole()
+    if len(hdus) > 1 and _is_idctab(hdus[1].header.values()):
+        return describe_idctab(IdcTab(hdus, name))
+    if any(hdu.name in AXES for hdu in hdus[1:]):
+        return describe_lookup_file(LookupFile(hdus, name))
+    if any(holds_wcs(hdu.header) for hdu in content.hdus):
+        return describe_wcs(content)
     if holds_wise_meta(path):
         return describe_wise_meta(read_wise_meta(path), name)
-    if damaged is not None and _looks_like_fits(path):
+    if damaged is not None:
         raise damaged
     raise InputError("is of no kind that is understood here", where=name, do=f"give {UNDERSTOOD}")
 
@@ -87,12 +81,6 @@ def describe(path: str | os.PathLike[str]) -> str:
 def _is_idctab(values: Iterable[object]) -> bool:
     columns = {str(v).strip() for v in values}
     return {"XREF", "YREF"} <= columns and bool({"CX10", "A10"} & columns)
-
-
-def _looks_like_fits(path: str | os.PathLike[str]) -> bool:
-    with Path(path).open("rb") as stream:
-        start = stream.read(9)
-    return start == b"SIMPLE  =" or start[:2] == b"\x1f\x8b"
 
 
 # -- IDCTAB --------------------------------------------------------------------------------------

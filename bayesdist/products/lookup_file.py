@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.blocks import Block, read_blocks, write_blocks
+from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.lookup_plane import Plane
 
 __all__ = ["AXES", "LookupFile", "check_kind", "read_lookup_file", "write_lookup_file"]
@@ -43,7 +43,7 @@ class LookupFile:
 
     Parameters
     ----------
-    blocks : tuple of Block
+    hdus : tuple of Hdu
         All HDUs.
     name : str
         What to call the file in errors.
@@ -54,7 +54,7 @@ class LookupFile:
         When there is no image extension DX or DY.
     """
 
-    blocks: tuple[Block, ...]
+    hdus: tuple[Hdu, ...]
     name: str = "look-up tables"
 
     def __post_init__(self) -> None:
@@ -68,7 +68,7 @@ class LookupFile:
     @cached_property
     def header(self) -> fits.Header:
         """The primary header."""
-        return self.blocks[0].header
+        return self.hdus[0].header
 
     @property
     def kind(self) -> str:
@@ -105,11 +105,11 @@ class LookupFile:
 
     def _planes(self, names: tuple[str, ...]) -> tuple[Plane, ...]:
         out = []
-        for number, block in enumerate(self.blocks[1:], start=1):
-            header, name = block.header, block.name
+        for number, hdu in enumerate(self.hdus[1:], start=1):
+            header, name = hdu.header, hdu.name
             image = str(header.get("XTENSION", "")).strip() == "IMAGE" and header["NAXIS"] == 2
-            if name in names and image and block.data:
-                out.append(Plane(block, name, f"{self.name}, HDU {number} ({name})"))
+            if name in names and image and hdu.data:
+                out.append(Plane(hdu, name, f"{self.name}, HDU {number} ({name})"))
         return tuple(out)
 
     @property
@@ -212,7 +212,7 @@ def read_lookup_file(path: str | os.PathLike[str]) -> LookupFile:
     FormatError
         When it is no FITS file, is truncated, or has no tables.
     """
-    return LookupFile(read_blocks(path), str(path))
+    return LookupFile(read_hdus(path), str(path))
 
 
 def write_lookup_file(file: LookupFile, path: str | os.PathLike[str]) -> None:
@@ -228,7 +228,7 @@ def write_lookup_file(file: LookupFile, path: str | os.PathLike[str]) -> None:
     InputError
         When the file cannot be written.
     """
-    write_blocks(file.blocks, path)
+    write_hdus(file.hdus, path)
 
 
 def check_kind(file: LookupFile, kind: str) -> None:

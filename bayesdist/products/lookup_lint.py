@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from bayesdist.products.lint import Finding
+from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.lookup_file import AXES, LookupFile
 from bayesdist.products.lookup_plane import Plane
 

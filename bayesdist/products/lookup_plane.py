@@ -10,7 +10,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError
-from bayesdist.products.blocks import Block
+from bayesdist.products.formats.common.content import Hdu
 
 __all__ = ["Plane"]
 
@@ -23,21 +23,21 @@ class Plane:
 
     Parameters
     ----------
-    block : Block
+    hdu : Hdu
     name : str
         EXTNAME: DX, DY, SIGMA_DX or SIGMA_DY.
     where : str
         The extension in words, for errors.
     """
 
-    block: Block
+    hdu: Hdu
     name: str
     where: str
 
     @cached_property
     def header(self) -> fits.Header:
         """Header of the extension."""
-        return self.block.header
+        return self.hdu.header
 
     def number(self, keyword: str, default: float) -> float:
         """Value of a keyword.
@@ -64,10 +64,10 @@ class Plane:
         """EXTVER; 1 without it, as in the FITS standard."""
         return int(self.number("EXTVER", 1))
 
-    @cached_property
+    @property
     def values(self) -> Float:
         """All nodes, padding included, shape (ny, nx)."""
-        return np.asarray(fits.ImageHDU.fromstring(self.block.to_bytes()).data, float)
+        return self.hdu.image
 
     @property
     def nodes(self) -> Float:

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.blocks import blocks_of
-from bayesdist.products.cards import number_card, text_card
+from bayesdist.products.formats.common.cards import number_card, text_card
+from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.lookup_file import AXES, LookupFile
 
 __all__ = ["Part", "identity_cards", "lookup_file", "one_per_chip", "optional_cards"]
@@ -118,7 +118,7 @@ def lookup_file(
                 place = _place_cards(part.table, version, size)
                 sigmas.append(_image(f"SIGMA_{name_of_axis}", part.sigma[axis], place))
     # stwcs goes through the extensions in turn until it has found its own
-    return LookupFile(blocks_of([*hdus, *sigmas]), name)
+    return LookupFile(hdus_of([*hdus, *sigmas]), name)
 
 
 def _image(name: str, plane: Float, cards: Sequence[str]) -> fits.ImageHDU:

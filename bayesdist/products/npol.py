@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, FormatError, InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.bivariate import evaluate
-from bayesdist.products.cards import number_card, text_card
+from bayesdist.products.formats.common.cards import number_card, text_card
+from bayesdist.products.formats.common.coefficients import evaluate
 from bayesdist.products.idctab import IdcTab
 from bayesdist.products.lookup_file import (
     LookupFile,

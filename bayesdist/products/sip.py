@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.products.bivariate import evaluate
+from bayesdist.products.formats.common.coefficients import evaluate
 
 __all__ = ["SIP_ORDERS", "SipHeader"]
 

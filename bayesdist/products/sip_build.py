@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.products.bivariate import largest_magnitude
-from bayesdist.products.cards import convergence_cards, number_card, text_card
+from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
+from bayesdist.products.formats.common.coefficients import largest_magnitude
 from bayesdist.products.monomials import ChipPolynomial, chip_polynomial
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
 from bayesdist.products.sip_inverse import fit_inverse, worst_closure

@@ -6,8 +6,8 @@ from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
-from bayesdist.products.indices import sip_keyword
-from bayesdist.products.lint import repeated_values
+from bayesdist.products.formats.common.coefficients import sip_keyword
+from bayesdist.products.formats.common.document import repeated_values
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
 
 __all__ = [

@@ -15,8 +15,7 @@ from scipy.special import betaln
 
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
-from bayesdist.products.bivariate import evaluate
-from bayesdist.products.indices import sip_keyword
+from bayesdist.products.formats.common.coefficients import evaluate, sip_keyword
 from bayesdist.products.sip import SipHeader
 from bayesdist.products.sip_families import (
     EDGE,

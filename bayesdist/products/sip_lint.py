@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.products.bivariate import largest_magnitude
-from bayesdist.products.indices import sip_keyword
-from bayesdist.products.lint import Finding
+from bayesdist.products.formats.common.coefficients import largest_magnitude, sip_keyword
+from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
 from bayesdist.products.sip_families import (
     EDGE,

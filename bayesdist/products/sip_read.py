@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import warnings
 from collections.abc import Iterator
@@ -13,9 +12,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError, InputError
-from bayesdist.products.blocks import content_of
-from bayesdist.products.cards import card_images
-from bayesdist.products.indices import sip_powers
+from bayesdist.products.formats.common.cards import card_images
+from bayesdist.products.formats.common.coefficients import sip_powers
+from bayesdist.products.formats.common.content import Content, read_content
 from bayesdist.products.sip import SipHeader
 
 __all__ = [
@@ -58,8 +57,9 @@ def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> S
     InputError
         When the file cannot be read.
     """
-    with readable(path) as where:
-        return parsed(_header(content_of(path), ext, where), where)
+    with readable(str(path)):
+        header = _chosen(read_content(path), ext)
+    return parsed(header, str(path))
 
 
 def holds_sip(path: str | os.PathLike[str]) -> bool:
@@ -70,62 +70,59 @@ def holds_sip(path: str | os.PathLike[str]) -> bool:
     InputError
         When the file cannot be read.
     """
-    try:
-        with readable(path) as where:
-            return "A_ORDER" in _header(content_of(path), None, where)
-    except FormatError:
-        return False
+    return any("A_ORDER" in hdu.header for hdu in read_content(path).hdus)
 
 
-# -- from bytes to a header ---------------------------------------------------------------------
+# -- from content to a header --------------------------------------------------------------------
 
 
 @contextmanager
-def readable(path: str | os.PathLike[str]) -> Iterator[str]:
-    """The file's name in errors; what astropy raises inside becomes a FormatError."""
-    where = str(path)
+def readable(where: str) -> Iterator[None]:
+    """What astropy raises of a card inside becomes a FormatError that names the file."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of cards that are not SIP's, and of missing data
-            yield where
-    except (fits.VerifyError, ValueError, EOFError, OSError) as error:
+            warnings.simplefilter("ignore")  # of cards that are not SIP's
+            yield
+    except (fits.VerifyError, ValueError) as error:
         raise FormatError(
             f"is not a header that can be read ({error})", where=where, do="check the file"
         ) from error
 
 
-def _header(raw: bytes, ext: int | str | None, where: str) -> fits.Header:
-    block = raw[:10] in (b"SIMPLE  = ", b"XTENSION= ") and b"\n" not in raw[:81]
-    if not block:
-        if ext is not None:
-            raise InputError("is a text file and has no HDUs", where=where, do="leave out ext")
-        text = raw.decode("ascii").replace("\r\n", "\n")
-        return fits.Header.fromstring(text, sep="\n")
-    try:  # a header without its data, of which astropy only warns, is complete for this purpose
-        with fits.open(io.BytesIO(raw), memmap=False) as hdus:
-            return _chosen(hdus, ext, where).copy()
-    except OSError:  # cards without the END that makes a FITS file
-        return fits.Header.fromstring(raw.decode("ascii"))
-
-
-def _chosen(hdus: fits.HDUList, ext: int | str | None, where: str) -> fits.Header:
+def _chosen(content: Content, ext: int | str | None) -> fits.Header:
+    """The header of an HDU; by default the first one with A_ORDER."""
+    if not content.hdus:
+        raise FormatError(
+            "is not a header that can be read: there is no A_ORDER",
+            where=content.name,
+            do="give a FITS file or cards of a header",
+        )
     if ext is None:
-        for hdu in hdus:
-            if "A_ORDER" in hdu.header:
-                return hdu.header
-        return hdus[0].header
-    try:
-        return hdus[ext].header
-    except (IndexError, KeyError):
-        raise InputError(
-            f"there is no HDU {ext!r}", where=where, do=f"choose one of 0 to {len(hdus) - 1}"
-        ) from None
+        found = [hdu for hdu in content.hdus if "A_ORDER" in hdu.header]
+        return (found or content.hdus)[0].header
+    if not content.is_fits:
+        raise InputError("is a text file and has no HDUs", where=content.name, do="leave out ext")
+    key = ext.upper() if isinstance(ext, str) else ext
+    for hdu in content.hdus:
+        if key in (hdu.number, hdu.name):
+            return hdu.header
+    raise InputError(
+        f"there is no HDU {ext!r}",
+        where=content.name,
+        do=f"choose one of 0 to {len(content.hdus) - 1}",
+    )
 
 
 # -- from a header to the noun -------------------------------------------------------------------
 
 
 def parsed(header: fits.Header, where: str) -> SipHeader:
+    """The SIP header that cards hold; `where` names them in errors."""
+    with readable(where):
+        return _parsed(header, where)
+
+
+def _parsed(header: fits.Header, where: str) -> SipHeader:
     if "A_ORDER" not in header:
         raise FormatError(
             "there is no A_ORDER", where=where, do="give a header with SIP keywords, or its HDU"

@@ -24,7 +24,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.views import Solution, View
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.basis import polynomial_terms
-from bayesdist.products.cards import header_of, keyword_of
+from bayesdist.products.formats.common.cards import header_of, keyword_of
 from bayesdist.products.orientation import check_frames
 from bayesdist.products.sip import SipHeader
 

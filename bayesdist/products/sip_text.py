@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from bayesdist.products.indices import sip_keyword
-from bayesdist.products.lint import finding_lines
+from bayesdist.products.formats.common.coefficients import sip_keyword
+from bayesdist.products.formats.common.document import finding_lines
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
 from bayesdist.products.sip_families import forward_is_used, inverse_is_used
 from bayesdist.products.sip_inverse import worst_closure

@@ -8,8 +8,8 @@ import numpy as np
 from astropy.io import fits
 
 from bayesdist.data.files import atomic_path
-from bayesdist.products.cards import header_of, keyword_of, number_card, text_card
-from bayesdist.products.indices import sip_keyword, sip_powers
+from bayesdist.products.formats.common.cards import header_of, keyword_of, number_card, text_card
+from bayesdist.products.formats.common.coefficients import sip_keyword, sip_powers
 from bayesdist.products.sip import SipHeader
 from bayesdist.products.sip_read import CD_KEYWORDS, LINEAR_KEYWORDS, cd_matrix, image_size
 

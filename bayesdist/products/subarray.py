@@ -19,7 +19,7 @@ from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import FormatError, InputError
-from bayesdist.products.blocks import read_blocks
+from bayesdist.products.formats.common.content import read_hdus
 
 __all__ = [
     "FULL",
@@ -173,9 +173,9 @@ def subarrays_of_image(
         When it cannot be read, has no such extension, or as `subarray_of_header`.
     """
     out = {}
-    for block in read_blocks(path):
-        header = block.header
-        if block.name != "SCI":
+    for hdu in read_hdus(path):
+        header = hdu.header
+        if hdu.name != "SCI":
             continue
         chip = int(header.get("CCDCHIP", 1))
         if chip not in sizes:

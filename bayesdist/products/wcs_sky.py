@@ -14,7 +14,7 @@ from astropy.wcs import WCS, NoConvergence
 
 from bayesdist.data.tangent import tangent_plane
 from bayesdist.errors import InputError
-from bayesdist.products.lint import Finding
+from bayesdist.products.formats.common.document import Finding
 
 __all__ = ["Words", "first_line", "pv_keywords", "sky_words"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,25 +12,43 @@ from astropy import log
 from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
-from bayesdist.products.lint import finding_lines
+from bayesdist.products.formats.common.content import Content, Hdu
+from bayesdist.products.formats.common.document import finding_lines
 from bayesdist.products.sip_lint import lint_sip
 from bayesdist.products.sip_read import image_size, parsed
 from bayesdist.products.sip_text import coefficient_lines, sip_lines
-from bayesdist.products.wcs_file import HeaderFile, HeaderHdu, holds_wcs, wcs_cards
 from bayesdist.products.wcs_sky import Words, first_line, pv_keywords, sky_words
 
-__all__ = ["describe_wcs"]
+__all__ = ["describe_wcs", "holds_wcs"]
+
+_WCS = re.compile(
+    r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|LTV)\d+[A-Z]?$|(CD|PC|PV|PS|LTM)\d+_\d+[A-Z]?$|"
+    r"(A|B|AP|BP)_(ORDER|\d_\d)$|(CPDIS|CPERR|D2IMDIS|D2IMERR)\d$|(DP|DQ|D2IM)\d$|(LON|LAT)POLE"
+)
+# Without one of these nothing ties pixels to a world.
+_NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
 
 _TABLE_HDUS = ("D2IMARR", "WCSDVARR")
 _TABLES = ("CPDIS1", "CPDIS2", "D2IMDIS1", "D2IMDIS2", "AXISCORR")
 
 
-def describe_wcs(file: HeaderFile) -> str:
+def holds_wcs(header: fits.Header) -> bool:
+    """Whether a header ties its pixels to a world."""
+    return any(_NEEDED.match(keyword) for keyword in header)
+
+
+def _wcs_cards(header: fits.Header) -> tuple[tuple[str, str], ...]:
+    """What of a header its positions depend on: of two with the same, one is enough to show."""
+    found = {(c.keyword, str(c.value)) for c in header.cards if _WCS.match(c.keyword)}
+    return tuple(sorted(found))
+
+
+def describe_wcs(file: Content) -> str:
     """Text of every world coordinate system of a file, with what is wrong in it.
 
     Parameters
     ----------
-    file : HeaderFile
+    file : Content
 
     Returns
     -------
@@ -41,13 +60,13 @@ def describe_wcs(file: HeaderFile) -> str:
     FormatError
         For SIP keywords that are missing or no numbers.
     """
-    shown: dict[tuple[tuple[str, str], ...], list[HeaderHdu]] = {}
+    shown: dict[tuple[tuple[str, str], ...], list[Hdu]] = {}
     several = sum(holds_wcs(hdu.header) for hdu in file.hdus) > 1
     for hdu in file.hdus:
         # what places the nodes of a table is told with the image that uses it
-        aside = several and hdu.name.partition(",")[0] in _TABLE_HDUS
+        aside = several and hdu.label.partition(",")[0] in _TABLE_HDUS
         if holds_wcs(hdu.header) and not aside:
-            shown.setdefault((*wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
+            shown.setdefault((*_wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
     groups = list(shown.values())
     if len(file.hdus) == 1:
         return "\n".join(_hdu_lines(file, groups[0][0], file.name))
@@ -61,13 +80,11 @@ def _extent(header: fits.Header) -> tuple[str, str]:
     return "size", str(image_size(header))
 
 
-def _label(hdu: HeaderHdu) -> str:
-    return f"HDU {hdu.number}" + (f" ({hdu.name})" if hdu.name else "")
+def _label(hdu: Hdu) -> str:
+    return f"HDU {hdu.number}" + (f" ({hdu.label})" if hdu.label else "")
 
 
-def _hdu_lines(
-    file: HeaderFile, hdu: HeaderHdu, name: str, others: Sequence[HeaderHdu] = ()
-) -> list[str]:
+def _hdu_lines(file: Content, hdu: Hdu, name: str, others: Sequence[Hdu] = ()) -> list[str]:
     """All lines of one HDU."""
     header, words, terms = hdu.header, Words(), list[str]()
     size = image_size(header)
@@ -81,9 +98,9 @@ def _hdu_lines(
         words.lines.append(f"{name}: WCS, image size {extent}")
     if others:
         words.lines.append(f"  same in   {', '.join(_label(other) for other in others)}")
-    if hdu.data == "none":
+    if hdu.state == "none":
         words.lines.append("  data      none: a header alone")
-    elif hdu.data == "cut":
+    elif hdu.state == "cut":
         words.doubt("error", "data", "the file ends before its data do: it is truncated")
     systems = _systems(file, hdu, words)
     for wcs in systems:
@@ -100,7 +117,7 @@ def _hdu_lines(
 # -- the systems ----------------------------------------------------------------------------------
 
 
-def _systems(file: HeaderFile, hdu: HeaderHdu, words: Words) -> list[WCS]:
+def _systems(file: Content, hdu: Hdu, words: Words) -> list[WCS]:
     """Every system of a header that astropy.wcs can make."""
     out = []
     header = hdu.header
@@ -118,7 +135,7 @@ def _systems(file: HeaderFile, hdu: HeaderHdu, words: Words) -> list[WCS]:
     return out
 
 
-def _system(file: HeaderFile, header: fits.Header, key: str, words: Words) -> WCS | None:
+def _system(file: Content, header: fits.Header, key: str, words: Words) -> WCS | None:
     where = f"WCS {key}".strip()
     stated = [k for k in _TABLES if k in header]
     fobj = file.opened

@@ -7,9 +7,12 @@ from collections import Counter
 from collections.abc import Iterator
 
 from bayesdist.model.basis import polynomial_terms
-from bayesdist.products.bivariate import largest_magnitude
-from bayesdist.products.indices import sip_keyword, sip_powers
-from bayesdist.products.lint import Finding
+from bayesdist.products.formats.common.coefficients import (
+    largest_magnitude,
+    sip_keyword,
+    sip_powers,
+)
+from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.sip import SipHeader
 from bayesdist.products.sip_families import (
     families,

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from astropy.io import fits
 
 from bayesdist.errors import FormatError
-from bayesdist.products.blocks import content_of
+from bayesdist.products.formats.common.content import read_content
 from bayesdist.products.sip import SipHeader
-from bayesdist.products.sip_read import parsed, readable
+from bayesdist.products.sip_read import parsed
 
 __all__ = ["ARRAYS", "WiseBand", "holds_wise_meta", "monomial", "read_wise_meta"]
 
@@ -73,8 +73,8 @@ def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
     InputError
         When the file cannot be read.
     """
-    with readable(path) as where:
-        lines = content_of(path).decode("ascii").splitlines()
+    where = str(path)
+    lines = read_content(path).text.splitlines()
     entries: dict[int, dict[str, tuple[str, str]]] = {}
     asides: dict[int, dict[str, str]] = {}
     for number, line in enumerate(lines, start=1):
@@ -106,12 +106,7 @@ def holds_wise_meta(path: str | os.PathLike[str]) -> bool:
     InputError
         When the file cannot be read.
     """
-    try:
-        with readable(path):
-            lines = content_of(path).decode("ascii").splitlines()
-    except FormatError:
-        return False
-    return any(_ENTRY.match(line) for line in lines)
+    return any(_ENTRY.match(line) for line in read_content(path).text.splitlines())
 
 
 def _entry(line: str, where: str) -> tuple[int, str, str, str]:

@@ -15,8 +15,7 @@ import numpy as np
 from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
-from bayesdist.products.bivariate import largest_magnitude
-from bayesdist.products.indices import sip_keyword
+from bayesdist.products.formats.common.coefficients import largest_magnitude, sip_keyword
 from bayesdist.products.sip import SIP_ORDERS, SipHeader
 from bayesdist.products.sip_families import EDGE, families, offset_ranges
 from bayesdist.products.sip_inverse import worst_closure

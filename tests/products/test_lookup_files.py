@@ -256,11 +256,11 @@ def test_a_filter_that_the_idctab_does_not_have(rng, tmp_path, real) -> None:
 def test_a_singular_polynomial_is_refused(rng, tmp_path, data_dir, real) -> None:
     solution = wfc_solution(real)
     flat = idctab_from_solution(solution, instrument="ACS", detector="WFC", scale_arcsec=0.05)
-    block = flat.blocks[1]
+    block = flat.hdus[1]
     data = fits.BinTableHDU.fromstring(block.to_bytes()).data.copy()
     data["CX11"] = data["CX10"] = 0.0
     broken = IdcTab(
-        (flat.blocks[0], type(block)(block.cards, data.view(np.ndarray).tobytes())), "flat"
+        (flat.hdus[0], type(block)(block.cards, data.view(np.ndarray).tobytes())), "flat"
     )
     with pytest.raises(DegenerateError, match="the linear part is singular"):
         write_npol([table(1, rng, "F606W")], tmp_path / "x.fits", idctab=broken, filters=F606W)

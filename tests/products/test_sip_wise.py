@@ -15,7 +15,7 @@ from scipy import stats
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products import describe, lint_sip
-from bayesdist.products.bivariate import evaluate, largest_magnitude
+from bayesdist.products.formats.common.coefficients import evaluate, largest_magnitude
 from bayesdist.products.sip_implied import implied_values
 from bayesdist.products.sip_inverse import fit_inverse, worst_closure
 from bayesdist.products.wise_lint import lint_wise_band
