@@ -23,6 +23,7 @@ FLOORS = (
     ("errors",),
     ("data", "model"),
     ("infer", "simulate"),
+    ("calibration",),
     ("diagnose",),
     ("assess",),
     ("products",),

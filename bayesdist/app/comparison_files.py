@@ -79,7 +79,7 @@ def comparison_summary(found: Comparison) -> dict[str, Any]:
             "unit": c.unit,
             "chip": c.chip,
             "epoch": c.epoch,
-            "errors": c.kind_of_error,
+            "errors": c.errors,
             "notes": list(c.notes),
         }
     return {

@@ -35,7 +35,7 @@ from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.discrepancy import DiscrepancyPriors
 from bayesdist.infer.period_dates import check_periods, mjd_periods
 from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
-from bayesdist.products.wise_meta import ARRAYS
+from bayesdist.products.formats.wise.meta import ARRAYS
 
 __all__ = [
     "CATALOGUE_WORDS",

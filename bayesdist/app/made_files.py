@@ -5,7 +5,7 @@ from __future__ import annotations
 from bayesdist.app.session import Session
 from bayesdist.assess.solution import Solution
 from bayesdist.products import IdcTab, SipHeader, idctab_from_solution, sip_from_solution
-from bayesdist.products.sip import SIP_ORDERS
+from bayesdist.products.formats.sip.header import SIP_ORDERS
 
 __all__ = ["idctab_of", "sip_of", "wise_sip_of"]
 

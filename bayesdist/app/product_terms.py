@@ -18,17 +18,18 @@ from numpy.typing import NDArray
 
 from bayesdist.app.campaign.release import write_files
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.file_positions import ReleasedSet, sip_positions
+from bayesdist.app.file_positions import sip_positions
 from bayesdist.app.made_files import idctab_of, sip_of, wise_sip_of
 from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.assess.product_terms import ProductTerm
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms import MEASURED
-from bayesdist.model import Chip, LookupTable, corrected
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.model import Chip, corrected
 from bayesdist.products import (
     SipHeader,
     read_d2im,
-    read_idctab,
     read_lookup_file,
     read_sip,
     read_wise_meta,
@@ -36,7 +37,7 @@ from bayesdist.products import (
     write_sip,
     write_wise_meta,
 )
-from bayesdist.products.sip_build import ARCSEC
+from bayesdist.products.registry import read_calibration
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
@@ -71,7 +72,7 @@ def product_terms(session: Session) -> tuple[ProductTerm, ...]:
         if asked.idctab is not None:
             name = idctab_name(session)
             write_idctab(idctab_of(session, session.solution), path)
-            out += _idctab_terms(session, name, [ReleasedSet(read_idctab(path))])
+            out += _idctab_terms(session, name, [read_calibration(path)])
         if asked.wise_meta and session.config.wise_band is not None:
             header = wise_sip_of(session, session.solution)
             write_wise_meta(path, {session.config.wise_band: header})
@@ -121,42 +122,52 @@ def _sip_terms(
     ]
 
 
-def _idctab_terms(session: Session, file: str, sets: Sequence[ReleasedSet]) -> list[ProductTerm]:
+def _idctab_terms(session: Session, file: str, sets: Sequence[Calibration]) -> list[ProductTerm]:
     """Forward, and inverse where there are such rows; one set for each segment of the drift."""
     time = session.solution.model.time
 
-    def of(epoch: float | None) -> ReleasedSet:
+    def of(epoch: float | None) -> Calibration:
         if time is None or epoch is None or len(sets) == 1:
             return sets[0]
         return sets[int(np.searchsorted(time.breaks, epoch, side="right"))]
 
     def place(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
         # a table without drift would refuse a date
-        return of(epoch)(x, y, chip, None if time is None else epoch)
+        return of(epoch).forward(x, y, chip=chip, epoch=None if time is None else epoch)
+
+    def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        one = of(epoch)
+        about_zero = one.at(origin="chip")[chip]  # at the reference date, for which the rows are
+        back = one.inverses[chip].pixels(*about_zero.at(x, y))
+        return np.stack([back[0] - x, back[1] - y], axis=-1)
 
     out = [_term(session, file, FORWARD, _Laid(session, place, scaled=True))]
-    if all(one.has_inverse for one in sets):
-        back = _in_unit(session, lambda x, y, chip, epoch: of(epoch).back(x, y, chip))
-        out.append(_term(session, file, INVERSE, back))
+    if all(one.inverses for one in sets):
+        out.append(_term(session, file, INVERSE, _in_unit(session, missed)))
     return out
 
 
-def _released(session: CampaignSession, folder: Path) -> list[ReleasedSet]:
+def _released(session: CampaignSession, folder: Path) -> list[Calibration]:
     """The files of a release, one set for each segment: of several periods of one, the first."""
     block, filter = session.config.products.release, session.inputs.filter
     assert block is not None
     entries = write_files(session, folder, {filter: session.solution}, session.tables)
     paths = {e["kind"]: folder / e["path"] for e in entries}
-    d2im = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
-    npol: dict[int, LookupTable] = {}
-    if "NPOLFILE" in paths:
-        after = read_lookup_file(paths["NPOLFILE"])
-        npol = {c: after.table(c, after.values(c), None) for c in after.chips}
-    tabs = {e["period"]: read_idctab(folder / e["path"]) for e in entries if e["kind"] == "IDCTAB"}
-    segments: dict[int, ReleasedSet] = {}
+    before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
+    npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None
+    sets = {}
+    for entry in entries:
+        if entry["kind"] == "IDCTAB":
+            one = read_calibration(folder / entry["path"], filter=filter)
+            after = (
+                ()
+                if npol is None
+                else [npol.table(c, one.pixel()[0] * npol.values(c), None) for c in npol.chips]
+            )
+            sets[entry["period"]] = one.with_tables(before, after)
+    segments: dict[int, Calibration] = {}
     for period in block.period:
-        one = ReleasedSet(tabs[period.name], d2im, npol, filter)
-        segments.setdefault(period.segment, one)
+        segments.setdefault(period.segment, sets[period.name])
     time = session.solution.model.time
     n = 1 if time is None else time.n_segments
     last = segments[min(segments)]

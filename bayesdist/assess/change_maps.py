@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as fisher
 
-from bayesdist.assess.calibration import Calibration
 from bayesdist.assess.comparison import SIGNIFICANT, Comparison, compare
 from bayesdist.assess.comparison_verdict import probability
 from bayesdist.assess.grid import DEFAULT_GRID
 from bayesdist.assess.misfit import Misfit
+from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.infer.change_date import ChangeDate
 from bayesdist.infer.monitoring import Change
 
@@ -180,13 +180,11 @@ def change_maps(
         cov = change.cov[rows, rows]
         old = change.released[c]
         shared = {"unit": model.unit, "chip": chip.number, "epoch": change.epoch}
-        new = Calibration(
-            names[0], basis, coefficients=old + change.difference[c], cov=cov, **shared
-        )
+        new = ChipMap(names[0], basis, coefficients=old + change.difference[c], cov=cov, **shared)
         out.append(
             compare(
                 new,
-                Calibration(names[1], basis, coefficients=old, **shared),
+                ChipMap(names[1], basis, coefficients=old, **shared),
                 rng=rng,
                 grid=grid,
                 keep=True,

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.calibration import Calibration
 from bayesdist.assess.units import convert
+from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.infer.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
@@ -28,7 +28,6 @@ __all__ = [
     "as_real",
     "common_frame",
     "linear_part",
-    "padded",
     "similarity_fields",
     "turn_between",
 ]
@@ -115,12 +114,12 @@ class CommonFrame:
         return term_squares(self.basis)
 
 
-def common_frame(a: Calibration, b: Calibration, *, keep: bool = False) -> CommonFrame:
+def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
     """Bring two calibrations to one frame.
 
     Parameters
     ----------
-    a, b : Calibration
+    a, b : ChipMap
         Of one detector; of any order, reference pixel, orientation, parity and unit.  Their errors
         are taken as independent.
     keep : bool
@@ -147,8 +146,8 @@ def common_frame(a: Calibration, b: Calibration, *, keep: bool = False) -> Commo
     basis = PolynomialBasis(order, a.basis.size, a.basis.reference_pixel)
     same_unit = (a.unit == "pix") == (b.unit == "pix")
     factor = convert(1.0, b.unit, a.unit) if same_unit else 1.0
-    wa, cov_a = padded(a, basis.n_terms)
-    wb, cov_b = padded(b, basis.n_terms)
+    wa, cov_a = a.padded(basis.n_terms)
+    wb, cov_b = b.padded(basis.n_terms)
     za, zb = wa[0] + 1j * wa[1], factor * (wb[0] + 1j * wb[1])
     turn, mirrored = turn_between(za, zb, basis, b)
     if mirrored:
@@ -205,20 +204,8 @@ def common_frame(a: Calibration, b: Calibration, *, keep: bool = False) -> Commo
     )
 
 
-def padded(c: Calibration, n_terms: int) -> tuple[Float, Float | None]:
-    """Coefficients (2, n) and covariance (2 n, 2 n) with zeros for terms that are not there."""
-    K = c.basis.n_terms
-    coefficients = np.zeros((2, n_terms))
-    coefficients[:, :K] = c.coefficients
-    if c.cov is None:
-        return coefficients, None
-    cov = np.zeros((2, n_terms, 2, n_terms))
-    cov[:, :K, :, :K] = c.cov.reshape(2, K, 2, K)
-    return coefficients, cov.reshape(2 * n_terms, 2 * n_terms)
-
-
 def turn_between(
-    za: Complex, zb: Complex, basis: PolynomialBasis, b: Calibration
+    za: Complex, zb: Complex, basis: PolynomialBasis, b: ChipMap
 ) -> tuple[complex, bool]:
     """Scale and rotation that bring B nearest to A, and whether B is mirrored first."""
     weight = term_squares(basis)[: basis.n_terms].copy()
@@ -231,7 +218,7 @@ def turn_between(
     return complex((flipped if mirrored else straight) / norm), mirrored
 
 
-def linear_part(basis: PolynomialBasis, coefficients: Float, a: Calibration) -> Float:
+def linear_part(basis: PolynomialBasis, coefficients: Float, a: ChipMap) -> Float:
     """Derivatives (2, 2) of A's positions by the pixel, at its reference pixel."""
     linear = basis.to_monomials(coefficients)[:, 1:3]
     if abs(np.linalg.det(linear)) <= 1e-9 * np.abs(linear).max() ** 2:
@@ -287,7 +274,7 @@ def _similarity(
     )
 
 
-def _pixel_mas(a: Calibration, b: Calibration, linear: Float, turn: complex) -> float | None:
+def _pixel_mas(a: ChipMap, b: ChipMap, linear: Float, turn: complex) -> float | None:
     pixel = float(np.sqrt(abs(np.linalg.det(linear))))  # in the unit of A
     if a.unit != "pix":
         return convert(pixel, a.unit, "mas")

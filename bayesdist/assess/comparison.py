@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.calibration import Calibration
 from bayesdist.assess.common_frame import CommonFrame, Similarity, common_frame
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
-from bayesdist.assess.moments import position_moments
-from bayesdist.assess.solution import point_blocks
+from bayesdist.calibration.chip_map import ChipMap, position_moments
 from bayesdist.infer.field_test import FieldTest, field_test, known_terms
+from bayesdist.model.basis import point_blocks
 
 __all__ = ["SIGNIFICANT", "Comparison", "compare", "term_sigmas"]
 
@@ -32,7 +31,7 @@ class Comparison:
 
     Parameters
     ----------
-    a, b : Calibration
+    a, b : ChipMap
     frame : CommonFrame
         The difference A - B as a polynomial, and what was taken out.
     x : ndarray, shape (nx,)
@@ -55,8 +54,8 @@ class Comparison:
         large: they account for the search.
     """
 
-    a: Calibration
-    b: Calibration
+    a: ChipMap
+    b: ChipMap
     frame: CommonFrame
     x: Float
     y: Float
@@ -130,8 +129,8 @@ class Comparison:
 
 
 def compare(
-    a: Calibration,
-    b: Calibration,
+    a: ChipMap,
+    b: ChipMap,
     *,
     rng: np.random.Generator,
     grid: tuple[int, int] = DEFAULT_GRID,
@@ -142,7 +141,7 @@ def compare(
 
     Parameters
     ----------
-    a, b : Calibration
+    a, b : ChipMap
         With independent errors.
     rng : numpy.random.Generator
         For the probabilities that account for a search.

@@ -17,21 +17,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.calibration import Calibration
 from bayesdist.assess.common_frame import (
     as_real,
     linear_part,
-    padded,
     similarity_fields,
     turn_between,
 )
-from bayesdist.assess.solution import Solution, place_of
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.infer.field_test import FieldTest, field_test
 from bayesdist.infer.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
 
-__all__ = ["ChipPair", "GapDifference", "gap_difference", "pair_of_solution"]
+__all__ = ["ChipPair", "GapDifference", "gap_difference", "pair_of_chips"]
 
 Float = NDArray[np.float64]
 
@@ -42,14 +41,14 @@ class ChipPair:
 
     Parameters
     ----------
-    reference, other : Calibration
+    reference, other : ChipMap
         Of one order, in one system of u, v.
     cov : ndarray, shape (4 K, 4 K), optional
         Joint covariance of their coefficients: u and v of the reference chip, then of the other.
     """
 
-    reference: Calibration
-    other: Calibration
+    reference: ChipMap
+    other: ChipMap
     cov: Float | None
 
 
@@ -84,43 +83,27 @@ class GapDifference:
         return None if self.cov is None else np.sqrt(np.maximum(np.diag(self.cov), 0.0))
 
 
-def pair_of_solution(
-    solution: Solution, name: str, reference: int, other: int, *, epoch: float | None = None
+def pair_of_chips(
+    calibration: Calibration, reference: int, other: int, *, epoch: float | None = None
 ) -> ChipPair:
-    """Two chips of a fit or posterior.
+    """Two chips of a calibration.
 
     Parameters
     ----------
-    solution : Solution
-    name : str
+    calibration : Calibration
     reference, other : int
         Chip numbers.
     epoch : float, optional
-        Decimal years; needed by a model with time dependence.
+        Decimal years, for what depends on time.
 
     Returns
     -------
     ChipPair
+        With a covariance where the calibration has one.
     """
-    model, convergence = solution.model, getattr(solution, "convergence", None)
-    jacobian, out = np.zeros((2, 2 * model.n_terms, model.n_params)), []
-    for k, number in enumerate((reference, other)):
-        place = place_of(model, epoch=epoch, chip=number)
-        [(columns, d)] = model.effective_jacobian(solution.mean, place.group)
-        jacobian[k][:, columns] = d.reshape(2 * model.n_terms, -1)
-        out.append(
-            Calibration(
-                name,
-                place.basis,
-                model.unit,
-                place.polynomial(solution.mean),
-                draws=np.inf if convergence is None else float(convergence.ess_bulk_min),
-                chip=number,
-                epoch=place.epoch,
-            )
-        )
-    joint = jacobian.reshape(-1, model.n_params)
-    return ChipPair(out[0], out[1], joint @ np.asarray(solution.cov, float) @ joint.T)
+    maps = calibration.at(epoch, origin="stated")
+    cov = calibration.joint_covariance((reference, other), epoch, origin="stated")
+    return ChipPair(maps[reference], maps[other], cov)
 
 
 def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
@@ -152,7 +135,7 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
         order = max(of_a.basis.order, of_b.basis.order)
         bases.append(PolynomialBasis(order, of_a.basis.size, of_a.basis.reference_pixel))
     K = bases[0].n_terms
-    both = [[padded(c, K)[0] for c in (pair.reference, pair.other)] for pair in (a, b)]
+    both = [[c.padded(K)[0] for c in (pair.reference, pair.other)] for pair in (a, b)]
     za, zb = ([c[0] + 1j * c[1] for c in one] for one in both)
     turn, mirrored = turn_between(za[0], zb[0], bases[0], b.reference)
     moved = [turn * (z.conj() if mirrored else z) for z in zb]

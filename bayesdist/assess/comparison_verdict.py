@@ -69,7 +69,7 @@ def comparison_lines(found: Comparison) -> list[str]:
         f"{letter}  {c.name}: order {c.basis.order}, in {c.unit}"
         + (f", chip {c.chip}" if c.chip is not None else "")
         + (f", at {c.epoch:g}" if c.epoch is not None else "")
-        + f", errors: {_errors(c.kind_of_error)}"
+        + f", errors: {_errors(c.errors)}"
         + "".join(f"; {note}" for note in c.notes)
         for letter, c in (("A", found.a), ("B", found.b))
     ]

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.assess.field_terms import FieldDraws, FieldTerm, part_of
-from bayesdist.assess.moments import position_moments
 from bayesdist.assess.rigid import without_rigid
-from bayesdist.assess.solution import Solution, place_of, point_blocks
+from bayesdist.assess.solution import Solution, place_of
+from bayesdist.calibration.chip_map import position_moments
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, PolynomialBasis
+from bayesdist.model.basis import point_blocks
 
 __all__ = [
     "COEFFICIENTS",

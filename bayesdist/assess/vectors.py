@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 from bayesdist.assess.names import require_known
-from bayesdist.assess.solution import Place, Solution, place_of, point_blocks
+from bayesdist.assess.solution import Place, Solution, place_of
 from bayesdist.errors import InputError
+from bayesdist.model.basis import point_blocks
 
 __all__ = ["PARTS", "VectorMap", "distortion_vectors"]
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
-from bayesdist.products.sip_build import ARCSEC
 
 __all__ = [
     "PARAMETERS",

@@ -6,6 +6,7 @@ import numpy as np
 
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.errors import InputError
+from bayesdist.products.formats.idctab.hst import parity_of
 from bayesdist.products.orientation import (
     Orientation,
     check_epoch,
@@ -14,7 +15,6 @@ from bayesdist.products.orientation import (
     held_scale,
     mirrored,
 )
-from bayesdist.products.parity import parity_of
 from bayesdist.products.siaf import Aperture
 
 __all__ = ["orientation_from_aperture"]

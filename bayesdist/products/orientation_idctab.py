@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.products.idctab import IdcTab
+from bayesdist.products.formats.idctab.hst import parity_of
+from bayesdist.products.formats.idctab.table import IdcTab
 from bayesdist.products.orientation import (
     Agreement,
     Orientation,
@@ -20,7 +21,6 @@ from bayesdist.products.orientation import (
     held_scale,
     mirrored,
 )
-from bayesdist.products.parity import parity_of
 
 __all__ = ["orientation_from_idctab"]
 

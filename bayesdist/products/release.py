@@ -15,14 +15,14 @@ from bayesdist.assess.solution import Solution
 from bayesdist.data.files import made_folder
 from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.d2im import write_d2im
-from bayesdist.products.idctab import IdcTab, write_idctab
-from bayesdist.products.idctab_build import idctab_from_solution
-from bayesdist.products.npol import write_npol
+from bayesdist.products.formats.idctab.build import idctab_from_solution
+from bayesdist.products.formats.idctab.hst import combination_of
+from bayesdist.products.formats.idctab.table import IdcTab, write_idctab
+from bayesdist.products.formats.lookup.d2im import write_d2im
+from bayesdist.products.formats.lookup.npol import write_npol
 from bayesdist.products.orientation import Orientation
 from bayesdist.products.oriented import oriented
 from bayesdist.products.storable import Lost, Stored, storable
-from bayesdist.products.wheels import combination_of
 
 __all__ = ["Period", "Release", "write_release"]
 

@@ -16,14 +16,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.inverse import detector_grid
 from bayesdist.data.tangent import ARCSEC, plane_axes, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
+from bayesdist.products.formats.sip.header import SIP_ORDERS
 from bayesdist.products.monomials import ChipPolynomial
-from bayesdist.products.newton import newton
-from bayesdist.products.sip import SIP_ORDERS
-from bayesdist.products.sip_inverse import detector_grid
 
 __all__ = ["SkyPolynomial", "sky_polynomial"]
 
@@ -164,8 +163,8 @@ def _pixel_of(
     at: tuple[float, float], basis: PolynomialBasis, coefficients: Float, linear: Float
 ) -> tuple[float, float] | None:
     """The pixel of a position; None where the polynomial, continued so far, has none."""
-    chip = Calibration("solution", basis, "", coefficients)
-    pixel, slope = newton(chip, np.array(at)[:, None])
+    chip = ChipMap("solution", basis, "", coefficients)
+    pixel, slope = chip.pixels(np.array(at)[:, None])
     if not np.isfinite(pixel).all() or np.linalg.det(slope[0]) * np.linalg.det(linear) <= 0:
         return None  # beyond a fold of the polynomial, which no chip has
     return float(pixel[0, 0]), float(pixel[1, 0])

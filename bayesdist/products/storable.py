@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
 from bayesdist.infer.views import Derived
 from bayesdist.infer.views import segment as segment_of
 from bayesdist.model import DistortionModel, TimeDependence
+from bayesdist.products.formats.idctab.drift import RATES
 from bayesdist.products.orientation import Orientation
-from bayesdist.products.sip_build import ARCSEC
-from bayesdist.products.tdd import RATES
 
 __all__ = ["Lost", "Stored", "storable"]
 

@@ -13,10 +13,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from bayesdist.errors import BayesdistError, DegenerateError, FormatError, InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products import IdcTab, describe, idctab_from_solution, read_idctab
-from bayesdist.products.d2im import read_d2im, write_d2im
-from bayesdist.products.lookup_file import LookupFile, read_lookup_file, write_lookup_file
-from bayesdist.products.lookup_lint import lint_lookup_file
-from bayesdist.products.npol import read_npol, write_npol
+from bayesdist.products.formats.lookup.d2im import read_d2im, write_d2im
+from bayesdist.products.formats.lookup.file import LookupFile, read_lookup_file, write_lookup_file
+from bayesdist.products.formats.lookup.lint import lint_lookup_file
+from bayesdist.products.formats.lookup.npol import read_npol, write_npol
 
 from .support import F606W, some_solution, wfc_solution
 

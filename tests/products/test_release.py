@@ -16,12 +16,12 @@ from bayesdist.errors import InputError
 from bayesdist.infer.views import reference_gauge
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products import idctab_from_solution, lint_idctab, read_idctab
+from bayesdist.products.formats.idctab.hst import combination_of
 from bayesdist.products.orientation import Orientation
 from bayesdist.products.orientation_idctab import orientation_from_idctab
 from bayesdist.products.oriented import oriented
 from bayesdist.products.release import Period, Release, write_release
 from bayesdist.products.storable import storable
-from bayesdist.products.wheels import combination_of
 from bayesdist.simulate.acs import acs_solution
 from bayesdist.simulate.acs.tables import detector_tables, filter_tables
 

@@ -17,7 +17,7 @@ from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products import lint_sip, read_sip, sip_from_solution, sip_header, write_sip
-from bayesdist.products.sip_rotate import (
+from bayesdist.products.formats.sip.rotate import (
     coefficient_map,
     pixel_matrix,
     rotated_sip,

@@ -171,7 +171,12 @@ class Content:
             )
         return hdus
 
-    @property
+    @cached_property
+    def tables(self) -> tuple[Hdu, ...]:
+        """HDUs of a whole FITS file; none for any other."""
+        return () if self.damage is not None or not self.is_fits else self.whole()
+
+    @cached_property
     def damage(self) -> FormatError | None:
         """Why a file that begins as a FITS file is none that is whole."""
         try:

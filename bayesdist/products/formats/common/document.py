@@ -1,11 +1,29 @@
-"""What is wrong, or looks wrong, in a product: the findings, and checks that formats share."""
+"""What a format is, a document of one, and what is found wrong in it.
+
+A format is its functions, each in a module of its own where it is long.  A file that its checks
+call broken has no calibration, and bit-by-bit losslessness is a property of bytes: so reading,
+checks and words are of a document, whose meaning is a calibration.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["LEVELS", "Finding", "finding_lines", "repeated_values"]
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.errors import InputError
+from bayesdist.products.formats.common.content import Content
+
+__all__ = [
+    "LEVELS",
+    "Choice",
+    "Document",
+    "Finding",
+    "Format",
+    "finding_lines",
+    "repeated_values",
+]
 
 LEVELS = ("error", "warning", "note")
 
@@ -68,3 +86,92 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
         return ["Findings: none"]
     ordered = sorted(findings, key=lambda f: LEVELS.index(f.level))
     return ["Findings:", *(f"  {finding}" for finding in ordered)]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which of the calibrations of a file is wanted, and what a file may not say itself.
+
+    Parameters
+    ----------
+    filter : str, optional
+        Of an IDCTAB, where names of both wheels may be joined by a comma; the band of WISE
+        meta-data, as in "W2".
+    size : tuple of float, optional
+        Columns and rows, for a header that does not say.
+    """
+
+    filter: str | None = None
+    size: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of files, as its functions.
+
+    Parameters
+    ----------
+    key : str
+        As in the configuration and on the command line.
+    title : str
+        With its article, as in "an IDCTAB".
+    rank : int
+        Formats are tried in this order: the most special first.
+    parse : callable
+        From a `Content` to what the file holds; None for a file of another kind.
+    describe : callable
+        From what `parse` gave to lines of text, findings excluded.
+    lint : callable, optional
+        From what `parse` gave to findings; of a format without checks there are none.
+    calibration : callable, optional
+        From what `parse` gave, the file's name and a `Choice` to a `Calibration`.
+    """
+
+    key: str
+    title: str
+    rank: int
+    parse: Callable[[Content], Any]
+    describe: Callable[[Any], list[str]]
+    lint: Callable[[Any], Sequence[Finding]] | None = None
+    calibration: Callable[[Any, str, Choice], Calibration] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """A file that was recognized.
+
+    Parameters
+    ----------
+    name : str
+    format : Format
+    holds : object
+        What the format's `parse` gave.
+    """
+
+    name: str
+    format: Format
+    holds: Any
+
+    def lint(self) -> tuple[Finding, ...]:
+        """What is wrong, or looks wrong, in the file."""
+        return () if self.format.lint is None else tuple(self.format.lint(self.holds))
+
+    def describe(self) -> str:
+        """Text of what the file holds, its findings at the end."""
+        return "\n".join(self.format.describe(self.holds))
+
+    def calibration(self, choice: Choice = Choice()) -> Calibration:
+        """The calibration that the file holds.
+
+        Raises
+        ------
+        InputError
+            For a format that holds none, or whatever the format misses in the choice.
+        """
+        if self.format.calibration is None:
+            raise InputError(
+                f"is {self.format.title}, which holds no calibration by itself",
+                where=self.name,
+                do="give an IDCTAB, a SIP header, WISE meta-data, or a run directory",
+            )
+        return self.format.calibration(self.holds, self.name, choice)
