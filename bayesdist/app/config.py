@@ -377,7 +377,6 @@ class Idctab(Section):
 
     instrument: str
     detector: str
-    v2v3: Literal["aperture"] = "aperture"
     v2ref: float = 0.0
     v3ref: float = 0.0
     vafactor: PositiveFloat = 1.0

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.units import convert
 from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
 from bayesdist.errors import InputError
 from bayesdist.infer.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
@@ -25,11 +26,8 @@ from bayesdist.model import PolynomialBasis
 __all__ = [
     "CommonFrame",
     "Similarity",
-    "as_real",
     "common_frame",
     "linear_part",
-    "similarity_fields",
-    "turn_between",
 ]
 
 Float = NDArray[np.float64]
@@ -149,7 +147,7 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
     wa, cov_a = a.padded(basis.n_terms)
     wb, cov_b = b.padded(basis.n_terms)
     za, zb = wa[0] + 1j * wa[1], factor * (wb[0] + 1j * wb[1])
-    turn, mirrored = turn_between(za, zb, basis, b)
+    turn, mirrored = turn_between(za, zb, basis, b.name)
     if mirrored:
         zb = zb.conj()
     linear = linear_part(basis, wa, a)
@@ -204,40 +202,12 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
     )
 
 
-def turn_between(
-    za: Complex, zb: Complex, basis: PolynomialBasis, b: ChipMap
-) -> tuple[complex, bool]:
-    """Scale and rotation that bring B nearest to A, and whether B is mirrored first."""
-    weight = term_squares(basis)[: basis.n_terms].copy()
-    weight[0] = 0.0  # the shift takes the mean
-    norm = float(weight @ np.abs(zb) ** 2)
-    if norm == 0.0:
-        raise InputError("has no linear part", where=b.name, do="check its coefficients")
-    straight, flipped = np.sum(weight * za * zb.conj()), np.sum(weight * za * zb)
-    mirrored = bool(abs(flipped) > abs(straight))
-    return complex((flipped if mirrored else straight) / norm), mirrored
-
-
 def linear_part(basis: PolynomialBasis, coefficients: Float, a: ChipMap) -> Float:
     """Derivatives (2, 2) of A's positions by the pixel, at its reference pixel."""
     linear = basis.to_monomials(coefficients)[:, 1:3]
     if abs(np.linalg.det(linear)) <= 1e-9 * np.abs(linear).max() ** 2:
         raise InputError("has a singular linear part", where=a.name, do="check its coefficients")
     return linear
-
-
-def as_real(z: Complex) -> Float:
-    """Coefficients (2 K,), u before v, of u + i v."""
-    return np.concatenate([z.real, z.imag])
-
-
-def similarity_fields(z: Complex) -> Float:
-    """What shift along u and v, scale and rotation do to positions, (2 K, 4)."""
-    one = np.zeros_like(z)
-    one[0] = 1.0
-    offsets = z.copy()
-    offsets[0] = 0.0  # about the mean position, so that a rotation is no shift
-    return np.stack([as_real(f) for f in (one, 1j * one, offsets, 1j * offsets)], axis=1)
 
 
 def _symmetric(cov: Float) -> Float:

@@ -17,14 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.common_frame import (
-    as_real,
-    linear_part,
-    similarity_fields,
-    turn_between,
-)
+from bayesdist.assess.common_frame import linear_part
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
 from bayesdist.errors import InputError
 from bayesdist.infer.field_test import FieldTest, field_test
 from bayesdist.infer.frame_fields import term_squares
@@ -137,7 +133,7 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
     K = bases[0].n_terms
     both = [[c.padded(K)[0] for c in (pair.reference, pair.other)] for pair in (a, b)]
     za, zb = ([c[0] + 1j * c[1] for c in one] for one in both)
-    turn, mirrored = turn_between(za[0], zb[0], bases[0], b.reference)
+    turn, mirrored = turn_between(za[0], zb[0], bases[0], b.reference.name)
     moved = [turn * (z.conj() if mirrored else z) for z in zb]
     raw = [as_real(x - y) for x, y in zip(za, moved, strict=True)]
     fits = [_estimate(similarity_fields(z), basis) for z, basis in zip(moved, bases, strict=True)]

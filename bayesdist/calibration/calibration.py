@@ -128,7 +128,7 @@ class Calibration:
             notes = (*notes, self.undated)
         out = {}
         for number in self.numbers:
-            coefficients, jacobian = self._coefficients(number, epoch, origin)
+            coefficients, jacobian = self.coefficients(number, epoch, origin)
             cov = None
             if self.errors != "none":
                 cov = jacobian @ np.asarray(self.solution.cov, float) @ jacobian.T
@@ -175,7 +175,7 @@ class Calibration:
         """Covariance (2 K n, 2 K n) of the coefficients of several chips; None without errors."""
         if self.errors == "none":
             return None
-        parts = [self._coefficients(number, epoch, origin)[1] for number in numbers]
+        parts = [self.coefficients(number, epoch, origin)[1] for number in numbers]
         joint = np.concatenate(parts)
         cov = joint @ np.asarray(self.solution.cov, float) @ joint.T
         return (cov + cov.T) / 2
@@ -187,15 +187,25 @@ class Calibration:
         px, py = np.asarray(x, float), np.asarray(y, float)
         if self.before:
             px, py = corrected(self.before, px, py, chip=chip, filter=self.filter)
-        coefficients, _ = self._coefficients(chip, epoch, "stated")
+        coefficients, _ = self.coefficients(chip, epoch, "stated")
         at = self.model.basis(chip).evaluate(px, py) @ coefficients.T
         for table in self.after:
             if table.chip == chip:
                 at = at + table.evaluate(px, py)
         return at
 
-    def _coefficients(self, number: int, epoch: float | None, origin: str) -> tuple[Float, Float]:
-        """Legendre coefficients (2, K) of a chip, and their derivatives (2 K, D)."""
+    def coefficients(
+        self, number: int, epoch: float | None = None, origin: str = "stated"
+    ) -> tuple[Float, Float]:
+        """Legendre coefficients (2, K) of a chip, and their derivatives (2 K, D) by the solution.
+
+        Parameters
+        ----------
+        number : int
+            Of the chip.
+        epoch, origin
+            As of `at`.
+        """
         if origin not in ORIGINS:
             raise ValueError(f"the origin is {origin!r}")
         coefficients, jacobian = self._stated(number, epoch)

@@ -18,13 +18,51 @@ from bayesdist.infer.views import Solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import point_blocks
 
-__all__ = ["ChipMap", "chip_map", "fitted_map", "position_moments", "sampling_of"]
+__all__ = ["ChipMap", "Monomials", "chip_map", "fitted_map", "position_moments", "sampling_of"]
 
 Float = NDArray[np.float64]
 
 # Newton's method has converged when a step is this short in pixels, which rounding allows.
 STEP, MAX_STEPS = 1e-9, 30
 SINGULAR = 1e-12  # of the largest slope squared: below that a linear part has no inverse
+
+
+@dataclass(frozen=True, eq=False)
+class Monomials:
+    """A map as products write it: coefficients of (x - xref)^i (y - yref)^j.
+
+    Parameters
+    ----------
+    basis : PolynomialBasis
+        For its order, size and reference pixel.
+    values : ndarray, shape (2, K)
+        Of u and v, in the order of `terms`.
+    cov : ndarray, shape (2 K, 2 K), optional
+        u before v.
+    """
+
+    basis: PolynomialBasis
+    values: Float
+    cov: Float | None = None
+
+    @property
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """Powers (i, j), length K."""
+        return self.basis.terms
+
+    def index(self, i: int, j: int) -> int:
+        """Position of a term."""
+        return self.terms.index((i, j))
+
+    @property
+    def constant(self) -> Float:
+        """(u, v) at the reference pixel, shape (2,)."""
+        return self.values[:, 0]
+
+    @property
+    def linear(self) -> Float:
+        """d(u, v) / d(x, y) at the reference pixel, shape (2, 2)."""
+        return self.values[:, 1:3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,13 +214,14 @@ class ChipMap:
         along = [phi @ (by @ self.coefficients.T) for by in (by_x, by_y)]
         return (phi @ self.coefficients.T).T, np.stack(along, axis=-1)
 
-    def monomials(self) -> tuple[Float, Float | None]:
-        """Coefficients (2, K) of (x - xref)^i (y - yref)^j, and their covariance (2 K, 2 K)."""
+    def monomials(self) -> Monomials:
+        """The map in powers of offsets from the reference pixel."""
         values = self.basis.to_monomials(self.coefficients)
-        if self.cov is None:
-            return values, None
-        change = np.kron(np.eye(2), self.basis.monomial_matrix)
-        return values, change @ self.cov @ change.T
+        cov = None
+        if self.cov is not None:
+            change = np.kron(np.eye(2), self.basis.monomial_matrix)
+            cov = change @ self.cov @ change.T
+        return Monomials(self.basis, values, cov)
 
     def padded(self, n_terms: int) -> tuple[Float, Float | None]:
         """Coefficients (2, n) and covariance (2 n, 2 n) with zeros for terms that are not there."""

@@ -28,7 +28,6 @@ _HOMES = {
     "bayesdist.products.pam_file": ("write_pam",),
     "bayesdist.products.registry": ("describe", "lint", "open_document", "read_calibration"),
     "bayesdist.products.release": ("Period", "Release", "write_release"),
-    "bayesdist.products.orientation_idctab": ("orientation_from_idctab",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

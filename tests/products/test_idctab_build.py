@@ -248,7 +248,6 @@ def test_one_chip_alone_is_enough_for_the_scheme(real) -> None:
     ("names", "message"),
     [
         ({"instrument": "WISE", "detector": "W1"}, "parity of WISE/W1 is not known"),
-        ({"v2v3": "sky"}, "choose 'aperture'"),
         ({"vafactor": 0.0}, "vafactor is 0.0"),
         ({"scale_arcsec": -1.0}, "positive"),
         ({"chips": (7,)}, "no chip 7"),

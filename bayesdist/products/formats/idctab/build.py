@@ -3,30 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from textwrap import wrap
 
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution
+from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
+from bayesdist.infer.views import Solution
 from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.idctab.cards import closure_cards, provenance_cards, tdd_cards
-from bayesdist.products.formats.idctab.covariance import joint_covariance
 from bayesdist.products.formats.idctab.hdus import Piece, coefficient_hdu, covariance_hdu, sigma_hdu
 from bayesdist.products.formats.idctab.hst import combination_of, parity_of
-from bayesdist.products.formats.idctab.inverse import inverse_of
-from bayesdist.products.formats.idctab.numbers import ChipNumbers, check_time, chip_numbers
+from bayesdist.products.formats.idctab.numbers import (
+    ChipNumbers,
+    check_time,
+    chip_inverse,
+    chip_numbers,
+    joint_covariance,
+)
 from bayesdist.products.formats.idctab.table import IdcTab
 
-__all__ = ["idctab_from_solution"]
+__all__ = ["build_idctab", "idctab_from_solution"]
 
 Float = NDArray[np.float64]
 Filter = str | tuple[str, ...]
+
+DESCRIPTION = "Geometric distortion with its uncertainty, by bayesdist"
 
 
 def idctab_from_solution(
@@ -37,12 +43,11 @@ def idctab_from_solution(
     scale_arcsec: float | None = None,
     v2ref: float = 0.0,
     v3ref: float = 0.0,
-    v2v3: str = "aperture",
     vafactor: float = 1.0,
     filters: Sequence[str] | Sequence[Sequence[str]] | None = None,
     useafter: str | None = None,
     pedigree: str | None = None,
-    description: str = "Geometric distortion with its uncertainty, by bayesdist",
+    description: str = DESCRIPTION,
     chips: Sequence[int] | None = None,
     inverse: bool = False,
     history: Sequence[str] = (),
@@ -71,8 +76,6 @@ def idctab_from_solution(
         scale of all chips at their reference pixels.
     v2ref, v3ref : float
         V2 and V3 of (u, v) = (0, 0), arcseconds.
-    v2v3 : {'aperture'}
-        How (u, v) lie: 'aperture' means along the ideal axes of the aperture, Xc = u and Yc = v.
     vafactor : float
         Velocity-aberration factor that the positions (u, v) still contain.
     filters : sequence, optional
@@ -97,7 +100,7 @@ def idctab_from_solution(
     IdcTab
         In doubles, with HDUs SIGMA and COVAR (see `bayesdist.products.idctab`).  COVAR names the
         filters where there are several solutions.  Solutions turned by the same orientation
-        (`bayesdist.products.oriented`) share its error, which stands between their blocks.
+        (`bayesdist.calibration.orientation`) share its error, which stands between their blocks.
 
     Raises
     ------
@@ -113,9 +116,52 @@ def idctab_from_solution(
     TDD_DATE is the reference date of the fit.  stwcs dates an exposure by year + day of year /
     365.25, which is within about a day of the decimal year.
     """
-    if v2v3 != "aperture":
-        raise InputError(f"v2v3 is {v2v3!r}", where="products.idctab.v2v3", do="choose 'aperture'")
-    entries = _entries(solution, filters, instrument)
+    named: Calibration | dict[Filter, Calibration]
+    if isinstance(solution, Mapping):
+        made: dict[int, Calibration] = {}  # filters with the very same solution share its rows
+        named = {
+            filter: made.setdefault(id(one), calibration_of(one))
+            for filter, one in solution.items()
+        }
+    else:
+        named = calibration_of(solution)
+    return build_idctab(
+        named,
+        instrument=instrument,
+        detector=detector,
+        scale_arcsec=scale_arcsec,
+        v2ref=v2ref,
+        v3ref=v3ref,
+        vafactor=vafactor,
+        filters=filters,
+        useafter=useafter,
+        pedigree=pedigree,
+        description=description,
+        chips=chips,
+        inverse=inverse,
+        history=history,
+    )
+
+
+def build_idctab(
+    calibration: Calibration | Mapping[Filter, Calibration],
+    *,
+    instrument: str,
+    detector: str,
+    scale_arcsec: float | None = None,
+    v2ref: float = 0.0,
+    v3ref: float = 0.0,
+    vafactor: float = 1.0,
+    filters: Sequence[str] | Sequence[Sequence[str]] | None = None,
+    useafter: str | None = None,
+    pedigree: str | None = None,
+    description: str = DESCRIPTION,
+    chips: Sequence[int] | None = None,
+    inverse: bool = False,
+    history: Sequence[str] = (),
+) -> IdcTab:
+    """As `idctab_from_solution`, of a calibration or of one for each filter."""
+    entries = _entries(calibration, filters, instrument)
     first = entries[0][0]
     model = first.model
     parity = parity_of(instrument, detector)
@@ -132,11 +178,13 @@ def idctab_from_solution(
     for one, combinations in entries:
         factor = _arcsec(one.model.unit, scale_arcsec) / vafactor
         fitted = tuple(
-            _numbers(one, n, factor, parity, (v2ref, v3ref), drift=one is first) for n in numbers
+            chip_numbers(one, n, factor=factor, parity=parity, zero=(v2ref, v3ref)) for n in numbers
         )
-        back = tuple(inverse_of(f) for f in fitted) if inverse else ()
+        if one is not first:  # the file stores the first one's drift
+            fitted = tuple(chip.without_rates() for chip in fitted)
+        back = tuple(chip_inverse(one, n, factor) for n in numbers) if inverse else ()
         pieces.append(Piece(combinations, fitted, back))
-    cov = joint_covariance([one for one, _ in entries], pieces)
+    cov = joint_covariance([one for one, _ in entries], [piece.fitted for piece in pieces])
     scale = _mean_scale(pieces[0].fitted) if scale_arcsec is None else scale_arcsec
 
     texts = {"DESCRIP": description, "USEAFTER": useafter, "PEDIGREE": pedigree}
@@ -151,7 +199,7 @@ def idctab_from_solution(
         *tdd_cards(pieces[0].fitted, model.time.epoch0[0] if model.time else None, acs_wfc),
         *provenance_cards(pieces[0].fitted, vafactor, first),
         *closure_cards(pieces),
-        *convergence_cards(first),
+        *convergence_cards(first.solution),
         *(text_card("HISTORY", part) for line in history for part in wrap(line, 72) or [""]),
     ]:
         primary.header.append(fits.Card.fromstring(card), end=True)
@@ -165,29 +213,29 @@ def idctab_from_solution(
 
 
 def _entries(
-    solution: Solution | Mapping[Filter, Solution],
+    calibration: Calibration | Mapping[Filter, Calibration],
     filters: Sequence[str] | Sequence[Sequence[str]] | None,
     instrument: str,
-) -> list[tuple[Solution, tuple[tuple[str, ...], ...]]]:
-    """Each solution with the filter combinations of its rows; () where rows serve all filters."""
+) -> list[tuple[Calibration, tuple[tuple[str, ...], ...]]]:
+    """Each calibration with the filter combinations of its rows; () for rows of all filters."""
     where = "products.idctab.filters"
-    named: list[tuple[tuple[str, ...], Solution]]
-    if isinstance(solution, Mapping):
+    named: list[tuple[tuple[str, ...], Calibration]]
+    if isinstance(calibration, Mapping):
         if filters:
             raise InputError(
                 "the filters are given twice", where=where, do="leave them to the solutions"
             )
-        named = [(combination_of(filter, instrument), one) for filter, one in solution.items()]
+        named = [(combination_of(filter, instrument), one) for filter, one in calibration.items()]
         if not named:
             raise InputError("no filter is given", where="solutions", do="give at least one")
     elif not filters:
-        return [(solution, ((),))]
+        return [(calibration, ((),))]
     elif all(isinstance(f, str) for f in filters):
-        named = [(tuple(map(str, filters)), solution)]
+        named = [(tuple(map(str, filters)), calibration)]
     else:
-        named = [(tuple(map(str, names)), solution) for names in filters]
+        named = [(tuple(map(str, names)), calibration) for names in filters]
     wanted = 2 if instrument == "ACS" else 1
-    out: dict[int, tuple[Solution, list[tuple[str, ...]]]] = {}
+    out: dict[int, tuple[Calibration, list[tuple[str, ...]]]] = {}
     seen: set[tuple[str, ...]] = set()
     for names, one in named:
         if len(names) != wanted:
@@ -203,24 +251,6 @@ def _entries(
         seen.add(names)
         out.setdefault(id(one), (one, []))[1].append(names)
     return [(one, tuple(combinations)) for one, combinations in out.values()]
-
-
-def _numbers(
-    solution: Solution,
-    chip: int,
-    factor: float,
-    parity: tuple[int, int],
-    zero: tuple[float, float],
-    *,
-    drift: bool,
-) -> ChipNumbers:
-    """Numbers of a chip; without `drift` those of its rates are left to another solution."""
-    out = chip_numbers(solution, chip, factor=factor, parity=parity, zero=zero)
-    if drift:
-        return out
-    keep = [k for k, name in enumerate(out.names) if not name.startswith("TDD")]
-    names = tuple(out.names[k] for k in keep)
-    return replace(out, names=names, values=out.values[keep], jacobian=out.jacobian[keep])
 
 
 # -- checks and scales ---------------------------------------------------------------------------
@@ -256,10 +286,12 @@ def _mean_scale(fitted: Sequence[ChipNumbers]) -> float:
     return round(float(np.mean(np.sqrt(np.abs(areas)))), 8)
 
 
-def _check_alike(solution: Solution, first: Solution, combination: tuple[str, ...]) -> None:
+def _check_alike(
+    calibration: Calibration, first: Calibration, combination: tuple[str, ...]
+) -> None:
     """A file has one order, one set of chips and one drift."""
     where = f"filters {' '.join(combination)}"
-    a, b = solution.model, first.model
+    a, b = calibration.model, first.model
     if a.order != b.order or a.chips != b.chips:
         raise InputError(
             "the solution has another order or other chips than the first one",
@@ -275,10 +307,10 @@ def _check_alike(solution: Solution, first: Solution, combination: tuple[str, ..
                 (chip.number, term): float(value)
                 for chip in m.chips
                 for term, value in zip(
-                    m.time.terms, np.asarray(s.mean)[m.tdd_slice(chip.number)], strict=True
+                    m.time.terms, np.asarray(s.solution.mean)[m.tdd_slice(chip.number)], strict=True
                 )
             }
-            for s, m in ((solution, a), (first, b))
+            for s, m in ((calibration, a), (first, b))
         )
         scale = max(map(abs, theirs.values()), default=0.0)
         same = all(
@@ -288,5 +320,5 @@ def _check_alike(solution: Solution, first: Solution, combination: tuple[str, ..
         raise InputError(
             "the solution drifts otherwise than the first one, and a file stores one drift",
             where=where,
-            do="give it the same reference date and rates (bayesdist.products.storable)",
+            do="give it the same reference date and rates (`drift.storable`)",
         )

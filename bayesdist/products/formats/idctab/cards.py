@@ -17,11 +17,11 @@ from textwrap import wrap
 
 import numpy as np
 
-from bayesdist.assess.solution import Solution
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import Orientation
 from bayesdist.products.formats.common.cards import number_card, text_card
 from bayesdist.products.formats.idctab.hdus import Piece
 from bayesdist.products.formats.idctab.numbers import ChipNumbers
-from bayesdist.products.orientation import Orientation
 
 __all__ = ["closure_cards", "provenance_cards", "tdd_cards"]
 
@@ -41,11 +41,11 @@ def tdd_cards(fitted: Sequence[ChipNumbers], epoch: float | None, acs_wfc: bool)
 
 
 def provenance_cards(
-    fitted: Sequence[ChipNumbers], vafactor: float, solution: Solution
+    fitted: Sequence[ChipNumbers], vafactor: float, calibration: Calibration
 ) -> list[str]:
     """Where the numbers come from: the fit's unit and constants, and the orientation."""
-    orientation: Orientation | None = getattr(solution, "orientation", None)
-    unit = solution.model.unit if orientation is None else orientation.base.model.unit
+    orientation = calibration.plane.orientation
+    unit = calibration.unit if orientation is None else orientation.base.model.unit
     cards = [
         text_card("CREATOR", "bayesdist"),
         number_card("BDVAFAC", float(vafactor), "VAFACTOR that was divided out"),

@@ -10,8 +10,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.products.formats.common.cards import number_card
-from bayesdist.products.formats.idctab.inverse import ChipInverse
-from bayesdist.products.formats.idctab.numbers import ChipNumbers
+from bayesdist.products.formats.idctab.numbers import ChipInverse, ChipNumbers
 
 __all__ = ["Piece", "coefficient_hdu", "covariance_hdu", "sigma_hdu"]
 
@@ -55,19 +54,14 @@ class _Row:
         return "FORWARD" if self.inverse is None else "INVERSE"
 
     def value(self, name: str) -> float:
-        if self.inverse is None or name not in self.inverse.names:
+        if self.inverse is None or name not in self.inverse.values:
             return self.numbers.column(name)
-        return float(self.inverse.values[self.inverse.names.index(name)])
+        return self.inverse.values[name]
 
     def sigmas(self, cov: Float) -> dict[str, float]:
         names, block = self.numbers.names, cov[self.place, self.place]
         out = dict(zip(names, _deviations(block).tolist(), strict=True))
-        if self.inverse is not None:
-            pick = [names.index(name) for name in self.inverse.names]
-            jacobian = self.inverse.jacobian
-            own = jacobian @ block[np.ix_(pick, pick)] @ jacobian.T
-            out.update(zip(self.inverse.names, _deviations(own).tolist(), strict=True))
-        return out
+        return out if self.inverse is None else out | self.inverse.sigmas
 
 
 def _deviations(cov: Float) -> Float:

@@ -9,17 +9,18 @@ from textwrap import wrap
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import fit_inverse
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.calibration.sky import reprojected
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.views import Solution
 from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
 from bayesdist.products.formats.common.coefficients import largest_magnitude
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
-from bayesdist.products.monomials import ChipPolynomial, chip_polynomial
-from bayesdist.products.sky_polynomial import sky_polynomial
 
-__all__ = ["sip_from_solution"]
+__all__ = ["build_sip", "sip_from_solution"]
 
 Float = NDArray[np.float64]
 
@@ -91,21 +92,51 @@ def sip_from_solution(
         part that is singular ('cd') or far from the identity ('sip'), a distortion without inverse,
         a tangent point of u, v in pixels, or a `crval` that is no position of the field.
     """
+    plane = None if tangent_point is None else Plane("sky", point=tangent_point)
+    return build_sip(
+        calibration_of(solution, plane=plane),
+        chip=chip,
+        epoch=epoch,
+        inverse_order=inverse_order,
+        linear=linear,
+        crval=crval,
+        scale_arcsec=scale_arcsec,
+        origin=origin,
+        notes=notes,
+    )
+
+
+def build_sip(
+    calibration: Calibration,
+    *,
+    chip: int | None = None,
+    epoch: float | None = None,
+    inverse_order: int | None = None,
+    linear: str = "cd",
+    crval: tuple[float, float] | None = None,
+    scale_arcsec: float | None = None,
+    origin: tuple[float, float] | None = None,
+    notes: Sequence[str] = (),
+) -> SipHeader:
+    """As `sip_from_solution`, of a calibration: on the sky where its plane is."""
     if linear not in ("cd", "sip"):
         raise InputError(
             f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
         )
     if scale_arcsec is not None and not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
         raise InputError(f"scale is {scale_arcsec} arcsec per pixel", do="give a positive number")
-    model = solution.model
+    model = calibration.model
     if model.time is not None and epoch is None:
         raise InputError(
             "a SIP header holds for one epoch, and the model depends on time",
             where="products.sip.epoch",
             do="give an epoch in decimal years",
         )
-    poly = chip_polynomial(solution, chip=chip, epoch=epoch)
-    _check_linear(poly)
+    tangent_point = calibration.plane.point
+    number = calibration.numbers[0] if chip is None else chip
+    one = calibration.chip(number, epoch, origin="stated")
+    poly = one.monomials()
+    _check_linear(poly, number)
     unit_arcsec = ARCSEC[model.unit] if model.unit != "pix" else (scale_arcsec or 1.0)
     sky = None
     if tangent_point is not None:
@@ -115,21 +146,19 @@ def sip_from_solution(
                 where="tangent_point",
                 do="leave one of them out",
             )
-        sky = sky_polynomial(poly, unit_arcsec, tangent_point, crval)
+        sky = reprojected(one, unit_arcsec, tangent_point, crval, SIP_ORDERS[0])
         poly, crval = sky.poly, sky.crval
     order = max(SIP_ORDERS[0], *(i + j for i, j in poly.terms))  # readers ignore order 1
     inverse = _inverse_order(inverse_order, order)
     if linear == "cd":
         cd = poly.linear * unit_arcsec / 3600.0
         offset = (float(poly.constant[0]), float(poly.constant[1]))
-        terms, jacobian = _relative_to_linear(poly)
+        terms, sigma = _relative_to_linear(poly)
     else:
         pixel = _units_per_pixel(poly, model.unit, scale_arcsec)
         cd = np.eye(2) * pixel * unit_arcsec / 3600.0
         offset = _origin(poly, model.unit) if origin is None else origin
-        terms, jacobian = _relative_to_identity(poly, pixel, offset)
-    variance = np.einsum("akd,akd->ak", jacobian @ np.asarray(solution.cov, float), jacobian)
-    sigma = np.sqrt(np.maximum(variance, 0.0))  # a variance of -1e-40 is a rounded zero
+        terms, sigma = _relative_to_identity(poly, pixel, offset)
     kept = [k for k, (i, j) in enumerate(poly.terms) if linear == "sip" or i + j >= 2]
     if sky is not None:
         offset = sky.offset
@@ -140,14 +169,14 @@ def sip_from_solution(
     if not kept:
         a = b = dict.fromkeys(((2, 0), (1, 1), (0, 2)), 0.0)
     cards = _cards(
-        poly, linear, epoch if model.time is not None else None, model.unit, scale_arcsec
+        number, linear, epoch if model.time is not None else None, model.unit, scale_arcsec
     )
     cards += _sky_cards(tangent_point, crval)
     cards += tuple(text_card("COMMENT", part) for note in notes for part in wrap(note, 70))
-    cards += tuple(convergence_cards(solution))
-    size = (int(poly.chip.size[0]), int(poly.chip.size[1]))
+    cards += tuple(convergence_cards(calibration.solution))
+    size = (int(poly.basis.size[0]), int(poly.basis.size[1]))
     sip = SipHeader(
-        crpix=poly.chip.reference_pixel,
+        crpix=poly.basis.reference_pixel,
         crval=(0.0, 0.0) if crval is None else (float(crval[0]), float(crval[1])),
         cd=cd,
         ctype=("RA---TAN-SIP", "DEC--TAN-SIP"),
@@ -173,11 +202,11 @@ def sip_from_solution(
     return replace(sip, closure=worst_closure(sip, size))
 
 
-def _check_linear(poly: ChipPolynomial) -> None:
+def _check_linear(poly: Monomials, chip: int) -> None:
     linear = poly.linear
     if abs(np.linalg.det(linear)) <= 1e-12 * np.abs(linear).max() ** 2:
         raise DegenerateError(
-            f"the linear part of chip {poly.chip.number} is singular",
+            f"the linear part of chip {chip} is singular",
             do="check that the stars cover the detector in x and in y",
         )
 
@@ -194,7 +223,7 @@ def _inverse_order(asked: int | None, order: int) -> int:
     return asked
 
 
-def _units_per_pixel(poly: ChipPolynomial, unit: str, scale_arcsec: float | None) -> float:
+def _units_per_pixel(poly: Monomials, unit: str, scale_arcsec: float | None) -> float:
     """Units of u, v in one pixel, after a check that (u, v) runs along (x, y)."""
     if unit == "pix":
         pixel = 1.0
@@ -211,35 +240,45 @@ def _units_per_pixel(poly: ChipPolynomial, unit: str, scale_arcsec: float | None
     return pixel
 
 
-def _relative_to_linear(poly: ChipPolynomial) -> tuple[Float, Float]:
-    """A, B = L^-1 C of every term, and their derivatives: dA = L^-1 (dC - dL A)."""
+def _relative_to_linear(poly: Monomials) -> tuple[Float, Float]:
+    """A, B = L^-1 C of every term, and their sigmas: dA = L^-1 (dC - dL A)."""
     terms = np.linalg.solve(poly.linear, poly.values)
-    d_linear = poly.jacobian[:, 1:3, :]
-    inner = poly.jacobian - np.einsum("abd,bk->akd", d_linear, terms)
-    return terms, np.einsum("ab,bkd->akd", np.linalg.inv(poly.linear), inner)
+    K = len(poly.terms)
+    inner = np.eye(K)
+    inner[:, 1:3] -= terms.T  # dL is the change of the two linear terms
+    return terms, _sigma(np.kron(np.linalg.inv(poly.linear), inner), poly)
 
 
-def _origin(poly: ChipPolynomial, unit: str) -> tuple[float, float]:
+def _sigma(by: Float, poly: Monomials) -> Float:
+    """Standard deviations (2, K) behind a linear map of the coefficients."""
+    if poly.cov is None:
+        return np.zeros(poly.values.shape)
+    variance = np.einsum("kl,lm,km->k", by, poly.cov, by, optimize=True)
+    # a variance of -1e-40 is a rounded zero
+    return np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1)
+
+
+def _origin(poly: Monomials, unit: str) -> tuple[float, float]:
     """(0, 0), or the reference pixel where that is nearer to the model's constant."""
-    reference = poly.chip.reference_pixel
+    reference = poly.basis.reference_pixel
     from_reference = np.hypot(*(poly.constant - reference))
     positions = unit == "pix" and from_reference < np.hypot(*poly.constant)
     return reference if positions else (0.0, 0.0)
 
 
 def _relative_to_identity(
-    poly: ChipPolynomial, pixel: float, origin: tuple[float, float]
+    poly: Monomials, pixel: float, origin: tuple[float, float]
 ) -> tuple[Float, Float]:
-    """The whole model in pixels from the origin, less u = x and v = y, and its derivatives."""
+    """The whole model in pixels from the origin, less u = x and v = y, and its sigmas."""
     terms = poly.values / pixel
     for axis, power in enumerate(((1, 0), (0, 1))):
         terms[axis, poly.index(0, 0)] -= origin[axis] / pixel
         terms[axis, poly.index(*power)] -= 1.0
-    return terms, poly.jacobian / pixel
+    return terms, _sigma(np.eye(2 * len(poly.terms)) / pixel, poly)
 
 
 def _cards(
-    poly: ChipPolynomial,
+    chip: int,
     linear: str,
     epoch: float | None,
     unit: str,
@@ -251,7 +290,7 @@ def _cards(
         "sip": "CD is a pure scale; A and B hold constant and linear terms.",
     }[linear]
     cards = [
-        text_card("COMMENT", f"Distortion of chip {poly.chip.number}, by bayesdist."),
+        text_card("COMMENT", f"Distortion of chip {chip}, by bayesdist."),
         text_card("COMMENT", what),
         text_card("COMMENT", "A_p_q multiplies u^p v^q; AE_p_q and BE_p_q are 1-sigma errors."),
     ]
@@ -261,7 +300,7 @@ def _cards(
         number_card("WCSAXES", 2, "number of axes"),
         text_card("CUNIT1", "deg"),
         text_card("CUNIT2", "deg"),
-        number_card("BDCHIP", poly.chip.number, "chip number"),
+        number_card("BDCHIP", chip, "chip number"),
     ]
     if epoch is not None:
         cards.append(number_card("BDEPOCH", float(epoch), "[yr] epoch of the coefficients"))

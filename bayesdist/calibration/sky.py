@@ -1,4 +1,4 @@
-"""A polynomial to a tangent plane as one about another tangent point, for a header on the sky.
+"""A polynomial to a tangent plane as one about another tangent point.
 
 Two gnomonic planes of one sky differ by a projective map: with the axes E of each as the rows of a
 matrix,
@@ -16,15 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.data.tangent import ARCSEC, plane_axes, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
-from bayesdist.products.formats.sip.header import SIP_ORDERS
-from bayesdist.products.monomials import ChipPolynomial
+from bayesdist.model.basis import MAX_ORDER
 
-__all__ = ["SkyPolynomial", "sky_polynomial"]
+__all__ = ["Reprojected", "reprojected"]
 
 Float = NDArray[np.float64]
 
@@ -33,13 +32,13 @@ _NODES = 33
 
 
 @dataclass(frozen=True, eq=False)
-class SkyPolynomial:
+class Reprojected:
     """The polynomial of a chip to the plane that touches the sky at CRVAL.
 
     Parameters
     ----------
-    poly : ChipPolynomial
-        About CRPIX, in the unit of the model; its constant is zero unless CRVAL lies where the
+    poly : Monomials
+        About CRPIX, in the unit of the map; its constant is zero unless CRVAL lies where the
         model has no pixel.
     crval : tuple of float
         Degrees.
@@ -47,39 +46,37 @@ class SkyPolynomial:
         CRVAL on the model's own plane, in its unit.
     """
 
-    poly: ChipPolynomial
+    poly: Monomials
     crval: tuple[float, float]
     offset: tuple[float, float]
 
-    @property
-    def order(self) -> int:
-        """Order of the polynomial."""
-        return max(i + j for i, j in self.poly.terms)
 
-
-def sky_polynomial(
-    poly: ChipPolynomial,
+def reprojected(
+    chip: ChipMap,
     unit_arcsec: float,
     tangent_point: tuple[float, float],
     crval: tuple[float, float] | None = None,
-) -> SkyPolynomial:
+    lowest: int = 1,
+) -> Reprojected:
     """A chip's polynomial about the sky position of its reference pixel, or about a given one.
 
     Parameters
     ----------
-    poly : ChipPolynomial
+    chip : ChipMap
         To the plane of the tangent point.
     unit_arcsec : float
         Its unit, arcseconds.
     tangent_point : tuple of float
         Degrees.
     crval : tuple of float, optional
-        Degrees.  CRPIX is then the pixel at which the solution has it.  Where the polynomial,
-        continued, has no such pixel, CRPIX stays and the constants are what they must be.
+        Degrees.  The reference pixel is then that at which the map has it.  Where the polynomial,
+        continued, has no such pixel, it stays and the constants are what they must be.
+    lowest : int
+        Order of the result at least.
 
     Returns
     -------
-    SkyPolynomial
+    Reprojected
 
     Raises
     ------
@@ -87,16 +84,15 @@ def sky_polynomial(
         For a CRVAL that is no position or 90 degrees or more from the field.
     """
     unit = unit_arcsec / ARCSEC
-    own = PolynomialBasis(_order(poly), poly.chip.size, poly.chip.reference_pixel)
-    coefficients = own.from_monomials(poly.values)
-    crpix: tuple[float, float] | None = poly.chip.reference_pixel
+    own, coefficients, poly = chip.basis, chip.coefficients, chip.monomials()
+    crpix: tuple[float, float] | None = own.reference_pixel
     if crval is None:
         ra, dec = sky_of_plane(*(poly.constant * unit_arcsec), tangent_point)
         crval = float(ra), float(dec)
         offset = float(poly.constant[0]), float(poly.constant[1])
     else:
         crval, offset = _given(crval, unit_arcsec, tangent_point)
-        crpix = _pixel_of(offset, own, coefficients, poly.linear)
+        crpix = _pixel_of(offset, chip, poly.linear)
     between = plane_axes(crval) @ plane_axes(tangent_point).T
     x, y = detector_grid(own.size, _NODES, chebyshev=True)
     plane = own.evaluate(x, y) @ coefficients.T * unit
@@ -108,7 +104,7 @@ def sky_polynomial(
             do="give a position in the field, or leave crval out",
         )
     pixel = float(np.sqrt(abs(np.linalg.det(poly.linear))))
-    for order in range(max(own.order, SIP_ORDERS[0]), SIP_ORDERS[1] + 1):
+    for order in range(max(own.order, lowest), MAX_ORDER + 1):
         basis = PolynomialBasis(order, own.size, crpix or own.reference_pixel)
         design = basis.evaluate(x, y)
         inverse = np.linalg.pinv(design)
@@ -119,22 +115,20 @@ def sky_polynomial(
     values = basis.to_monomials(legendre.T)
     if crpix is not None and np.hypot(*values[:, 0]) > LEFT * pixel:
         # beyond the chip, where the fit holds less well: what is written is to have its zero there
-        crpix = _pixel_of((0.0, 0.0), basis, legendre.T, values[:, 1:3])
+        about = ChipMap(chip.name, basis, chip.unit, legendre.T)
+        crpix = _pixel_of((0.0, 0.0), about, values[:, 1:3])
         basis = replace(basis, reference_pixel=crpix or own.reference_pixel)
         values = basis.to_monomials(legendre.T)
     if crpix is not None:
         values[:, 0] = 0.0
-    # each coefficient moves each new one: through the slope of the projection, then the fit
-    moved = np.einsum("mn,nab,nl->amlb", inverse, slope, own.evaluate(x, y))
-    from_powers = own.from_monomials(np.eye(own.n_terms))
-    to_powers = np.einsum("km,amlb,jl->akjb", basis.monomial_matrix, moved, from_powers)
-    jacobian = np.einsum("akjb,bjd->akd", to_powers, poly.jacobian)
-    chip = replace(poly.chip, reference_pixel=basis.reference_pixel)
-    return SkyPolynomial(ChipPolynomial(chip, basis.terms, values, jacobian), crval, offset)
-
-
-def _order(poly: ChipPolynomial) -> int:
-    return max(i + j for i, j in poly.terms)
+    cov = None
+    if chip.cov is not None:
+        # each coefficient moves each new one: through the slope of the projection, then the fit
+        moved = np.einsum("mn,nab,nl->amlb", inverse, slope, own.evaluate(x, y))
+        by = np.einsum("km,amlb->akbl", basis.monomial_matrix, moved)
+        by = by.reshape(2 * basis.n_terms, -1)
+        cov = by @ chip.cov @ by.T
+    return Reprojected(Monomials(basis, values, cov), crval, offset)
 
 
 def _given(
@@ -159,11 +153,8 @@ def _given(
     return (float(crval[0]), float(crval[1])), at
 
 
-def _pixel_of(
-    at: tuple[float, float], basis: PolynomialBasis, coefficients: Float, linear: Float
-) -> tuple[float, float] | None:
+def _pixel_of(at: tuple[float, float], chip: ChipMap, linear: Float) -> tuple[float, float] | None:
     """The pixel of a position; None where the polynomial, continued so far, has none."""
-    chip = ChipMap("solution", basis, "", coefficients)
     pixel, slope = chip.pixels(np.array(at)[:, None])
     if not np.isfinite(pixel).all() or np.linalg.det(slope[0]) * np.linalg.det(linear) <= 0:
         return None  # beyond a fold of the polynomial, which no chip has
