@@ -104,9 +104,12 @@ class Plane:
         V2 and V3 of (u, v) = 0, arcseconds.
     orientation : Orientation, optional
         How the calibration was laid there; calibrations with the same one share its error.
+    note : str
+        What a reader has to know of it.
     """
 
     kind: str = "free"
     point: tuple[float, float] | None = None
     v2v3: tuple[float, float] | None = None
     orientation: Orientation | None = None
+    note: str = ""

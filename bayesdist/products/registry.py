@@ -14,10 +14,27 @@ from importlib import import_module
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.products import formats
-from bayesdist.products.formats.common.content import read_content
-from bayesdist.products.formats.common.document import Choice, Document, Finding, Format
+from bayesdist.products.formats.common.content import Content, read_content
+from bayesdist.products.formats.common.document import (
+    BuildOptions,
+    Built,
+    Choice,
+    Document,
+    Finding,
+    Format,
+    FormatSettings,
+)
 
-__all__ = ["all_formats", "describe", "lint", "open_document", "read_calibration"]
+__all__ = [
+    "all_formats",
+    "build",
+    "describe",
+    "lint",
+    "open_document",
+    "product_settings",
+    "read_calibration",
+    "recognized",
+]
 
 
 @cache
@@ -52,7 +69,11 @@ def open_document(path: str | os.PathLike[str]) -> Document:
     FormatError
         When it is of a format and broken.
     """
-    content = read_content(path)
+    return recognized(read_content(path))
+
+
+def recognized(content: Content) -> Document:
+    """As `open_document`, of content in memory."""
     for one in all_formats():
         holds = one.parse(content)
         if holds is not None:
@@ -102,3 +123,43 @@ def describe(path: str | os.PathLike[str]) -> str:
 def lint(path: str | os.PathLike[str]) -> tuple[Finding, ...]:
     """What is wrong, or looks wrong, in a file; raises as `open_document`."""
     return open_document(path).lint()
+
+
+def product_settings() -> dict[str, type[FormatSettings]]:
+    """Settings of the formats that can be built, by key: what [products] may hold."""
+    return {one.key: one.settings for one in all_formats() if one.settings is not None}
+
+
+def build(
+    key: str,
+    calibration: Calibration,
+    settings: FormatSettings,
+    options: BuildOptions = BuildOptions(),  # noqa: B008
+) -> tuple[Built, ...]:
+    """Files of a format, built and not written.
+
+    Parameters
+    ----------
+    key : str
+        Of the format.
+    calibration : Calibration
+    settings : FormatSettings
+        Of that format.
+    options : BuildOptions
+
+    Returns
+    -------
+    tuple of Built
+
+    Raises
+    ------
+    InputError
+        For what the format cannot hold.
+    """
+    for one in all_formats():
+        if one.key == key and one.build is not None:
+            return one.build(calibration, settings, options)
+    raise InputError(
+        f"there is no format {key!r} that can be built",
+        do=f"choose one of {', '.join(product_settings())}",
+    )

@@ -228,7 +228,7 @@ W4 = {
     "data": {"matches": "stars.ecsv"},
     "detector": {"name": "W4", "size": (508, 508), "scale_mas": 5500.0},
     "model": {"order": 4},
-    "products": {"wise_meta": True},
+    "products": {"wise_meta": {}},
 }
 
 

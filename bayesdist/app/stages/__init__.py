@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 
 from bayesdist.app.judging import budget_of, margins_of
-from bayesdist.app.made_files import idctab_of, sip_of, wise_sip_of
+from bayesdist.app.made_files import made_files
 from bayesdist.app.periods import check_pairs
 from bayesdist.app.session import Session
 from bayesdist.app.stages.assess import run_assess
@@ -78,13 +78,7 @@ def rehearse_solution(session: Session, fit: LinearFit) -> None:
     config = session.config
     budget_of(session, fit, REHEARSAL_DRAWS)
     margins_of(session, config.requirements(), fit, REHEARSAL_DRAWS)
-    if config.products.sip is not None:
-        for chip in fit.model.chips:
-            sip_of(session, fit, chip.number)
-    if config.products.idctab is not None:
-        idctab_of(session, fit)
-    if config.products.wise_meta:
-        wise_sip_of(session, fit)
+    made_files(session, fit)
 
 
 def _check_residuals(session: Session, fit: LinearFit, errors: MagnitudeErrors | None) -> None:

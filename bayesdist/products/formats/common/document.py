@@ -8,8 +8,10 @@ checks and words are of a document, whose meaning is a calibration.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+from pydantic import BaseModel, ConfigDict
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
@@ -17,10 +19,13 @@ from bayesdist.products.formats.common.content import Content
 
 __all__ = [
     "LEVELS",
+    "BuildOptions",
+    "Built",
     "Choice",
     "Document",
     "Finding",
     "Format",
+    "FormatSettings",
     "finding_lines",
     "repeated_values",
 ]
@@ -105,6 +110,67 @@ class Choice:
     size: tuple[float, float] | None = None
 
 
+class FormatSettings(BaseModel):
+    """What the configuration says of a file to be built; keys that are not known are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def check(
+        self,
+        detector: str,
+        size: tuple[float, float] | None,
+        reference_pixel: tuple[float, float] | None,
+    ) -> None:
+        """Refuse a detector that the file is not for.
+
+        Raises
+        ------
+        ValueError
+        """
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """What files are built with, whatever their format.
+
+    Parameters
+    ----------
+    epoch : float, optional
+        Decimal years, for files that hold for one date.
+    scale_arcsec : float, optional
+        Arcseconds in a pixel, where the configuration says it.
+    """
+
+    epoch: float | None = None
+    scale_arcsec: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """A file that was built and not yet written.
+
+    Parameters
+    ----------
+    file_name : str
+    kind : str
+        As in summary.json.
+    content : bytes
+    made : object
+        What the content was made from, in the terms of its format.
+    chip : int, optional
+        Of a file of one chip.
+    summary : mapping
+        What summary.json says of it besides.
+    """
+
+    file_name: str
+    kind: str
+    content: bytes
+    made: Any
+    chip: int | None = None
+    summary: Mapping[str, Any] = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class Format:
     """A format of files, as its functions.
@@ -125,6 +191,10 @@ class Format:
         From what `parse` gave to findings; of a format without checks there are none.
     calibration : callable, optional
         From what `parse` gave, the file's name and a `Choice` to a `Calibration`.
+    settings : type of FormatSettings, optional
+        Of a format that can be built.
+    build : callable, optional
+        From a `Calibration`, its settings and `BuildOptions` to files.
     """
 
     key: str
@@ -134,6 +204,8 @@ class Format:
     describe: Callable[[Any], list[str]]
     lint: Callable[[Any], Sequence[Finding]] | None = None
     calibration: Callable[[Any, str, Choice], Calibration] | None = None
+    settings: type[FormatSettings] | None = None
+    build: Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]] | None = None
 
 
 @dataclass(frozen=True, eq=False)

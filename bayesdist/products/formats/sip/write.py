@@ -13,7 +13,7 @@ from bayesdist.products.formats.common.coefficients import sip_keyword, sip_powe
 from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.products.formats.sip.read import CD_KEYWORDS, LINEAR_KEYWORDS, cd_matrix, image_size
 
-__all__ = ["sip_header", "write_sip"]
+__all__ = ["sip_header", "sip_text", "write_sip"]
 
 _FITS_SUFFIXES = (".fits", ".fit", ".fts", ".fits.gz")
 _STRUCTURE = (
@@ -56,7 +56,12 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
                 header["IMAGEW"], header["IMAGEH"] = sip.size
             fits.PrimaryHDU(header=header).writeto(temporary)
         else:
-            temporary.write_text("\n".join(_cards(sip)) + "\n", encoding="ascii", newline="\n")
+            temporary.write_text(sip_text(sip), encoding="ascii", newline="\n")
+
+
+def sip_text(sip: SipHeader) -> str:
+    """The header as text, one card a line."""
+    return "\n".join(_cards(sip)) + "\n"
 
 
 def sip_header(sip: SipHeader) -> fits.Header:

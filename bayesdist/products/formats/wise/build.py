@@ -20,7 +20,7 @@ from bayesdist.products.formats.sip.families import EDGE, families, offset_range
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
 from bayesdist.products.formats.wise.meta import ARRAYS, monomial
 
-__all__ = ["write_wise_meta"]
+__all__ = ["wise_text", "write_wise_meta"]
 
 # How far A_DMAX and B_DMAX look beyond the centres of the outermost pixels: the printed ones do so
 # in W4 alone.
@@ -55,14 +55,20 @@ def write_wise_meta(
         For no band or an unknown one, a header that has no inverse, another array, a CD that holds
         more than a scale, a number that is not finite, or a file that cannot be written.
     """
+    text = wise_text(bands, skew)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="ascii", newline="\n")
+
+
+def wise_text(bands: Mapping[int, SipHeader], skew: Mapping[int, float] | None = None) -> str:
+    """As `write_wise_meta`, the text of the file."""
     if not bands:
         raise InputError("there is no band to write", do="give a header for each band")
     skew = {} if skew is None else skew
     lines = [
         line for band in sorted(bands) for line in _lines(band, bands[band], skew.get(band, 0.0))
     ]
-    with atomic_path(path) as temporary:
-        temporary.write_text("\n".join([*lines, "\\"]) + "\n", encoding="ascii", newline="\n")
+    return "\n".join([*lines, "\\"]) + "\n"
 
 
 def _lines(band: int, sip: SipHeader, skew: float) -> list[str]:
