@@ -157,7 +157,8 @@ class Application:
         x, y = self._image(chip).to_chip(np.atleast_1d(x), np.atleast_1d(y))
         at = k * c.at(x, y) + np.array(self.frame.origin)[:, None]
         cov = c.covariance_at(x, y)
-        return Positions(*at, None if cov is None else k**2 * cov, np.full(x.size, chip))
+        cov = None if cov is None else k**2 * cov
+        return Positions(at[0], at[1], cov, np.full(x.size, chip))
 
     def inverse(self, X: ArrayLike, Y: ArrayLike, *, chip: int) -> Positions:
         """Output positions to pixels of one chip, by Newton's method.
@@ -204,7 +205,8 @@ class Application:
         X, Y = np.atleast_1d(np.asarray(X, float)), np.atleast_1d(np.asarray(Y, float))
         known = all(c.cov is not None for c in self.chips.values())
         out = Positions(
-            *np.full((2, X.size), np.nan),
+            np.full(X.size, np.nan),
+            np.full(X.size, np.nan),
             np.full((X.size, 2, 2), np.nan) if known else None,
             np.zeros(X.size, np.int64),
         )

@@ -234,7 +234,7 @@ class ChipMap:
         cov[:, :K, :, :K] = self.cov.reshape(2, K, 2, K)
         return coefficients, cov.reshape(2 * n_terms, 2 * n_terms)
 
-    def transformed(self, linear: ArrayLike, shift: ArrayLike = (0.0, 0.0), **changes) -> ChipMap:  # type: ignore[no-untyped-def]
+    def transformed(self, linear: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> ChipMap:
         """The map to linear (u, v) + shift, both taken as exact."""
         L = np.asarray(linear, float)
         coefficients = L @ self.coefficients
@@ -243,7 +243,7 @@ class ChipMap:
         if self.cov is not None:
             by = np.kron(L, np.eye(self.basis.n_terms))
             cov = by @ self.cov @ by.T
-        return replace(self, coefficients=coefficients, cov=cov, **changes)
+        return replace(self, coefficients=coefficients, cov=cov)
 
 
 def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:

@@ -248,7 +248,7 @@ class _Fit:
 
     def terms(self, wanted: Float) -> tuple[dict, dict]:
         """Polynomials through values (N, 2), as powers and their coefficients."""
-        fitted = np.linalg.lstsq(self.design, wanted, rcond=None)[0]
+        fitted = np.asarray(np.linalg.lstsq(self.design, wanted, rcond=None)[0], float)
         powers = self.basis.terms
         x, y = (
             self.basis.to_monomials(fitted.T) if self.at_zero is None else self._monomials(fitted).T
@@ -262,7 +262,7 @@ class _Fit:
     @property
     def projection(self) -> Float:
         """Matrix (n, N) from values at the points to the coefficients of powers."""
-        out = self._monomials(np.linalg.pinv(self.design))
+        out = self._monomials(np.asarray(np.linalg.pinv(self.design), float))
         return out if self.at_zero is None else out[1:]
 
 
@@ -271,4 +271,4 @@ def _value(terms: Terms, U: Float, V: Float) -> Float:
     matrix = np.zeros((n + 1, n + 1))
     for (i, j), value in terms.items():
         matrix[i, j] = value
-    return polynomial.polyval2d(U, V, matrix)
+    return np.asarray(polynomial.polyval2d(U, V, matrix), float)

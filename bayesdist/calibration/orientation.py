@@ -142,12 +142,12 @@ def lay_on(
         b = S / Q
         d_log = (dS / Q - b * 2 * np.real((weight * z.conj()) @ slopes) / Q) / b
     else:
-        b = held * S / abs(S)
-        d_log = 1j * np.imag(dS / S)
-    shift = w[0] - b * z[0]
+        b = complex(held * S / abs(S))
+        d_log = np.asarray(1j * np.imag(dS / S), complex)
+    shift = complex(w[0] - b * z[0])
     d_shift = -b * d_log * z[0] - b * slopes[0]
 
-    left = w - b * z
+    left = np.asarray(w - b * z, complex)
     left[0] -= shift
     agreement = _agreement(left, basis)
     n_free = 2 * basis.n_terms - (4 if held is None else 3)

@@ -30,7 +30,7 @@ __all__ = ["coefficient_map", "is_exact", "pixel_matrix", "rotated"]
 Float = NDArray[np.float64]
 
 # Exact, where cosines and sines are not.
-_QUARTERS = {0: (1.0, 0.0), 90: (0.0, 1.0), 180: (-1.0, 0.0), 270: (0.0, -1.0)}
+_QUARTERS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
 
 
 def pixel_matrix(degrees: float, *, mirror: bool = False) -> Float:

@@ -87,7 +87,8 @@ def reprojected(
     own, coefficients, poly = chip.basis, chip.coefficients, chip.monomials()
     crpix: tuple[float, float] | None = own.reference_pixel
     if crval is None:
-        ra, dec = sky_of_plane(*(poly.constant * unit_arcsec), tangent_point)
+        xi, eta = unit_arcsec * poly.constant
+        ra, dec = sky_of_plane(xi, eta, tangent_point)
         crval = float(ra), float(dec)
         offset = float(poly.constant[0]), float(poly.constant[1])
     else:

@@ -14,7 +14,7 @@ from importlib import import_module
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.products import formats
-from bayesdist.products.formats.common.content import Content, read_content
+from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.common.document import (
     BuildOptions,
     Built,
@@ -75,7 +75,8 @@ def open_document(path: str | os.PathLike[str]) -> Document:
 def recognized(content: Content) -> Document:
     """As `open_document`, of content in memory."""
     for one in all_formats():
-        holds = one.parse(content)
+        with readable(content.name):
+            holds = one.parse(content)
         if holds is not None:
             return Document(content.name, one, holds)
     if content.damage is not None:

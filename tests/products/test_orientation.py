@@ -207,11 +207,9 @@ def test_covariance_is_that_of_the_draws(truth) -> None:
         calibration = turned_by(solution, o)
         turned = calibration.solution
         draws = turned.draws(n, rng)
-        weights = (
-            rng.normal(size=(draws.shape[1], 8)) / np.sqrt(np.diag(turned.solution.cov))[:, None]
-        )
-        stated = np.sqrt(np.diag(weights.T @ turned.solution.cov @ weights))
-        found = (draws - turned.solution.mean) @ weights
+        weights = rng.normal(size=(draws.shape[1], 8)) / np.sqrt(np.diag(turned.cov))[:, None]
+        stated = np.sqrt(np.diag(weights.T @ turned.cov @ weights))
+        found = (draws - turned.mean) @ weights
         assert_allclose(found.std(axis=0) / stated, 1.0, atol=5 / np.sqrt(2 * n))
         assert np.abs(found.mean(axis=0) / stated).max() < 5 / np.sqrt(n)
         # with the orientation, by draws too

@@ -43,6 +43,7 @@ _IDCTAB = re.compile(r"(CX|CY|A|B)(\d)(\d)")
 _SIP = re.compile(r"(A|B|AP|BP|AE|BE)_(\d)_(\d)")
 # Starting points of the search for an extremum: the interior grid, and the best of all to refine.
 _GRID, _BEST = 65, 8
+_BORDER = 2**16  # steps along an edge at most: a size may be a slip of the pen
 
 
 def idctab_column(prefix: str, i: int, j: int) -> str:
@@ -172,7 +173,10 @@ def largest_magnitude(
 def _candidates(low: Float, high: Float) -> tuple[Float, Float]:
     """A grid over the rectangle and every unit step along its border."""
     gx, gy = np.meshgrid(*np.linspace(low, high, _GRID).T)
-    ex, ey = (np.linspace(a, b, int(np.ceil(b - a)) + 1) for a, b in zip(low, high, strict=True))
+    ex, ey = (
+        np.linspace(a, b, min(int(np.ceil(b - a)), _BORDER) + 1)
+        for a, b in zip(low, high, strict=True)
+    )
     x = [gx.ravel(), ex, ex, np.full(ey.size, low[0]), np.full(ey.size, high[0])]
     y = [gy.ravel(), np.full(ex.size, low[1]), np.full(ex.size, high[1]), ey, ey]
     return np.concatenate(x), np.concatenate(y)

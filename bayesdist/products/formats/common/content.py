@@ -14,7 +14,8 @@ import os
 import re
 import warnings
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,10 +25,10 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from bayesdist.data.files import atomic_path
-from bayesdist.errors import FormatError, InputError
+from bayesdist.errors import BayesdistError, FormatError, InputError
 from bayesdist.products.formats.common.cards import card_images, header_of
 
-__all__ = ["Content", "Hdu", "hdus_of", "read_content", "read_hdus", "write_hdus"]
+__all__ = ["Content", "Hdu", "hdus_of", "read_content", "read_hdus", "readable", "write_hdus"]
 
 RECORD = 2880  # bytes
 LARGEST = 2**32  # bytes: what a compressed file may grow to
@@ -196,6 +197,21 @@ class Content:
                 return fits.open(io.BytesIO(self.raw), memmap=False, lazy_load_hdus=False)
             except (OSError, ValueError, fits.VerifyError):
                 return None
+
+
+@contextmanager
+def readable(where: str) -> Iterator[None]:
+    """What a library raises of a damaged file inside becomes a FormatError that names it."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of cards that are not ours to judge
+            yield
+    except BayesdistError:
+        raise
+    except (fits.VerifyError, ValueError, KeyError, IndexError, TypeError, OSError) as error:
+        raise FormatError(
+            f"is not a header that can be read ({error})", where=where, do="check the file"
+        ) from error
 
 
 def read_content(path: str | os.PathLike[str]) -> Content:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
-from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.content import Content, readable
 
 __all__ = [
     "LEVELS",
@@ -226,11 +226,13 @@ class Document:
 
     def lint(self) -> tuple[Finding, ...]:
         """What is wrong, or looks wrong, in the file."""
-        return () if self.format.lint is None else tuple(self.format.lint(self.holds))
+        with readable(self.name):
+            return () if self.format.lint is None else tuple(self.format.lint(self.holds))
 
     def describe(self) -> str:
         """Text of what the file holds, its findings at the end."""
-        return "\n".join(self.format.describe(self.holds))
+        with readable(self.name):
+            return "\n".join(self.format.describe(self.holds))
 
     def calibration(self, choice: Choice = Choice()) -> Calibration:
         """The calibration that the file holds.
@@ -246,4 +248,5 @@ class Document:
                 where=self.name,
                 do="give an IDCTAB, a SIP header, WISE meta-data, or a run directory",
             )
-        return self.format.calibration(self.holds, self.name, choice)
+        with readable(self.name):
+            return self.format.calibration(self.holds, self.name, choice)

@@ -65,7 +65,7 @@ def _build(
 FORMAT = Format(
     "idctab",
     "an IDCTAB",
-    1,
+    2,
     _parse,
     describe_idctab,
     lint_idctab,

@@ -19,5 +19,5 @@ def _parse(content: Content) -> LookupFile | None:
 
 
 FORMAT = Format(
-    "lookup", "a D2IMFILE or NPOLFILE", 2, _parse, describe_lookup_file, lint_lookup_file
+    "lookup", "a D2IMFILE or NPOLFILE", 3, _parse, describe_lookup_file, lint_lookup_file
 )

@@ -68,5 +68,5 @@ def _build(
 
 
 FORMAT = Format(
-    "sip", "a SIP header", 3, _parse, describe_wcs, _lint, _calibration, Settings, _build
+    "sip", "a SIP header", 1, _parse, describe_wcs, _lint, _calibration, Settings, _build
 )

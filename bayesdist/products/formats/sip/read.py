@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 from astropy.io import fits
@@ -14,7 +11,7 @@ from numpy.typing import NDArray
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.formats.common.cards import card_images
 from bayesdist.products.formats.common.coefficients import sip_powers
-from bayesdist.products.formats.common.content import Content, read_content
+from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.sip.header import SipHeader
 
 __all__ = [
@@ -73,19 +70,6 @@ def holds_sip(content: Content) -> bool:
 
 
 # -- from content to a header --------------------------------------------------------------------
-
-
-@contextmanager
-def readable(where: str) -> Iterator[None]:
-    """What astropy raises of a card inside becomes a FormatError that names the file."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of cards that are not SIP's
-            yield
-    except (fits.VerifyError, ValueError) as error:
-        raise FormatError(
-            f"is not a header that can be read ({error})", where=where, do="check the file"
-        ) from error
 
 
 def _chosen(content: Content, ext: int | str | None) -> fits.Header:
