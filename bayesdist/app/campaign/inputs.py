@@ -26,6 +26,7 @@ from bayesdist.data.tangent import mean_direction, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
+from bayesdist.products.formats.idctab.hst import parity_of
 
 __all__ = [
     "Inputs",
