@@ -11,13 +11,13 @@ from bayesdist.app.calibrations import calibration_at
 from bayesdist.app.comparison_files import write_comparison
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.assess import DEFAULT_GRID
-from bayesdist.assess.comparison import Comparison, compare
-from bayesdist.assess.comparison_gap import (
+from bayesdist.assess.comparison.compare import Comparison, compare
+from bayesdist.assess.comparison.gap import (
     GapDifference,
     gap_difference,
     pair_of_chips,
 )
-from bayesdist.assess.comparison_verdict import comparison_lines, gap_lines, gap_verdict, verdict
+from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.products.formats.sip.calibration import MissingSize

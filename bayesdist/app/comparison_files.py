@@ -11,10 +11,10 @@ from astropy.table import Table, vstack
 from bayesdist.app.folder import whole_folder
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.session import write_table
-from bayesdist.assess.comparison import Comparison
-from bayesdist.assess.comparison_gap import GapDifference
-from bayesdist.assess.comparison_table import comparison_table, difference_table, gap_table
-from bayesdist.assess.comparison_verdict import gap_verdict, verdict
+from bayesdist.assess.comparison.compare import Comparison
+from bayesdist.assess.comparison.gap import GapDifference
+from bayesdist.assess.comparison.sentences import gap_verdict, verdict
+from bayesdist.assess.comparison.tables import comparison_table, difference_table, gap_table
 from bayesdist.report.comparison import difference_vectors
 from bayesdist.report.drawing import save_figures
 

@@ -25,16 +25,16 @@ from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.section import Section
 from bayesdist.app.selfcal.config import GaugeBlock, SelfcalBlock
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.discrepancy_terms import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
-from bayesdist.assess.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
-from bayesdist.assess.linear_term import LINEAR_KINDS, LinearTerm
 from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms import GIVEN, said_by_user
+from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
+from bayesdist.assess.terms.given import GIVEN, said_by_user
+from bayesdist.assess.terms.parameters import LINEAR_KINDS, LinearTerm
 from bayesdist.data.units import length_advice
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
+from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
 from bayesdist.infer.discrepancy import DiscrepancyPriors
-from bayesdist.infer.period_dates import check_periods, mjd_periods
 from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
 from bayesdist.products.formats.common.document import FormatSettings
 from bayesdist.products.registry import product_settings

@@ -19,16 +19,16 @@ from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.rvb import load_rvb
 from bayesdist.app.session import Session, write_table
 from bayesdist.assess import misfit_of, partitions_for, star_sums
-from bayesdist.assess.change_maps import Monitored, change_maps, is_late
-from bayesdist.assess.comparison_table import comparison_table, difference_table
-from bayesdist.assess.misfit import Misfit, worst_misfit
+from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
+from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.data import input_files, sha256_of
+from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
 from bayesdist.errors import InputError
 from bayesdist.infer import Matches, Posterior
-from bayesdist.infer.change_date import PeriodScore, period_scores, scan_dates
-from bayesdist.infer.membership import count_outliers
-from bayesdist.infer.monitoring import NewFit, change_of, fit_new
+from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan_dates
+from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
+from bayesdist.infer.density.memberships import count_outliers
 from bayesdist.report.comparison import change_over_time, difference_vectors
 from bayesdist.report.drawing import save_figures
 

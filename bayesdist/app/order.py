@@ -19,8 +19,8 @@ from bayesdist.app.screen import table_text
 from bayesdist.app.session import Session, write_table
 from bayesdist.data import atomic_path
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.order import select_order
-from bayesdist.infer.order_results import OrderSelection
+from bayesdist.infer.compare.order import select_order
+from bayesdist.infer.compare.order_result import OrderSelection
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["order"]

@@ -20,13 +20,13 @@ from bayesdist.app.campaign.release import write_files
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.file_positions import sip_positions
 from bayesdist.app.made_files import made_files
-from bayesdist.assess.grid import grid_pixels, mesh
-from bayesdist.assess.product_terms import ProductTerm
 from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms import MEASURED
+from bayesdist.assess.terms.given import MEASURED
+from bayesdist.assess.terms.product_terms import ProductTerm
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.model import corrected
+from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.products import SipHeader, read_d2im, read_lookup_file
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Built

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.calibration.area import determinant
 from bayesdist.calibration.chip_map import chip_map
 from bayesdist.errors import InputError
-from bayesdist.infer.views import Solution
+from bayesdist.infer.transforms import Solution
 from bayesdist.model.basis import point_blocks
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
 __all__ = ["AreaMap", "area_map"]
 

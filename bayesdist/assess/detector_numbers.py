@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.assess.grid import mesh
 from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.model.grid import mesh
 
 __all__ = ["DetectorNumbers", "detector_numbers"]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.views import Solution
+from bayesdist.infer.transforms import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
 
 __all__ = ["Place", "Solution", "kind_of", "place_of"]

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.grid import mesh
 from bayesdist.calibration.area import pixel_areas
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
+from bayesdist.model.grid import mesh
 
 __all__ = ["ChipField", "WholeDetector"]
 

@@ -17,7 +17,7 @@ from bayesdist.calibration.chip_map import ChipMap, sampling_of
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
-from bayesdist.infer.views import Solution, View, without_frames
+from bayesdist.infer.transforms import Solution, View, without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 
 __all__ = ["Calibration", "calibration_of", "calibration_of_maps", "gaussian_solution"]

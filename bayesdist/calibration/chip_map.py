@@ -14,7 +14,7 @@ from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.views import Solution
+from bayesdist.infer.transforms import Solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import point_blocks
 

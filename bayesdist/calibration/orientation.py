@@ -11,8 +11,8 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
 from bayesdist.calibration.similarity import correlations
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.frame_fields import term_squares
-from bayesdist.infer.views import Derived, Solution
+from bayesdist.infer.compare.frame_fields import term_squares
+from bayesdist.infer.transforms import Derived, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.similarity import turned, turned_model
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.views import Solution
+from bayesdist.infer.transforms import Solution
 
 __all__ = ["ARCSEC", "Agreement", "Orientation", "Plane"]
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
-from bayesdist.infer.views import View
+from bayesdist.infer.transforms import View
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["coefficient_map", "is_exact", "pixel_matrix", "rotated"]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.frame_fields import term_squares
+from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
 
 __all__ = ["as_real", "correlations", "similarity_fields", "turn_between"]

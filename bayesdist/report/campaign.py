@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from bayesdist.assess import BinnedResiduals, Misfit
-    from bayesdist.assess.alignment import Alignment
     from bayesdist.data import MagnitudeErrors
+    from bayesdist.diagnose.alignment import Alignment
     from bayesdist.model import Chip, LookupTable
 
 __all__ = [

@@ -19,7 +19,7 @@ from bayesdist.report.panels import ChipPanels
 from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
 
 if TYPE_CHECKING:
-    from bayesdist.assess.comparison import Comparison
+    from bayesdist.assess.comparison.compare import Comparison
 
 __all__ = [
     "change_over_time",

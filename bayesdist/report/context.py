@@ -24,16 +24,16 @@ if TYPE_CHECKING:
         UncertaintyMap,
         VectorMap,
     )
-    from bayesdist.assess.budget_surface import BudgetSurface
-    from bayesdist.assess.detector_budget import DetectorBudget
-    from bayesdist.assess.holdout import HeldOutTruth
-    from bayesdist.assess.horizon import Horizon
-    from bayesdist.assess.misfit import Misfit
+    from bayesdist.assess.budget.detector import DetectorBudget
+    from bayesdist.assess.budget.surface import BudgetSurface
     from bayesdist.assess.periods import TimeVariation
+    from bayesdist.assess.requirements.validity import Horizon
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
+    from bayesdist.diagnose.holdout.validation import HeldOutTruth
+    from bayesdist.diagnose.residuals.misfit import Misfit
     from bayesdist.infer import LinearFit, Posterior
-    from bayesdist.infer.added_errors import GroupedErrors
+    from bayesdist.infer.catalogue.added_errors import GroupedErrors
     from bayesdist.model import Chip
     from bayesdist.report.campaign import CampaignResults
 

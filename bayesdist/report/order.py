@@ -13,7 +13,7 @@ from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:
-    from bayesdist.infer.order_results import OrderSelection
+    from bayesdist.infer.compare.order_result import OrderSelection
 
 __all__ = ["order_comparison"]
 

@@ -21,10 +21,10 @@ from bayesdist.app.sessions import session_of
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.series import Series
-from bayesdist.infer.shared_drift import drift_priors, with_drift_of
-from bayesdist.infer.views import linear_terms, lines, reference_gauge, without_frames
+from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.model import LookupTable, TimeDependence, corrected
 from bayesdist.products import (
     read_d2im,

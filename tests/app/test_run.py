@@ -25,7 +25,7 @@ from bayesdist.app import stages
 from bayesdist.app.config import parse_config
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages.report import title_of
-from bayesdist.assess.discrepancy_terms import STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior, outlier_probability, residuals

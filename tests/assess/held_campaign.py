@@ -10,16 +10,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.assess.holdout import HeldOutTruth, held_out_truth
-from bayesdist.assess.holdout_predictive import ExposureDeviations, Predictive
 from bayesdist.data.holdout import SetAside, Split, split_matches
 from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
+from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
 from bayesdist.infer import OutlierMixture, load
-from bayesdist.infer.grid import build_proposal
-from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical
-from bayesdist.infer.star_errors import star_covariance
-from bayesdist.infer.star_influence import StarErrors, star_influence
-from bayesdist.infer.target import Target
+from bayesdist.infer.catalogue.star_errors import star_covariance
+from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical
 from bayesdist.model import DistortionModel
 from tests.infer.small_campaign import campaign_model, campaign_truth
 

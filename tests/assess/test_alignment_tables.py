@@ -34,7 +34,7 @@ from bayesdist.assess.wise import (
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
 from bayesdist.infer.linear import Clip
-from bayesdist.infer.shards import LocalShards
+from bayesdist.infer.stars.shards import LocalShards
 from bayesdist.simulate import simulate_wise
 from bayesdist.simulate.wise import SAMPLE_SIZES
 

@@ -12,8 +12,8 @@ from astropy.io import fits
 from astropy.table import Table
 from scipy.stats import chi2, kstest
 
-from bayesdist.assess.comparison_gap import gap_difference, pair_of_chips
-from bayesdist.assess.comparison_verdict import gap_lines, gap_verdict
+from bayesdist.assess.comparison.gap import gap_difference, pair_of_chips
+from bayesdist.assess.comparison.sentences import gap_lines, gap_verdict
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear, save_fit

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from bayesdist.assess.dithered_misfit import _shifts, dithered_misfit
+from bayesdist.diagnose.selfcal.misfit import _shifts, dithered_misfit
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.infer.selfcal.following import taken_by_stars
 from bayesdist.infer.selfcal.normal import memberships

@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest, norm
 
-from bayesdist.assess.holdout import DOUBTFUL, held_out_truth
-from bayesdist.assess.holdout_predictive import (
+from bayesdist.data.holdout import SetAside, split_matches
+from bayesdist.diagnose.holdout.predictive import (
     SCALES,
     Predictive,
     marginals_of,
     scores_of,
     uniforms_of,
 )
-from bayesdist.assess.holdout_spread import SpreadMoments, sum_tails
-from bayesdist.assess.holdout_sums import _beyond
-from bayesdist.assess.holdout_tests import holm
-from bayesdist.data.holdout import SetAside, split_matches
+from bayesdist.diagnose.holdout.spread import SpreadMoments, sum_tails
+from bayesdist.diagnose.holdout.sums import _beyond
+from bayesdist.diagnose.holdout.tests import holm
+from bayesdist.diagnose.holdout.validation import DOUBTFUL, held_out_truth
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, load
-from bayesdist.infer.grid import build_proposal
-from bayesdist.infer.target import Target
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.target import Target
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 

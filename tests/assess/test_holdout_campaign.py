@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest
 
-from bayesdist.assess.holdout import held_out_truth
-from bayesdist.assess.holdout_frames import frames_for
 from bayesdist.data.holdout import SetAside, split_matches
+from bayesdist.diagnose.holdout.frames import frames_for
+from bayesdist.diagnose.holdout.validation import held_out_truth
 from bayesdist.errors import InputError
-from bayesdist.infer.star_errors import star_covariance
-from bayesdist.infer.star_influence import star_influence
+from bayesdist.infer.catalogue.star_errors import star_covariance
+from bayesdist.infer.catalogue.star_influence import star_influence
 from bayesdist.report.sections.run.holdout import holdout_coverage, holdout_table
 from tests.assess.held_campaign import field, judged, solved
 

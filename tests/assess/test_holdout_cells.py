@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import binom, kstest
 
-from bayesdist.assess.holdout import held_out_truth
-from bayesdist.assess.holdout_predictive import Predictive
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.holdout.predictive import Predictive
+from bayesdist.diagnose.holdout.validation import held_out_truth
 from bayesdist.model import Chip, DistortionModel, LookupTable
 
 SIZE, CELL = (1000.0, 800.0), (25.0, 25.0)

@@ -8,7 +8,7 @@ from numpy.polynomial import legendre
 from scipy.stats import binom
 
 from bayesdist.assess import Misfit, binned_sums, misfit_of, partitions_for
-from bayesdist.assess.misfit import worst_misfit
+from bayesdist.diagnose.residuals.misfit import worst_misfit
 from bayesdist.model import Chip
 
 SIZE = (1000.0, 800.0)

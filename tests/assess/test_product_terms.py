@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from bayesdist.assess.budget_surface import budget_surface
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.place_budget import place_budget
-from bayesdist.assess.position_errors import position_errors
-from bayesdist.assess.product_terms import PRODUCT, ProductTerm, with_product
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.terms.product_terms import PRODUCT, ProductTerm, with_product
 from bayesdist.model import Chip, DistortionModel
 
 SIZE, GRID = (201.0, 101.0), (9, 5)

@@ -10,9 +10,9 @@ import numpy as np
 
 from bayesdist.app.judging import margins_of
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.fields import MODEL
-from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.terms.fields import MODEL
+from bayesdist.model.grid import grid_pixels, mesh
 
 from .campaigns import BEYOND, EXPOSURES, KINDS, OFFSET, assessed, campaign
 from .places import model_errors, one_thread

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.stats import norm
 
 from bayesdist.app.judging import errors_of
-from bayesdist.assess.budget import TOTAL
-from bayesdist.assess.discrepancy_terms import STRUCTURE_IN_FIT
-from bayesdist.assess.fields import COEFFICIENTS, MODEL, TIME_DEPENDENCE
-from bayesdist.assess.place_budget import place_budget
-from bayesdist.assess.position_errors import CENTROID, PositionErrors
+from bayesdist.assess.budget.budget import TOTAL
+from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.drawn import CENTROID, PositionErrors
+from bayesdist.assess.terms.correlated import STRUCTURE_IN_FIT
+from bayesdist.assess.terms.fields import COEFFICIENTS, MODEL, TIME_DEPENDENCE
 from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.model import DistortionModel
 

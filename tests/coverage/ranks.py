@@ -15,13 +15,13 @@ import numpy as np
 
 from bayesdist.app.judging import errors_of, margins_of
 from bayesdist.assess import Requirement
-from bayesdist.assess.grid import grid_pixels, mesh
-from bayesdist.assess.position_errors import Judged
+from bayesdist.assess.drawn import Judged
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.infer import OutlierMixture
 from bayesdist.infer.discrepancy import DiscrepancyPriors
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.structure import LENGTHS, UNLIKE
+from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial import fields
 from tests.adversarial.measure import GRID, assessed
 from tests.adversarial.truth import SIGMA, Truth, mapped, order_config, pixels

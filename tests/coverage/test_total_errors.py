@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from bayesdist.assess.budget import TOTAL
-from bayesdist.assess.fields import COEFFICIENTS, TIME_DEPENDENCE
-from bayesdist.assess.position_errors import CENTROID
+from bayesdist.assess.budget.budget import TOTAL
+from bayesdist.assess.drawn import CENTROID
+from bayesdist.assess.terms.fields import COEFFICIENTS, TIME_DEPENDENCE
 
 from .campaigns import KINDS
 from .places import PLACE_TOTAL

@@ -12,7 +12,7 @@ from bayesdist.data import MatchTable
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear
-from bayesdist.infer.added_errors import DECISIVE, grouped_errors
+from bayesdist.infer.catalogue.added_errors import DECISIVE, grouped_errors
 from bayesdist.model import Chip
 
 SIZE = (1000.0, 800.0)

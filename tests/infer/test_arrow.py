@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.infer.arrow import Arrow
+from bayesdist.infer.equations.arrow import Arrow
 
 SHAPES = [(5, 0, 0, 0), (5, 2, 0, 0), (4, 0, 3, 2), (4, 2, 5, 3), (3, 1, 1, 6)]  # g, tail, n, q
 

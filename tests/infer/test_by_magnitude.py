@@ -8,7 +8,8 @@ from numpy.polynomial import legendre
 
 from bayesdist.data import MatchTable, read_matches
 from bayesdist.errors import InputError
-from bayesdist.infer import build_model, by_magnitude, fit_by_magnitude, fit_linear, residuals
+from bayesdist.infer import build_model, fit_by_magnitude, fit_linear, residuals
+from bayesdist.infer.catalogue import by_magnitude
 
 from .support import simulated
 

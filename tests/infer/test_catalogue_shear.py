@@ -11,7 +11,7 @@ from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.infer.catalogue_shear import catalogue_shear, one_roll_angle, roll_spread
+from bayesdist.infer.catalogue.catalogue_shear import catalogue_shear, one_roll_angle, roll_spread
 
 from .small_campaign import campaign
 

@@ -11,8 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer import OutlierMixture
-from bayesdist.infer.certificate import LEAST_HELD_OUT, Surrogate, certify, draw_surrogate
-from bayesdist.infer.grid import build_proposal
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.sampler.surrogate import LEAST_HELD_OUT, Surrogate, certify, draw_surrogate
 
 from .support import simulated, target_of
 

@@ -10,9 +10,9 @@ from scipy import stats
 
 from bayesdist.errors import InputError
 from bayesdist.infer import OutlierMixture, fit_linear, load_posterior, sample, save_posterior
-from bayesdist.infer.certified import AFFORDABLE, run_certified
-from bayesdist.infer.chains import Settings
-from bayesdist.infer.grid import build_proposal
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.sampler.certified import AFFORDABLE, run_certified
+from bayesdist.infer.sampler.chains import Settings
 from bayesdist.products.formats.common.cards import convergence_cards
 
 from .support import simulated, target_of

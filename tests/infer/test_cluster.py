@@ -29,9 +29,9 @@ from bayesdist import errors
 from bayesdist.data import matches as matches_module
 from bayesdist.data import open_matches, partitioned
 from bayesdist.infer import Compute, fit_linear, load, sample
-from bayesdist.infer import cluster as cluster_module
-from bayesdist.infer.cluster import ClusterShards
-from bayesdist.infer.shards import Shards
+from bayesdist.infer.stars.cluster import ClusterShards
+from bayesdist.infer.stars.shards import Shards
+from bayesdist.infer.stars.stars import cluster as cluster_module
 from tests.infer.support import TWO_CHIPS, simulated
 
 PIECE = 500
@@ -413,7 +413,7 @@ def test_other_version_on_the_workers(problem, compute, monkeypatch):
 
 
 def test_distributed_is_not_installed(problem, monkeypatch):
-    monkeypatch.delitem(sys.modules, "bayesdist.infer.cluster")
+    monkeypatch.delitem(sys.modules, "bayesdist.infer.stars.cluster")
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(errors.InputError, match=r"pip install 'bayesdist\[dask\]'"):
         load(*problem, Compute(engine="dask"))

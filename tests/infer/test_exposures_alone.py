@@ -10,8 +10,8 @@ from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.infer.exposures_alone import fit_exposures
-from bayesdist.infer.views import LINEAR_TERMS, in_exposure, linear_terms, reference_gauge
+from bayesdist.infer.exposures.alone import fit_exposures
+from bayesdist.infer.transforms import LINEAR_TERMS, in_exposure, linear_terms, reference_gauge
 
 from .small_campaign import Truth, campaign
 

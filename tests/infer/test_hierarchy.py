@@ -10,12 +10,12 @@ from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, sample
-from bayesdist.infer import scatter as scatter_module
-from bayesdist.infer.arrow import Arrow
-from bayesdist.infer.exposures_alone import fit_exposures
-from bayesdist.infer.hierarchy import fit_hierarchical, held_in_reference
-from bayesdist.infer.scatter import Scatter
-from bayesdist.infer.views import in_exposure, lines, reference_gauge
+from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.infer.exposures import scatter as scatter_module
+from bayesdist.infer.exposures.alone import fit_exposures
+from bayesdist.infer.exposures.hierarchy import fit_hierarchical, held_in_reference
+from bayesdist.infer.exposures.scatter import Scatter
+from bayesdist.infer.transforms import in_exposure, lines, reference_gauge
 from bayesdist.model import FRAME_KINDS
 from bayesdist.model.frames import CHIP_DEVIATIONS
 

@@ -15,8 +15,8 @@ from scipy import stats
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import fit_linear, load, residuals
-from bayesdist.infer.arrow import Arrow
-from bayesdist.infer.identify import check_coverage, null_space
+from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.infer.equations.rank import check_coverage, null_space
 from bayesdist.model import DistortionModel, TimeDependence
 
 from .support import CHIP, TWO_CHIPS, exposures, simulated, table

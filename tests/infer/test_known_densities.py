@@ -16,10 +16,11 @@ import pytest
 from emcee.moves import DEMove, MHMove
 from scipy import special, stats
 
-from bayesdist.infer import Limits, OutlierMixture, sampler
-from bayesdist.infer.grid import build_proposal
-from bayesdist.infer.labelled.convergence import diagnose
-from bayesdist.infer.proposal import GridProposal
+from bayesdist.infer import Limits, OutlierMixture
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.sampler.convergence import diagnose
+from bayesdist.infer.sampler.ensembles import ensembles as sampler
 
 from .fakes import FakeTarget, advanced, ensembles_of, gaussian_proposal
 from .oracle import JitterOracle

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from bayesdist.infer import Limits, OutlierMixture, lookahead
-from bayesdist.infer.blocks import Walkers
-from bayesdist.infer.chains import Settings, run_chains
-from bayesdist.infer.grid import build_proposal
-from bayesdist.infer.importance import (
+from bayesdist.infer import Limits, OutlierMixture
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.importance import (
     draws_per_effective,
     quality_of,
     rejection,
     warmup_steps,
 )
-from bayesdist.infer.lookahead import Page, draw_page
-from bayesdist.infer.plan import expected_passes
-from bayesdist.infer.sampler import replay
+from bayesdist.infer.sampler.blocks import Walkers
+from bayesdist.infer.sampler.chains import Settings, run_chains
+from bayesdist.infer.sampler.ensembles import lookahead, replay
+from bayesdist.infer.sampler.lookahead import Page, draw_page
+from bayesdist.infer.sampler.move_schedule import expected_passes
 
 from .fakes import FakeTarget, gaussian_proposal
 from .support import simulated, target_of

@@ -6,21 +6,15 @@ import numpy as np
 import pytest
 
 from bayesdist.data import matches as tables
-from bayesdist.infer import (
-    GaussianPriors,
-    OutlierMixture,
-    load,
-    membership,
-    memberships,
-    outlier_probability,
-)
-from bayesdist.infer.membership import (
+from bayesdist.infer import GaussianPriors, OutlierMixture, load, memberships, outlier_probability
+from bayesdist.infer.density import memberships as membership
+from bayesdist.infer.density.memberships import (
     count_outliers,
     sampled_points,
     some_draws,
     star_log_likelihood,
 )
-from bayesdist.infer.target import Target
+from bayesdist.infer.density.target import Target
 
 from .oracle import star_terms
 from .support import (

@@ -10,8 +10,8 @@ from scipy.stats import binom, chi2, kstest
 
 from bayesdist.errors import InputError
 from bayesdist.infer import OutlierMixture, fit_linear
-from bayesdist.infer.change_date import period_scores, scan_dates
-from bayesdist.infer.monitoring import change_of, fit_new
+from bayesdist.infer.compare.change_date import period_scores, scan_dates
+from bayesdist.infer.compare.monitoring import change_of, fit_new
 from bayesdist.model import TimeDependence
 from bayesdist.simulate import simulate_matches
 from tests.infer.support import CHIP, TWO_CHIPS, UNCLIPPED, simulated

@@ -14,8 +14,9 @@ import pytest
 from scipy import stats
 
 from bayesdist.infer import Limits, OutlierMixture
-from bayesdist.infer.grid import build_proposal
-from bayesdist.infer.plan import (
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.sampler.move_schedule import (
     boundaries,
     expected_passes,
     ladder,
@@ -23,8 +24,7 @@ from bayesdist.infer.plan import (
     plan_moves,
     walkers_for,
 )
-from bayesdist.infer.proposal import GridProposal
-from bayesdist.infer.whitening import Whitening
+from bayesdist.infer.sampler.whitening import Whitening
 
 from .fakes import advanced, ensembles_of
 from .oracle import JitterOracle

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesdist.infer import OutlierMixture
-from bayesdist.infer.normal import NormalEquations, least_squares, mixture
+from bayesdist.infer.equations.normal import NormalEquations, least_squares, mixture
 from bayesdist.model import TimeDependence
 
 from .oracle import star_terms

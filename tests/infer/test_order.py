@@ -12,9 +12,9 @@ from scipy import stats
 from bayesdist.data import open_matches, write_partitioned
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import fit_linear
-from bayesdist.infer.order import select_order
-from bayesdist.infer.order_sums import bin_sums, departures, held_out_gain, share_sums
-from bayesdist.infer.stars import prepare
+from bayesdist.infer.compare.order import select_order
+from bayesdist.infer.compare.order_sums import bin_sums, departures, held_out_gain, share_sums
+from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches, wise_solution
 

@@ -10,10 +10,10 @@ from scipy.stats import kstest, ncx2
 from bayesdist.data import MatchTable, matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import fit_linear
-from bayesdist.infer.period_changes import PeriodComparison
-from bayesdist.infer.period_dates import mjd_periods
-from bayesdist.infer.period_verdict import period_verdict
-from bayesdist.infer.periods import compare_periods, period_sums
+from bayesdist.infer.compare.period_changes import PeriodComparison
+from bayesdist.infer.compare.period_dates import mjd_periods
+from bayesdist.infer.compare.period_verdict import period_verdict
+from bayesdist.infer.compare.periods import compare_periods, period_sums
 from bayesdist.model import DistortionModel, TimeDependence
 from tests.infer.support import CHIP, SIZE, TWO_CHIPS, UNCLIPPED, legendre_design, simulated
 

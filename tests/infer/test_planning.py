@@ -6,7 +6,11 @@ import pytest
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear
-from bayesdist.infer.planning import exposure_content, exposure_information, with_information
+from bayesdist.infer.compare.planning import (
+    exposure_content,
+    exposure_information,
+    with_information,
+)
 from bayesdist.infer.recoloured import recolouring
 from bayesdist.model import TimeDependence
 

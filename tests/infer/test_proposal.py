@@ -7,13 +7,13 @@ import pytest
 from scipy import integrate, stats
 
 from bayesdist.infer import GaussianPriors, OutlierMixture
-from bayesdist.infer.coordinates import Split, inside
-from bayesdist.infer.grid import build_proposal
-from bayesdist.infer.importance import quality_of
-from bayesdist.infer.laplace import _expand, conditional_mode, expected_mode, starting_point
-from bayesdist.infer.marginal import Marginal
-from bayesdist.infer.piecewise import PiecewiseExponential
-from bayesdist.infer.proposal import GridProposal
+from bayesdist.infer.density.coordinates import Split, inside
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.importance import quality_of
+from bayesdist.infer.density.laplace import _expand, conditional_mode, expected_mode, starting_point
+from bayesdist.infer.density.marginal import Marginal
+from bayesdist.infer.density.piecewise import PiecewiseExponential
+from bayesdist.infer.density.proposal import GridProposal
 
 from .oracle import JitterOracle
 from .support import UNCLIPPED, numerical_gradient, simulated, target_of

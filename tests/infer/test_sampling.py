@@ -175,8 +175,8 @@ def test_too_short_a_run_says_so(campaign):
 @pytest.mark.parametrize("walkers", [None, 8])
 def test_counts_of_passes(campaign, monkeypatch, walkers):
     """Evaluations of the likelihood of all stars, as the report states them, but for the mode."""
-    from bayesdist.infer import sampling
-    from bayesdist.infer.target import Target
+    from bayesdist.infer.density.target import Target
+    from bayesdist.infer.sampler.ensembles import sample as sampling
 
     fit, matches, _ = campaign
     count, real, build = [0], Target.log_density, sampling.build_proposal

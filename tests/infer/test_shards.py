@@ -13,10 +13,10 @@ from bayesdist.data import matches as tables
 from bayesdist.data import open_matches, partitioned, write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load
-from bayesdist.infer.normal import least_squares, mixture
-from bayesdist.infer.shards import total
-from bayesdist.infer.stars import in_table_order, prepare
-from bayesdist.infer.target import Target
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.equations.normal import least_squares, mixture
+from bayesdist.infer.stars.shards import total
+from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel, TimeDependence
 
 from .support import CHIP, TWO_CHIPS, residual_of, simulated

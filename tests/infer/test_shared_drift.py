@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.shared_drift import drift_priors, with_drift_of
-from bayesdist.infer.views import lines, reference_gauge, without_frames
+from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
+from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 from bayesdist.model import TimeDependence
 from bayesdist.model.similarity import turned, turned_model
 from tests.infer.test_views import Gaussian, acs

@@ -12,10 +12,10 @@ from threadpoolctl import threadpool_limits
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.infer import star_errors as module
-from bayesdist.infer.hierarchy import fit_hierarchical
-from bayesdist.infer.star_errors import star_covariance, with_star_errors
-from bayesdist.infer.views import linear_terms, reference_gauge
+from bayesdist.infer.catalogue import star_errors as module
+from bayesdist.infer.catalogue.star_errors import star_covariance, with_star_errors
+from bayesdist.infer.exposures.hierarchy import fit_hierarchical
+from bayesdist.infer.transforms import linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
 
 from .small_campaign import campaign, shared_stars

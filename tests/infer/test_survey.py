@@ -8,9 +8,9 @@ from scipy.spatial import ConvexHull
 
 from bayesdist.data import matches as tables
 from bayesdist.infer import load
-from bayesdist.infer.shards import total
-from bayesdist.infer.stars import prepare
-from bayesdist.infer.survey import survey
+from bayesdist.infer.stars.shards import total
+from bayesdist.infer.stars.stars import prepare
+from bayesdist.infer.stars.survey import survey
 
 from .support import CHIP, TWO_CHIPS, pieces, simulated, table
 

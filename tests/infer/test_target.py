@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, OutlierMixture, load, target
-from bayesdist.infer.membership import star_log_likelihood
-from bayesdist.infer.stars import prepare
-from bayesdist.infer.target import Target
+from bayesdist.infer import GaussianPriors, OutlierMixture, load
+from bayesdist.infer.density import target
+from bayesdist.infer.density.memberships import star_log_likelihood
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import FRAME_KINDS, DistortionModel
 
 from .support import (

@@ -14,12 +14,12 @@ from scipy.stats import chi2, ncx2
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load, sample
-from bayesdist.infer.coordinates import Split
+from bayesdist.infer.density.coordinates import Split
+from bayesdist.infer.density.laplace import conditional_mode, starting_point
+from bayesdist.infer.density.memberships import memberships, star_log_likelihood
+from bayesdist.infer.density.target import Target
 from bayesdist.infer.kernel import circle_terms
-from bayesdist.infer.laplace import conditional_mode, starting_point
-from bayesdist.infer.membership import memberships, star_log_likelihood
-from bayesdist.infer.scores import Scores
-from bayesdist.infer.target import Target
+from bayesdist.infer.stars.likelihood import Scores
 from tests.seeds import over
 
 from .selected import SIGMA, selected

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import InputError
-from bayesdist.infer.views import (
+from bayesdist.infer.transforms import (
     in_exposure,
     linear_terms,
     lines,

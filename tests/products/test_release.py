@@ -15,7 +15,7 @@ from bayesdist.assess.solution import kind_of
 from bayesdist.calibration.calibration import calibration_of, gaussian_solution
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
-from bayesdist.infer.views import reference_gauge
+from bayesdist.infer.transforms import reference_gauge
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products import idctab_from_solution, lint_idctab, read_idctab
 from bayesdist.products.formats.idctab.build import build_idctab

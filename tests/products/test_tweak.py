@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesdist.assess.alignment import Alignment, alignment_residuals
 from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.diagnose.alignment import Alignment, alignment_residuals
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products.release import Period, write_release

@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.quiver import Quiver
 
 from bayesdist.assess import UncertaintyMap, VectorMap
-from bayesdist.assess.histograms import histogram
+from bayesdist.assess.wise.histograms import histogram
 from bayesdist.assess.wise.published import printed_rows
 from bayesdist.report.bands.curves import CASES, histograms
 from bayesdist.report.bands.figures import FLOW, alignment, formal_uncertainty, residuals, vectors

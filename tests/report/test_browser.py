@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm
-from bayesdist.assess.budget_surface import budget_surface
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.linear_term import LinearTerm
-from bayesdist.assess.place_budget import place_budget
-from bayesdist.assess.position_errors import position_errors
-from bayesdist.assess.product_terms import ProductTerm
-from bayesdist.assess.terms import LocalTerm
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.assess.terms.parameters import LinearTerm
+from bayesdist.assess.terms.product_terms import ProductTerm
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.report.run_report import write_report
 

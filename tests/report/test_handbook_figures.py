@@ -8,8 +8,8 @@ from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose
 
 from bayesdist.assess.detector_numbers import detector_numbers
-from bayesdist.assess.residuals import binned_sums
 from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.diagnose.residuals.binned import binned_sums
 from bayesdist.products import read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.report.handbook_numbers import handbook_rows

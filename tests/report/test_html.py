@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.assess.misfit import Misfit
 from bayesdist.diagnose import ScoreTest
+from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.errors import InputError
 from bayesdist.report.context import Check, Product
 from bayesdist.report.run_report import render_report, write_report

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from bayesdist.assess.patterns import Beforehand, Camera, PlannedStars, compare_patterns
+from bayesdist.assess.planning.dithers import Beforehand, Camera, PlannedStars, compare_patterns
 from bayesdist.model import Chip
 from bayesdist.report.drawing import png_of
 from bayesdist.report.patterns import pattern_maps

@@ -13,7 +13,7 @@ from matplotlib.quiver import Quiver
 from bayesdist.assess.periods import time_variation
 from bayesdist.data import MatchTable
 from bayesdist.infer import fit_linear
-from bayesdist.infer.order import select_order
+from bayesdist.infer.compare.order import select_order
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.report.order import order_comparison
 from bayesdist.report.run_report import render_report

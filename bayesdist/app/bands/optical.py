@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.assess.distortion_field import DistortionField
+from bayesdist.assess.wise.distortion_field import DistortionField
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.products import SipHeader, read_sip, read_wise_meta, rotated_sip

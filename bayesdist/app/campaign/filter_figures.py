@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.assess.solution import Solution
-from bayesdist.infer.views import lines, reference_gauge, without_frames
+from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 
 __all__ = ["draw_filters"]
 

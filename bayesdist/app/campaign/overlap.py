@@ -9,10 +9,10 @@ from scipy.sparse import csr_array
 
 from bayesdist.app.campaign.inputs import known_calibration
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.assess.alignment import Alignment, alignment_residuals
-from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
 from bayesdist.data import MatchTable
-from bayesdist.infer.views import without_frames
+from bayesdist.diagnose.alignment import Alignment, alignment_residuals
+from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
+from bayesdist.infer.transforms import without_frames
 from bayesdist.model import corrected
 from bayesdist.report.campaign import OverlapTest
 

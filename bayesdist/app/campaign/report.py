@@ -11,14 +11,14 @@ from bayesdist.app.campaign.inputs import cuts_of, read_campaign_catalog
 from bayesdist.app.campaign.overlap import overlap_test
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import as_json
-from bayesdist.assess.grid import outline_pixels
-from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
 from bayesdist.data import MatchTable, with_centroid_errors
 from bayesdist.data.motions import motion_error_line
+from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.infer.nodes import pixel_shifts
 from bayesdist.infer.nodes.alternation import inside_chips, with_columns
 from bayesdist.model import corrected
+from bayesdist.model.grid import outline_pixels
 from bayesdist.report.campaign import (
     CampaignResults,
     CatalogStars,

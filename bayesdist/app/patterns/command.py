@@ -14,8 +14,8 @@ from bayesdist.app.patterns.config import PlanConfig, load_plan
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
-from bayesdist.assess.pattern_words import lacking, nearly_free
-from bayesdist.assess.patterns import KINDS, PlannedPattern, compare_patterns
+from bayesdist.assess.planning.dithers import KINDS, PlannedPattern, compare_patterns
+from bayesdist.assess.planning.words import lacking, nearly_free
 
 __all__ = ["plan_patterns"]
 

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.selfcal.session import SelfcalSession
-from bayesdist.assess.grid import outline_pixels
+from bayesdist.model.grid import outline_pixels
 from bayesdist.report.context import SelfcalResults
 
 __all__ = ["selfcal_results"]

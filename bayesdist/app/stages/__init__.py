@@ -15,7 +15,7 @@ from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.report import run_report
 from bayesdist.app.stages.sample import run_sample
 from bayesdist.assess import SAMPLE, star_sample
-from bayesdist.assess.centroid import centroid_scatter
+from bayesdist.assess.terms.centroid import centroid_scatter
 from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit

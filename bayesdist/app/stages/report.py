@@ -29,7 +29,7 @@ from bayesdist.assess import (
     flagged_by_exposure,
     uncertainty_map,
 )
-from bayesdist.assess.budget_surface import BudgetSurface, budget_surface
+from bayesdist.assess.budget.surface import BudgetSurface, budget_surface
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.errors import InputError

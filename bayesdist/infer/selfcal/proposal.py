@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.arrow import Arrow
-from bayesdist.infer.coordinates import Split
-from bayesdist.infer.laplace import Node
-from bayesdist.infer.proposal import GridProposal
+from bayesdist.infer.density.coordinates import Split
+from bayesdist.infer.density.laplace import Node
+from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.target import SelfTarget
 

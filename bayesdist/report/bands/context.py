@@ -10,11 +10,11 @@ from bayesdist.report.registry import Registry, Section
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
-    from bayesdist.assess.histograms import BandSums
-    from bayesdist.assess.residual_correlation import ResidualCorrelation
-    from bayesdist.assess.residual_structure import ResidualPartition
     from bayesdist.assess.wise import StatisticsTable
     from bayesdist.assess.wise.account import RowAccount
+    from bayesdist.assess.wise.histograms import BandSums
+    from bayesdist.assess.wise.residual_correlation import ResidualCorrelation
+    from bayesdist.assess.wise.residual_structure import ResidualPartition
 
 __all__ = ["BANDS", "BandResult", "BandsInput", "Printed"]
 

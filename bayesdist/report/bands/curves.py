@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.assess.residual_correlation import DRAWS
+from bayesdist.assess.wise.residual_correlation import DRAWS
 from bayesdist.report.bands.context import BANDS, BandsInput
 from bayesdist.report.numbers import probability
 from bayesdist.report.registry import Plot

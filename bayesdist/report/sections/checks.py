@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bayesdist.assess.misfit import SIGNIFICANT, Misfit, worst_misfit
+from bayesdist.diagnose.residuals.misfit import SIGNIFICANT, Misfit, worst_misfit
 from bayesdist.report.context import Check
 from bayesdist.report.numbers import MISSING, number, percent, probability, size_of
 from bayesdist.report.texttable import Level

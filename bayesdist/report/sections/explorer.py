@@ -10,11 +10,11 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from bayesdist.assess.budget_surface import BudgetSurface, SurfaceProduct
-from bayesdist.assess.fields import MODEL
-from bayesdist.assess.position_errors import CENTROID
-from bayesdist.assess.product_terms import PRODUCT
-from bayesdist.assess.terms import LOCAL, MEASURED
+from bayesdist.assess.budget.surface import BudgetSurface, SurfaceProduct
+from bayesdist.assess.drawn import CENTROID
+from bayesdist.assess.terms.fields import MODEL
+from bayesdist.assess.terms.given import LOCAL, MEASURED
+from bayesdist.assess.terms.product_terms import PRODUCT
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numbers import ladder

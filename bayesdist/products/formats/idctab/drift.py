@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
-from bayesdist.infer.views import Solution, View
-from bayesdist.infer.views import segment as segment_of
+from bayesdist.infer.transforms import Solution, View
+from bayesdist.infer.transforms import segment as segment_of
 from bayesdist.model import TimeDependence
 
 __all__ = ["RATES", "Loss", "drift", "scheme_of", "storable"]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess import residual_statistics
-from bayesdist.diagnose.result import FAMILY_LEVEL, POWER
+from bayesdist.diagnose.score.result import FAMILY_LEVEL, POWER
 from bayesdist.infer.skew import skew_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput

@@ -11,7 +11,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.patches import Rectangle
 from scipy.stats import binom
 
-from bayesdist.assess.holdout import DOUBTFUL, HeldOutTruth
+from bayesdist.diagnose.holdout.validation import DOUBTFUL, HeldOutTruth
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import Check, ReportInput
 from bayesdist.report.numbers import count, number, probability
@@ -21,7 +21,7 @@ from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
 from bayesdist.report.texttable import TextTable
 
 if TYPE_CHECKING:
-    from bayesdist.assess.holdout_tests import HeldTest
+    from bayesdist.diagnose.holdout.tests import HeldTest
 
 __all__ = [
     "holdout",

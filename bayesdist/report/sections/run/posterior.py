@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from bayesdist.infer.added_errors import DECISIVE
+from bayesdist.infer.catalogue.added_errors import DECISIVE
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.corners import Column, corner_figure

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.assess.verdict import LEAST_CHI2, scatter_too_small
+from bayesdist.assess.requirements.verdict import LEAST_CHI2, scatter_too_small
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import Check, ReportInput
 from bayesdist.report.numbers import count, number, percent, rounded, with_mas
