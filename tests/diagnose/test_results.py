@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose import score_tests
+from bayesdist.diagnose.score import sample as sample_module
 from bayesdist.diagnose.score.result import Outcome, corrected, noncentrality
 from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
-from bayesdist.diagnose.score.score import sample as sample_module
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import without_frames
 

@@ -29,9 +29,9 @@ from bayesdist import errors
 from bayesdist.data import matches as matches_module
 from bayesdist.data import open_matches, partitioned
 from bayesdist.infer import Compute, fit_linear, load, sample
+from bayesdist.infer.stars import cluster as cluster_module
 from bayesdist.infer.stars.cluster import ClusterShards
 from bayesdist.infer.stars.shards import Shards
-from bayesdist.infer.stars.stars import cluster as cluster_module
 from tests.infer.support import TWO_CHIPS, simulated
 
 PIECE = 500

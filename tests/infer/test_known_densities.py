@@ -19,8 +19,8 @@ from scipy import special, stats
 from bayesdist.infer import Limits, OutlierMixture
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.sampler import ensembles as sampler
 from bayesdist.infer.sampler.convergence import diagnose
-from bayesdist.infer.sampler.ensembles import ensembles as sampler
 
 from .fakes import FakeTarget, advanced, ensembles_of, gaussian_proposal
 from .oracle import JitterOracle

@@ -176,7 +176,7 @@ def test_too_short_a_run_says_so(campaign):
 def test_counts_of_passes(campaign, monkeypatch, walkers):
     """Evaluations of the likelihood of all stars, as the report states them, but for the mode."""
     from bayesdist.infer.density.target import Target
-    from bayesdist.infer.sampler.ensembles import sample as sampling
+    from bayesdist.infer.sampler import sample as sampling
 
     fit, matches, _ = campaign
     count, real, build = [0], Target.log_density, sampling.build_proposal
