@@ -7,7 +7,7 @@ from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.planning.exposures import MOST, Schedule, exposures_needed
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.planning import exposure_content, exposure_information
-from tests.infer.test_planning import SIGMA, model_of, stars
+from tests.infer.compare.test_planning import SIGMA, model_of, stars
 
 
 def judge(requirement, **options):
