@@ -10,6 +10,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.orientation import oriented
@@ -161,8 +162,8 @@ def write_release(
             for filter, some in left.items()
             for entry in some
         ]
-        for filter, other in stand_ins.items():
-            rows[filter] = rows[other]
+        for stand_in, other in stand_ins.items():
+            rows[stand_in] = rows[other]
         made[period.name] = build_idctab(
             rows,
             instrument=instrument,
@@ -187,7 +188,7 @@ def write_release(
         idctabs[period_name] = folder / f"{name}_{period_name}_idc.fits"
         write_idctab(tab, idctabs[period_name])
     first = periods[0]
-    common = {
+    common: dict[str, Any] = {
         "description": description,
         "useafter": first.useafter,
         "pedigree": first.pedigree,

@@ -149,15 +149,15 @@ def largest_magnitude(
     dx, dy = polynomial.polyder(c, axis=0), polynomial.polyder(c, axis=1)
 
     def falling(z: Float, sign: float) -> tuple[float, Float]:
-        p = centre + half * z
-        slope = np.array([polynomial.polyval2d(*p, dx), polynomial.polyval2d(*p, dy)]) * half
-        return -sign * float(polynomial.polyval2d(*p, c)) / sampled, -sign * slope / sampled
+        px, py = centre + half * z
+        slope = np.array([polynomial.polyval2d(px, py, d) for d in (dx, dy)]) * half
+        return -sign * float(polynomial.polyval2d(px, py, c)) / sampled, -sign * slope / sampled
 
     bounds = list(zip((low - centre) / half, (high - centre) / half, strict=True))
     best = sampled
     for start in np.argsort(values)[-_BEST:]:
         point = np.array([x[start], y[start]])
-        sign = float(np.sign(polynomial.polyval2d(*point, c)))
+        sign = float(np.sign(polynomial.polyval2d(x[start], y[start], c)))
         found = minimize(
             falling,
             (point - centre) / half,

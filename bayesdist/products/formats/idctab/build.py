@@ -307,10 +307,10 @@ def _check_alike(
                 (chip.number, term): float(value)
                 for chip in m.chips
                 for term, value in zip(
-                    m.time.terms, np.asarray(s.solution.mean)[m.tdd_slice(chip.number)], strict=True
+                    time.terms, np.asarray(s.solution.mean)[m.tdd_slice(chip.number)], strict=True
                 )
             }
-            for s, m in ((calibration, a), (first, b))
+            for s, m, time in ((calibration, a, a.time), (first, b, b.time))
         )
         scale = max(map(abs, theirs.values()), default=0.0)
         same = all(

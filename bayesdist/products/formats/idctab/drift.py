@@ -11,7 +11,7 @@ are left out only where what they do over the years of the file is bounded, and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -185,7 +185,11 @@ def storable(
             f"the years {first} to {last} do not rise", where="years", do="give first and last date"
         )
     _check_like(solution, like, segment)
-    view = solution if solution.model.time is None else segment_of(solution, segment)
+    view: Solution = solution
+    of_view: Callable[[Float], Float] = np.asarray
+    if solution.model.time is not None:
+        own = segment_of(solution, segment)
+        view, of_view = own, own.transform
     model, time = view.model, view.model.time
     kept: list[Term] = []
     if time is not None and like is None:
@@ -199,8 +203,7 @@ def storable(
     _check_lost(lost, limit_mas)
 
     def transform(theta: Float) -> Float:
-        seen = theta if view is solution else view.transform(theta)
-        return seen[..., columns]
+        return of_view(theta)[..., columns]
 
     cov = np.asarray(view.cov, float)[np.ix_(columns, columns)]
     held = View(new, np.asarray(view.mean, float)[columns], cov, solution, transform)

@@ -89,7 +89,7 @@ def coefficient_hdu(pieces: Sequence[Piece], scale: float) -> fits.BinTableHDU:
     """HDU 1: the table that pipelines read, in doubles."""
     rows = list(_rows(pieces))
 
-    def column(name: str, values: list[float], unit: str = "", form: str = "1D") -> fits.Column:
+    def column(name: str, values: Sequence[float], unit: str = "", form: str = "1D") -> fits.Column:
         return fits.Column(name, form, unit=unit or None, array=np.array(values))
 
     columns = _key_columns(rows)

@@ -91,12 +91,12 @@ def _non_linear(tab: IdcTab, row: int) -> str:
     scale = float(record["SCALE"])
     if scale == 0 or not np.isfinite(scale):
         return "?"
-    ranges = [
+    x_range, y_range = (
         (1 - float(record[f"{a}REF"]), float(record[f"{a}SIZE"]) - float(record[f"{a}REF"]))
         for a in "XY"
-    ]
+    )
     out = []
     for values in tab.coefficients_of_row(row):
         terms = {t: c for t, c in zip(tab.terms, values.tolist(), strict=True) if sum(t) > 1}
-        out.append(f"{largest_magnitude(terms, *ranges) / abs(scale):.4g}")
+        out.append(f"{largest_magnitude(terms, x_range, y_range) / abs(scale):.4g}")
     return " and ".join(out)

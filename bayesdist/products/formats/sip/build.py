@@ -18,6 +18,7 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.transforms import Solution
 from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
 from bayesdist.products.formats.common.coefficients import largest_magnitude
+from bayesdist.products.formats.sip.families import offset_ranges
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
 
 __all__ = ["build_sip", "sip_from_solution"]
@@ -190,7 +191,7 @@ def build_sip(
         size=size,
         cards=cards,
     )
-    ranges = [(1 - ref, n - ref) for n, ref in zip(size, sip.crpix, strict=True)]
+    ranges = offset_ranges(sip, size)
     ap, bp = fit_inverse(sip.forward, sip.crpix, size, inverse)
     sip = replace(
         sip,
@@ -246,7 +247,7 @@ def _relative_to_linear(poly: Monomials) -> tuple[Float, Float]:
     K = len(poly.terms)
     inner = np.eye(K)
     inner[:, 1:3] -= terms.T  # dL is the change of the two linear terms
-    return terms, _sigma(np.kron(np.linalg.inv(poly.linear), inner), poly)
+    return np.asarray(terms), _sigma(np.kron(np.linalg.inv(poly.linear), inner), poly)
 
 
 def _sigma(by: Float, poly: Monomials) -> Float:

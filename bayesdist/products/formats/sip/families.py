@@ -65,9 +65,10 @@ def repeated_names(sip: SipHeader) -> list[tuple[str, ...]]:
 
 def offset_ranges(
     sip: SipHeader, size: tuple[int, int], margin: float = 0.0
-) -> list[tuple[float, float]]:
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """Lowest and highest offset from CRPIX along each axis, for pixel centres and a margin."""
-    return [(1 - margin - ref, n + margin - ref) for n, ref in zip(size, sip.crpix, strict=True)]
+    (nx, ny), (x0, y0) = size, sip.crpix
+    return (1 - margin - x0, nx + margin - x0), (1 - margin - y0, ny + margin - y0)
 
 
 def half_unit(sip: SipHeader) -> float:

@@ -274,7 +274,7 @@ class StatedMaxima:
         return evaluate(terms, self.u, self.v, self.sip.order["AB".index(prefix)])
 
     def _limits(self, prefix: str) -> tuple[float, float]:
-        stated = self.sip.dmax["AB".index(prefix)]
+        stated = self.sip.dmax["AB".index(prefix)] or 0.0
         tolerance = max(half_unit(self.sip), _SAMPLED * stated)
         return stated - tolerance, stated + tolerance
 

@@ -55,10 +55,14 @@ def rotated_sip(sip: SipHeader, degrees: float, *, mirror: bool = False) -> SipH
     exact = is_exact(M)
     swapped = exact and M[0, 0] == 0
     order, a, b = _pair(sip.a, sip.b, sip.order, M)
-    inverse_order, ap, bp = sip.inverse_order, {}, {}
+    inverse_order: tuple[int, int] | None = None
+    ap: Terms = {}
+    bp: Terms = {}
     if sip.inverse_order is not None:
         inverse_order, ap, bp = _pair(sip.ap, sip.bp, sip.inverse_order, M)
-    sigma_a, sigma_b, dmax = {}, {}, (None, None)
+    sigma_a: Terms = {}
+    sigma_b: Terms = {}
+    dmax: tuple[float | None, float | None] = (None, None)
     if exact:
         # a permutation: the same one for standard deviations, without its signs
         sigma_a, sigma_b = (

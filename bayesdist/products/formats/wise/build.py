@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -115,7 +116,7 @@ def _lines(band: int, sip: SipHeader, skew: float) -> list[str]:
 
 def _as_written(sip: SipHeader) -> SipHeader:
     """The header with the digits of the file, every term of its orders there."""
-    terms = {
+    terms: dict[str, Any] = {
         prefix.lower(): {k: float(f"{values.get(k, 0.0):.6E}") for k in _powers(order)}
         for prefix, order, values in families(sip)
     }
