@@ -238,7 +238,9 @@ class Calibration:
             raise InputError(f"the epoch is {epoch}", do="give it in decimal years")
         if epoch is not None and self.no_date:
             raise InputError(
-                self.no_date, where=self.name, do="leave out the epoch, or give a file whose drift has a reference date, as TDD_DATE"
+                self.no_date,
+                where=self.name,
+                do="leave out the epoch, or give a file with a date of reference (TDD_DATE)",
             )
         if self.model.time is None:
             return None
