@@ -1,6 +1,7 @@
-# Four targets do everything on a bare machine with Python 3.11 or newer:
+# Five targets do everything on a bare machine with Python 3.11 or newer:
 #   make demo    the environment, then `bayesdist demo`
 #   make test    the environment with the test extra, then the tests
+#   make test-full  the same, with the statistical suites in full: an hour or two
 #   make bench   the same environment, then the benchmarks: build/bench/bench.json and bench.md;
 #                some 20 minutes on two cores that have nothing else to do
 #   make docs    the environment with the docs extra, then the site: build/docs/index.html; a
@@ -9,7 +10,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
 
-.PHONY: demo test docs bench lint clean
+.PHONY: demo test test-full docs bench lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bayesdist demo -o demo-run --force
@@ -19,6 +20,9 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+test-full: $(VENV)/.installed-test
+	BAYESDIST_FULL=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -q -W --keep-going -n -d build/doctrees docs build/docs

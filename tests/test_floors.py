@@ -23,6 +23,7 @@ FLOORS = (
     ("errors",),
     ("data", "model"),
     ("infer", "simulate"),
+    ("calibration",),
     ("diagnose",),
     ("assess",),
     ("products",),
@@ -34,14 +35,14 @@ LEVEL = {name: level for level, names in enumerate(FLOORS) for name in names}
 
 # library: the only module or folder (relative to bayesdist/) that may import it
 DOORS = {
-    "emcee": "infer/sampler.py",
+    "emcee": "infer/sampler/ensembles.py",
     "numba": "infer/kernel/",
     "llvmlite": "infer/kernel/",
-    "dask": "infer/cluster.py",
-    "distributed": "infer/cluster.py",
+    "dask": "infer/stars/cluster.py",
+    "distributed": "infer/stars/cluster.py",
     "pyarrow": "data/",
-    "xarray": "infer/labelled/",
-    "arviz": "infer/labelled/",
+    "xarray": "infer/files/",
+    "arviz": "infer/sampler/convergence.py",
     "matplotlib": "report/",
     "corner": "report/",
 }
@@ -95,7 +96,7 @@ def imports_of(name: str, *, at_import_time: bool = False) -> set[str]:
 
 
 def floor(name: str) -> str:
-    """'infer' of bayesdist.infer.sampler; '' of bayesdist itself and of __main__."""
+    """'infer' of bayesdist.infer.sampler.ensembles; '' of bayesdist itself and of __main__."""
     parts = name.split(".")
     return "" if len(parts) == 1 or parts[1] == "__main__" else parts[1]
 

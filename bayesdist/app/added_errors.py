@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.added_errors import ONE, GroupedErrors, grouped_errors
+from bayesdist.infer.catalogue.added_errors import ONE, GroupedErrors, grouped_errors
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session

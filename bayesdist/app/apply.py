@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.applied import Applied, applied, images_of
+from bayesdist.app.calibrations import calibration_at, images_of, notes_of
 from bayesdist.app.position_table import (
     OUT,
     add_positions,
@@ -18,16 +18,17 @@ from bayesdist.app.position_table import (
     write_positions,
 )
 from bayesdist.app.screen import number
-from bayesdist.data.tables import read_table
-from bayesdist.products.application import (
+from bayesdist.calibration.apply import (
     Application,
     OutputFrame,
     Positions,
     frame_that_holds,
     on_chip,
 )
-from bayesdist.products.application_inverse import InversePolynomial, fitted_inverse
-from bayesdist.products.inverse_rows import InverseRows
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.inverse import fitted_inverse
+from bayesdist.data.tables import read_table
+from bayesdist.errors import InputError
 
 __all__ = ["METHODS", "apply_to_table"]
 
@@ -61,7 +62,7 @@ def apply_to_table(
     Parameters
     ----------
     path : path
-        As of `applied`.
+        As of `calibration_at`.
     table : path
         Positions in columns x, y (back: x_out, y_out), and the chip's number in chip.
     output : path
@@ -77,8 +78,10 @@ def apply_to_table(
         Names of the two columns of positions.
     chip : int, optional
         In place of a column; back it is found where it is not given.
-    filter, epoch, scale
-        As of `applied`.
+    filter, scale
+        As of `calibration_at`.
+    epoch : float, optional
+        Decimal years, for what depends on time.
     origin : sequence of float, optional
         Output pixel of the zero point; (0, 0) by default.
     vafactor : float
@@ -99,26 +102,28 @@ def apply_to_table(
     """
     output = Path(output)
     check_output(output, force)
-    found = applied(path, filter=filter, epoch=epoch, scale=scale)
+    found = calibration_at(path, filter=filter, scale=scale)
+    chips_of = found.in_frame(epoch)
+    pixel, source = found.pixel(epoch)
     ox, oy = origin or (0.0, 0.0)
-    frame = OutputFrame(found.scale, (ox, oy), vafactor)
+    frame = OutputFrame(pixel, (ox, oy), vafactor)
     images = images_of(found, image=image, ltv=ltv, corner=corner)
-    a = Application(found.chips, frame, images)
+    a = Application(chips_of, frame, images)
     names = tuple(columns or (OUT if inverse else ("x", "y")))
     rows = read_table(Path(table))
     x, y = (position_column(rows, name, str(table)) for name in names)
-    chips = chip_numbers(rows, chip, list(found.chips), found.name, str(table), needed=not inverse)
+    chips = chip_numbers(rows, chip, list(chips_of), found.name, str(table), needed=not inverse)
     if inverse:
-        at, lines = _back(a, found, x, y, chips, method, order, filter)
+        at, lines = _back(a, found, x, y, chips, method, order, epoch)
         added = ("x", "y")
     else:
         at, added = _forth(a, x, y, chips), OUT
-        lines = _frame_lines(found, vafactor)
+        lines = _frame_lines(a, source)
     add_positions(rows, at, added, str(table))
-    rows.meta = {"calibration": found.name, "scale": found.scale, "unit": found.unit}
+    rows.meta = {"calibration": found.name, "scale": pixel, "unit": found.unit}
     rows.meta |= {"origin": [ox, oy], "vafactor": vafactor}
     write_positions(rows, output)
-    return "\n".join([_head(output, at, found), *lines, *_losses(a, at, x, y, inverse)])
+    return "\n".join([_head(output, at, found, epoch), *lines, *_losses(a, at, x, y, inverse)])
 
 
 def _forth(a: Application, x: Float, y: Float, chips: NDArray[np.int64] | None) -> Positions:
@@ -130,13 +135,13 @@ def _forth(a: Application, x: Float, y: Float, chips: NDArray[np.int64] | None) 
 
 def _back(
     a: Application,
-    found: Applied,
+    found: Calibration,
     X: Float,
     Y: Float,
     chips: NDArray[np.int64] | None,
     method: str,
     order: int | None,
-    filter: str | None,
+    epoch: float | None,
 ) -> tuple[Positions, list[str]]:
     """Pixels, and what to say of their error."""
     if chips is None:
@@ -148,19 +153,27 @@ def _back(
         worst = max(a.closure(n) for n in a.chips)
         return at, [f"  inverse by Newton's method: closes to {number(worst, 2)} pix"]
     lines = []
+    about_zero = found.at(epoch, origin="chip")
     x, y = at.x.copy(), at.y.copy()
     for n in a.chips:
         mine = at.chip == n
-        back: InversePolynomial | InverseRows
+        chip = about_zero[n]
         if method == "polynomial":
-            back = fitted_inverse(a, n, order)
+            back = fitted_inverse(chip, order)
             what = f"polynomial of order {back.order}"
         else:
-            back = InverseRows.of(a, found.tab, n, filter, found.name)
-            what = "INVERSE row"
-        pixels = back.pixels(X[mine], Y[mine])
+            if n not in found.inverses:
+                raise InputError(
+                    f"holds no INVERSE row of chip {n}",
+                    where=found.name,
+                    do="choose --method newton or polynomial",
+                )
+            back, what = found.inverses[n], "INVERSE row"
+        zero = a.chips[n].at(*(([v]) for v in chip.basis.reference_pixel))
+        pixels = back.pixels(*(a.plane(X[mine], Y[mine]) - zero))
         x[mine], y[mine] = a.images[n].from_chip(*pixels) if n in a.images else pixels
-        errors = f"{number(back.closure, 3)} pix at worst, {number(back.rms, 3)} rms"
+        worst, rms = back.misses(chip)
+        errors = f"{number(worst, 3)} pix at worst, {number(rms, 3)} rms"
         lines.append(f"  chip {n}: {what}, closes to {errors}")
     return Positions(x, y, at.cov, at.chip), lines
 
@@ -178,16 +191,17 @@ def _gathered(parts: dict[int, tuple[NDArray[np.bool_], Positions]], n: int) -> 
     return Positions(*at, cov, number)
 
 
-def _head(output: Path, at: Positions, found: Applied) -> str:
-    notes = "".join(f"; {note}" for note in found.notes)
+def _head(output: Path, at: Positions, found: Calibration, epoch: float | None) -> str:
+    notes = "".join(f"; {note}" for note in notes_of(found, epoch))
     return f"{output}: {at.x.size} positions, by {found.name}{notes}"
 
 
-def _frame_lines(found: Applied, vafactor: float) -> list[str]:
-    frame, size = frame_that_holds(found.chips, found.scale, vafactor)
-    unit = "pix of u, v" if found.unit == "pix" else found.unit
+def _frame_lines(a: Application, source: str) -> list[str]:
+    frame, size = frame_that_holds(a.chips, a.frame.scale, a.frame.vafactor)
+    unit = next(iter(a.chips.values())).unit
+    unit = "pix of u, v" if unit == "pix" else unit
     return [
-        f"  output pixels of {number(found.scale, 6)} {unit} ({found.scale_from})",
+        f"  output pixels of {number(a.frame.scale, 6)} {unit} ({source})",
         f"  an image of {size[0]} x {size[1]} pixels holds all chips, with --origin "
         f"{frame.origin[0]:g} {frame.origin[1]:g}",
     ]

@@ -13,10 +13,10 @@ from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
-from bayesdist.assess.budget import TOTAL
-from bayesdist.assess.place_budget import PlaceBudget, place_budget
-from bayesdist.assess.product_terms import PRODUCT
-from bayesdist.assess.verdict import effective_draws
+from bayesdist.assess.budget.budget import TOTAL
+from bayesdist.assess.budget.place import PlaceBudget, place_budget
+from bayesdist.assess.requirements.verdict import effective_draws
+from bayesdist.assess.terms.product_terms import PRODUCT
 from bayesdist.errors import InputError
 
 __all__ = ["budget_at"]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.session import Session
-from bayesdist.assess.verdict import Caveat, scatter_too_small
+from bayesdist.assess.requirements.verdict import Caveat, scatter_too_small
 from bayesdist.infer.discrepancy.linear import CURVATURE
 
 __all__ = ["caveats_of", "rests_on", "visits_of"]

@@ -17,8 +17,8 @@ from bayesdist.app.sessions import own_lines, session_of
 from bayesdist.app.stages import rehearse
 from bayesdist.app.trust import warnings_of
 from bayesdist.infer import Limits
-from bayesdist.infer.certified import PILOTS, has_second_stage
-from bayesdist.infer.plan import expected_passes
+from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
+from bayesdist.infer.sampler.move_schedule import expected_passes
 
 __all__ = ["check"]
 

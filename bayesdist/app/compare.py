@@ -7,31 +7,25 @@ from pathlib import Path
 
 import numpy as np
 
+from bayesdist.app.calibrations import calibration_at
 from bayesdist.app.comparison_files import write_comparison
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.solutions import solution_at
 from bayesdist.assess import DEFAULT_GRID
-from bayesdist.assess.calibration import Calibration, calibration_of_solution
-from bayesdist.assess.comparison import Comparison, compare
-from bayesdist.assess.comparison_gap import (
-    ChipPair,
+from bayesdist.assess.comparison.compare import Comparison, compare
+from bayesdist.assess.comparison.gap import (
     GapDifference,
     gap_difference,
-    pair_of_solution,
+    pair_of_chips,
 )
-from bayesdist.assess.comparison_verdict import comparison_lines, gap_lines, gap_verdict, verdict
+from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
-from bayesdist.products import read_idctab
-from bayesdist.products.calibration_file import read_calibrations
-from bayesdist.products.chip_pairs import pair_of_idctab, reference_first
-from bayesdist.products.sip_read import holds_sip, read_sip
+from bayesdist.products.formats.sip.calibration import MissingSize
 
-__all__ = ["calibrations_of", "compare_files"]
+__all__ = ["compare_files"]
 
 SCHEMA = 1
 SEED = 20150206  # of the noise fields: the same comparison gives the same numbers
-
-Chips = dict[int | None, Calibration]
 
 
 def compare_files(
@@ -75,33 +69,37 @@ def compare_files(
     Raises
     ------
     InputError
-        As `calibrations_of` and `compare`; for files without a common chip.
+        As `calibration_at` and `compare`; for files without a common chip.
     """
     first, _, second = (filter or "").partition(":")
-    filters = (first or None, second or first or None)
-    paths, both, size = (Path(a), Path(b)), dict[int, Chips](), None
-    # a SIP header may not say how large the image is: then the other file tells
-    for k in sorted((0, 1), key=lambda k: _lacks_size(paths[k])):
-        both[k] = calibrations_of(paths[k], filter=filters[k], epoch=epoch, size=size)
-        size = next(iter(both[k].values())).basis.size
+    both = _read((Path(a), Path(b)), (first or None, second or first or None))
+    maps = [one.by_chip(epoch) for one in both]
+    numbers = _common(both, chip)
     rng = np.random.default_rng(SEED)
     nx, ny = grid
-    found = [
-        compare(one, other, rng=rng, grid=(nx, ny), keep=keep)
-        for one, other in _pairs(both[0], both[1], chip, (str(a), str(b)))
-    ]
-    gaps = _gaps(paths, filters, epoch, [one.a.chip for one in found])
+    found = [compare(maps[0][n], maps[1][m], rng=rng, grid=(nx, ny), keep=keep) for n, m in numbers]
+    gaps = _gaps(both, epoch, [n for n, m in numbers if n == m])
     if output is not None:
         write_comparison(Path(output), found, gaps, command)
     scale = _scale_of(a) or _scale_of(b)
     return _text(found, gaps, scale, related=_home(a) == _home(b))
 
 
-def _lacks_size(path: Path) -> bool:
-    """Whether a file is a SIP header that does not say how large its image is."""
-    if not path.is_file() or path.suffix == ".nc" or not holds_sip(path):
-        return False
-    return read_sip(path).size is None
+def _read(
+    paths: tuple[Path, Path], filters: tuple[str | None, str | None]
+) -> tuple[Calibration, Calibration]:
+    """Both calibrations; a SIP header that does not say its size has that of the other one."""
+    sizes: list[tuple[float, float] | None] = [None, None]
+    for k, other in ((0, 1), (1, 0)):
+        try:
+            calibration_at(paths[k], filter=filters[k])
+        except MissingSize:
+            sizes[k] = calibration_at(paths[other], filter=filters[other]).model.chips[0].size
+    a, b = (
+        calibration_at(path, filter=one, size=size)
+        for path, one, size in zip(paths, filters, sizes, strict=True)
+    )
+    return a, b
 
 
 def _home(path: str | Path) -> Path:
@@ -118,120 +116,53 @@ def _scale_of(path: str | Path) -> float | None:
     return RunDirectory(home).config.detector.scale_mas
 
 
-def calibrations_of(
-    path: str | Path,
-    *,
-    filter: str | None = None,
-    epoch: float | None = None,
-    size: tuple[float, float] | None = None,
-) -> Chips:
-    """The chips of a calibration, whatever holds it.
-
-    Parameters
-    ----------
-    path : path
-        A run directory stands for its posterior, or its fit where there is none yet.
-    filter, epoch, size
-        As of `read_calibrations`.
-
-    Returns
-    -------
-    dict of int or None to Calibration
-        None for a file that knows of no chips.
-
-    Raises
-    ------
-    InputError
-        As `load_posterior`, `load_fit` and `read_calibrations`; for a solution that depends on time
-        and no epoch.
-    """
-    path = Path(path)
-    solution = solution_at(path)
-    if solution is None:
-        if not path.exists():
-            raise InputError("there is no such file", where=str(path), do="check the name")
-        return dict(read_calibrations(path, filter=filter, epoch=epoch, size=size))
-    return {
-        one.number: calibration_of_solution(
-            solution,
-            str(path),
-            chip=one.number,
-            epoch=epoch if solution.model.time is not None else None,
-        )
-        for one in solution.model.chips
-    }
-
-
-def _pairs(
-    a: Chips, b: Chips, chip: int | None, names: tuple[str, str]
-) -> list[tuple[Calibration, Calibration]]:
+def _common(both: tuple[Calibration, Calibration], chip: int | None) -> list[tuple[int, int]]:
     """What is compared with what: chips by their numbers, or the single ones of both."""
+    a, b = both
     if chip is not None:
-        return [(_chip(a, chip, names[0]), _chip(b, chip, names[1]))]
-    common = [number for number in a if number in b]
-    if common:
-        return [(a[number], b[number]) for number in common]
-    if len(a) == len(b) == 1:
-        return [(next(iter(a.values())), next(iter(b.values())))]
-    listed = " and ".join(", ".join("none" if n is None else str(n) for n in c) for c in (a, b))
+        return [(_number(a, chip), _number(b, chip))]
+    if a.numbered == b.numbered:
+        common = sorted(set(a.numbers) & set(b.numbers))
+        if common:
+            return [(number, number) for number in common]
+    if len(a.numbers) == len(b.numbers) == 1:
+        return [(a.numbers[0], b.numbers[0])]
+    listed = " and ".join(
+        ", ".join(map(str, one.numbers)) if one.numbered else "none" for one in both
+    )
     raise InputError(
         f"their chips are {listed}",
-        where=", ".join(names),
+        where=f"{a.name}, {b.name}",
         do="choose the chip by --chip, which a file without chip numbers takes for its own",
     )
 
 
-def _chip(chips: Chips, number: int, name: str) -> Calibration:
-    if None in chips:
-        return chips[None]
-    if number not in chips:
+def _number(one: Calibration, number: int) -> int:
+    if not one.numbered:
+        return one.numbers[0]
+    if number not in one.numbers:
         raise InputError(
             f"there is no chip {number}",
-            where=name,
-            do=f"choose one of {', '.join(map(str, chips))}",
+            where=one.name,
+            do=f"choose one of {', '.join(map(str, one.numbers))}",
         )
-    return chips[number]
+    return number
 
 
 def _gaps(
-    paths: tuple[Path, Path],
-    filters: tuple[str | None, str | None],
-    epoch: float | None,
-    numbers: list[int | None],
+    both: tuple[Calibration, Calibration], epoch: float | None, numbers: list[int]
 ) -> list[GapDifference]:
-    """How every further chip lies against the first one of A, or chip 2 of a table."""
+    """How every further chip lies against the reference chip of A."""
     if len(numbers) < 2:
         return []
-    reference = next((n for n in _in_order(paths[0]) if n in numbers), None)
+    reference = next(n for n in both[0].numbers if n in numbers)
     out = []
     for number in numbers:
-        if number is None or reference is None or number == reference:
+        if number == reference:
             continue
-        a, b = (
-            _chip_pair(path, reference, number, filter=one, epoch=epoch)
-            for path, one in zip(paths, filters, strict=True)
-        )
+        a, b = (pair_of_chips(one, reference, number, epoch=epoch) for one in both)
         out.append(gap_difference(a, b))
     return out
-
-
-def _in_order(path: Path) -> list[int]:
-    """Chips of a calibration, that first which the others are referred to."""
-    solution = solution_at(path)
-    if solution is not None:
-        return [chip.number for chip in solution.model.chips]
-    return reference_first(read_idctab(path))
-
-
-def _chip_pair(
-    path: Path, reference: int, number: int, *, filter: str | None, epoch: float | None
-) -> ChipPair:
-    """Two chips of whatever holds several: a solution or an IDCTAB."""
-    solution = solution_at(path)
-    if solution is None:
-        return pair_of_idctab(read_idctab(path), reference, number, filter=filter, epoch=epoch)
-    date = epoch if solution.model.time is not None else None
-    return pair_of_solution(solution, str(path), reference, number, epoch=date)
 
 
 def _text(

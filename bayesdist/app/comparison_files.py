@@ -11,16 +11,14 @@ from astropy.table import Table, vstack
 from bayesdist.app.folder import whole_folder
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.session import write_table
-from bayesdist.assess.comparison import Comparison
-from bayesdist.assess.comparison_gap import GapDifference
-from bayesdist.assess.comparison_table import comparison_table, difference_table, gap_table
-from bayesdist.assess.comparison_verdict import gap_verdict, verdict
-from bayesdist.report import drawn, save_images
+from bayesdist.assess.comparison.compare import Comparison
+from bayesdist.assess.comparison.gap import GapDifference
+from bayesdist.assess.comparison.sentences import gap_verdict, verdict
+from bayesdist.assess.comparison.tables import comparison_table, difference_table, gap_table
 from bayesdist.report.comparison import difference_vectors
-from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.vectors import grid_size
+from bayesdist.report.drawing import save_figures
 
-__all__ = ["comparison_summary", "joined", "mosaic_of", "write_comparison"]
+__all__ = ["comparison_summary", "joined", "write_comparison"]
 
 SCHEMA = 1
 
@@ -50,10 +48,7 @@ def write_comparison(
         write_table(joined(found, difference_table), folder / "difference.ecsv")
         if gaps:
             write_table(gap_table(gaps), folder / "gap.ecsv")
-        save_images(
-            drawn({"difference": difference_vectors(*found, mosaic=mosaic_of(found))}),
-            folder / "figures",
-        )
+        save_figures({"difference": difference_vectors(found)}, folder / "figures")
         record = {
             "schema": SCHEMA,
             "command": command,
@@ -84,7 +79,7 @@ def comparison_summary(found: Comparison) -> dict[str, Any]:
             "unit": c.unit,
             "chip": c.chip,
             "epoch": c.epoch,
-            "errors": c.kind_of_error,
+            "errors": c.errors,
             "notes": list(c.notes),
         }
     return {
@@ -160,9 +155,3 @@ def joined(found: Sequence[Comparison], table_of: Any) -> Table:
             table.add_column([one.a.chip] * len(table), name="chip", index=0)
         tables.append(table)
     return vstack(tables, metadata_conflicts="silent")
-
-
-def mosaic_of(found: Sequence[Comparison]) -> Mosaic:
-    """The chips of a comparison one above the other, with their names."""
-    column = Mosaic.column(*(grid_size(c.x, c.y) for c in found))
-    return Mosaic(column.sizes, tuple(f"chip {c.a.chip}" for c in found), column.places)

@@ -13,6 +13,7 @@ from pydantic import (
     PositiveFloat,
     PositiveInt,
     ValidationError,
+    create_model,
     field_validator,
     model_validator,
 )
@@ -24,18 +25,19 @@ from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.section import Section
 from bayesdist.app.selfcal.config import GaugeBlock, SelfcalBlock
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.discrepancy_terms import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
-from bayesdist.assess.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
-from bayesdist.assess.linear_term import LINEAR_KINDS, LinearTerm
 from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms import GIVEN, said_by_user
+from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
+from bayesdist.assess.terms.given import GIVEN, said_by_user
+from bayesdist.assess.terms.parameters import LINEAR_KINDS, LinearTerm
 from bayesdist.data.units import length_advice
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
+from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
 from bayesdist.infer.discrepancy import DiscrepancyPriors
-from bayesdist.infer.period_dates import check_periods, mjd_periods
 from bayesdist.model import FRAME_KINDS, Chip, TimeDependence
-from bayesdist.products.wise_meta import ARRAYS
+from bayesdist.products.formats.common.document import FormatSettings
+from bayesdist.products.registry import product_settings
 
 __all__ = [
     "CATALOGUE_WORDS",
@@ -364,35 +366,22 @@ class PriorBlock(Section):
     sigma: PositiveFloat
 
 
-class Sip(Section):
-    """A SIP header."""
+class _Products(Section):
+    """Files for pipelines: a table for each format that can be built, and the set of a release."""
 
-    inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
-    linear: Literal["cd", "sip"] = "cd"
-    crval: tuple[float, float] | None = None
-
-
-class Idctab(Section):
-    """An IDCTAB reference file."""
-
-    instrument: str
-    detector: str
-    v2v3: Literal["aperture"] = "aperture"
-    v2ref: float = 0.0
-    v3ref: float = 0.0
-    vafactor: PositiveFloat = 1.0
-    filters: list[str] | list[list[str]] | None = None
-    useafter: str | None = None
-    pedigree: str | None = None
-
-
-class Products(Section):
-    """Files for pipelines."""
-
-    sip: Sip | None = None
-    idctab: Idctab | None = None
-    wise_meta: bool = False
     release: ReleaseBlock | None = None
+
+    def asked(self) -> dict[str, FormatSettings]:
+        """Settings of the files that are asked for, by format."""
+        found = {key: getattr(self, key) for key in product_settings()}
+        return {key: settings for key, settings in found.items() if settings is not None}
+
+
+Products = create_model(
+    "Products",
+    __base__=_Products,
+    **{key: (settings | None, None) for key, settings in product_settings().items()},
+)
 
 
 # rows of every budget, and what its totals are called
@@ -466,7 +455,7 @@ class Config(Section):
             "holdout": (self.holdout, None, "leave it out"),
             "fit": (self.fit, Fit(), "leave it out"),
             "compute": (self.compute, ComputeBlock(), "leave it out"),
-            "products.wise_meta": (self.products.wise_meta, False, "ask for sip or idctab"),
+            "products.wise_meta": (self.products.wise_meta, None, "ask for sip or idctab"),
             "outliers.match_radius": (
                 self.outliers.match_radius,
                 None,
@@ -621,29 +610,11 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _wise_meta_of_wise(self) -> Config:
-        if not self.products.wise_meta:
-            return self
-        band = self.wise_band
-        if band is None or self.campaign is not None:
-            raise ValueError(
-                "products.wise_meta is of a run of WISE W1, W2, W3 or W4, and detector.name is "
-                f"{self.detector.name!r}; name the band there, or leave wise_meta out"
-            )
-        side, _ = ARRAYS[band]
-        reference = self.model.reference_pixel
-        if self.detector.size != (side, side) or reference not in (None, ((side + 1) / 2,) * 2):
-            raise ValueError(
-                f"products.wise_meta is of the whole array of W{band}, {side} x {side} pixels "
-                f"about {(side + 1) / 2:g}, {(side + 1) / 2:g}; correct detector.size and "
-                "model.reference_pixel, or leave wise_meta out"
-            )
+    def _files_of_this_detector(self) -> Config:
+        name = self.detector.name if self.campaign is None else ""
+        for settings in self.products.asked().values():
+            settings.check(name, self.detector.size, self.model.reference_pixel)
         return self
-
-    @property
-    def wise_band(self) -> int | None:
-        """Number of the WISE band that the detector is named after."""
-        return next((band for band in ARRAYS if self.detector.name == f"W{band}"), None)
 
     def chips(self) -> tuple[Chip, ...]:
         """Chips of the model; empty for a detector of one chip."""

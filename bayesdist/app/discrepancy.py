@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.fingerprint import fingerprint_of
-from bayesdist.assess.centroid import without
-from bayesdist.assess.discrepancy_terms import DeviationsTerm, StructureInFit, structure_term
-from bayesdist.assess.field_terms import FieldTerm
-from bayesdist.assess.terms import LocalTerm
+from bayesdist.assess.terms.centroid import without
+from bayesdist.assess.terms.correlated import DeviationsTerm, StructureInFit, structure_term
+from bayesdist.assess.terms.field_terms import FieldTerm
+from bayesdist.assess.terms.given import LocalTerm
 from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
-from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.discrepancy.storage import discrepancy_from_arrays, discrepancy_to_arrays
 from bayesdist.infer.recoloured import with_spread
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from astropy.table import Table
 
-from bayesdist.app.applied import Applied, applied
+from bayesdist.app.calibrations import calibration_at
 from bayesdist.app.folder import whole_folder
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
@@ -17,6 +17,7 @@ from bayesdist.app.session import write_table
 from bayesdist.app.sessions import session_of
 from bayesdist.assess.detector_numbers import detector_numbers
 from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,11 +41,13 @@ def handbook(
     Parameters
     ----------
     path : path
-        As of `applied`.
+        As of `calibration_at`.
     output : path
         New or empty folder.
-    filter, epoch, scale
-        As of `applied`.
+    filter, scale
+        As of `calibration_at`.
+    epoch : float, optional
+        Decimal years, for what depends on time.
     detector : str, optional
         WFC, HRC or SBC, whose printed numbers stand beside; that of an IDCTAB of ACS by default.
     magnification : float, optional
@@ -62,7 +65,7 @@ def handbook(
     """
     # figures take seconds to import
     from bayesdist.products.detectors import acs_detector
-    from bayesdist.report import drawn, save_images
+    from bayesdist.report.drawing import save_figures
     from bayesdist.report.handbook_numbers import handbook_rows
     from bayesdist.report.whole_detector import area_figure, non_linear_figure, residual_figure
 
@@ -74,10 +77,11 @@ def handbook(
             where="--magnification",
             do="give a positive number",
         )
-    found = applied(path, filter=filter, epoch=epoch, scale=scale)
+    found = calibration_at(path, filter=filter, scale=scale)
+    pixel, _ = found.pixel(epoch)
     if detector is None and found.instrument == "ACS":
         detector = found.detector
-    whole = WholeDetector(found.chips, found.scale)
+    whole = WholeDetector(found.in_frame(epoch), pixel)
     title = _title(found, filter, epoch)
     with whole_folder(Path(output)) as folder:
         figures = {
@@ -88,15 +92,15 @@ def handbook(
         if binned:
             figures["residuals"] = residual_figure(whole, binned, found.unit, title)
         rows = handbook_rows(
-            detector_numbers(whole), scale=found.scale, unit=found.unit, detector=detector or ""
+            detector_numbers(whole), scale=pixel, unit=found.unit, detector=detector or ""
         )
-        save_images(drawn(figures), folder)
+        save_figures(figures, folder)
         write_table(Table(rows), folder / "numbers.ecsv")
     shown = [row | {"published": row["published"] or "-"} for row in rows]
     return f"{output}: {', '.join(figures)}{missing}\n{table_text(shown, 5)}"
 
 
-def _title(found: Applied, filter: str | None, epoch: float | None) -> str:
+def _title(found: Calibration, filter: str | None, epoch: float | None) -> str:
     parts = [Path(found.name).resolve().name, filter or "", f"at {epoch:g}" if epoch else ""]
     whose = "/".join(p for p in (found.instrument, found.detector) if p)
     return ", ".join(p for p in (whose, *parts) if p)

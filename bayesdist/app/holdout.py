@@ -9,12 +9,12 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.kept import kept
-from bayesdist.assess.grid import grid_pixels
-from bayesdist.assess.holdout import LEAST_HELD, HeldOutTruth, held_out_truth
-from bayesdist.assess.holdout_predictive import Predictive, predictive_of
 from bayesdist.data.holdout import SetAside, Split, exposures_drawn, split_matches
+from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
+from bayesdist.diagnose.holdout.validation import LEAST_HELD, HeldOutTruth, held_out_truth
 from bayesdist.errors import InputError
 from bayesdist.model import LookupTable
+from bayesdist.model.grid import grid_pixels
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session

@@ -11,11 +11,11 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.session import Session, write_table
-from bayesdist.assess.horizon import Horizon, horizon_of
-from bayesdist.assess.position_errors import PositionErrors
-from bayesdist.assess.requirement import Requirement
+from bayesdist.assess.drawn import PositionErrors
+from bayesdist.assess.requirements.requirement import Requirement
+from bayesdist.assess.requirements.validity import Horizon, horizon_of
+from bayesdist.assess.requirements.verdict import effective_draws
 from bayesdist.assess.units import pixel_scale_of
-from bayesdist.assess.verdict import effective_draws
 
 __all__ = ["horizon_rows", "horizons_of", "kept_horizons", "last_epoch", "write_horizons"]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bayesdist.app.screen import number, table_text
 from bayesdist.infer import Posterior, load_posterior
-from bayesdist.products import describe
+from bayesdist.products.registry import describe
 
 __all__ = ["inspect"]
 

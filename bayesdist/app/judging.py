@@ -12,11 +12,11 @@ from bayesdist.app.horizon import horizons_of
 from bayesdist.app.product_terms import product_terms
 from bayesdist.app.session import Session
 from bayesdist.assess import Margin, Requirement, check_requirements, pixel_scale_of
-from bayesdist.assess.detector_budget import DetectorBudget, detector_budget
-from bayesdist.assess.horizon import Horizon
-from bayesdist.assess.position_errors import PositionErrors, position_errors
-from bayesdist.assess.product_terms import ProductTerm
+from bayesdist.assess.budget.detector import DetectorBudget, detector_budget
+from bayesdist.assess.drawn import PositionErrors, position_errors
+from bayesdist.assess.requirements.validity import Horizon
 from bayesdist.assess.solution import Solution
+from bayesdist.assess.terms.product_terms import ProductTerm
 from bayesdist.errors import BayesdistError, InputError
 
 __all__ = [

@@ -2,60 +2,40 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from bayesdist.app.session import Session
-from bayesdist.assess.solution import Solution
-from bayesdist.products import IdcTab, SipHeader, idctab_from_solution, sip_from_solution
-from bayesdist.products.sip import SIP_ORDERS
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.plane import Plane
+from bayesdist.infer.transforms import Solution
+from bayesdist.products.formats.common.document import BuildOptions, Built
+from bayesdist.products.registry import build
 
-__all__ = ["idctab_of", "sip_of", "wise_sip_of"]
-
-
-def sip_of(session: Session, solution: Solution, chip: int) -> SipHeader:
-    sip = session.config.products.sip
-    assert sip is not None
-    return sip_from_solution(
-        solution,
-        chip=chip,
-        epoch=session.epoch,
-        inverse_order=sip.inverse_order,
-        linear=sip.linear,
-        crval=sip.crval,
-        tangent_point=session.tangent_point,
-        scale_arcsec=session.scale_arcsec,
-        notes=[*_notes(session), *_sky_notes(session)],
-    )
+__all__ = ["calibration_for_files", "made_files"]
 
 
-def wise_sip_of(session: Session, solution: Solution) -> SipHeader:
-    """As WISE has it: all linear terms in A and B, and an inverse of the same order."""
-    return sip_from_solution(
-        solution,
-        epoch=session.epoch,
-        inverse_order=max(solution.model.order, SIP_ORDERS[0]),
-        linear="sip",
-        scale_arcsec=session.scale_arcsec,
-    )
+def made_files(session: Session, solution: Solution) -> dict[str, tuple[Built, ...]]:
+    """Files by the key of their format."""
+    calibration = calibration_for_files(session, solution)
+    options = BuildOptions(session.epoch, session.scale_arcsec)
+    return {
+        key: build(key, calibration, settings, options)
+        for key, settings in session.config.products.asked().items()
+    }
 
 
-def idctab_of(session: Session, solution: Solution) -> IdcTab:
-    idc = session.config.products.idctab
-    assert idc is not None
-    return idctab_from_solution(
-        solution,
-        scale_arcsec=session.scale_arcsec,
-        history=_notes(session),
-        **idc.model_dump(exclude_none=True),
-    )
+def calibration_for_files(session: Session, solution: Solution) -> Calibration:
+    """The calibration that the files hold, with what they have to say of the run it is from."""
+    point = session.tangent_point
+    plane = Plane() if point is None else Plane("sky", point=point, note=_sky_note(session))
+    name = session.config.detector.name
+    calibration = calibration_of(solution, str(session.run.path), plane=plane, detector=name)
+    return replace(calibration, notes=(session.gauge_words,) if session.gauge_words else ())
 
 
-def _notes(session: Session) -> list[str]:
-    """What a file has to say of the run it is from."""
-    return [session.gauge_words] if session.gauge_words else []
-
-
-def _sky_notes(session: Session) -> list[str]:
-    """For which exposure a header is right on the sky, where they differ."""
+def _sky_note(session: Session) -> str:
+    """For which exposure a file is right on the sky, where they differ."""
     model = session.model
-    if session.tangent_point is None or model.frames == "none" or len(model.exposures) < 2:
-        return []
-    return [f"On the sky it is exposure {model.exposures[0]}: others have frames of their own."]
+    if model.frames == "none" or len(model.exposures) < 2:
+        return ""
+    return f"On the sky it is exposure {model.exposures[0]}: others have frames of their own."

@@ -11,7 +11,7 @@ from astropy.table import Table
 
 from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.comparison_files import joined, mosaic_of
+from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.folder import whole_folder
 from bayesdist.app.matches import load_matches, reading_options
@@ -19,18 +19,18 @@ from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.rvb import load_rvb
 from bayesdist.app.session import Session, write_table
 from bayesdist.assess import misfit_of, partitions_for, star_sums
-from bayesdist.assess.change_maps import Monitored, change_maps, is_late
-from bayesdist.assess.comparison_table import comparison_table, difference_table
-from bayesdist.assess.misfit import Misfit, worst_misfit
+from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
+from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.data import input_files, sha256_of
+from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
 from bayesdist.errors import InputError
 from bayesdist.infer import Matches, Posterior
-from bayesdist.infer.change_date import PeriodScore, period_scores, scan_dates
-from bayesdist.infer.membership import count_outliers
-from bayesdist.infer.monitoring import NewFit, change_of, fit_new
-from bayesdist.report import drawn, save_images
+from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan_dates
+from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
+from bayesdist.infer.density.memberships import count_outliers
 from bayesdist.report.comparison import change_over_time, difference_vectors
+from bayesdist.report.drawing import save_figures
 
 __all__ = ["monitor"]
 
@@ -260,9 +260,7 @@ def _write(
     with whole_folder(output) as folder:
         write_table(joined(maps, comparison_table), folder / "change.ecsv")
         write_table(joined(maps, difference_table), folder / "difference.ecsv")
-        figures = {
-            "change": difference_vectors(*maps, mosaic=mosaic_of(maps), names=("new", "release"))
-        }
+        figures = {"change": difference_vectors(maps, names=("new", "release"))}
         if date is not None:
             table = Table(
                 {
@@ -277,7 +275,7 @@ def _write(
                 figures["dates"] = change_over_time(
                     table["first"], date.gain, date.dof, found.p_since
                 )
-        save_images(drawn(figures), folder / "figures")
+        save_figures(figures, folder / "figures")
         write_json(folder / "monitor.json", _summary(found, facts, command))
 
 

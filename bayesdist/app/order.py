@@ -19,8 +19,8 @@ from bayesdist.app.screen import table_text
 from bayesdist.app.session import Session, write_table
 from bayesdist.data import atomic_path
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.order import select_order
-from bayesdist.infer.order_results import OrderSelection
+from bayesdist.infer.compare.order import select_order
+from bayesdist.infer.compare.order_result import OrderSelection
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["order"]
@@ -197,9 +197,9 @@ def _with_error(value: float | None, error: float | None) -> str:
 
 
 def _draw(found: OrderSelection, path: Path) -> None:
-    from bayesdist.report import drawn  # figures take seconds to import
+    from bayesdist.report.drawing import png_of  # figures take seconds to import
     from bayesdist.report.order import order_comparison
 
-    png = drawn({"orders": order_comparison(found)})["orders"]
+    png = png_of(order_comparison(found))
     with atomic_path(path) as temporary:
         temporary.write_bytes(png)

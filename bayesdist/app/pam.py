@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.applied import applied, images_of
+from bayesdist.app.calibrations import calibration_at, images_of, notes_of
 from bayesdist.app.output import refuse_existing
 from bayesdist.app.screen import number
+from bayesdist.calibration.area import PixelAreaMap, pixel_area_map
+from bayesdist.calibration.subarray import FULL
 from bayesdist.errors import InputError
-from bayesdist.products.pam import PixelAreaMap, pixel_area_map, write_pam
-from bayesdist.products.subarray import FULL
+from bayesdist.products.pam_file import write_pam
 
 __all__ = ["write_area_maps"]
 
@@ -32,13 +33,15 @@ def write_area_maps(
     Parameters
     ----------
     path : path
-        As of `applied`.
+        As of `calibration_at`.
     output : path
         A FITS file.
     chip : int, optional
         All by default.
-    filter, epoch, scale
-        As of `applied`.
+    filter, scale
+        As of `calibration_at`.
+    epoch : float, optional
+        Decimal years, for what depends on time.
     image : path, optional
         A calibrated image: maps are of its chips, in its order, and of its subarrays.
     force : bool
@@ -62,9 +65,10 @@ def write_area_maps(
             do="choose a name that ends in .fits",
         )
     refuse_existing(output, force)
-    found = applied(path, filter=filter, epoch=epoch, scale=scale)
+    found = calibration_at(path, filter=filter, scale=scale)
+    chips, (pixel, source) = found.in_frame(epoch), found.pixel(epoch)
     images = images_of(found, image=image)
-    numbers = list(images or found.chips)
+    numbers = list(images or chips)
     if chip is not None:
         if chip not in numbers:
             raise InputError(
@@ -73,7 +77,7 @@ def write_area_maps(
                 do=f"choose one of {', '.join(map(str, numbers))}",
             )
         numbers = [chip]
-    maps = [pixel_area_map(found.chips[n], found.scale, image=images.get(n, FULL)) for n in numbers]
+    maps = [pixel_area_map(chips[n], pixel, image=images.get(n, FULL)) for n in numbers]
     write_pam(
         output,
         maps,
@@ -81,11 +85,11 @@ def write_area_maps(
         detector=found.detector,
         source=found.name,
     )
-    notes = "".join(f"; {note}" for note in found.notes)
+    notes = "".join(f"; {note}" for note in notes_of(found, epoch))
     unit = "pix of u, v" if found.unit == "pix" else found.unit
     head = (
-        f"{output}: pixel area over that of {number(found.scale, 6)} {unit} squared "
-        f"({found.scale_from}), by {found.name}{notes}"
+        f"{output}: pixel area over that of {number(pixel, 6)} {unit} squared "
+        f"({source}), by {found.name}{notes}"
     )
     return "\n".join([head, *(_line(one) for one in maps)])
 

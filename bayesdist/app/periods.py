@@ -17,7 +17,7 @@ from bayesdist.errors import InputError
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
     from bayesdist.assess.wise import PatternChange, StatisticsTable
-    from bayesdist.infer.period_positions import PositionChange
+    from bayesdist.infer.compare.positions import PositionChange
 
 __all__ = ["check_pairs", "periods_of", "periods_summary", "periods_table"]
 

@@ -15,11 +15,11 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
-from bayesdist.assess.planning import Schedule, exposures_needed
-from bayesdist.assess.requirement import Requirement
+from bayesdist.assess.planning.exposures import Schedule, exposures_needed
+from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
-from bayesdist.infer.planning import ExposureContent, exposure_content, exposure_information
+from bayesdist.infer.compare.planning import ExposureContent, exposure_content, exposure_information
 
 __all__ = ["plan"]
 

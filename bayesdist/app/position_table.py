@@ -10,9 +10,9 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.output import refuse_existing
+from bayesdist.calibration.apply import Positions
 from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
-from bayesdist.products.application import Positions
 
 __all__ = [
     "OUT",

@@ -18,25 +18,21 @@ from numpy.typing import NDArray
 
 from bayesdist.app.campaign.release import write_files
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.file_positions import ReleasedSet, sip_positions
-from bayesdist.app.made_files import idctab_of, sip_of, wise_sip_of
-from bayesdist.assess.grid import grid_pixels, mesh
-from bayesdist.assess.product_terms import ProductTerm
+from bayesdist.app.file_positions import sip_positions
+from bayesdist.app.made_files import made_files
 from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms import MEASURED
-from bayesdist.model import Chip, LookupTable, corrected
-from bayesdist.products import (
-    SipHeader,
-    read_d2im,
-    read_idctab,
-    read_lookup_file,
-    read_sip,
-    read_wise_meta,
-    write_idctab,
-    write_sip,
-    write_wise_meta,
-)
-from bayesdist.products.sip_build import ARCSEC
+from bayesdist.assess.terms.given import MEASURED
+from bayesdist.assess.terms.product_terms import ProductTerm
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.model import corrected
+from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.products import SipHeader, read_d2im, read_lookup_file
+from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import Built
+from bayesdist.products.formats.sip.read import sip_of
+from bayesdist.products.formats.wise.meta import bands_of
+from bayesdist.products.registry import read_calibration, recognized
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
@@ -55,44 +51,29 @@ SKY_ROUNDING = 2e-9  # arcsec: what double precision leaves of an RA of 360 degr
 def product_terms(session: Session) -> tuple[ProductTerm, ...]:
     """Terms of the files that the configuration asks for.
 
-    They are written into a folder of their own and read back, so that digits and orders are those
-    of the files; nothing of the run is touched.
+    They are read back from their bytes, so that digits and orders are those of the files; nothing
+    of the run is touched.
     """
-    asked, chips = session.config.products, session.solution.model.chips
+    release, made = session.config.products.release, made_files(session, session.solution)
     out: list[ProductTerm] = []
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "file"
-        if asked.sip is not None:
-            headers = {}
-            for chip in chips:
-                write_sip(sip_of(session, session.solution, chip.number), path)
-                headers[chip.number] = read_sip(path)
-            out += _sip_terms(session, ", ".join(sip_names(chips)), headers)
-        if asked.idctab is not None:
-            name = idctab_name(session)
-            write_idctab(idctab_of(session, session.solution), path)
-            out += _idctab_terms(session, name, [ReleasedSet(read_idctab(path))])
-        if asked.wise_meta and session.config.wise_band is not None:
-            header = wise_sip_of(session, session.solution)
-            write_wise_meta(path, {session.config.wise_band: header})
-            [band] = read_wise_meta(path)
-            name = f"w{session.config.wise_band}.meta"
-            out += _sip_terms(session, name, {chips[0].number: band.sip}, like=header)
-        if asked.release is not None and isinstance(session, CampaignSession):
-            out += _idctab_terms(session, asked.release.name, _released(session, Path(folder)))
+    if "sip" in made:
+        headers = {one.chip: sip_of(_content(one)) for one in made["sip"] if one.chip is not None}
+        out += _sip_terms(session, ", ".join(one.file_name for one in made["sip"]), headers)
+    for one in made.get("idctab", ()):
+        of_file = recognized(_content(one)).calibration()
+        out += _idctab_terms(session, one.file_name, [of_file])
+    for one in made.get("wise_meta", ()):
+        [band] = bands_of(_content(one))
+        chip = session.solution.model.chips[0].number
+        out += _sip_terms(session, one.file_name, {chip: band.sip}, like=one.made)
+    if release is not None and isinstance(session, CampaignSession):
+        with TemporaryDirectory() as folder:
+            out += _idctab_terms(session, release.name, _released(session, Path(folder)))
     return tuple(out)
 
 
-def sip_names(chips: tuple[Chip, ...]) -> tuple[str, ...]:
-    """Names of the SIP headers that a run writes."""
-    return tuple(f"sip_{c.number}.hdr" for c in chips) if len(chips) > 1 else ("sip.hdr",)
-
-
-def idctab_name(session: Session) -> str:
-    """Name of the IDCTAB that a run writes."""
-    idc = session.config.products.idctab
-    assert idc is not None
-    return f"{idc.instrument}_{idc.detector}_idc.fits".lower()
+def _content(built: Built) -> Content:
+    return Content(built.file_name, built.content)
 
 
 def _sip_terms(
@@ -121,42 +102,52 @@ def _sip_terms(
     ]
 
 
-def _idctab_terms(session: Session, file: str, sets: Sequence[ReleasedSet]) -> list[ProductTerm]:
+def _idctab_terms(session: Session, file: str, sets: Sequence[Calibration]) -> list[ProductTerm]:
     """Forward, and inverse where there are such rows; one set for each segment of the drift."""
     time = session.solution.model.time
 
-    def of(epoch: float | None) -> ReleasedSet:
+    def of(epoch: float | None) -> Calibration:
         if time is None or epoch is None or len(sets) == 1:
             return sets[0]
         return sets[int(np.searchsorted(time.breaks, epoch, side="right"))]
 
     def place(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
         # a table without drift would refuse a date
-        return of(epoch)(x, y, chip, None if time is None else epoch)
+        return of(epoch).forward(x, y, chip=chip, epoch=None if time is None else epoch)
+
+    def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        one = of(epoch)
+        about_zero = one.at(origin="chip")[chip]  # at the reference date, for which the rows are
+        back = one.inverses[chip].pixels(*about_zero.at(x, y))
+        return np.stack([back[0] - x, back[1] - y], axis=-1)
 
     out = [_term(session, file, FORWARD, _Laid(session, place, scaled=True))]
-    if all(one.has_inverse for one in sets):
-        back = _in_unit(session, lambda x, y, chip, epoch: of(epoch).back(x, y, chip))
-        out.append(_term(session, file, INVERSE, back))
+    if all(one.inverses for one in sets):
+        out.append(_term(session, file, INVERSE, _in_unit(session, missed)))
     return out
 
 
-def _released(session: CampaignSession, folder: Path) -> list[ReleasedSet]:
+def _released(session: CampaignSession, folder: Path) -> list[Calibration]:
     """The files of a release, one set for each segment: of several periods of one, the first."""
     block, filter = session.config.products.release, session.inputs.filter
     assert block is not None
     entries = write_files(session, folder, {filter: session.solution}, session.tables)
     paths = {e["kind"]: folder / e["path"] for e in entries}
-    d2im = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
-    npol: dict[int, LookupTable] = {}
-    if "NPOLFILE" in paths:
-        after = read_lookup_file(paths["NPOLFILE"])
-        npol = {c: after.table(c, after.values(c), None) for c in after.chips}
-    tabs = {e["period"]: read_idctab(folder / e["path"]) for e in entries if e["kind"] == "IDCTAB"}
-    segments: dict[int, ReleasedSet] = {}
+    before = read_d2im(paths["D2IMFILE"]) if "D2IMFILE" in paths else ()
+    npol = read_lookup_file(paths["NPOLFILE"]) if "NPOLFILE" in paths else None
+    sets = {}
+    for entry in entries:
+        if entry["kind"] == "IDCTAB":
+            one = read_calibration(folder / entry["path"], filter=filter)
+            after = (
+                ()
+                if npol is None
+                else [npol.table(c, one.pixel()[0] * npol.values(c), None) for c in npol.chips]
+            )
+            sets[entry["period"]] = one.with_tables(before, after)
+    segments: dict[int, Calibration] = {}
     for period in block.period:
-        one = ReleasedSet(tabs[period.name], d2im, npol, filter)
-        segments.setdefault(period.segment, one)
+        segments.setdefault(period.segment, sets[period.name])
     time = session.solution.model.time
     n = 1 if time is None else time.n_segments
     last = segments[min(segments)]

@@ -21,7 +21,7 @@ from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
-from bayesdist.infer.shared_drift import with_drift_of
+from bayesdist.infer.exposures.shared_drift import with_drift_of
 from bayesdist.model import LookupTable
 
 __all__ = ["release_runs"]

@@ -16,8 +16,7 @@ from bayesdist.products import (
     write_sip,
     write_wise_meta,
 )
-from bayesdist.products.sip_read import holds_sip
-from bayesdist.products.wise_meta import holds_wise_meta
+from bayesdist.products.registry import open_document
 
 __all__ = ["rotate"]
 
@@ -55,11 +54,12 @@ def rotate(
     """
     path, output = Path(path), Path(output)
     refuse_existing(output, force)
-    if holds_sip(path):
+    key = open_document(path).format.key
+    if key == "sip":
         turned = rotated_sip(read_sip(path), degrees, mirror=mirror)
         write_sip(turned, output)
         lines = [_line("", turned)]
-    elif holds_wise_meta(path):
+    elif key == "wise_meta":
         bands = {one.band: _turned(one, degrees, mirror, str(path)) for one in read_wise_meta(path)}
         write_wise_meta(output, bands)
         lines = [_line(f"W{one.band}: ", one.sip) for one in read_wise_meta(output)]

@@ -34,20 +34,20 @@ from bayesdist.assess import (
     star_sample,
     star_sums,
 )
-from bayesdist.assess.centroid import centroid_scatter
 from bayesdist.assess.coverage import Coverage, coverage_of
-from bayesdist.assess.discrepancy_terms import STRUCTURE
-from bayesdist.assess.field_terms import FieldTerm
-from bayesdist.assess.holdout_predictive import Predictive
-from bayesdist.assess.majority import majority_sentence
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map, with_local
-from bayesdist.assess.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
-from bayesdist.assess.quoted_errors import error_scale, error_scale_sentence
 from bayesdist.assess.solution import Solution
+from bayesdist.assess.terms.centroid import centroid_scatter
+from bayesdist.assess.terms.correlated import STRUCTURE
+from bayesdist.assess.terms.field_terms import FieldTerm
 from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
 from bayesdist.data.holdout import Split
 from bayesdist.diagnose import ScoreTest, score_tests
-from bayesdist.diagnose.epoch_shift import EpochShift, epoch_shift
+from bayesdist.diagnose.holdout.predictive import Predictive
+from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
+from bayesdist.diagnose.residuals.majority import majority_sentence
+from bayesdist.diagnose.residuals.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
+from bayesdist.diagnose.residuals.quoted import error_scale, error_scale_sentence
 from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
@@ -62,9 +62,9 @@ from bayesdist.infer import (
     load_fit,
     load_posterior,
 )
-from bayesdist.infer.added_errors import GroupedErrors
+from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
-from bayesdist.infer.frame_choice import FrameChoice, frames_that_help
+from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.model import DistortionModel
 
 Float = NDArray[np.float64]

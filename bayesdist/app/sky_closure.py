@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from bayesdist.app.file_positions import sky_of_header
 from bayesdist.app.session import Session
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.tangent import sky_of_plane
-from bayesdist.products.sip_build import ARCSEC
 
 __all__ = ["SkyClosure", "sky_closure"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bayesdist.assess.field_terms import FieldTerm
+from bayesdist.assess.terms.field_terms import FieldTerm
 from bayesdist.infer import Posterior
 
 __all__ = ["Systematics"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.periods import periods_of
 from bayesdist.app.session import Session
+from bayesdist.assess.requirements.verdict import scatter_too_small
 from bayesdist.assess.units import pixel_doubt
-from bayesdist.assess.verdict import scatter_too_small
 from bayesdist.errors import InputError
 
 __all__ = ["frames_doubt", "labelled", "posterior_warnings", "trust", "warnings_of"]

@@ -1,29 +1,34 @@
 """What a solution is worth: uncertainty maps, error budget, margins against requirements."""
 
-from bayesdist.assess.alignment import Alignment, alignment_residuals
 from bayesdist.assess.area import AreaMap, area_map
-from bayesdist.assess.budget import BudgetTerm, ErrorBudget, error_budget, error_budgets
-from bayesdist.assess.detector_budget import DetectorBudget, detector_budget
-from bayesdist.assess.fields import ErrorFields, error_fields
-from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels
+from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget, error_budget, error_budgets
+from bayesdist.assess.budget.detector import DetectorBudget, detector_budget
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
-from bayesdist.assess.misfit import Misfit, misfit_of, partitions_for, worst_misfit
 from bayesdist.assess.mosaic import chip_places
-from bayesdist.assess.requirements import Margin, Requirement, check_requirements
-from bayesdist.assess.residuals import (
+from bayesdist.assess.requirements.margins import Margin, Requirement, check_requirements
+from bayesdist.assess.solution import Solution
+from bayesdist.assess.statistics import STATISTICS, field_statistic
+from bayesdist.assess.terms.fields import ErrorFields, error_fields
+from bayesdist.assess.terms.given import TERM_KINDS, LocalTerm, UserTerm
+from bayesdist.assess.units import UNITS, convert, pixel_scale_of
+from bayesdist.assess.vectors import VectorMap, distortion_vectors
+from bayesdist.diagnose.alignment import Alignment, alignment_residuals
+from bayesdist.diagnose.residuals.binned import (
     BinnedResiduals,
     BinnedSums,
     binned_residuals,
     binned_sums,
     residual_statistics,
 )
-from bayesdist.assess.solution import Solution
-from bayesdist.assess.star_sample import SAMPLE, StarSample, star_sample
-from bayesdist.assess.star_sums import ExposureSums, StarSums, flagged_by_exposure, star_sums
-from bayesdist.assess.statistics import STATISTICS, field_statistic
-from bayesdist.assess.terms import TERM_KINDS, LocalTerm, UserTerm
-from bayesdist.assess.units import UNITS, convert, pixel_scale_of
-from bayesdist.assess.vectors import VectorMap, distortion_vectors
+from bayesdist.diagnose.residuals.misfit import Misfit, misfit_of, partitions_for, worst_misfit
+from bayesdist.diagnose.residuals.sample import SAMPLE, StarSample, star_sample
+from bayesdist.diagnose.residuals.star_sums import (
+    ExposureSums,
+    StarSums,
+    flagged_by_exposure,
+    star_sums,
+)
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels
 
 __all__ = [
     "DEFAULT_GRID",

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
-from bayesdist.assess.grid import grid_pixels, mesh
-from bayesdist.assess.regions import in_region
-from bayesdist.assess.requirement import Requirement
-from bayesdist.assess.residuals import BinnedSums
+from bayesdist.assess.requirements.regions import in_region
+from bayesdist.assess.requirements.requirement import Requirement
+from bayesdist.diagnose.residuals.binned import BinnedSums
 from bayesdist.model import Chip
+from bayesdist.model.grid import grid_pixels, mesh
 
 __all__ = ["Coverage", "coverage_of"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.assess.grid import mesh
-from bayesdist.assess.whole_detector import WholeDetector, slopes_at
+from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.model.grid import mesh
 
 __all__ = ["DetectorNumbers", "detector_numbers"]
 
@@ -77,7 +77,7 @@ def detector_numbers(detector: WholeDetector) -> DetectorNumbers:
             best, where = float(field.length[iy, ix]), (float(field.x[ix]), float(field.y[iy]))
         area = detector.relative_area(n, x, y)
         low, high = min(low, float(area.min())), max(high, float(area.max()))
-        slopes = slopes_at(c, *mesh(x, y))
+        slopes = c.slope(*mesh(x, y))
         weight = c.basis.size[0] * c.basis.size[1]
         scales += weight * np.hypot(slopes[:, 0], slopes[:, 1]).mean(axis=0)
         pixels += weight

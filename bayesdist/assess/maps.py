@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
-from bayesdist.assess.moments import position_moments
 from bayesdist.assess.solution import Solution, kind_of, place_of
-from bayesdist.assess.terms import LocalTerm
+from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.calibration.chip_map import position_moments
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
 __all__ = ["RELATIVE", "SigmaMap", "UncertaintyMap", "uncertainty_map", "with_local"]
 

@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.misfit import STARS_PER_BIN
 from bayesdist.assess.wise import (
     BandBins,
     PatternChange,
@@ -23,13 +22,19 @@ from bayesdist.assess.wise import (
     period_table,
 )
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit, Matches
-from bayesdist.infer.period_changes import PeriodComparison
-from bayesdist.infer.period_positions import PositionChange
-from bayesdist.infer.period_verdict import SIGNIFICANT, all_below, period_verdict
-from bayesdist.infer.periods import PeriodSums, compare_periods, sum_by_period, sums_of_stars
-from bayesdist.infer.stars import prepare
+from bayesdist.infer.compare.period_changes import PeriodComparison
+from bayesdist.infer.compare.period_verdict import SIGNIFICANT, all_below, period_verdict
+from bayesdist.infer.compare.periods import (
+    PeriodSums,
+    compare_periods,
+    sum_by_period,
+    sums_of_stars,
+)
+from bayesdist.infer.compare.positions import PositionChange
+from bayesdist.infer.stars.stars import prepare
 
 __all__ = ["PeriodPart", "TimeVariation", "bins_for", "period_part", "time_variation"]
 

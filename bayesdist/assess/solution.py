@@ -7,22 +7,18 @@ for each grid point and parameter: their cost on the grid does not grow with the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.views import Solution
+from bayesdist.infer.transforms import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
 
-__all__ = ["Place", "Solution", "kind_of", "place_of", "point_blocks"]
+__all__ = ["Place", "Solution", "kind_of", "place_of"]
 
 Float = NDArray[np.float64]
-
-# Points whose basis values are held at once: 55 terms (order 9) of them are 14 MB.
-BLOCK = 32768
 
 
 def kind_of(solution: Solution) -> str:
@@ -108,9 +104,3 @@ def place_of(
         model.chip_code(chip)  # a model of one chip would accept any number
     group = model.groups(1, epoch=epoch, exposure=exposure, chip=chip)
     return Place(model, group, None if epoch is None else float(epoch))
-
-
-def point_blocks(n: int) -> Iterator[slice]:
-    """Slices that cut n points into blocks of bounded size."""
-    for start in range(0, n, BLOCK):
-        yield slice(start, min(start + BLOCK, n))

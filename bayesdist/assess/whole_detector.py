@@ -15,12 +15,12 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.area import pixel_areas
-from bayesdist.assess.calibration import Calibration
-from bayesdist.assess.grid import mesh
+from bayesdist.calibration.area import pixel_areas
+from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
+from bayesdist.model.grid import mesh
 
-__all__ = ["ChipField", "WholeDetector", "slopes_at"]
+__all__ = ["ChipField", "WholeDetector"]
 
 Float = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class WholeDetector:
 
     Parameters
     ----------
-    chips : mapping of int to Calibration
+    chips : mapping of int to ChipMap
         By chip number; the first one's pixels are those of the whole array.
     scale : float
         Size of an output pixel, in the unit of the calibrations.
@@ -72,7 +72,7 @@ class WholeDetector:
         Without chips, for a scale that is not positive, or a chip without area.
     """
 
-    chips: Mapping[int, Calibration]
+    chips: Mapping[int, ChipMap]
     scale: float
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ class WholeDetector:
                 f"the scale is {self.scale}", where="scale", do="give a positive number"
             )
         for c in self.chips.values():
-            if not np.abs(np.linalg.det(slopes_at(c, *_middle(c)))).min() > 0:
+            if not np.abs(np.linalg.det(c.slope(*_middle(c)))).min() > 0:
                 raise InputError(
                     "maps its middle to a line", where=f"{c.name}, chip {c.chip}", do="check it"
                 )
@@ -101,14 +101,14 @@ class WholeDetector:
         out = {first: (0.0, 0.0)}
         a = self.chips[first]
         ax, ay = _edge_points(a)
-        on_a = _values(a, ax, ay)
+        on_a = a.at(ax, ay)
         for number in others:
             b = self.chips[number]
             bx, by = _edge_points(b)
-            on_b = _values(b, bx, by)
+            on_b = b.at(bx, by)
             far = np.hypot(*(on_a[:, :, None] - on_b[:, None, :]))
             i, j = np.unravel_index(int(far.argmin()), far.shape)
-            mean = (slopes_at(a, ax[[i]], ay[[i]]) + slopes_at(b, bx[[j]], by[[j]]))[0] / 2
+            mean = (a.slope(ax[[i]], ay[[i]]) + b.slope(bx[[j]], by[[j]]))[0] / 2
             way = np.linalg.solve(mean, on_b[:, j] - on_a[:, i])
             out[number] = float(ax[i] + way[0] - bx[j]), float(ay[i] + way[1] - by[j])
         return out
@@ -143,7 +143,7 @@ class WholeDetector:
             (hx, hy), (nx, ny) = c.basis.half_size, c.basis.size
             x, y = X * hx + (nx + 1) / 2, Y * hy + (ny + 1) / 2
             design.append(self._design(number, x, y))
-            values.append(_values(c, x, y).T)
+            values.append(c.at(x, y).T)
             weights.append(np.sqrt(np.outer(q, q).ravel() * hx * hy))
         w = np.concatenate(weights)[:, None]
         found = np.linalg.lstsq(w * np.concatenate(design), w * np.concatenate(values), rcond=None)[
@@ -173,7 +173,7 @@ class WholeDetector:
         X, Y = mesh(x, y)
         constant, slope = self.linear
         left = (
-            _values(self.chips[number], X, Y)
+            self.chips[number].at(X, Y)
             - (self._design(number, X, Y) @ np.vstack([constant, slope.T])).T
         )
         shape = (y.size, x.size)
@@ -191,7 +191,7 @@ class WholeDetector:
         least = min(near.values())
         return np.mean(
             [
-                slopes_at(self.chips[n], *self._centre_on(n))[0]
+                self.chips[n].slope(*self._centre_on(n))[0]
                 for n, far in near.items()
                 if far < least + 1.0
             ],
@@ -216,22 +216,12 @@ class WholeDetector:
         return area / abs(float(np.linalg.det(self.central_slope)))
 
 
-def _values(c: Calibration, x: Float, y: Float) -> Float:
-    """(u, v), (2, N)."""
-    return c.coefficients @ c.basis.evaluate(x, y).T
-
-
-def slopes_at(c: Calibration, x: Float, y: Float) -> Float:
-    """Derivatives d(u, v) / d(x, y), (N, 2, 2), at pixels (N,)."""
-    return np.stack([g @ c.coefficients.T for g in c.basis.gradient(x, y)], axis=-1)
-
-
-def _middle(c: Calibration) -> tuple[Float, Float]:
+def _middle(c: ChipMap) -> tuple[Float, Float]:
     nx, ny = c.basis.size
     return np.array([(nx + 1) / 2]), np.array([(ny + 1) / 2])
 
 
-def _edge_points(c: Calibration) -> tuple[Float, Float]:
+def _edge_points(c: ChipMap) -> tuple[Float, Float]:
     """The middles of a chip's edges."""
     (nx, ny), (mx, my) = c.basis.size, (v[0] for v in _middle(c))
     return np.array([mx, mx, 0.5, nx + 0.5]), np.array([0.5, ny + 0.5, my, my])

@@ -1,15 +1,15 @@
 """From matches to knowledge: the linear fit, the outlier mixture, and its posterior."""
 
-from bayesdist.infer.by_magnitude import fit_by_magnitude
-from bayesdist.infer.catalogue_shear import CatalogueShear, catalogue_shear
-from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
-from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
-from bayesdist.infer.labelled.convergence import Convergence, Limits
-from bayesdist.infer.labelled.fit_file import load_fit, save_fit
-from bayesdist.infer.labelled.posterior_file import load_posterior, save_posterior
+from bayesdist.infer.catalogue.by_magnitude import fit_by_magnitude
+from bayesdist.infer.catalogue.catalogue_shear import CatalogueShear, catalogue_shear
+from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance, with_star_errors
+from bayesdist.infer.density.memberships import Memberships, memberships, outlier_probability
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
+from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
+from bayesdist.infer.files.fit_file import load_fit, save_fit
+from bayesdist.infer.files.posterior_file import load_posterior, save_posterior
 from bayesdist.infer.linear import LinearFit, build_model, fit_linear, residuals
-from bayesdist.infer.membership import Memberships, memberships, outlier_probability
-from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.nodes import (
     TableFit,
     TablePosterior,
@@ -18,11 +18,11 @@ from bayesdist.infer.nodes import (
     fit_with_tables,
 )
 from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.sampling import sample
-from bayesdist.infer.shards import Compute, Matches, Shards, load
-from bayesdist.infer.star_errors import StarCovariance, star_covariance, with_star_errors
-from bayesdist.infer.views import (
+from bayesdist.infer.sampler.convergence import Convergence, Limits
+from bayesdist.infer.sampler.sample import sample
+from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.infer.stars.shards import Compute, Matches, Shards, load
+from bayesdist.infer.transforms import (
     LinearTerms,
     ReferenceGauge,
     View,

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.identify import check_coverage, require_full_rank
-from bayesdist.infer.normal import NormalEquations, least_squares
-from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.shards import Compute, Matches, Shards, opened
-from bayesdist.infer.stars import Stars, in_table_order, prepare
+from bayesdist.infer.equations.normal import NormalEquations, least_squares
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.rank import check_coverage, require_full_rank
+from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import nearest_frame
 

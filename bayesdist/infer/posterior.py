@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.certificate import Certificate
-from bayesdist.infer.labelled.convergence import Convergence
-from bayesdist.infer.mixture import OutlierMixture
+from bayesdist.infer.sampler.convergence import Convergence
+from bayesdist.infer.sampler.surrogate import Certificate
+from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
 
 __all__ = ["Posterior", "SamplerInfo"]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.posterior import Posterior
-from bayesdist.infer.views import Derived, Solution
+from bayesdist.infer.transforms import Derived, Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["Recoloured", "recolouring", "with_spread"]

@@ -7,7 +7,7 @@ pixel offsets, with their covariance, only where a product is written.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb
@@ -19,9 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["MAX_ORDER", "PolynomialBasis", "as_pair", "polynomial_terms"]
+__all__ = ["MAX_ORDER", "PolynomialBasis", "as_pair", "point_blocks", "polynomial_terms"]
 
 MAX_ORDER = 9
+# Points whose basis values are held at once: 55 terms (order 9) of them are 14 MB.
+BLOCK = 32768
 
 Float = NDArray[np.float64]
 
@@ -44,6 +46,12 @@ def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
         ``(order + 1) (order + 2) / 2`` pairs.
     """
     return tuple((n - j, j) for n in range(order + 1) for j in range(n + 1))
+
+
+def point_blocks(n: int) -> Iterator[slice]:
+    """Slices that cut n points into blocks whose basis values can be held at once."""
+    for start in range(0, n, BLOCK):
+        yield slice(start, min(start + BLOCK, n))
 
 
 def as_pair(values: Sequence[float]) -> tuple[float, float]:

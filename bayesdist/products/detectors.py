@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bayesdist.errors import InputError
-from bayesdist.products.parity import parity_of
+from bayesdist.products.formats.idctab.hst import parity_of
 
 __all__ = ["ACS", "Detector", "acs_detector"]
 

@@ -10,19 +10,20 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from bayesdist.assess.solution import Solution
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.orientation import oriented
+from bayesdist.calibration.plane import Orientation
 from bayesdist.data.files import made_folder
 from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.d2im import write_d2im
-from bayesdist.products.idctab import IdcTab, write_idctab
-from bayesdist.products.idctab_build import idctab_from_solution
-from bayesdist.products.npol import write_npol
-from bayesdist.products.orientation import Orientation
-from bayesdist.products.oriented import oriented
-from bayesdist.products.storable import Lost, Stored, storable
-from bayesdist.products.wheels import combination_of
+from bayesdist.products.formats.idctab.build import build_idctab
+from bayesdist.products.formats.idctab.drift import Loss, storable
+from bayesdist.products.formats.idctab.hst import combination_of
+from bayesdist.products.formats.idctab.table import IdcTab, write_idctab
+from bayesdist.products.formats.lookup.d2im import write_d2im
+from bayesdist.products.formats.lookup.npol import write_npol
 
 __all__ = ["Period", "Release", "write_release"]
 
@@ -65,14 +66,14 @@ class Release:
     d2im : Path or None
     npol : dict of str to Path
         By filter.
-    lost : dict of str to tuple of Lost
+    lost : dict of str to tuple of Loss
         By the name of the period: drifts that no file could store, with what they amount to.
     """
 
     idctabs: dict[str, Path]
     d2im: Path | None = None
     npol: dict[str, Path] = field(default_factory=dict)
-    lost: dict[str, tuple[Lost, ...]] = field(default_factory=dict)
+    lost: dict[str, tuple[Loss, ...]] = field(default_factory=dict)
 
     @property
     def paths(self) -> list[Path]:
@@ -84,7 +85,7 @@ class Release:
 def write_release(
     folder: str | os.PathLike[str],
     name: str,
-    solutions: Mapping[str, Solution],
+    calibrations: Mapping[str, Calibration],
     orientation: Orientation,
     periods: Sequence[Period],
     *,
@@ -105,7 +106,7 @@ def write_release(
         Made where it is not there.
     name : str
         What the names of all files begin with.
-    solutions : mapping of filter to Solution
+    calibrations : mapping of filter to Calibration
         Free of velocity aberration, with all segments, in the system of the orientation.  The
         first one's drift is stored, and must hold for the others (see `storable`).
     orientation : Orientation
@@ -134,37 +135,36 @@ def write_release(
     ------
     InputError
         For no filter or period, periods of one name, a table or stand-in of a filter that has no
-        solution, whatever `oriented`, `storable` and `idctab_from_solution` refuse, or a file that
+        solution, whatever `oriented`, `storable` and `build_idctab` refuse, or a file that
         cannot be written.  No file is written unless all IDCTABs could be made.
     DegenerateError
         When the linear part of a chip is singular.
     """
     stand_ins = stand_ins or {}
-    _check(solutions, periods, tables, stand_ins)
-    turned = {filter: oriented(solution, orientation) for filter, solution in solutions.items()}
+    _check(calibrations, periods, tables, stand_ins)
+    turned = {filter: oriented(one, orientation) for filter, one in calibrations.items()}
     made: dict[str, IdcTab] = {}
-    lost: dict[str, tuple[Lost, ...]] = {}
+    lost: dict[str, tuple[Loss, ...]] = {}
     for period in periods:
-        base: Stored | None = None
-        rows: dict[Filter, Stored] = {}
-        for filter, solution in turned.items():
-            rows[filter] = storable(
-                solution,
+        rows: dict[Filter, Calibration] = {}
+        left: dict[Filter, tuple[Loss, ...]] = {}
+        for filter, one in turned.items():
+            rows[filter], left[filter] = storable(
+                one,
                 years=period.years,
                 segment=period.segment,
                 limit_mas=limit_mas,
-                like=base,
+                like=next(iter(rows.values()), None),
             )
-            base = base or rows[filter]
-        lost[period.name] = tuple(entry for stored in rows.values() for entry in stored.lost)
+        lost[period.name] = tuple(entry for some in left.values() for entry in some)
         notes = [
             f"{filter}: {entry}." if len(rows) > 1 else f"{entry}."
-            for filter, stored in rows.items()
-            for entry in stored.lost
+            for filter, some in left.items()
+            for entry in some
         ]
-        for filter, other in stand_ins.items():
-            rows[filter] = rows[other]
-        made[period.name] = idctab_from_solution(
+        for stand_in, other in stand_ins.items():
+            rows[stand_in] = rows[other]
+        made[period.name] = build_idctab(
             rows,
             instrument=instrument,
             detector=detector,
@@ -188,7 +188,7 @@ def write_release(
         idctabs[period_name] = folder / f"{name}_{period_name}_idc.fits"
         write_idctab(tab, idctabs[period_name])
     first = periods[0]
-    common = {
+    common: dict[str, Any] = {
         "description": description,
         "useafter": first.useafter,
         "pedigree": first.pedigree,
@@ -198,7 +198,7 @@ def write_release(
     d2im = None
     if detector_tables:
         d2im = folder / f"{name}_d2i.fits"
-        columns, lines = next(iter(solutions.values())).model.chips[0].size
+        columns, lines = next(iter(calibrations.values())).model.chips[0].size
         size = (int(columns), int(lines))
         write_d2im(
             detector_tables, d2im, instrument=instrument, detector=detector, size=size, **common
@@ -217,12 +217,12 @@ def write_release(
 
 
 def _check(
-    solutions: Mapping[str, Solution],
+    calibrations: Mapping[str, Calibration],
     periods: Sequence[Period],
     tables: Sequence[LookupTable],
     stand_ins: Mapping[Filter, str],
 ) -> None:
-    if not solutions:
+    if not calibrations:
         raise InputError("no filter is given", where="solutions", do="give at least one")
     if not periods:
         raise InputError("no period is given", where="periods", do="give one for each IDCTAB")
@@ -231,16 +231,16 @@ def _check(
         raise InputError(
             "two periods have one name", where="periods", do="give each a name of its own"
         )
-    known = f"solutions are given for {', '.join(map(str, solutions))}"
+    known = f"solutions are given for {', '.join(map(str, calibrations))}"
     for table in tables:
-        if table.filter and table.filter not in solutions:
+        if table.filter and table.filter not in calibrations:
             raise InputError(
                 f"the look-up table {table.label} is of a filter without a solution",
                 where="tables",
                 do=known,
             )
     for filter, other in stand_ins.items():
-        if other not in solutions:
+        if other not in calibrations:
             raise InputError(
                 f"{other!r} is to stand in for {filter!r} and has no solution",
                 where="stand_ins",

@@ -1,7 +1,8 @@
-"""The difference of two calibrations over the detector, shaded by its significance."""
+"""How two calibrations differ: over the detector, shaded by significance, and against time."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,23 +12,20 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi_square
 from scipy.stats import norm
 
+from bayesdist.report.arrows import Arrows, vector_map
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.scales import display_scale
-from bayesdist.report.style import (
-    PALETTE,
-    WIDTH,
-    draw_vectors,
-    figure_style,
-    new_figure,
-    nice_below,
-    vector_key,
-)
-from bayesdist.report.vectors import grid_size, spacing, square_cells
+from bayesdist.report.numbers import size_of
+from bayesdist.report.panels import ChipPanels
+from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
 
 if TYPE_CHECKING:
-    from bayesdist.assess.comparison import Comparison
+    from bayesdist.assess.comparison.compare import Comparison
 
-__all__ = ["change_over_time", "difference_vectors", "gaussian_sigmas"]
+__all__ = [
+    "change_over_time",
+    "difference_vectors",
+    "gaussian_sigmas",
+]
 
 Float = NDArray[np.float64]
 
@@ -53,72 +51,58 @@ def gaussian_sigmas(chi2: Float) -> Float:
 
 
 def difference_vectors(
-    *found: Comparison,
-    mosaic: Mosaic | None = None,
-    names: tuple[str, str] = ("A", "B"),
-    magnification: float | None = None,
+    found: Sequence[Comparison], *, names: tuple[str, str] = ("A", "B")
 ) -> Figure:
     """Arrows of A minus B, over shades of how significant each is by itself.
 
     Parameters
     ----------
-    *found : Comparison
-        One for each chip; all are drawn to the same scale.
-    mosaic : Mosaic, optional
-        How the chips lie; one above the other by default.
+    found : sequence of Comparison
+        One for each chip: one above the other, drawn to the same scale.
     names : tuple of str
         What A and B are called.
-    magnification : float, optional
-        Pixels of the axes for one pixel of the difference; a round number by default.
 
     Returns
     -------
     matplotlib.figure.Figure
         Without shades where no covariance is known.
     """
-    mosaic = mosaic or Mosaic.column(*(grid_size(c.x, c.y) for c in found))
-    shaded = all(c.chi2 is not None for c in found)
-    cells = [square_cells(c.x, c.y) for c in found]
-    largest = max(c.largest for c in found)
-    step = min(
-        spacing(c.x[columns], c.y[rows]) for c, (rows, columns) in zip(found, cells, strict=True)
+    mosaic = Mosaic(
+        tuple((float(c.x.max()), float(c.y.max())) for c in found),
+        tuple(f"chip {c.a.chip}" for c in found),
+        tuple((k, 0) for k in range(len(found))),
     )
-    M = magnification or (nice_below(1.5 * step / largest) if largest > 1e-12 else 1.0)
-    margin = M * largest + 0.02 * max(max(s) for s in mosaic.sizes)
-    fig, panels = mosaic.panels(colorbar=shaded)
-    shades = None
+    chips = [Arrows.of_grid(c.x, c.y, c.du, c.dv) for c in found]
+    shaded = all(c.chi2 is not None for c in found)
+    largest = max(c.largest for c in found)
+    M = 1.0
+    if largest > 1e-12:
+        M = nice_below(1.5 * min(one.step for one in chips) / largest)
+    panels = ChipPanels(mosaic, colorbar=shaded)
+    panels.frame(M * largest + 0.02 * mosaic.longest_side)
+    titles = [
+        panels.title(
+            k, f"{names[0]} minus {names[1]}: rms {size_of(c.rms)}, largest {size_of(c.largest)}"
+        )
+        for k, c in enumerate(found)
+    ]
+    key = nice_below(largest / 1.5)
+    vector_map(panels, chips, titles, magnification=M, key=key, pad=20)
     with figure_style():
-        for k, (c, (rows, columns), (ax,)) in enumerate(zip(found, cells, panels, strict=True)):
-            mosaic.draw(ax, k, margin=margin)
-            if c.chi2 is not None and shaded:
-                shades = ax.contourf(
-                    c.x,
-                    c.y,
-                    gaussian_sigmas(c.chi2),
-                    levels=LEVELS,
-                    cmap=_SHADES,
-                    extend="max",
-                    zorder=1,
-                )
-            gx, gy = np.meshgrid(c.x[columns], c.y[rows])
-            draw_vectors(ax, gx, gy, c.du[rows, columns], c.dv[rows, columns], magnification=M)
-            x, y = c.position_of_largest
-            ax.plot(x, y, "o", ms=5, mfc="none", mec=PALETTE["vermilion"], mew=1.3, zorder=5)
-            text = (
-                f"{names[0]} minus {names[1]}: rms {display_scale('pix', c.rms).text(c.rms)}, "
-                f"largest {display_scale('pix', c.largest).text(c.largest)}"
-            )
-            ax.set_title(mosaic.title(k, text), pad=20)
-            vector_key(ax, nice_below(largest / 1.5), magnification=M, unit="pix")
-        if shades is not None:
-            fig.colorbar(
+        for c, (ax,) in zip(found, panels.axes, strict=True):
+            if not shaded or c.chi2 is None:
+                continue
+            look = {"levels": LEVELS, "cmap": _SHADES, "extend": "max", "zorder": 1}
+            shades = ax.contourf(c.x, c.y, gaussian_sigmas(c.chi2), **look)
+        if shaded:
+            panels.figure.colorbar(
                 shades,
-                ax=[ax for (ax,) in panels],
+                ax=panels.all_axes,
                 label="significance of each place by itself [σ]",
                 fraction=0.05,
                 pad=0.02,
             )
-    return fig
+    return panels.figure
 
 
 def change_over_time(first: Float, gain: Float, dof: int, p_value: float | None) -> Figure:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.report.numerals import count
-from bayesdist.report.scales import with_mas
-from bayesdist.report.words import DETECTED, MATCHED, Words
+from bayesdist.report.mosaic import Mosaic
+from bayesdist.report.numbers import MISSING, count, with_mas
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -25,21 +24,22 @@ if TYPE_CHECKING:
         UncertaintyMap,
         VectorMap,
     )
-    from bayesdist.assess.budget_surface import BudgetSurface
-    from bayesdist.assess.detector_budget import DetectorBudget
-    from bayesdist.assess.holdout import HeldOutTruth
-    from bayesdist.assess.horizon import Horizon
-    from bayesdist.assess.misfit import Misfit
+    from bayesdist.assess.budget.detector import DetectorBudget
+    from bayesdist.assess.budget.surface import BudgetSurface
     from bayesdist.assess.periods import TimeVariation
+    from bayesdist.assess.requirements.validity import Horizon
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
+    from bayesdist.diagnose.holdout.validation import HeldOutTruth
+    from bayesdist.diagnose.residuals.misfit import Misfit
     from bayesdist.infer import LinearFit, Posterior
-    from bayesdist.infer.added_errors import GroupedErrors
+    from bayesdist.infer.catalogue.added_errors import GroupedErrors
     from bayesdist.model import Chip
-    from bayesdist.report.campaign.context import CampaignResults
-    from bayesdist.report.selfcal import SelfcalResults
+    from bayesdist.report.campaign import CampaignResults
 
-__all__ = ["Check", "ChipResults", "Product", "ReportInput"]
+__all__ = ["Check", "ChipResults", "Product", "ReportInput", "SelfcalResults", "campaign_of"]
+
+Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,87 @@ class ChipResults:
     def best_map(self) -> UncertaintyMap:
         """That of the posterior where there is one."""
         return self.formal_map if self.posterior_map is None else self.posterior_map
+
+
+@dataclass(frozen=True, eq=False)
+class SelfcalResults:
+    """What a run without a catalogue adds.
+
+    Parameters
+    ----------
+    words : str
+        In which gauge everything stands.
+    gauge : astropy.table.Table
+        As gauge.ecsv.
+    matching : astropy.table.Table
+        One row for each exposure.
+    stars : astropy.table.Table
+        As stars.ecsv.
+    outlines : tuple of ndarray, each (M, 2)
+        Closed outline of each chip in each exposure, on the sky.
+    held : tuple of str
+        Parameters that the gauge holds.
+    summary : mapping
+        As in summary.json.
+    """
+
+    words: str
+    gauge: Table
+    matching: Table
+    stars: Table
+    outlines: tuple[Float, ...]
+    held: tuple[str, ...]
+    summary: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Words:
+    """Words of a report.
+
+    Parameters
+    ----------
+    things : str
+        What is fitted, one row each.
+    all_things : str
+        These as they come into the fit.
+    false : str
+        Rows that are none of them.
+    chooser : str
+        What leaves out rows that are far off: the sampling does not.
+    fit : str
+        What the parameters are from before they are sampled.
+    holder : str
+        What holds parameters that the data say nothing of.
+    taken : str
+        What makes residuals smaller than errors, as a clause; empty where nothing does.
+    """
+
+    things: str
+    all_things: str
+    false: str
+    chooser: str
+    fit: str
+    holder: str
+    taken: str = ""
+
+
+MATCHED = Words(
+    things="stars",
+    all_things="matched stars",
+    false="false matches",
+    chooser="least-squares fit",
+    fit="linear fit",
+    holder="a prior",
+)
+DETECTED = Words(
+    things="detections",
+    all_things="detections of stars",
+    false="false detections",
+    chooser="limits of residuals",
+    fit="solution",
+    holder="the gauge",
+    taken=", less what the fitted stars take of them",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +318,11 @@ class ReportInput:
         return self.fit if self.posterior is None else self.posterior
 
     @property
+    def mosaic(self) -> Mosaic:
+        """How the chips lie."""
+        return Mosaic.of_chips([c.chip for c in self.chips], [c.place for c in self.chips])
+
+    @property
     def several(self) -> bool:
         """Whether the detector has more than one chip."""
         return len(self.chips) > 1
@@ -244,6 +330,10 @@ class ReportInput:
     def length(self, value: float) -> str:
         """A length in the unit of u and v, and in mas where the size of a pixel is known."""
         return with_mas(value, self.unit, self.scale_mas)
+
+    def marked(self, text: str) -> str:
+        """A number that rests on the sampler, with a dagger where that did not converge."""
+        return f"{text}\u202f†" if self.provisional and text != MISSING else text
 
     def on_chip(self, chip: Chip) -> str:
         """' of WFC1' where there are several chips, else nothing."""
@@ -271,3 +361,9 @@ class ReportInput:
         if self.posterior is None or key not in self.posterior.hyper:
             return 0.0
         return float(np.mean(self.posterior.hyper[key]))
+
+
+def campaign_of(r: ReportInput) -> CampaignResults:
+    """What a campaign adds, of a run that has it."""
+    assert r.campaign is not None
+    return r.campaign

@@ -1,126 +1,57 @@
-"""Corner plots: the posterior of pairs of parameters."""
+"""Corner plots: what draws of several quantities say of each pair of them."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from bayesdist.report.numerals import broken_name
-from bayesdist.report.scales import display_scale
-from bayesdist.report.style import HYPER_LABELS, PALETTE, WIDTH, figure_style, new_figure
+from bayesdist.report.numbers import display_scale
+from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure
 
-if TYPE_CHECKING:
-    from bayesdist.infer import LinearFit, Posterior
-
-__all__ = ["corner_coefficients", "corner_outliers", "correlated_parameters"]
+__all__ = [
+    "Column",
+    "corner_figure",
+]
 
 Float = NDArray[np.float64]
 
-_MAX_POINTS = 20_000  # draws that enter a corner plot
 _LEVELS = tuple(1.0 - np.exp(-0.5 * np.array([1.0, 2.0]) ** 2))  # what 1 and 2 sigma hold in 2-D
 
 
-def correlated_parameters(posterior: Posterior, n: int = 5) -> tuple[str, ...]:
-    """The coefficients that take part in the strongest correlations of the posterior.
+@dataclass(frozen=True, eq=False)
+class Column:
+    """Draws of one quantity.
 
     Parameters
     ----------
-    posterior : Posterior
-    n : int
-        How many.
-
-    Returns
-    -------
-    tuple of str
-        In the model's order; polynomial and time-dependent terms only, without those that are
-        held.
+    label, unit : str
+    draws : ndarray, shape (N,)
     """
-    moves = np.ptp(posterior.flat, axis=0) > 0
-    kinds = [p.kind for p in posterior.model.parameters]
-    chosen = [k for k, kind in enumerate(kinds) if kind != "frame" and moves[k]]
-    cov = np.asarray(posterior.cov)[np.ix_(chosen, chosen)]
-    sd = np.sqrt(np.diag(cov))
-    strength = np.triu(np.abs(cov / np.outer(sd, sd)), k=1)
-    picked: list[int] = []
-    for flat in np.argsort(-strength, axis=None, kind="stable"):
-        for k in divmod(int(flat), len(chosen)):
-            if k not in picked and len(picked) < n:
-                picked.append(k)
-        if len(picked) == min(n, len(chosen)):
-            break
-    return tuple(posterior.model.names[chosen[k]] for k in sorted(picked))
 
-
-def corner_coefficients(
-    posterior: Posterior, fit: LinearFit, names: Sequence[str] | None = None
-) -> Figure:
-    """Corner plot of coefficients, as differences from least squares, with its Gaussian over it.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    fit : LinearFit
-        Its values are the zero of every axis.
-    names : sequence of str, optional
-        Parameters to show; those of `correlated_parameters` by default.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    names = tuple(names or correlated_parameters(posterior))
-    index = [posterior.model.names.index(name) for name in names]
-    draws = _thinned(posterior.flat)[:, index] - fit.mean[index]
-    columns = [
-        _Column(f"{broken_name(name)}\n− l. s.", posterior.model.units[k], draws[:, c])
-        for c, (name, k) in enumerate(zip(names, index, strict=True))
-    ]
-    return _corner(columns, formal=np.asarray(fit.cov)[np.ix_(index, index)])
-
-
-def corner_outliers(posterior: Posterior) -> Figure:
-    """Corner plot of the outlier fraction, jitter and outlier scale, of those that were sampled.
-
-    Parameters
-    ----------
-    posterior : Posterior
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    unit = posterior.model.unit
-    columns = []
-    for key in ("f", "j", "s_out"):
-        if key in posterior.hyper:
-            draws = _thinned(np.asarray(posterior.hyper[key], float).ravel())
-            percent = key == "f"
-            columns.append(
-                _Column(
-                    HYPER_LABELS[key],
-                    "%" if percent else unit,
-                    100.0 * draws if percent else draws,
-                )
-            )
-    return _corner(columns)
-
-
-@dataclass(frozen=True)
-class _Column:
     label: str
     unit: str
     draws: Float
 
 
-def _corner(columns: Sequence[_Column], *, formal: Float | None = None) -> Figure:
-    """Corner plot; with a formal covariance, that Gaussian about zero over it."""
+def corner_figure(columns: Sequence[Column], *, formal: Float | None = None) -> Figure:
+    """Corner plot of draws, at 1 and 2 sigma.
+
+    Parameters
+    ----------
+    columns : sequence of Column
+    formal : ndarray, shape (n, n), optional
+        Covariance of a Gaussian about zero that is drawn over it.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
     with warnings.catch_warnings():
         # corner imports arviz where it is installed, which then announces its own future
         warnings.simplefilter("ignore", FutureWarning)
@@ -200,7 +131,3 @@ def _draw_gaussian(panels: NDArray[np.object_], cov: Float) -> None:
             root = np.linalg.cholesky(cov[np.ix_(index, index)])
             for radius in (1.0, 2.0):
                 panels[row, column].plot(*(radius * root @ circle), **style)
-
-
-def _thinned(draws: Float) -> Float:
-    return draws[:: max(1, len(draws) // _MAX_POINTS)]

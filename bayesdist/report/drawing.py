@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
+from pickle import PickleError
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -16,48 +22,102 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from bayesdist.data.files import atomic_path, made_folder
-from bayesdist.report.style import figure_style
-from bayesdist.report.ticks import plain_ticks
+from bayesdist.report.registry import Item, Plot, Registry
+from bayesdist.report.style import figure_style, plain_ticks
 
 __all__ = [
     "DPI",
     "Drawing",
-    "drawing_of",
-    "drawn",
+    "draw_all",
     "png_of",
+    "render",
     "save_drawings",
-    "save_images",
+    "save_figures",
 ]
+
+log = logging.getLogger("bayesdist")
 
 DPI = 150
 PAD = 0.05  # inches left around what is drawn
+MIN_FIGURES_SHARED = 20  # fewer are drawn sooner than another process has started
+
+_received: list[Any] = []  # of a process that draws for another one
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure as files.
+    """A figure as files, with its words.
 
     Parameters
     ----------
     png, pdf : bytes
+    title, text, alt : str
+        As of `Plot`.
     """
 
     png: bytes
     pdf: bytes
+    title: str = ""
+    text: str = ""
+    alt: str = ""
 
 
-def drawn(figures: Mapping[str, Figure]) -> dict[str, bytes]:
-    """Figures as PNG files, by name: drawn once, for the folder and for the report.
+def render(plot: Plot) -> Drawing:
+    """A figure as PNG and as PDF, whose letters are letters; the same figure gives the same.
 
-    Their layout is settled by that, and serves other files of them: it takes as long as drawing.
+    Parameters
+    ----------
+    plot : Plot
+
+    Returns
+    -------
+    Drawing
     """
-    return {name: png_of(figure) for name, figure in figures.items()}
+    canvas, box = _laid_out(plot.figure)
+    files = _png(plot.figure, canvas, box), _pdf(plot.figure, box)
+    return Drawing(*files, plot.title, plot.text, plot.alt)
 
 
-def drawing_of(figure: Figure) -> Drawing:
-    """A figure as PNG and as PDF, whose letters are letters; the same figure gives the same."""
-    canvas, box = _laid_out(figure)
-    return Drawing(_png(figure, canvas, box), _pdf(figure, box))
+def draw_all(registry: Registry, results: Any, *, processes: int = 1) -> dict[str, Drawing]:
+    """All figures of a page, by name in its order, each made, drawn and let go.
+
+    Parameters
+    ----------
+    registry : Registry
+    results
+        What its functions are given.
+    processes : int
+        That draw.  More than one import the main module of this process anew: a script must guard
+        what it does by ``if __name__ == "__main__"``.
+
+    Returns
+    -------
+    dict of str to Drawing
+    """
+    items = registry.items(results, "figure")
+    if processes > 1 and len(items) >= MIN_FIGURES_SHARED:
+        try:
+            return _drawn_together(items, results, processes)
+        except (BrokenProcessPool, OSError, PickleError) as error:
+            log.warning("report: figures are drawn by one process, others failed: %s", error)
+    return {item.name: render(item.made(results)) for item in items}
+
+
+def _drawn_together(items: Sequence[Item], results: Any, processes: int) -> dict[str, Drawing]:
+    # not a fork: threads of numerical libraries run here
+    with ProcessPoolExecutor(
+        processes, mp_context=get_context("spawn"), initializer=_receive, initargs=(results,)
+    ) as pool:
+        return {item.name: one for item, one in zip(items, pool.map(_drawn, items), strict=True)}
+
+
+def _receive(results: Any) -> None:
+    """Keep what the figures are made of: once for each process, as it may be large."""
+    _received.append(results)
+
+
+def _drawn(item: Item) -> Drawing:
+    return render(item.made(_received[0]))
 
 
 def png_of(figure: Figure) -> bytes:
@@ -114,13 +174,12 @@ def _cut(pixels: np.ndarray, box: Bbox) -> np.ndarray:
     return np.ascontiguousarray(pixels[top:bottom, left:right, :3])
 
 
-def save_images(images: Mapping[str, bytes], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write the PNG files of a report.
+def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Draw figures and write them as PNG files.
 
     Parameters
     ----------
-    images : mapping of str to bytes
-        As of `drawn`.
+    figures : mapping of str to matplotlib.figure.Figure
     folder : path-like
         Made where it does not exist.
 
@@ -133,6 +192,7 @@ def save_images(images: Mapping[str, bytes], folder: str | os.PathLike[str]) -> 
     InputError
         When the folder cannot be made or a file cannot be written.
     """
+    images = {name: png_of(figure) for name, figure in figures.items()}
     return _saved(images, "png", made_folder(folder))
 
 

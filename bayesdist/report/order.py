@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from bayesdist.report.scales import display_scale
+from bayesdist.report.numbers import display_scale
 from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:
-    from bayesdist.infer.order_results import OrderSelection
+    from bayesdist.infer.compare.order_result import OrderSelection
 
 __all__ = ["order_comparison"]
 

@@ -11,13 +11,13 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bayesdist.assess.grid import mesh, outline_pixels
+from bayesdist.model.grid import mesh, outline_pixels
 from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, figure_style, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
 
-    from bayesdist.assess.patterns import PlannedPattern
+    from bayesdist.assess.planning.dithers import PlannedPattern
 
 __all__ = ["pattern_maps"]
 

@@ -6,40 +6,33 @@ They stand as pipelines have them, x to the right and y up; two of the handbook'
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from bayesdist.assess.detector_numbers import detector_numbers
-from bayesdist.report.scales import display_scale
-from bayesdist.report.style import (
-    INK,
-    PALETTE,
-    WIDTH,
-    draw_vectors,
-    figure_style,
-    new_figure,
-    nice_below,
-    vector_key,
-)
-from bayesdist.report.uncertainty import contour_levels, contour_map
-from bayesdist.report.vectors import significant_cells
+from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.report.arrows import Arrows, magnification_of, vector_map
+from bayesdist.report.fields import Grid, contour_levels, scalar_map
+from bayesdist.report.numbers import size_of
+from bayesdist.report.panels import OneArray
+from bayesdist.report.style import PALETTE, nice_below
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from bayesdist.assess import BinnedResiduals
-from bayesdist.assess.whole_detector import WholeDetector
 
-__all__ = ["area_figure", "non_linear_figure", "residual_figure"]
+__all__ = [
+    "area_figure",
+    "non_linear_figure",
+    "residual_figure",
+]
 
 Float = NDArray[np.float64]
 
-# Vectors, and points of contours, along the longer side of a chip.
+# vectors, and points of contours, along the longer side of a chip
 _VECTORS, _POINTS = 21, 65
 
 
@@ -61,27 +54,32 @@ def non_linear_figure(
     matplotlib.figure.Figure
         Vectors along the detector's axes, in its pixels.
     """
-    fields = [
-        detector.non_linear(n, *_grid(c.basis.size, _VECTORS)) for n, c in detector.chips.items()
-    ]
-    found = detector_numbers(detector)
-    step = min(float(f.x[1] - f.x[0]) for f in fields)
-    longest = max(float(np.hypot(f.along_x, f.along_y).max()) for f in fields)
+    found, sizes, chips = detector_numbers(detector), _sizes(detector), []
+    for n, size in sizes.items():
+        x, y = _grid(size, _VECTORS)
+        f = detector.non_linear(n, x, y)
+        along = f.along_x.ravel(), f.along_y.ravel()
+        gx, gy = (a.ravel() for a in np.meshgrid(x, y))
+        chips.append(Arrows(gx, gy, *along, float(x[1] - x[0])))
+    step = min(one.step for one in chips)
+    longest = max(float(one.length.max()) for one in chips)
     M = magnification or (nice_below(2.5 * step / longest) if longest > 1e-9 * step else 1.0)
-    fig, ax = _panel(detector, margin=M * longest + 0.01 * step)
-    with figure_style():
-        for f in fields:
-            gx, gy = np.meshgrid(f.x, f.y)
-            draw_vectors(ax, gx, gy, f.along_x, f.along_y, magnification=M)
-        ring = {"ms": 6, "mfc": "none", "mec": PALETTE["vermilion"], "mew": 1.3, "zorder": 5}
-        ax.plot(*found.non_linear_at, "o", **ring)
-        x, y = found.non_linear_at
-        text = f"largest {found.non_linear_max:.3g}\u202foutput pix at ({x:.0f}, {y:.0f})".replace(
-            "-", "−"
-        )
-        ax.set_title(f"{title}\n{text}" if title else text, pad=11)
-        vector_key(ax, nice_below(longest / 1.5), magnification=M, unit="pix")
-    return fig
+    panels = OneArray(sizes, detector.places, margin=M * longest + 0.01 * step)
+    place = found.non_linear_at
+    at = f"({place[0]:.0f}, {place[1]:.0f})"
+    text = f"largest {found.non_linear_max:.3g}\u202foutput pix at {at}"
+    text = text.replace("-", "−")
+    vector_map(
+        panels,
+        chips,
+        [f"{title}\n{text}" if title else text],
+        magnification=M,
+        key=nice_below(longest / 1.5),
+        pad=11,
+    )
+    ring = {"ms": 6, "mfc": "none", "mec": PALETTE["vermilion"], "mew": 1.3, "zorder": 5}
+    panels.all_axes[0].plot(*place, "o", **ring)
+    return panels.figure
 
 
 def area_figure(detector: WholeDetector, title: str = "") -> Figure:
@@ -97,21 +95,23 @@ def area_figure(detector: WholeDetector, title: str = "") -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    grids = {n: _grid(c.basis.size, _POINTS) for n, c in detector.chips.items()}
-    areas = {n: detector.relative_area(n, *grid) for n, grid in grids.items()}
-    every = np.concatenate([a.ravel() for a in areas.values()])
-    levels = contour_levels(every, 12)
-    fig, ax = _panel(detector, margin=0.0, colorbar=True)
-    with figure_style():
-        for n, (x, y) in grids.items():
-            px, py = detector.places[n]
-            filled = contour_map(ax, x + px, y + py, areas[n], levels)
-        text = f"pixel area {every.min():.3f} to {every.max():.3f} of that at the centre"
-        ax.set_title(f"{title}\n{text}" if title else text)
-        fig.colorbar(
-            filled, ax=ax, label="pixel area / area at the centre", fraction=0.05, pad=0.02
-        )
-    return fig
+    sizes = _sizes(detector)
+    grids = []
+    for n, size in sizes.items():
+        x, y = _grid(size, _POINTS)
+        grids.append(Grid(x, y, detector.relative_area(n, x, y)))
+    every = np.concatenate([g.values.ravel() for g in grids])
+    panels = OneArray(sizes, detector.places, colorbar=True)
+    text = f"pixel area {every.min():.3f} to {every.max():.3f} of that at the centre"
+    scalar_map(
+        panels,
+        grids,
+        [f"{title}\n{text}" if title else text],
+        levels=contour_levels(every, 12),
+        label="pixel area / area at the centre",
+        labelled=True,
+    )
+    return panels.figure
 
 
 def residual_figure(
@@ -137,61 +137,31 @@ def residual_figure(
     matplotlib.figure.Figure
         Cells whose mean lies within two of its standard errors from zero are light.
     """
-    full = {n: (b.count > 0) & np.isfinite(b.mean_u + b.mean_v) for n, b in binned.items()}
-    length = np.concatenate([np.hypot(b.mean_u, b.mean_v)[full[n]] for n, b in binned.items()])
+    chips = [Arrows.of_cells(b) for b in binned.values()]
+    length = np.concatenate([one.length for one in chips])
     typical = float(np.quantile(length, 0.95)) if length.size else 0.0
     step = min(float(b.x[1] - b.x[0]) for b in binned.values())
-    M = nice_below(1.1 * step / typical) if typical > 0 else 1.0
-    fig, ax = _panel(detector, margin=0.6 * step)
-    with figure_style():
-        for n, b in binned.items():
-            px, py = detector.places[n]
-            gx, gy = np.meshgrid(b.x + px, b.y + py)
-            clear = full[n] & significant_cells(b)
-            for cells, color in ((full[n] & ~clear, "#A9B4C0"), (clear, INK)):
-                vectors = b.mean_u[cells], b.mean_v[cells]
-                draw_vectors(ax, gx[cells], gy[cells], *vectors, magnification=M, color=color)
-        scale = display_scale(unit, typical)
-        lines = [title, "dark: beyond 2 sigma", f"95 % of cells below {scale.text(typical)}"]
-        ax.set_title("\n".join(line for line in lines if line), pad=11)
-        vector_key(ax, nice_below(typical), magnification=M, unit=unit)
-    return fig
+    sizes = {n: _sizes(detector)[n] for n in binned}
+    panels = OneArray(sizes, detector.places, margin=0.6 * step)
+    lines = [
+        title,
+        "dark: beyond 2 sigma",
+        f"95 % of cells below {size_of(typical, unit)}",
+    ]
+    vector_map(
+        panels,
+        chips,
+        ["\n".join(line for line in lines if line)],
+        magnification=magnification_of(1.1 * step, typical),
+        key=nice_below(typical),
+        unit=unit,
+        pad=11,
+    )
+    return panels.figure
 
 
-def _panel(
-    detector: WholeDetector, *, margin: float, colorbar: bool = False
-) -> tuple[Figure, Axes]:
-    """Figure with the outlines of all chips, at equal scale on both axes."""
-    low, high = detector.bounds
-    extent = high - low + 2 * margin
-    width = 0.8 * WIDTH
-    room = 0.8 + (0.7 if colorbar else 0.0)
-    height = (width - room) * min(float(extent[1] / extent[0]), 1.6) + 0.9
-    with figure_style():
-        fig = new_figure(width, height, layout="compressed")
-        ax = fig.subplots()
-        ax.set_aspect("equal")
-        ax.set_xlim(low[0] - margin, high[0] + margin)
-        ax.set_ylim(low[1] - margin, high[1] + margin)
-        ax.set_xlabel("x [pix]")
-        ax.set_ylabel("y [pix]")
-        _outlines(ax, detector)
-    return fig, ax
-
-
-def _outlines(ax: Axes, detector: WholeDetector) -> None:
-    """Edges of all chips; those of one column are named at the right."""
-    places = detector.places
-    shift = max(abs(px) for px, _ in places.values())
-    named = len(places) > 1 and shift < 0.5 * min(c.basis.size[0] for c in detector.chips.values())
-    for n, (px, py) in places.items():
-        nx, ny = detector.chips[n].basis.size
-        corner = px + 0.5, py + 0.5
-        ax.add_patch(Rectangle(corner, nx, ny, fill=False, lw=0.7, ec="#9AA5B1", zorder=4))
-        if named:
-            beside = ax.get_yaxis_transform()
-            words = {"rotation": 270, "ha": "left", "va": "center", "fontsize": 7.5}
-            ax.text(1.012, py + ny / 2, f"chip {n}", transform=beside, **words)
+def _sizes(detector: WholeDetector) -> dict[int, tuple[float, float]]:
+    return {n: c.basis.size for n, c in detector.chips.items()}
 
 
 def _grid(size: tuple[float, float], longest: int) -> tuple[Float, Float]:

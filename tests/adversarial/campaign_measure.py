@@ -16,9 +16,9 @@ from bayesdist.app.session import Session
 from bayesdist.app.sessions import own_stages, rehearse_run, session_of
 from bayesdist.app.stages import run_stage
 from bayesdist.app.stages.assess import run_assess
-from bayesdist.assess.grid import grid_pixels, mesh
-from bayesdist.infer.views import reference_gauge, without_frames
+from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
+from bayesdist.model.grid import grid_pixels, mesh
 
 from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth
 from .written import toml_text

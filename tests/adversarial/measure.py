@@ -20,9 +20,9 @@ from bayesdist.app.session import Session
 from bayesdist.app.sessions import own_stages, rehearse_run, session_of
 from bayesdist.app.stages import run_stage
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.statistics import field_statistic
-from bayesdist.assess.verdict import clopper_pearson
+from bayesdist.model.grid import grid_pixels, mesh
 
 from . import campaign_measure
 from .campaign_truth import CampaignTruth

@@ -9,7 +9,7 @@ from astropy.table import Table
 from numpy.polynomial import legendre
 
 from bayesdist.app.selfcal.session import SelfcalSession
-from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.model.grid import grid_pixels, mesh
 
 from .fields import MIDDLE, SIDE
 from .truth import Truth

@@ -9,7 +9,7 @@ import pytest
 
 from bayesdist.app.config import parse_config
 from bayesdist.assess import Requirement
-from bayesdist.assess.verdict import verdict_of
+from bayesdist.assess.requirements.verdict import verdict_of
 
 from . import KINDS
 from .fields import SIDE, distortion, even_pixels, of_rms, smooth, tree_rings

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,22 +45,19 @@ def sketched(full) -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         if not full:
-            import bayesdist.report
+            from bayesdist.report import drawing
 
-            patch.setattr(bayesdist.report, "drawn_report", _made)
-            patch.setattr(bayesdist.report, "second_hand", lambda wanted: nullcontext())
+            patch.setattr(drawing, "render", _sketch)
         yield
 
 
-def _made(inputs, hand=None) -> dict:
+def _sketch(plot):
+    """The words of a figure, and a speck in place of it."""
     from bayesdist.report.drawing import Drawing
-    from bayesdist.report.figures import plan_of_figures
 
     page = io.BytesIO()
     Image.new("RGB", (4, 3), "white").save(page, format="png")
-    for make in plan_of_figures(inputs).values():
-        make()
-    return {name: Drawing(page.getvalue(), b"%PDF-1.7") for name in plan_of_figures(inputs)}
+    return Drawing(page.getvalue(), b"%PDF-1.7", plot.title, plot.text, plot.alt)
 
 
 @pytest.fixture(scope="package")

@@ -13,7 +13,7 @@ from bayesdist.data.tables import read_table
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid
 from bayesdist.infer.nodes.sums import interpolation
-from bayesdist.infer.views import reference_gauge, segment, without_frames
+from bayesdist.infer.transforms import reference_gauge, segment, without_frames
 from bayesdist.model import corrected
 from bayesdist.products import read_d2im, read_idctab
 from bayesdist.simulate.acs import read_acs

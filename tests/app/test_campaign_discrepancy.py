@@ -12,10 +12,10 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.app.session import Session
-from bayesdist.assess.discrepancy_terms import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.infer.discrepancy.cells import cell_sums
 from bayesdist.infer.discrepancy.information import Information
-from bayesdist.infer.scores import scores_of
+from bayesdist.infer.stars.likelihood import scores_of
 from tests.adversarial import KINDS
 from tests.adversarial.campaign_measure import actual_error, assessed, stated_sigma
 from tests.adversarial.campaign_truth import CampaignTruth

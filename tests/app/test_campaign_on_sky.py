@@ -21,7 +21,7 @@ from scipy import stats
 
 from bayesdist.data import read_matches
 from bayesdist.infer import load_fit
-from bayesdist.infer.views import without_frames
+from bayesdist.infer.transforms import without_frames
 from tests.app.support import cli, good, one_sentence, refused, summary_of, write_config
 
 SIDE, PIXEL = 1024, 0.05  # pixels, arcsec

@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.compare import calibrations_of
+from bayesdist.app.calibrations import calibration_at
 from bayesdist.infer import LinearFit, fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import idctab_from_solution, write_idctab
@@ -138,12 +138,12 @@ def test_an_idctab_has_the_covariance_of_what_it_was_made_from(solution, tmp_pat
     tab = idctab_from_solution(solution, instrument="ACS", detector="WFC", scale_arcsec=0.05)
     write_idctab(tab, tmp_path / "x_idc.fits")
     save_fit(solution, tmp_path / "fit.nc")
-    one = calibrations_of(tmp_path / "x_idc.fits", epoch=2016.0)
-    other = calibrations_of(tmp_path / "fit.nc", epoch=2016.0)
+    one = calibration_at(tmp_path / "x_idc.fits").by_chip(2016.0)
+    other = calibration_at(tmp_path / "fit.nc").by_chip(2016.0)
     assert set(one) == set(other) == {1, 2}
     for chip in (1, 2):
         a, b = one[chip], other[chip]
-        assert a.basis == b.basis and a.kind_of_error == b.kind_of_error == "covariance"
+        assert a.basis == b.basis and a.errors == b.errors == "covariance"
         np.testing.assert_allclose(a.coefficients[:, 1:], b.coefficients[:, 1:], atol=1e-12)
         K = a.basis.n_terms
         # the constant of the monomials is V2REF, V3REF, and is not in the polynomial
@@ -165,7 +165,9 @@ def test_filters_of_one_table_have_their_own_covariance(solution, tmp_path) -> N
         {"F606W": bare, "F814W": wide}, instrument="ACS", detector="WFC", scale_arcsec=0.05
     )
     write_idctab(tab, tmp_path / "x_idc.fits")
-    one, two = (calibrations_of(tmp_path / "x_idc.fits", filter=f) for f in ("F606W", "F814W"))
+    one, two = (
+        calibration_at(tmp_path / "x_idc.fits", filter=f).by_chip() for f in ("F606W", "F814W")
+    )
     for chip in (1, 2):
         assert one[chip].cov is not None and two[chip].cov is not None
         np.testing.assert_allclose(two[chip].cov, 4 * one[chip].cov, rtol=1e-9)
@@ -208,7 +210,7 @@ def test_what_is_no_calibration_is_refused(finished, tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     run = finished.path
-    refused(tmp_path, "compare", run, tmp_path / "text", words=["neither an IDCTAB"])
+    refused(tmp_path, "compare", run, tmp_path / "text", words=["of no kind that is understood"])
     refused(tmp_path, "compare", run, tmp_path / "none.fits", words=["no such file"])
     refused(tmp_path, "compare", run, folder, words=["in"])
     refused(tmp_path, "compare", run, run, "--grid", 1, 1, words=["grid"])

@@ -62,7 +62,7 @@ probability = 0.95
 epoch = 2006.5
 [products]
 sip = {inverse_order = 6}
-idctab = {instrument = "ACS", detector = "WFC", v2v3 = "aperture"}
+idctab = {instrument = "ACS", detector = "WFC", v2ref = 256.6}
 """
 CHIP = {"number": 2, "name": "WFC2", "size": [4096, 2048], "reference_pixel": [2048.0, 1024.0]}
 

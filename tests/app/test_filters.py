@@ -21,24 +21,23 @@ from bayesdist.app.sessions import session_of
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
+from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.series import Series
-from bayesdist.infer.shared_drift import drift_priors, with_drift_of
-from bayesdist.infer.views import linear_terms, lines, reference_gauge, without_frames
+from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.model import LookupTable, TimeDependence, corrected
 from bayesdist.products import (
-    orientation_from_idctab,
     read_d2im,
     read_idctab,
     read_lookup_file,
 )
-from bayesdist.products.oriented import oriented
 from bayesdist.simulate.acs import acs_solution, making, read_acs, simulate_acs
 from tests.app.support import cli, good, one_sentence, snapshot
 from tests.infer.small_campaign import Truth
 from tests.products.acs_offline import Pointing, to_sky
 from tests.products.acs_offline import corrected as corrected_by_stwcs
 from tests.products.stwcs_offline import separation_mas
+from tests.products.support import laid_on, turned_by
 
 FILTERS = {"F606W": ("F606W", "CLEAR2L"), "F814W": ("CLEAR1L", "F814W")}
 # coarse nodes and few draws: quick
@@ -225,13 +224,15 @@ def plane(sessions, folder):
     formal = sessions["F814W"].fit
     released = {"F606W": first, "F814W": with_drift_of(other, first, formal=formal)}
     views = {name: reference_gauge(without_frames(one), 2) for name, one in released.items()}
-    orientation = orientation_from_idctab(
+    orientation = laid_on(
         views["F606W"],
         read_idctab(folder / "start_idc.fits"),
         epoch=2004.5,
         scale_arcsec=0.05,
     )
-    return {name: oriented(view, orientation) for name, view in views.items()}, orientation
+    return {
+        name: turned_by(view, orientation).solution for name, view in views.items()
+    }, orientation
 
 
 @pytest.mark.parametrize("filter", FILTERS)

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from bayesdist.infer import fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import idctab_from_solution, read_idctab, write_idctab
-from bayesdist.products.chips_in_frame import chips_of_idctab
+from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.simulate import simulate_matches
 from tests.app.support import begin_stagewise, cli, good, one_sentence, refused, write_job
 
@@ -147,7 +147,7 @@ def test_subarrays_by_number_and_by_image(idctab, tmp_path):
 def test_area_maps_say_how_well_they_are_known(idctab, tmp_path):
     result = good("pam", idctab, "-o", tmp_path / "one.fits", "--chip", 1)
     assert "mmag at worst" in result.out and "SCALE" in result.out
-    c = chips_of_idctab(read_idctab(idctab))[1]
+    c = idctab_calibration(read_idctab(idctab)).in_frame()[1]
     by_x, by_y = (c.coefficients @ g[0] for g in c.basis.gradient([30.0], [200.0]))
     wanted = (by_x[0] * by_y[1] - by_x[1] * by_y[0]) / 0.05**2
     assert_allclose(fits.getdata(tmp_path / "one.fits")[199, 29], wanted, rtol=1e-6)
@@ -187,7 +187,7 @@ def test_a_run_is_shown_with_its_residuals(idctab, tmp_path):
         (("apply", "no_idc.fits", "S", "-o", "o.ecsv"), ["there is no such file"]),
         (("apply", "I", "S", "-o", "o.txt"), ["extension '.txt'"]),
         (("apply", "I", "S", "-o", "S", "--origin", "0", "0"), ["exists", "--force"]),
-        (("apply", "S", "S", "-o", "o.ecsv"), ["neither an IDCTAB"]),
+        (("apply", "S", "S", "-o", "o.ecsv"), ["of no kind that is understood"]),
         (("apply", "I", "no.csv", "-o", "o.ecsv"), ["no.csv", "does not exist"]),
         (("apply", "I", "S", "-o", "o.ecsv", "--inverse"), ["no column 'x_out'", "--columns"]),
         (("apply", "I", "S", "-o", "o.ecsv", "--columns", "name", "y"), ["holds no numbers"]),
@@ -206,7 +206,7 @@ def test_a_run_is_shown_with_its_residuals(idctab, tmp_path):
         (("pam", "I", "-o", "S.fits"), ["exists", "--force"]),
         (("pam", "I", "-o", "pam.fits", "--chip", "9"), ["no chip 9"]),
         (("pam", "I", "-o", "pam.fits", "--image", "I"), ["no extension SCI"]),
-        (("pam", "S", "-o", "pam.fits"), ["neither an IDCTAB"]),
+        (("pam", "S", "-o", "pam.fits"), ["of no kind that is understood"]),
         (("handbook", "I", "-o", "full"), ["full"]),
         (("handbook", "I", "-o", "new", "--detector", "UVIS"), ["no detector 'UVIS'"]),
         (("handbook", "I", "-o", "new", "--magnification", "0"), ["magnification is 0"]),

@@ -25,7 +25,7 @@ from bayesdist.app import stages
 from bayesdist.app.config import parse_config
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages.report import title_of
-from bayesdist.assess.discrepancy_terms import STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior, outlier_probability, residuals
@@ -552,8 +552,7 @@ def test_figures_are_listed_once_they_are_there(copy, monkeypatch):
     def full(drawings, folder):
         raise InputError("No space left on device", where=str(folder), do="make room")
 
-    monkeypatch.setattr("bayesdist.report.drawn_report", lambda inputs, hand: {"one": None})
-    monkeypatch.setattr("bayesdist.report.save_drawings", full)
+    monkeypatch.setattr("bayesdist.report.drawing.save_drawings", full)
     before = summary_of(copy)["figures"]
     assert cli("report", copy).code == 1
     assert summary_of(copy)["figures"] == before

@@ -15,7 +15,7 @@ from astropy.wcs import WCS
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.assess import area_map, binned_residuals, misfit_of, uncertainty_map
-from bayesdist.assess.discrepancy_terms import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.infer import load_fit, load_posterior, residuals
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import read_idctab

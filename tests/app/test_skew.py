@@ -11,7 +11,7 @@ from scipy import stats
 
 from bayesdist.infer import fit_linear, load_fit, load_posterior
 from bayesdist.infer.skew import skew_of
-from bayesdist.report.tables import fit_tables
+from bayesdist.report.sections.run.fit import fit_tables
 from tests.app.support import (
     CENTRE,
     as_table,

@@ -168,13 +168,13 @@ def test_two_chips_have_a_header_each(tmp_path, rng) -> None:
 
 def test_a_header_that_is_off_is_called_wrong(tmp_path, rng, monkeypatch) -> None:
     """CRVAL moved by ten pixels on its way to the file."""
-    from bayesdist.app.stages import export
-    from bayesdist.products import write_sip
+    from bayesdist.products.formats.sip import format, write
 
-    def moved(sip, path):
-        write_sip(replace(sip, crval=(sip.crval[0], sip.crval[1] + 10 * PIXEL / 3600)), path)
+    def moved(sip):
+        off = replace(sip, crval=(sip.crval[0], sip.crval[1] + 10 * PIXEL / 3600))
+        return write.sip_text(off)
 
-    monkeypatch.setattr(export, "write_sip", moved)
+    monkeypatch.setattr(format, "sip_text", moved)
     run = made(tmp_path, camera((83.8, -5.4), -1), rng)
     [product] = summary_of(run)["products"]
     assert any(f.startswith("error: sky: astropy.wcs puts pixels up to 4 arcsec") for f in

@@ -15,11 +15,11 @@ from bayesdist.app.campaign.systematics import (
     catalogue_terms,
     with_shared_stars,
 )
-from bayesdist.assess.field_terms import CATALOGUE as POSITIONS
-from bayesdist.assess.field_terms import MOTIONS
+from bayesdist.assess.terms.field_terms import CATALOGUE as POSITIONS
+from bayesdist.assess.terms.field_terms import MOTIONS
 from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.infer import Posterior, fit_linear
-from bayesdist.infer.mixture import OutlierMixture
+from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import Chip, DistortionModel
 
 STARS, EXPOSURES = 60, 9

@@ -9,10 +9,10 @@ import pytest
 from scipy.special import ndtri
 
 from bayesdist.assess import distortion_vectors
-from bayesdist.assess.distortion_field import field_of_solution
-from bayesdist.assess.histograms import histogram
 from bayesdist.assess.wise import StatisticsRow
 from bayesdist.assess.wise.account import RowAccount
+from bayesdist.assess.wise.distortion_field import field_of_solution
+from bayesdist.assess.wise.histograms import histogram
 from bayesdist.assess.wise.published import PrintedRow
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.wise import LONGEST_VECTORS, WISE_ARRAYS, wise_solution

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess.budget_surface import budget_surface
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.fields import MODEL
-from bayesdist.assess.grid import grid_pixels, mesh
-from bayesdist.assess.linear_term import LinearTerm
-from bayesdist.assess.place_budget import place_budget
-from bayesdist.assess.position_errors import position_errors
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.terms.fields import MODEL
+from bayesdist.assess.terms.parameters import LinearTerm
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
+from bayesdist.model.grid import grid_pixels, mesh
 
 SIZE = (201.0, 101.0)
 CHIPS = tuple(Chip(k, f"WFC{k}", SIZE, (101.0, 51.0)) for k in (1, 2))

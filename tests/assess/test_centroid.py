@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess.centroid import centroid_scatter
-from bayesdist.assess.star_sample import StarSample
+from bayesdist.assess.terms.centroid import centroid_scatter
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.residuals.sample import StarSample
 from bayesdist.errors import InputError
 
 

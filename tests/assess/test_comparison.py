@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from bayesdist.assess.calibration import Calibration, calibration_of_map
-from bayesdist.assess.comparison import compare
-from bayesdist.assess.comparison_table import comparison_table, difference_table
-from bayesdist.assess.comparison_verdict import comparison_lines, verdict
+from bayesdist.assess.comparison.compare import compare
+from bayesdist.assess.comparison.sentences import comparison_lines, verdict
+from bayesdist.assess.comparison.tables import comparison_table, difference_table
+from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
-from bayesdist.products.calibration_file import read_calibrations
+from bayesdist.products.registry import read_calibration
 
 SIZE = (1000.0, 800.0)
 BASIS = PolynomialBasis(4, SIZE, (500.0, 400.0))
@@ -51,7 +51,7 @@ def drawn(rng, c, cov):
 
 
 def test_with_itself_nothing_is_left(rng) -> None:
-    one = Calibration("A", BASIS, "pix", truth(), covariance(30, 1))
+    one = ChipMap("A", BASIS, "pix", truth(), covariance(30, 1))
     found = compare(one, one, rng=rng)
     assert found.largest < 1e-11
     assert found.field.chi2 < 1e-12 and found.field.p_value == 1.0
@@ -72,8 +72,8 @@ def test_errors_alone_make_a_chi_square(keep, rng) -> None:
             drawn(rng, truth()[:, : LOW.n_terms], B), B, turn, 0j if keep else 7, mirror
         )
         found = compare(
-            Calibration("A", BASIS, "pix", a, A),
-            Calibration("B", LOW, unit, b, B_moved),
+            ChipMap("A", BASIS, "pix", a, A),
+            ChipMap("B", LOW, unit, b, B_moved),
             rng=rng,
             grid=(5, 4),
             keep=keep,
@@ -101,8 +101,8 @@ def test_shift_rotation_and_scale_are_told_and_taken_out(rng) -> None:
     turn = 1.0005 * np.exp(2e-4j)
     a, cov_a = moved(truth(), cov, turn, 0.3 - 0.2j, False)
     found = compare(
-        Calibration("A", BASIS, "pix", a, cov_a),
-        Calibration("B", BASIS, "pix", truth(), cov),
+        ChipMap("A", BASIS, "pix", a, cov_a),
+        ChipMap("B", BASIS, "pix", truth(), cov),
         rng=rng,
     )
     s = found.similarity
@@ -121,8 +121,8 @@ def test_kept_they_are_the_difference(rng) -> None:
     cov = covariance(30, 1, 1e-4)
     a, _ = moved(truth(), None, 1.0 + 1e-4j, 0j, False)
     found = compare(
-        Calibration("A", BASIS, "pix", a, cov),
-        Calibration("B", BASIS, "pix", truth(), cov),
+        ChipMap("A", BASIS, "pix", a, cov),
+        ChipMap("B", BASIS, "pix", truth(), cov),
         rng=rng,
         keep=True,
     )
@@ -137,8 +137,8 @@ def test_a_known_difference_is_found_where_it_is(rng) -> None:
     more = truth()
     more[0, 3] += 0.02
     found = compare(
-        Calibration("A", BASIS, "pix", more, cov),
-        Calibration("B", BASIS, "pix", truth(), cov),
+        ChipMap("A", BASIS, "pix", more, cov),
+        ChipMap("B", BASIS, "pix", truth(), cov),
         rng=rng,
     )
     assert found.differs and found.errors_of == "both"
@@ -159,8 +159,8 @@ def test_map_and_its_errors_against_sums_of_terms(rng) -> None:
     A = covariance(30, 1)
     a, b = truth(), truth() + 1e-3 * rng.standard_normal((2, 15))
     found = compare(
-        Calibration("A", BASIS, "pix", a, A),
-        Calibration("B", BASIS, "pix", b),
+        ChipMap("A", BASIS, "pix", a, A),
+        ChipMap("B", BASIS, "pix", b),
         rng=rng,
         grid=(3, 3),
         keep=True,
@@ -179,9 +179,7 @@ def test_map_and_its_errors_against_sums_of_terms(rng) -> None:
 def test_without_errors_only_sizes_are_told(rng) -> None:
     b = truth()
     b[1, 5] += 0.01
-    found = compare(
-        Calibration("A", BASIS, "pix", truth()), Calibration("B", BASIS, "pix", b), rng=rng
-    )
+    found = compare(ChipMap("A", BASIS, "pix", truth()), ChipMap("B", BASIS, "pix", b), rng=rng)
     assert found.field is None and found.differs is None and found.sigma_u is None
     assert "neither gives errors" in verdict(found)
     assert np.isnan(comparison_table(found)["z"]).all()
@@ -195,10 +193,8 @@ def test_sigmas_without_correlations_test_single_terms_only(rng) -> None:
         return dx + 2e-8 * dx**2, dy + 0.0 * dx
 
     options = {"order": 4, "size": SIZE, "reference_pixel": (500.0, 400.0), "unit": "pix"}
-    given = calibration_of_map(
-        positions, "A", monomial_cov=np.diag(sigma**2), correlated=False, **options
-    )
-    plain = calibration_of_map(lambda x, y: (x - 500.0, y - 400.0), "B", **options)
+    given = fitted_map(positions, "A", monomial_cov=np.diag(sigma**2), correlated=False, **options)
+    plain = fitted_map(lambda x, y: (x - 500.0, y - 400.0), "B", **options)
     found = compare(given, plain, rng=rng)
     assert found.field is None and "without their correlations" in verdict(found)
     table = comparison_table(found)
@@ -212,8 +208,8 @@ def test_terms_that_no_covariance_speaks_of_are_told_apart(rng) -> None:
     a[0, 12] += 0.05  # fourth order, of which B knows nothing and A gives no error
     b = truth()[:, : LOW.n_terms]
     found = compare(
-        Calibration("A", BASIS, "pix", a),
-        Calibration("B", LOW, "pix", b, covariance(20, 2)),
+        ChipMap("A", BASIS, "pix", a),
+        ChipMap("B", LOW, "pix", b, covariance(20, 2)),
         rng=rng,
     )
     i, j = BASIS.terms[12]
@@ -231,8 +227,8 @@ def test_a_covariance_from_few_draws_does_not_cry_wolf(rng) -> None:
         estimate = np.cov(rng.standard_normal((n, 30)) @ root.T, rowvar=False)
         values.append(
             compare(
-                Calibration("A", BASIS, "pix", drawn(rng, truth(), A), estimate, draws=n),
-                Calibration("B", BASIS, "pix", truth()),
+                ChipMap("A", BASIS, "pix", drawn(rng, truth(), A), estimate, draws=n),
+                ChipMap("B", BASIS, "pix", truth()),
                 rng=rng,
                 grid=(2, 2),
                 n_draws=1,
@@ -253,15 +249,15 @@ def test_a_covariance_from_few_draws_does_not_cry_wolf(rng) -> None:
 def test_what_cannot_be_compared_is_refused(change, words, rng) -> None:
     plain = {"name": "B", "basis": BASIS, "unit": "pix", "coefficients": truth()}
     with pytest.raises(InputError, match=words):
-        compare(Calibration("A", BASIS, "pix", truth()), Calibration(**(plain | change)), rng=rng)
+        compare(ChipMap("A", BASIS, "pix", truth()), ChipMap(**(plain | change)), rng=rng)
 
 
 def test_frames_of_other_axes_cannot_be_kept(rng) -> None:
     b, _ = moved(truth(), None, 1j, 0j, False)
     with pytest.raises(InputError, match="keep-linear"):
         compare(
-            Calibration("A", BASIS, "pix", truth()),
-            Calibration("B", BASIS, "pix", b),
+            ChipMap("A", BASIS, "pix", truth()),
+            ChipMap("B", BASIS, "pix", b),
             rng=rng,
             keep=True,
         )
@@ -276,7 +272,7 @@ def test_two_released_tables_by_themselves(data_dir, rng) -> None:
 
     names = ("0461802ej_idc.fits", "qbu1641sj_idc.fits")
     paths = [data_dir / "hst_reference" / name for name in names]
-    a, b = (read_calibrations(p, filter="F606W") for p in paths)
+    a, b = (read_calibration(p, filter="F606W").by_chip() for p in paths)
     x = np.linspace(0.5, 4096.5, 401)[:-1] + 5.12  # cell centres: an even cover of the chip
     y = np.linspace(0.5, 2048.5, 201)[:-1] + 5.12
     X, Y = (g.ravel() for g in np.meshgrid(x, y))

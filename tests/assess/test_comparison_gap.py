@@ -12,8 +12,9 @@ from astropy.io import fits
 from astropy.table import Table
 from scipy.stats import chi2, kstest
 
-from bayesdist.assess.comparison_gap import gap_difference, pair_of_solution
-from bayesdist.assess.comparison_verdict import gap_lines, gap_verdict
+from bayesdist.assess.comparison.gap import gap_difference, pair_of_chips
+from bayesdist.assess.comparison.sentences import gap_lines, gap_verdict
+from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel
@@ -62,7 +63,7 @@ def drawn(model, theta, seed, n=600, sigma=2e-3):
 
 
 def pair(fit, name="fit"):
-    return pair_of_solution(fit, name, 2, 1)
+    return pair_of_chips(calibration_of(fit, name), 2, 1)
 
 
 def test_errors_alone_make_a_chi_square_of_four():

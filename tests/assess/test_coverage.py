@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.assess import Requirement, binned_sums, partitions_for
 from bayesdist.assess.coverage import BY_CHANCE, coverage_of
-from bayesdist.infer.survey import _hull
+from bayesdist.infer.stars.survey import _hull
 from bayesdist.model import Chip
 
 SIZE = (1016.0, 508.0)

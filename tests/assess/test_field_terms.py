@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import LocalTerm, Requirement, UserTerm, check_requirements, error_fields
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.field_terms import MOTIONS, CatalogueTerm, ExposureScatter
-from bayesdist.assess.fields import MODEL, draw_errors
-from bayesdist.assess.linear_term import LinearTerm
-from bayesdist.assess.rigid import without_rigid
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.terms.field_terms import MOTIONS, CatalogueTerm, ExposureScatter
+from bayesdist.assess.terms.fields import MODEL, draw_errors
+from bayesdist.assess.terms.parameters import LinearTerm
+from bayesdist.assess.terms.rigid import without_rigid
 from bayesdist.errors import InputError
-from bayesdist.infer.views import reference_gauge, without_frames
+from bayesdist.infer.transforms import reference_gauge, without_frames
 from tests.infer.small_campaign import campaign_model, campaign_truth
 
 N = 8000

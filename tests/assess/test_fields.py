@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess import error_fields, solution, uncertainty_map
+from bayesdist.assess import error_fields, uncertainty_map
 from bayesdist.errors import InputError
-from bayesdist.model import Chip, DistortionModel, TimeDependence
+from bayesdist.model import Chip, DistortionModel, TimeDependence, basis
 
 X, Y = (a.ravel() for a in np.meshgrid(np.linspace(1, 4096, 5), np.linspace(1, 2048, 4)))
 PARTS = ("coefficients", "time dependence", "exposure frame")
@@ -115,7 +115,7 @@ def test_drift_grows_from_its_reference_date_and_the_coefficients_stay(rich):
 def test_some_draws_and_blocks_of_points_are_the_same_field(rich, monkeypatch):
     f = fields_of(rich, epoch=2003.0)
     whole = f.field("model")
-    monkeypatch.setattr(solution, "BLOCK", 3)
+    monkeypatch.setattr(basis, "BLOCK", 3)
     np.testing.assert_allclose(f.field("model", slice(10, 25)), whole[10:25], rtol=1e-12)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.assess.formal_radii import (
+from bayesdist.assess.wise.formal_radii import (
     corner_weight,
     effective_sigma,
     formal_radii,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm
-from bayesdist.assess import position_errors as module
-from bayesdist.assess.judged import Judged
-from bayesdist.assess.position_errors import position_errors
+from bayesdist.assess import drawn as module
+from bayesdist.assess.domain import Judged
+from bayesdist.assess.drawn import position_errors
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 CHIPS = tuple(Chip(k, f"C{k}", (101.0, 81.0), (51.0, 41.0)) for k in (1, 2))

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import error_budget
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.linear_term import LinearTerm
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.terms.parameters import LinearTerm
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess.mean_square import MeanSquare
-from bayesdist.assess.position_errors import Judged, position_errors
-from bayesdist.assess.regions import WHOLE
-from bayesdist.assess.terms import LocalTerm
+from bayesdist.assess.drawn import Judged, position_errors
+from bayesdist.assess.requirements.regions import WHOLE
+from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.infer import fit_linear
 from tests.infer.support import UNCLIPPED, simulated
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess import grid_pixels, solution, uncertainty_map
+from bayesdist.assess import grid_pixels, uncertainty_map
 from bayesdist.errors import InputError
-from bayesdist.model import Chip, DistortionModel
+from bayesdist.model import Chip, DistortionModel, basis
 
 
 def mesh_of(m):
@@ -95,7 +95,7 @@ def test_largest_radius_and_its_place(rich):
 
 def test_blocks_of_points_do_not_change_the_map(rich, monkeypatch):
     whole = uncertainty_map(rich, epoch=2005.0)
-    monkeypatch.setattr(solution, "BLOCK", 7)
+    monkeypatch.setattr(basis, "BLOCK", 7)
     np.testing.assert_allclose(
         uncertainty_map(rich, epoch=2005.0).sigma_u, whole.sigma_u, rtol=1e-13
     )

@@ -10,8 +10,8 @@ from scipy import stats
 from scipy.sparse import coo_array, csr_array, hstack
 from scipy.sparse.linalg import spsolve
 
-from bayesdist.assess.pattern_words import lacking
-from bayesdist.assess.patterns import Beforehand, Camera, PlannedStars, compare_patterns
+from bayesdist.assess.planning.dithers import Beforehand, Camera, PlannedStars, compare_patterns
+from bayesdist.assess.planning.words import lacking
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.model import Chip

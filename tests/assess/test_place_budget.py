@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm, error_budget
-from bayesdist.assess.mean_square import MeanSquare
-from bayesdist.assess.place_budget import place_budget
-from bayesdist.assess.position_errors import position_errors
-from bayesdist.assess.terms import LocalTerm
+from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.terms.given import LocalTerm
 from bayesdist.data import MagnitudeErrors
+from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 

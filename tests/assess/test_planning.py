@@ -4,10 +4,10 @@ import numpy as np
 from scipy import stats
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
-from bayesdist.assess.planning import MOST, Schedule, exposures_needed
+from bayesdist.assess.planning.exposures import MOST, Schedule, exposures_needed
 from bayesdist.infer import fit_linear
-from bayesdist.infer.planning import exposure_content, exposure_information
-from tests.infer.test_planning import SIGMA, model_of, stars
+from bayesdist.infer.compare.planning import exposure_content, exposure_information
+from tests.infer.compare.test_planning import SIGMA, model_of, stars
 
 
 def judge(requirement, **options):

@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from bayesdist.assess.budget_surface import budget_surface
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.place_budget import place_budget
-from bayesdist.assess.position_errors import position_errors
-from bayesdist.assess.product_terms import PRODUCT, ProductTerm, with_product
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.terms.product_terms import PRODUCT, ProductTerm, with_product
 from bayesdist.model import Chip, DistortionModel
 
 SIZE, GRID = (201.0, 101.0), (9, 5)
@@ -74,7 +74,7 @@ def test_at_a_place_it_is_the_field_and_between_two_the_difference(solution):
 
 
 def test_the_page_carries_it(solution):
-    from bayesdist.report.explorer import _product
+    from bayesdist.report.sections.explorer import _product
 
     errors = position_errors(solution, grid=GRID, n_draws=100, rng=np.random.default_rng(3))
     surface = budget_surface(errors, products=(TERM,))

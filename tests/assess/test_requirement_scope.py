@@ -6,10 +6,10 @@ from scipy import stats
 from scipy.spatial.distance import pdist
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
-from bayesdist.assess.horizon import horizon_of
-from bayesdist.assess.position_errors import position_errors
+from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.requirements.validity import horizon_of
+from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.statistics import extent
-from bayesdist.assess.verdict import clopper_pearson
 from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence

@@ -5,14 +5,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess import (
-    STATISTICS,
-    Requirement,
-    UserTerm,
-    check_requirements,
-    position_errors,
-)
-from bayesdist.assess.verdict import Caveat, clopper_pearson, scatter_too_small
+from bayesdist.assess import STATISTICS, Requirement, UserTerm, check_requirements
+from bayesdist.assess import drawn as position_errors
+from bayesdist.assess.requirements.verdict import Caveat, clopper_pearson, scatter_too_small
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 

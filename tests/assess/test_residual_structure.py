@@ -8,8 +8,8 @@ from numpy.polynomial import legendre
 from scipy.stats import chi2, kstest
 
 from bayesdist.assess import BinnedResiduals
-from bayesdist.assess.residual_correlation import residual_correlation
-from bayesdist.assess.residual_structure import residual_partition
+from bayesdist.assess.wise.residual_correlation import residual_correlation
+from bayesdist.assess.wise.residual_structure import residual_partition
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model.basis import polynomial_terms
 

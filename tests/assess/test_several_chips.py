@@ -13,7 +13,7 @@ from bayesdist.assess import (
     check_requirements,
     error_budget,
 )
-from bayesdist.assess.detector_budget import detector_budget
+from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel

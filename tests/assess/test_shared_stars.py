@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.field_terms import CatalogueTerm, ExposureScatter
-from bayesdist.assess.fields import draw_errors
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.terms.field_terms import CatalogueTerm, ExposureScatter
+from bayesdist.assess.terms.fields import draw_errors
 from bayesdist.infer import fit_linear
-from bayesdist.infer.hierarchy import fit_hierarchical
-from bayesdist.infer.star_errors import with_star_errors
+from bayesdist.infer.catalogue.star_errors import with_star_errors
+from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from tests.infer.small_campaign import campaign, campaign_truth, shared_stars
 from tests.infer.support import UNCLIPPED
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bayesdist.assess.calibration import calibration_of_map
 from bayesdist.assess.detector_numbers import detector_numbers
 from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.errors import InputError
 
 SIZE = (400.0, 200.0)
 
 
 def chip(positions, number=1, size=SIZE, order=3):
-    return calibration_of_map(
+    return fitted_map(
         positions, "made up", order=order, size=size, reference_pixel=(1.0, 1.0),
         unit="arcsec", chip=number,
     )  # fmt: skip

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.horizon import horizon_of
-from bayesdist.assess.position_errors import position_errors
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.requirements.validity import horizon_of
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.benchmarks.timing import median, say
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 import bayesdist as bd
 from bayesdist.data import PartitionedMatches, open_matches
 from bayesdist.infer import GaussianPriors, kernel, load
-from bayesdist.infer.stars import prepare
-from bayesdist.infer.target import Target
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.stars.stars import prepare
 
 __all__ = [
     "HYPER",

@@ -14,7 +14,7 @@ from bayesdist.data import MatchTable
 from bayesdist.infer import fit_by_magnitude
 from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables, pixel_jacobian
 from bayesdist.infer.series import Course, Series, fit_series
-from bayesdist.infer.views import Solution, View, lines, reference_gauge, without_frames
+from bayesdist.infer.transforms import Solution, View, lines, reference_gauge, without_frames
 from bayesdist.model import corrected
 from bayesdist.simulate.acs.pointings import SPANS
 from bayesdist.simulate.acs.stars import centroid_error

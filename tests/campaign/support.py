@@ -18,11 +18,11 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.data import MatchTable
-from bayesdist.infer.hierarchy import HierarchicalFit
+from bayesdist.infer.catalogue.star_errors import star_covariance, with_star_errors
+from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
 from bayesdist.infer.recoloured import Recoloured
 from bayesdist.infer.series import Series
-from bayesdist.infer.star_errors import star_covariance, with_star_errors
 from bayesdist.model import LookupTable
 from bayesdist.simulate.acs import AcsCampaign, acs_model, read_acs
 from bayesdist.simulate.acs.pointings import OWN

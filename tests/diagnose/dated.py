@@ -9,12 +9,12 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose import ScoreTest, score_tests
-from bayesdist.diagnose.gap import gap_test
-from bayesdist.diagnose.motions import motion_test
-from bayesdist.diagnose.projection import projection_of
-from bayesdist.diagnose.regressors import functions_for
-from bayesdist.diagnose.result import Outcome
-from bayesdist.diagnose.sample import scored_sample
+from bayesdist.diagnose.score.gap import gap_test
+from bayesdist.diagnose.score.motions import motion_test
+from bayesdist.diagnose.score.projection import projection_of
+from bayesdist.diagnose.score.regressors import functions_for
+from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.model import DistortionModel, TimeDependence
 

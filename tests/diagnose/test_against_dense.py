@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.diagnose.exposures import exposure_test
-from bayesdist.diagnose.projection import Projection, projection_of
-from bayesdist.diagnose.regressors import functions_for
-from bayesdist.diagnose.sample import scored_sample
-from bayesdist.diagnose.score import regressor_tests
+from bayesdist.diagnose.score.exposures import exposure_test
+from bayesdist.diagnose.score.projection import Projection, projection_of
+from bayesdist.diagnose.score.regressors import functions_for
+from bayesdist.diagnose.score.sample import scored_sample
+from bayesdist.diagnose.score.score import regressor_tests
 from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.infer.scores import scores_of
-from bayesdist.infer.stars import in_table_order, prepare
+from bayesdist.infer.stars.likelihood import scores_of
+from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel
 
 from ..infer.support import CHIP, TWO_CHIPS, columns_of, exposures, legendre_design, truth_of

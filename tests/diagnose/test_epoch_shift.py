@@ -8,7 +8,7 @@ from astropy.table import Table
 from scipy.spatial import cKDTree
 
 from bayesdist.data import MatchTable, find_similarity, pattern_index
-from bayesdist.diagnose.epoch_shift import epoch_shift
+from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.infer import build_model, fit_linear
 
 SIGMA, PM = 0.02, 0.012  # arcsec, and arcsec per year

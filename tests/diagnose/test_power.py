@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose import score_tests
-from bayesdist.diagnose.result import FAMILY_LEVEL
+from bayesdist.diagnose.score.result import FAMILY_LEVEL
 
 from .. import seeds
 from ..infer.patterned import moved

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.diagnose import sample as sample_module
 from bayesdist.diagnose import score_tests
-from bayesdist.diagnose.result import Outcome, corrected, noncentrality
-from bayesdist.diagnose.sample import SAMPLE, scored_sample
+from bayesdist.diagnose.score import sample as sample_module
+from bayesdist.diagnose.score.result import Outcome, corrected, noncentrality
+from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
 from bayesdist.errors import InputError
-from bayesdist.infer.views import without_frames
+from bayesdist.infer.transforms import without_frames
 
 from ..infer.patterned import moved
 from .support import TIME, Scene, by_name, polynomial

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose import score_tests
-from bayesdist.diagnose.result import corrected
+from bayesdist.diagnose.score.result import corrected
 
 from .. import seeds
 from ..infer.support import columns_of, truth_of

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.diagnose.gap import visit_codes
-from bayesdist.diagnose.result import FAMILY_LEVEL
+from bayesdist.diagnose.score.gap import visit_codes
+from bayesdist.diagnose.score.result import FAMILY_LEVEL
 from bayesdist.model import TimeDependence
 
 from .. import seeds

@@ -7,15 +7,15 @@ from collections.abc import Callable
 import numpy as np
 
 from bayesdist.infer import OutlierMixture
-from bayesdist.infer.arrow import Arrow
-from bayesdist.infer.blocks import Walkers
-from bayesdist.infer.coordinates import Split
-from bayesdist.infer.laplace import Node
-from bayesdist.infer.lookahead import Page
-from bayesdist.infer.plan import Plan, Stretch
-from bayesdist.infer.proposal import GridProposal
-from bayesdist.infer.sampler import Ensembles
-from bayesdist.infer.whitening import Whitening
+from bayesdist.infer.density.coordinates import Split
+from bayesdist.infer.density.laplace import Node
+from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.infer.sampler.blocks import Walkers
+from bayesdist.infer.sampler.ensembles import Ensembles
+from bayesdist.infer.sampler.lookahead import Page
+from bayesdist.infer.sampler.move_schedule import Plan, Stretch
+from bayesdist.infer.sampler.whitening import Whitening
 
 
 class FakeTarget:

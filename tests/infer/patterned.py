@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import LinearFit, OutlierMixture, Posterior, load
-from bayesdist.infer.laplace import starting_point
+from bayesdist.infer.density.laplace import starting_point
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 

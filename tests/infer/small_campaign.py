@@ -9,8 +9,8 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import LinearFit
-from bayesdist.infer.star_errors import StarCovariance, star_covariance
-from bayesdist.infer.views import lines
+from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
+from bayesdist.infer.transforms import lines
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import CHIP_DEVIATIONS
 from bayesdist.simulate import simulate_matches

@@ -19,8 +19,8 @@ from bayesdist.infer import (
     fit_linear,
     load,
 )
-from bayesdist.infer.stars import Stars, prepare
-from bayesdist.infer.target import Target
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches
 

@@ -19,7 +19,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.infer import OutlierMixture, sample
-from bayesdist.infer.grid import build_proposal
+from bayesdist.infer.density.grid import build_proposal
 
 from .support import UNCLIPPED, simulated, target_of
 

@@ -23,7 +23,7 @@ from bayesdist.infer import (
     save_fit,
     save_posterior,
 )
-from bayesdist.infer.labelled import posterior_file
+from bayesdist.infer.files import posterior_file
 from bayesdist.model import TimeDependence
 
 from .support import TWO_CHIPS, simulated

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial import polynomial
 
-from bayesdist.assess.calibration import Calibration, calibration_of_map
+from bayesdist.calibration.chip_map import ChipMap, fitted_map
 
 SIZE, ZERO, SCALE = (1024.0, 1024.0), (512.0, 512.0), 0.025
 
@@ -54,7 +54,7 @@ COEFFICIENTS = {
 }  # fmt: skip
 
 
-def siaf_calibration(detector: str) -> Calibration:
+def siaf_calibration(detector: str) -> ChipMap:
     """The polynomials of an aperture, from its zero point."""
     matrices = []
     for terms in COEFFICIENTS[detector]:
@@ -67,7 +67,7 @@ def siaf_calibration(detector: str) -> Calibration:
         u, v = (polynomial.polyval2d(x - ZERO[0], y - ZERO[1], c) for c in matrices)
         return u, v
 
-    return calibration_of_map(
+    return fitted_map(
         positions, f"SIAF, {detector}", order=4, size=SIZE, reference_pixel=ZERO,
         unit="arcsec", chip=1,
     )  # fmt: skip

@@ -10,8 +10,12 @@ from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 from numpy.typing import NDArray
 
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.orientation import lay_on, oriented
+from bayesdist.calibration.plane import Orientation
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import IdcTab
+from bayesdist.products.formats.idctab.calibration import idctab_calibration
 
 Float = NDArray[np.float64]
 
@@ -118,3 +122,16 @@ def astropy_wcs(header: fits.Header) -> WCS:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FITSFixedWarning)
         return WCS(header)
+
+
+def laid_on(
+    solution, tab: IdcTab, *, filter: tuple[str, ...] | None = None, **options
+) -> Orientation:
+    """How a solution lies on an IDCTAB."""
+    reference = idctab_calibration(tab, None if filter is None else ",".join(filter))
+    return lay_on(calibration_of(solution), reference, **options)
+
+
+def turned_by(solution, orientation: Orientation) -> Calibration:
+    """A solution in the plane of the orientation."""
+    return oriented(calibration_of(solution), orientation)

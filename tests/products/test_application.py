@@ -9,24 +9,20 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
-from bayesdist.errors import FormatError, InputError
-from bayesdist.products import idctab_from_solution, read_idctab
-from bayesdist.products.application import Application, OutputFrame, frame_that_holds
-from bayesdist.products.application_inverse import fitted_inverse
-from bayesdist.products.chips_in_frame import (
-    chips_of_idctab,
-    chips_of_solution,
-    scale_of_idctab,
-)
-from bayesdist.products.detectors import ACS, acs_detector
-from bayesdist.products.inverse_rows import InverseRows
-from bayesdist.products.subarray import (
+from bayesdist.calibration.apply import Application, OutputFrame, frame_that_holds
+from bayesdist.calibration.calibration import calibration_of
+from bayesdist.calibration.inverse import fitted_inverse
+from bayesdist.calibration.subarray import (
     Subarray,
     subarray_at_corner,
     subarray_of_centre,
     subarray_of_header,
     subarrays_of_image,
 )
+from bayesdist.errors import FormatError, InputError
+from bayesdist.products import idctab_from_solution, read_idctab
+from bayesdist.products.detectors import ACS, acs_detector
+from bayesdist.products.formats.idctab.calibration import idctab_calibration
 
 from .acs_offline import Pointing, corrected, to_sky
 from .siaf_acs import ZERO, siaf_calibration
@@ -45,6 +41,11 @@ SIZE = (4096, 2048)
 POINTING = Pointing("2009-10-03", (5.66, -72.07), 71.3, vafactor=1.00003)
 
 
+def headers(path):
+    with fits.open(path) as hdus:
+        return [hdu.header for hdu in hdus]
+
+
 @pytest.fixture(scope="module")
 def table(data_dir):
     return data_dir / "hst_reference" / "0461802ej_idc.fits"
@@ -57,14 +58,16 @@ def real(table):
 
 @pytest.fixture(scope="module")
 def wfc(real) -> Application:
-    chips = chips_of_idctab(real, filter="F606W,CLEAR2L")
-    return Application(chips, OutputFrame(scale_of_idctab(real, "F606W,CLEAR2L")))
+    chips = idctab_calibration(real, "F606W,CLEAR2L").in_frame()
+    return Application(chips, OutputFrame(idctab_calibration(real, "F606W,CLEAR2L").pixel()[0]))
 
 
 def mirrored() -> Application:
     """A chip of no telescope: turned, mirrored, strongly bent, with errors."""
     solution = some_solution(3, unit="mas", pixel=40.0, angle=2.1, flip=True, strength=8.0)
-    return Application(chips_of_solution(solution, "made up"), OutputFrame(35.0, (700.0, 400.0)))
+    return Application(
+        calibration_of(solution, "made up").in_frame(), OutputFrame(35.0, (700.0, 400.0))
+    )
 
 
 # -- forward --------------------------------------------------------------------------------------
@@ -101,7 +104,7 @@ def test_four_steps_written_out_from_the_columns_of_the_table(table, wfc):
 
 def test_both_chips_lie_on_the_sky_where_stwcs_puts_them(table, real, tmp_path):
     """With drift and velocity aberration: 0.1 mas."""
-    chips = chips_of_idctab(real, filter="F606W,CLEAR2L", epoch=POINTING.epoch)
+    chips = idctab_calibration(real, "F606W,CLEAR2L").in_frame(POINTING.epoch)
     a = Application(chips, OutputFrame(0.05, (3.0, -8.0)))  # VAFACTOR is in `to_sky`
     record = real.rows[real.row(2, F606W)]
     v2v3 = float(record["V2REF"]), float(record["V3REF"])
@@ -144,7 +147,7 @@ def test_the_frame_holds_every_pixel_and_nothing_less_would(wfc):
 def test_errors_are_those_of_the_position_from_the_reference_zero_point(real):
     """By the model's own derivatives: D(x) - D(zero point of chip 2)."""
     s = wfc_solution(real)
-    a = Application(chips_of_solution(s, "made up", epoch=2011.0), OutputFrame(0.05))
+    a = Application(calibration_of(s, "made up").in_frame(2011.0), OutputFrame(0.05))
     x, y = random_pixels(SIZE, 40)
     at_zero = s.model.jacobian(s.mean, [2048.0], [1024.0], epoch=2011.0, chip=2)[0]
     value = s.model.predict(s.mean, [2048.0], [1024.0], epoch=2011.0, chip=2)[0]
@@ -167,8 +170,8 @@ def test_a_table_with_its_covariance_says_the_same_as_the_solution(real, epoch):
     s = wfc_solution(real)
     tab = idctab_from_solution(s, instrument="ACS", detector="WFC", v2ref=256.6, v3ref=302.3)
     frame = OutputFrame(0.05, (7.0, 8.0))
-    of_table = Application(chips_of_idctab(tab, epoch=epoch), frame)
-    of_solution = Application(chips_of_solution(s, "made up", epoch=epoch), frame)
+    of_table = Application(idctab_calibration(tab).in_frame(epoch), frame)
+    of_solution = Application(calibration_of(s, "made up").in_frame(epoch), frame)
     x, y = random_pixels(SIZE, 40)
     for chip in (1, 2):
         a, b = (one.forward(x, y, chip=chip) for one in (of_table, of_solution))
@@ -195,12 +198,12 @@ def test_filters_have_their_own_errors():
     tab = idctab_from_solution(solutions, instrument="ACS", detector="WFC")
     x, y = random_pixels(SIZE, 20)
     for name, s in solutions.items():
-        a = Application(chips_of_idctab(tab, filter=name), frame).forward(x, y, chip=1)
-        b = Application(chips_of_solution(s, name), frame).forward(x, y, chip=1)
+        a = Application(idctab_calibration(tab, name).in_frame(), frame).forward(x, y, chip=1)
+        b = Application(calibration_of(s, name).in_frame(), frame).forward(x, y, chip=1)
         assert_allclose([a.x, a.y], [b.x, b.y], atol=1e-8, rtol=0)
         assert_allclose(a.cov, b.cov, rtol=1e-7, atol=1e-9 * np.abs(b.cov).max())
     with pytest.raises(InputError, match="differ from filter to filter"):
-        chips_of_idctab(tab)
+        idctab_calibration(tab).in_frame()
 
 
 # -- back -----------------------------------------------------------------------------------------
@@ -260,40 +263,39 @@ def test_a_fitted_inverse_says_its_own_error(wfc):
     """On pixels that it was not judged on, and falling with the order."""
     rng = np.random.default_rng(3)
     for a, chip in ((wfc, 1), (mirrored(), 1)):
-        size = a.chips[chip].basis.size
-        x, y = (rng.uniform(1, n, 20_000) for n in size)
-        at = a.forward(x, y, chip=chip)
+        one = a.chips[chip]
+        x, y = (rng.uniform(1, n, 20_000) for n in one.basis.size)
         closures = []
         for order in (3, 4, 5, 6):
-            fitted = fitted_inverse(a, chip, order)
-            px, py = fitted.pixels(at.x, at.y)
+            fitted = fitted_inverse(one, order)
+            closure, rms = fitted.misses(one)
+            px, py = fitted.pixels(*one.at(x, y))
             miss = np.hypot(px - x, py - y)
-            assert 0.3 * fitted.closure < miss.max() <= fitted.closure * (1 + 1e-6)
-            assert np.sqrt(np.mean(miss**2)) == pytest.approx(fitted.rms, rel=0.1)
-            closures.append(fitted.closure)
+            assert 0.3 * closure < miss.max() <= closure * (1 + 1e-6)
+            assert np.sqrt(np.mean(miss**2)) == pytest.approx(rms, rel=0.1)
+            closures.append(closure)
         assert np.all(np.diff(closures) < 0)
     # what plain least squares leaves on WFC1 at orders 4 to 7, pixels
     for order, left in ((4, 0.070), (5, 0.0067), (6, 7e-4), (7, 7e-5)):
-        assert fitted_inverse(wfc, 1, order).closure < left
-    assert fitted_inverse(wfc, 1).order == 6
+        assert fitted_inverse(wfc.chips[1], order).misses(wfc.chips[1])[0] < left
+    assert fitted_inverse(wfc.chips[1]).order == 6
     for order in (0, 10):
         with pytest.raises(InputError, match="order of the inverse"):
-            fitted_inverse(wfc, 1, order)
+            fitted_inverse(wfc.chips[1], order)
 
 
 def test_inverse_rows_close_as_the_file_says(real):
     s = wfc_solution(real)
     tab = idctab_from_solution(s, instrument="ACS", detector="WFC", inverse=True)
-    a = Application(chips_of_idctab(tab), OutputFrame(0.05, (11.0, -4.0)))
+    found = idctab_calibration(tab)
     x, y = random_pixels(SIZE, 100)
-    for chip in (1, 2):
-        rows = InverseRows.of(a, tab, chip, None, "made up")
-        assert rows.closure == pytest.approx(tab.header[f"BDCLOS_{chip}"], rel=1e-6)
-        at = a.forward(x, y, chip=chip)
-        px, py = rows.pixels(at.x, at.y)
-        assert 0 < np.hypot(px - x, py - y).max() <= rows.closure
-    with pytest.raises(InputError, match="no INVERSE row of chip 2"):
-        InverseRows.of(a, real, 2, "F606W", "table")
+    for chip, one in found.at(origin="chip").items():
+        rows = found.inverses[chip]
+        closure, _ = rows.misses(one)
+        assert closure == pytest.approx(tab.header[f"BDCLOS_{chip}"], rel=1e-6)
+        px, py = rows.pixels(*one.at(x, y))
+        assert 0 < np.hypot(px - x, py - y).max() <= closure
+    assert not idctab_calibration(real, "F606W").inverses
 
 
 # -- subarrays ------------------------------------------------------------------------------------
@@ -312,8 +314,8 @@ def test_subarrays_lie_on_the_sky_where_stwcs_puts_them(table, real, tmp_path):
         hdu.header["CRVAL1"], hdu.header["CRVAL2"] = POINTING.crval
         hdu.header["VAFACTOR"] = POINTING.vafactor
     theirs = updated(hdus, tmp_path / "sub_flt.fits")
-    images = subarrays_of_image(tmp_path / "sub_flt.fits", {1: SIZE, 2: SIZE})
-    chips = chips_of_idctab(real, filter="F606W,CLEAR2L", epoch=POINTING.epoch)
+    images = subarrays_of_image(headers(tmp_path / "sub_flt.fits"), {1: SIZE, 2: SIZE})
+    chips = idctab_calibration(real, "F606W,CLEAR2L").in_frame(POINTING.epoch)
     whole = Application(chips, OutputFrame(0.05))
     part = replace(whole, images=images)
     x, y = random_pixels((1024, 512), 100)
@@ -355,14 +357,14 @@ def test_what_is_no_subarray_is_refused(tmp_path):
     image.header["CCDCHIP"] = 7
     fits.HDUList([fits.PrimaryHDU(), image]).writeto(tmp_path / "a.fits")
     with pytest.raises(InputError, match="chip 7"):
-        subarrays_of_image(tmp_path / "a.fits", {1: SIZE})
+        subarrays_of_image(headers(tmp_path / "a.fits"), {1: SIZE})
     image.header["CCDCHIP"] = 1
     fits.HDUList([fits.PrimaryHDU(), image]).writeto(tmp_path / "b.fits")
     with pytest.raises(InputError, match="chip 1: has no LTV1"):
-        subarrays_of_image(tmp_path / "b.fits", {1: SIZE})
+        subarrays_of_image(headers(tmp_path / "b.fits"), {1: SIZE})
     fits.PrimaryHDU().writeto(tmp_path / "c.fits")
     with pytest.raises(FormatError, match="no extension SCI"):
-        subarrays_of_image(tmp_path / "c.fits", {1: SIZE})
+        subarrays_of_image(headers(tmp_path / "c.fits"), {1: SIZE})
 
 
 def test_what_cannot_be_applied_is_refused(real, wfc):
@@ -378,7 +380,7 @@ def test_what_cannot_be_applied_is_refused(real, wfc):
         acs_detector("UVIS")
     s = wfc_solution(real)
     with pytest.raises(InputError, match="depends on time"):
-        chips_of_solution(s, "made up")
+        calibration_of(s, "made up").in_frame()
     flat = wfc.chips[2].coefficients * np.array([[1.0], [0.0]])
     folded = replace(wfc, chips={2: replace(wfc.chips[2], coefficients=flat)})
     with pytest.raises(InputError, match="to a line"):
@@ -392,12 +394,12 @@ def test_every_filter_has_the_errors_of_the_drift(real):
     both = {"F606W": s, "F814W": other}
     tab = idctab_from_solution(both, instrument="ACS", detector="WFC")
     a, b = (
-        Application(chips_of_idctab(tab, filter=name, epoch=2020.0), OutputFrame(0.05)).forward(
+        Application(idctab_calibration(tab, name).in_frame(2020.0), OutputFrame(0.05)).forward(
             [1.0, 4000.0], [1.0, 300.0], chip=1
         )
         for name in both
     )
-    then = Application(chips_of_idctab(tab, filter="F814W"), OutputFrame(0.05))
+    then = Application(idctab_calibration(tab, "F814W").in_frame(), OutputFrame(0.05))
     # what 15 years add is there in both, though their correlation with the rest differs
     for one in (a, b):
         ratio = one.sigma_x / then.forward([1.0, 4000.0], [1.0, 300.0], chip=1).sigma_x

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from bayesdist.model import polynomial_terms
-from bayesdist.products.bivariate import evaluate, largest_magnitude
+from bayesdist.products.formats.common.coefficients import evaluate, largest_magnitude
 
 
 def test_value_is_the_sum_of_its_terms() -> None:

@@ -141,7 +141,7 @@ def test_covariance_is_that_of_the_numbers_in_the_file() -> None:
     assert_allclose(stated["COV"] / np.outer(sd, sd), expected / np.outer(sd, sd), atol=1e-7)
     columns = {n for n in stated["PARAM"] if not n.startswith("TDD")}
     assert columns == {n for n in made.columns if n[:2] in ("CX", "CY", "V2", "V3")}
-    header = next(b for b in made.blocks if b.name == "SIGMA").header
+    header = next(b for b in made.hdus if b.name == "SIGMA").header
     for chip, name, value, s in zip(
         stated["DETCHIP"], stated["PARAM"], stated["VALUE"], sd, strict=True
     ):
@@ -207,7 +207,7 @@ def test_one_solution_for_several_filters_is_told_in_two_ways() -> None:
     solution = some_solution(2, unit="arcsec")
     beside = idctab_from_solution(solution, **UVIS, filters=(("F606W",), ("F814W",)))
     each = idctab_from_solution({"F606W": solution, "F814W": solution}, **UVIS)
-    assert [b.to_bytes() for b in beside.blocks] == [b.to_bytes() for b in each.blocks]
+    assert [b.to_bytes() for b in beside.hdus] == [b.to_bytes() for b in each.hdus]
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,6 @@ def test_one_chip_alone_is_enough_for_the_scheme(real) -> None:
     ("names", "message"),
     [
         ({"instrument": "WISE", "detector": "W1"}, "parity of WISE/W1 is not known"),
-        ({"v2v3": "sky"}, "choose 'aperture'"),
         ({"vafactor": 0.0}, "vafactor is 0.0"),
         ({"scale_arcsec": -1.0}, "positive"),
         ({"chips": (7,)}, "no chip 7"),

@@ -3,7 +3,12 @@
 import pytest
 
 from bayesdist.model import polynomial_terms
-from bayesdist.products.indices import idctab_column, idctab_powers, sip_keyword, sip_powers
+from bayesdist.products.formats.common.coefficients import (
+    idctab_column,
+    idctab_powers,
+    sip_keyword,
+    sip_powers,
+)
 
 
 @pytest.mark.parametrize(("i", "j"), polynomial_terms(9))

@@ -13,10 +13,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from bayesdist.errors import BayesdistError, DegenerateError, FormatError, InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products import IdcTab, describe, idctab_from_solution, read_idctab
-from bayesdist.products.d2im import read_d2im, write_d2im
-from bayesdist.products.lookup_file import LookupFile, read_lookup_file, write_lookup_file
-from bayesdist.products.lookup_lint import lint_lookup_file
-from bayesdist.products.npol import read_npol, write_npol
+from bayesdist.products.formats.lookup.d2im import read_d2im, write_d2im
+from bayesdist.products.formats.lookup.file import LookupFile, read_lookup_file, write_lookup_file
+from bayesdist.products.formats.lookup.lint import lint_lookup_file
+from bayesdist.products.formats.lookup.npol import read_npol, write_npol
 
 from .support import F606W, some_solution, wfc_solution
 
@@ -256,11 +256,11 @@ def test_a_filter_that_the_idctab_does_not_have(rng, tmp_path, real) -> None:
 def test_a_singular_polynomial_is_refused(rng, tmp_path, data_dir, real) -> None:
     solution = wfc_solution(real)
     flat = idctab_from_solution(solution, instrument="ACS", detector="WFC", scale_arcsec=0.05)
-    block = flat.blocks[1]
+    block = flat.hdus[1]
     data = fits.BinTableHDU.fromstring(block.to_bytes()).data.copy()
     data["CX11"] = data["CX10"] = 0.0
     broken = IdcTab(
-        (flat.blocks[0], type(block)(block.cards, data.view(np.ndarray).tobytes())), "flat"
+        (flat.hdus[0], type(block)(block.cards, data.view(np.ndarray).tobytes())), "flat"
     )
     with pytest.raises(DegenerateError, match="the linear part is singular"):
         write_npol([table(1, rng, "F606W")], tmp_path / "x.fits", idctab=broken, filters=F606W)

@@ -16,9 +16,9 @@ from numpy.testing import assert_allclose
 
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products import IdcTab, idctab_from_solution, read_idctab, write_idctab
-from bayesdist.products.d2im import read_d2im, write_d2im
-from bayesdist.products.lookup_file import LookupFile, write_lookup_file
-from bayesdist.products.npol import read_npol, write_npol
+from bayesdist.products.formats.lookup.d2im import read_d2im, write_d2im
+from bayesdist.products.formats.lookup.file import LookupFile, write_lookup_file
+from bayesdist.products.formats.lookup.npol import read_npol, write_npol
 
 from .stwcs_offline import gnomonic, separation_mas, sky
 from .support import F606W, wfc_solution

@@ -8,13 +8,13 @@ from astropy.io import fits
 from numpy.testing import assert_allclose
 
 from bayesdist.assess import area_map
-from bayesdist.assess.area import pixel_areas
-from bayesdist.assess.calibration import calibration_of_solution
+from bayesdist.calibration.area import pixel_area_map, pixel_areas
+from bayesdist.calibration.calibration import calibration_of
+from bayesdist.calibration.subarray import Subarray, subarray_at_corner
 from bayesdist.errors import InputError
 from bayesdist.products import read_idctab
-from bayesdist.products.chips_in_frame import chips_of_idctab
-from bayesdist.products.pam import pixel_area_map, write_pam
-from bayesdist.products.subarray import Subarray, subarray_at_corner
+from bayesdist.products.formats.idctab.calibration import idctab_calibration
+from bayesdist.products.pam_file import write_pam
 
 from .acs_offline import Pointing, corrected
 from .support import F606W, some_solution
@@ -29,7 +29,7 @@ def table(data_dir):
 
 @pytest.fixture(scope="module")
 def chips(table):
-    return chips_of_idctab(read_idctab(table), filter="F606W,CLEAR2L")
+    return idctab_calibration(read_idctab(table), "F606W,CLEAR2L").in_frame()
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_areas_of_the_real_table_are_its_jacobian(table, maps):
 def test_areas_on_the_sky_are_those_of_stwcs(table, tmp_path):
     """Corners of pixels taken to the sky, at a date, in units of IDCSCALE squared."""
     pointing = Pointing("2012-04-11", (5.66, -72.07), 31.0)
-    at_date = chips_of_idctab(read_idctab(table), filter="F606W,CLEAR2L", epoch=pointing.epoch)
+    at_date = idctab_calibration(read_idctab(table), "F606W,CLEAR2L").in_frame(pointing.epoch)
     rng = np.random.default_rng(2)
     x, y = rng.integers(1, 4097, 300), rng.integers(1, 2049, 300)
     for chip, wcs in corrected(tmp_path, "exposure", pointing, idctab=table).items():
@@ -78,7 +78,7 @@ def test_areas_on_the_sky_are_those_of_stwcs(table, tmp_path):
 def test_errors_are_the_spread_of_draws():
     """Determinants of 4000 draws: standard deviations within five of their errors."""
     s = some_solution(4, unit="arcsec", pixel=0.05, size=(60.0, 40.0), reference_pixel=(30.0, 20.0))
-    one = pixel_area_map(calibration_of_solution(s, "made up"), SCALE)
+    one = pixel_area_map(calibration_of(s, "made up").chip(origin="stated"), SCALE)
     basis, theta = s.model.basis(), s.draws(4000, np.random.default_rng(6))
     x, y = np.array([1.0, 60.0, 33.0]), np.array([40.0, 5.0, 21.0])
     by_x, by_y = basis.gradient(x, y)
@@ -93,10 +93,10 @@ def test_errors_are_the_spread_of_draws():
 @pytest.mark.parametrize("order", [1, 3, 9])
 def test_exact_at_every_order(order):
     """Values and errors by nodes are those at the pixels themselves."""
-    from bayesdist.assess.area import determinant
+    from bayesdist.calibration.area import determinant
 
     s = some_solution(order, size=(50.0, 30.0), reference_pixel=(20.0, 20.0))
-    c = calibration_of_solution(s, "made up")
+    c = calibration_of(s, "made up").chip(origin="stated")
     x, y = np.array([1.0, 17.5, 50.0]), np.array([1.0, 30.0])
     area, sigma = pixel_areas(c, x, y)
     X, Y = (a.ravel() for a in np.meshgrid(x, y))
@@ -109,13 +109,16 @@ def test_exact_at_every_order(order):
 def test_relative_to_the_zero_point_it_is_the_map_of_the_assessment():
     s = some_solution(3, size=(64.0, 48.0), reference_pixel=(30.0, 20.0))
     theirs = area_map(s, grid=(64, 48))
-    ours = pixel_area_map(calibration_of_solution(s, "made up"), 1.0)
+    ours = pixel_area_map(calibration_of(s, "made up").chip(origin="stated"), 1.0)
     assert_allclose(ours.area / ours.area[19, 29], theirs.area, rtol=1e-12)
 
 
 def test_a_mirrored_detector_has_areas_too():
     plain, flipped = (some_solution(3, flip=flip, size=(64.0, 48.0)) for flip in (False, True))
-    a, b = (pixel_area_map(calibration_of_solution(s, "made up"), 1.0) for s in (plain, flipped))
+    a, b = (
+        pixel_area_map(calibration_of(s, "made up").chip(origin="stated"), 1.0)
+        for s in (plain, flipped)
+    )
     assert a.area.min() > 0 and b.area.min() > 0
 
 
@@ -145,7 +148,7 @@ def test_files_of_one_chip_and_of_two(tmp_path, chips):
         assert (hdus[1].header["LTV1"], hdus[1].header["LTV2"]) == (-10.0, -20.0)
         assert_allclose(hdus["SCI", 2].data, maps[1].area, rtol=1e-7)
     s = some_solution(2, size=(30.0, 20.0), reference_pixel=(15.0, 10.0))
-    one = pixel_area_map(calibration_of_solution(s, "made up"), 1.0)
+    one = pixel_area_map(calibration_of(s, "made up").chip(origin="stated"), 1.0)
     write_pam(tmp_path / "one.fits", [one])
     with fits.open(tmp_path / "one.fits") as hdus:
         assert_allclose(hdus[0].data, one.area, rtol=1e-7)

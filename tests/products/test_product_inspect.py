@@ -70,7 +70,7 @@ def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
     fits.PrimaryHDU(np.zeros((3, 3))).writeto(tmp_path / "image.fits")
     for path in (tmp_path / "notes.txt", tmp_path / "image.fits"):
         with pytest.raises(
-            InputError, match="give an IDCTAB, a D2IMFILE or NPOLFILE, or"
+            InputError, match="give a SIP header, an IDCTAB, a D2IMFILE or NPOLFILE, "
         ) as caught:
             describe(path)
         assert path.name in str(caught.value)

@@ -16,8 +16,8 @@ from bayesdist.products import (
     read_idctab,
     sip_from_solution,
 )
-from bayesdist.products.blocks import Block
-from bayesdist.products.cards import number_card
+from bayesdist.products.formats.common.cards import number_card
+from bayesdist.products.formats.common.content import Hdu
 
 from .support import F606W, some_solution
 
@@ -131,30 +131,30 @@ def real(data_dir) -> IdcTab:
 
 
 def keep(tab: IdcTab, rows: list[int]) -> IdcTab:
-    block = tab.blocks[1]
+    block = tab.hdus[1]
     width = block.header["NAXIS1"]
     data = b"".join(block.data[k * width : (k + 1) * width] for k in rows)
     cards = [
         number_card("NAXIS2", len(rows)) if card.startswith("NAXIS2 ") else card
         for card in block.cards
     ]
-    return IdcTab((tab.blocks[0], Block(tuple(cards), data)), "real")
+    return IdcTab((tab.hdus[0], Hdu(tuple(cards), data)), "real")
 
 
 def altered(tab: IdcTab, row: int, **values: float) -> IdcTab:
     """The table with some numbers of one row replaced."""
-    block = tab.blocks[1]
+    block = tab.hdus[1]
     data = fits.BinTableHDU.fromstring(block.to_bytes()).data.copy()
     for name, value in values.items():
         data[name][row] = value
     data = data.view(np.ndarray).tobytes()
-    return IdcTab((tab.blocks[0], Block(block.cards, data), *tab.blocks[2:]), "altered")
+    return IdcTab((tab.hdus[0], Hdu(block.cards, data), *tab.hdus[2:]), "altered")
 
 
 def with_keywords(tab: IdcTab, drop: tuple[str, ...] = (), add: tuple[str, ...] = ()) -> IdcTab:
-    block = tab.blocks[0]
+    block = tab.hdus[0]
     cards = [c for c in block.cards if not c.startswith(drop)] if drop else list(block.cards)
-    return IdcTab((Block((*cards, *add), block.data), *tab.blocks[1:]), "altered")
+    return IdcTab((Hdu((*cards, *add), block.data), *tab.hdus[1:]), "altered")
 
 
 def test_a_delivered_table_is_clean(real: IdcTab) -> None:

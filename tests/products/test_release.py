@@ -12,23 +12,23 @@ from astropy.io import fits
 from numpy.testing import assert_allclose
 
 from bayesdist.assess.solution import kind_of
+from bayesdist.calibration.calibration import calibration_of, gaussian_solution
+from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
-from bayesdist.infer.views import reference_gauge
+from bayesdist.infer.transforms import reference_gauge
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products import idctab_from_solution, lint_idctab, read_idctab
-from bayesdist.products.orientation import Orientation
-from bayesdist.products.orientation_idctab import orientation_from_idctab
-from bayesdist.products.oriented import oriented
+from bayesdist.products.formats.idctab.build import build_idctab
+from bayesdist.products.formats.idctab.drift import storable
+from bayesdist.products.formats.idctab.hst import combination_of
 from bayesdist.products.release import Period, Release, write_release
-from bayesdist.products.storable import storable
-from bayesdist.products.wheels import combination_of
 from bayesdist.simulate.acs import acs_solution
 from bayesdist.simulate.acs.tables import detector_tables, filter_tables
 
 from .acs_offline import Pointing, to_sky
 from .acs_offline import corrected as corrected_by_stwcs
 from .stwcs_offline import separation_mas
-from .support import StandIn, random_pixels, some_covariance
+from .support import StandIn, laid_on, random_pixels, some_covariance, turned_by
 
 ACS = {"instrument": "ACS", "detector": "WFC"}
 PERIODS = (
@@ -40,6 +40,10 @@ PERIODS = (
 def solution_of(filter: str, seed: int) -> StandIn:
     model, theta = acs_solution(filter)
     return StandIn(model, theta, some_covariance(theta.size, 1e-3, np.random.default_rng(seed)))
+
+
+def calibrations(solutions):
+    return {filter: calibration_of(one) for filter, one in solutions.items()}
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +77,7 @@ def reference_of(solution: StandIn):
 
 @pytest.fixture(scope="module")
 def orientation(solutions) -> Orientation:
-    return orientation_from_idctab(
+    return laid_on(
         solutions["F606W"], reference_of(solutions["F606W"]), epoch=2004.5,
         reference_drift=False, scale_arcsec=0.05,
     )  # fmt: skip
@@ -82,7 +86,8 @@ def orientation(solutions) -> Orientation:
 @pytest.fixture(scope="module")
 def release(tmp_path_factory, solutions, orientation, tables) -> Release:
     return write_release(
-        tmp_path_factory.mktemp("release") / "new", "acs", solutions, orientation, PERIODS,
+        tmp_path_factory.mktemp("release") / "new",
+        "acs", calibrations(solutions), orientation, PERIODS,
         tables=tables, stand_ins={"F555W": "F606W", ("CLEAR1L", "CLEAR2L"): "F606W"},
         history=["Simulated campaign."],
     )  # fmt: skip
@@ -102,13 +107,13 @@ class Sky:
     pointing: Pointing
 
     def at(self, x, y, chip: int, *, tables: bool = True) -> np.ndarray:
-        turned = oriented(self.solution, self.orientation)
+        turned = turned_by(self.solution, self.orientation)
         epoch = self.pointing.epoch
-        [centre] = turned.model.predict(turned.mean, 2048.0, 1024.0, epoch=epoch, chip=2)
+        [centre] = turned.model.predict(turned.solution.mean, 2048.0, 1024.0, epoch=epoch, chip=2)
         v2v3 = self.orientation.v2v3[0] + centre[0], self.orientation.v2v3[1] - centre[1]
         if tables:
             x, y = corrected(self.tables, x, y, chip=chip, filter=self.filter)
-        plane = turned.model.predict(turned.mean, x, y, epoch=epoch, chip=chip)
+        plane = turned.model.predict(turned.solution.mean, x, y, epoch=epoch, chip=chip)
         return to_sky(plane - centre, self.pointing, v2v3)
 
 
@@ -216,8 +221,8 @@ def test_inverse_rows_lead_back(tab, chip, filter) -> None:
 
 def test_sigma_of_inverse_rows(solutions, orientation) -> None:
     """Against inverses fitted anew after small steps of the solution."""
-    turned = oriented(solutions["F606W"], orientation)
-    base = storable(turned, years=(2002.2, 2009.4))
+    turned = turned_by(solutions["F606W"], orientation)
+    base = storable(turned, years=(2002.2, 2009.4))[0].solution
 
     def rows(solution):
         made = idctab_from_solution({"F606W": solution}, **ACS, scale_arcsec=0.05, inverse=True)
@@ -246,16 +251,16 @@ def test_covariance_over_filters_by_steps(solutions) -> None:
     names = {"epoch": 2004.5, "reference_drift": False}
 
     def made(a, b, error=None):
-        o = orientation_from_idctab(a, reference, **names)
+        o = laid_on(a, reference, **names)
         if error is not None:
             turn = error[2] + 1j * error[3]
             o = replace(
                 o, shift=o.shift + error[:2], scale=o.scale * np.exp(turn.real),
                 angle=o.angle + turn.imag,
             )  # fmt: skip
-        first = storable(oriented(a, o), years=(2002.2, 2009.4), limit_mas=9.0)
-        second = storable(oriented(b, o), years=(2002.2, 2009.4), like=first, limit_mas=9.0)
-        return idctab_from_solution(
+        first, _ = storable(turned_by(a, o), years=(2002.2, 2009.4), limit_mas=9.0)
+        second, _ = storable(turned_by(b, o), years=(2002.2, 2009.4), like=first, limit_mas=9.0)
+        return build_idctab(
             {"F606W": first, "F814W": second}, **ACS, scale_arcsec=0.05
         ).covariance, o
 
@@ -287,14 +292,14 @@ def test_the_gauge_of_the_fit_is_not_in_the_file(solutions) -> None:
     base = solutions["F606W"]
     reference = reference_of(base)
     names = {"epoch": 2004.5, "reference_drift": False}
-    o = orientation_from_idctab(base, reference, **names, scale_arcsec=1.0)
-    away = oriented(base, replace(o, angle=1.0, shift=np.array([100.0, -50.0])))
+    o = laid_on(base, reference, **names, scale_arcsec=1.0)
+    away = turned_by(base, replace(o, angle=1.0, shift=np.array([100.0, -50.0]))).solution
     away = StandIn(replace(away.model, unit="pix"), away.mean, away.cov)
     covariances = []
     for solution in (base, reference_gauge(away, 2)):
-        o = orientation_from_idctab(solution, reference, **names, scale_arcsec=0.05)
-        stored = storable(oriented(solution, o), years=(2009.4, 2015.0), segment=1)
-        made = idctab_from_solution({"F606W": stored}, **ACS, scale_arcsec=0.05)
+        o = laid_on(solution, reference, **names, scale_arcsec=0.05)
+        stored, _ = storable(turned_by(solution, o), years=(2009.4, 2015.0), segment=1)
+        made = build_idctab({"F606W": stored}, **ACS, scale_arcsec=0.05)
         covariances.append(made.covariance)
     a, b = covariances
     assert_allclose(a["VALUE"], b["VALUE"], rtol=1e-11)
@@ -343,13 +348,14 @@ def test_draws_and_convergence_come_through(solutions) -> None:
     """Turned and cut to a segment, a posterior is still one; its draws have its covariance."""
     base = solutions["F606W"]
     sampled = Sampled(base.model, base.mean, base.cov)
-    o = orientation_from_idctab(sampled, reference_of(base), epoch=2004.5, reference_drift=False)
-    stored = storable(oriented(sampled, o), years=(2009.5, 2015.0), segment=1)
+    o = laid_on(sampled, reference_of(base), epoch=2004.5, reference_drift=False)
+    held, _ = storable(turned_by(sampled, o), years=(2009.5, 2015.0), segment=1)
+    stored = held.solution
     assert kind_of(stored) == "posterior"
-    header = idctab_from_solution({"F606W": stored}, **ACS, scale_arcsec=0.05).header
+    header = build_idctab({"F606W": held}, **ACS, scale_arcsec=0.05).header
     assert header["BDCONV"] == "NO" and "Laplace" in str(header["COMMENT"])
-    plain = storable(oriented(base, o), years=(2009.5, 2015.0), segment=1)
-    assert kind_of(plain) == "least squares"
+    plain, _ = storable(turned_by(base, o), years=(2009.5, 2015.0), segment=1)
+    assert kind_of(plain.solution) == "least squares"
     n = 3000
     draws = stored.draws(n, np.random.default_rng(7))
     ratio = draws.std(axis=0) / np.sqrt(np.diag(stored.cov))
@@ -363,7 +369,7 @@ def test_draws_and_convergence_come_through(solutions) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"solutions": {}}, "no filter is given"),
+        ({"calibrations": {}}, "no filter is given"),
         ({"periods": ()}, "no period is given"),
         ({"periods": (PERIODS[0], PERIODS[0])}, "two periods have one name"),
         ({"stand_ins": {"F555W": "F435W"}}, "'F435W' is to stand in"),
@@ -375,7 +381,12 @@ def test_draws_and_convergence_come_through(solutions) -> None:
 def test_wrong_sets_are_refused_before_a_file_is_written(
     change, message, solutions, orientation, tmp_path
 ) -> None:
-    names = {"solutions": solutions, "orientation": orientation, "periods": PERIODS, **change}
+    names = {
+        "calibrations": calibrations(solutions),
+        "orientation": orientation,
+        "periods": PERIODS,
+        **change,
+    }
     with pytest.raises(InputError, match=message):
         write_release(tmp_path / "new", "acs", **names)
     assert not (tmp_path / "new").exists()
@@ -388,28 +399,37 @@ def test_a_filter_that_stands_still_is_refused(solutions, orientation, tmp_path:
     still = StandIn(replace(still.model, time=None), still.mean[:n], still.cov[:n, :n])
     with pytest.raises(InputError, match="does not depend on time"):
         write_release(
-            tmp_path, "acs", {"F606W": solutions["F606W"], "F814W": still}, orientation, PERIODS
+            tmp_path,
+            "acs",
+            calibrations({"F606W": solutions["F606W"], "F814W": still}),
+            orientation,
+            PERIODS,
         )
 
 
 def test_solutions_that_do_not_go_into_one_table_are_refused(solutions, orientation) -> None:
-    base = storable(oriented(solutions["F606W"], orientation), years=(2002.2, 2009.4))
-    moved = base.mean.copy()
+    base, _ = storable(turned_by(solutions["F606W"], orientation), years=(2002.2, 2009.4))
+    mean, cov = base.solution.mean, base.solution.cov
+    moved = mean.copy()
     moved[base.model.tdd_slice(1).start] *= 1.01
-    other = replace(base, mean=moved)
+    other = replace(base, solution=gaussian_solution(base.model, moved, cov))
     with pytest.raises(InputError, match="drifts otherwise than the first one"):
-        idctab_from_solution({"F606W": base, "F814W": other}, **ACS)
+        build_idctab({"F606W": base, "F814W": other}, **ACS)
     with pytest.raises(InputError, match="stands twice"):
-        idctab_from_solution({"F606W": base, ("F606W", "CLEAR2L"): base}, **ACS)
+        build_idctab({"F606W": base, ("F606W", "CLEAR2L"): base}, **ACS)
     with pytest.raises(InputError, match="filters are given twice"):
-        idctab_from_solution({"F606W": base}, **ACS, filters=("F606W", "CLEAR2L"))
+        build_idctab({"F606W": base}, **ACS, filters=("F606W", "CLEAR2L"))
     with pytest.raises(InputError, match="no filter is given"):
-        idctab_from_solution({}, **ACS)
+        build_idctab({}, **ACS)
     chips = (base.model.chips[1],)
     n = 2 * base.model.n_terms
-    single = StandIn(replace(base.model, chips=chips, time=None), base.mean[:n], np.eye(n))
+    single = calibration_of(
+        StandIn(replace(base.model, chips=chips, time=None), mean[:n], np.eye(n))
+    )
     with pytest.raises(InputError, match="another order or other chips"):
-        idctab_from_solution({"F606W": base, "F814W": single}, **ACS)
+        build_idctab({"F606W": base, "F814W": single}, **ACS)
     # the very same drift is no difference
-    same = idctab_from_solution({"F606W": base, "F814W": replace(base)}, **ACS)
+    same = build_idctab(
+        {"F606W": base, "F814W": replace(base, solution=replace(base.solution))}, **ACS
+    )
     assert len(same.rows) == 4

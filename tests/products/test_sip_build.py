@@ -9,6 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from bayesdist.calibration.inverse import FIT_NODES, detector_grid
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import (
@@ -18,8 +20,6 @@ from bayesdist.products import (
     sip_header,
     worst_closure,
 )
-from bayesdist.products.sip_build import ARCSEC
-from bayesdist.products.sip_inverse import _FIT_NODES, detector_grid
 from bayesdist.simulate.wise import WISE_COEFFICIENTS, wise_solution
 
 from .support import StandIn, random_pixels, some_solution, wfc_solution
@@ -176,7 +176,7 @@ def test_ap_is_what_astropy_reads() -> None:
 def test_higher_inverse_order_closes_better(seed: int, order: int) -> None:
     """In the mean over the nodes of the fit, as nested least squares must; the worst may not."""
     solution = some_solution(order, seed=seed, strength=4.0)
-    x, y = detector_grid(solution.model.chips[0].size, _FIT_NODES, chebyshev=True)
+    x, y = detector_grid(solution.model.chips[0].size, FIT_NODES, chebyshev=True)
     closures = []
     for n in (order, order + 1, order + 2):
         sip = sip_from_solution(solution, inverse_order=n)

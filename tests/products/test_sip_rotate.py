@@ -13,16 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from bayesdist.calibration.calibration import calibration_of
+from bayesdist.calibration.rotation import coefficient_map, pixel_matrix, rotated
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products import lint_sip, read_sip, sip_from_solution, sip_header, write_sip
-from bayesdist.products.sip_rotate import (
-    coefficient_map,
-    pixel_matrix,
-    rotated_sip,
-    rotated_solution,
-)
+from bayesdist.products.formats.sip.rotate import rotated_sip
 
 from .support import StandIn, astropy_wcs, random_pixels, some_covariance, some_solution
 
@@ -302,7 +299,7 @@ def two_chips() -> StandIn:
 @pytest.mark.parametrize("degrees", [*QUARTERS, 33.3])
 def test_a_turned_solution_predicts_turned_positions(degrees: float, mirror: bool) -> None:
     source, origin = two_chips(), (3.0, -2.0)
-    turned = rotated_solution(source, degrees, mirror=mirror, origin=origin)
+    turned = rotated(calibration_of(source), degrees, mirror=mirror, origin=origin).solution
     M = pixel_matrix(degrees, mirror=mirror)
     for old, new in zip(source.model.chips, turned.model.chips, strict=True):
         x, y = random_pixels(old.size, 200)
@@ -320,7 +317,7 @@ def test_a_turned_solution_predicts_turned_positions(degrees: float, mirror: boo
 
 def test_covariance_turns_as_draws_do() -> None:
     source = two_chips()
-    turned = rotated_solution(source, 33.3, mirror=True)
+    turned = rotated(calibration_of(source), 33.3, mirror=True).solution
     # by the error field: Cov(M f) = M Cov(f) M^T at every pixel
     M = pixel_matrix(33.3, mirror=True)
     old, new = source.model.chips[0], turned.model.chips[0]
@@ -340,7 +337,7 @@ def test_covariance_turns_as_draws_do() -> None:
 
 def test_quarter_turns_of_a_solution_only_move_numbers() -> None:
     source = two_chips()
-    turned = rotated_solution(source, 90)
+    turned = rotated(calibration_of(source), 90).solution
     assert np.array_equal(np.sort(np.abs(turned.mean)), np.sort(np.abs(source.mean)))
     assert np.array_equal(np.sort(np.diag(turned.cov)), np.sort(np.diag(source.cov)))
     assert turned.model.chips[0].size == (900.0, 1200.0)
@@ -348,9 +345,7 @@ def test_quarter_turns_of_a_solution_only_move_numbers() -> None:
 
 def test_what_cannot_be_turned_is_refused() -> None:
     source = two_chips()
-    frames = replace(source.model, frames="shift", exposures=("a", "b"))
-    drift = replace(source.model, time=TimeDependence((("u", 1, 0),), (2004.5,)))
-    for model, message in ((frames, "a frame for each exposure"), (drift, "depends on time")):
-        n = model.n_params
-        with pytest.raises(InputError, match=message):
-            rotated_solution(StandIn(model, np.zeros(n), np.eye(n)), 90)
+    model = replace(source.model, time=TimeDependence((("u", 1, 0),), (2004.5,)))
+    n = model.n_params
+    with pytest.raises(InputError, match="depends on time"):
+        rotated(calibration_of(StandIn(model, np.zeros(n), np.eye(n))), 90)

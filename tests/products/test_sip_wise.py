@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayesdist.calibration.inverse import fit_inverse
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products import describe, lint_sip
-from bayesdist.products.bivariate import evaluate, largest_magnitude
-from bayesdist.products.sip_implied import implied_values
-from bayesdist.products.sip_inverse import fit_inverse, worst_closure
-from bayesdist.products.wise_lint import lint_wise_band
-from bayesdist.products.wise_meta import read_wise_meta
+from bayesdist.products.formats.common.coefficients import evaluate, largest_magnitude
+from bayesdist.products.formats.sip.header import worst_closure
+from bayesdist.products.formats.sip.implied import implied_values
+from bayesdist.products.formats.wise.lint import lint_wise_band
+from bayesdist.products.formats.wise.meta import read_wise_meta
 
 # band: (A_DMAX, B_DMAX), then rows of p_q, A, B, AP, BP
 # fmt: off

@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesdist.assess.alignment import Alignment, alignment_residuals
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.diagnose.alignment import Alignment, alignment_residuals
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model.lookup import LookupTable, corrected
-from bayesdist.products.orientation_idctab import orientation_from_idctab
-from bayesdist.products.oriented import Oriented, oriented
 from bayesdist.products.release import Period, write_release
 from bayesdist.simulate.acs.tables import detector_tables, filter_tables
 
 from .acs_offline import Pointing, plane_matrix
 from .acs_offline import corrected as corrected_by_stwcs
 from .stwcs_offline import gnomonic
+from .support import laid_on, turned_by
 from .test_release import reference_of, solution_of
 
 CENTRE = (80.8, -69.49836)
@@ -47,26 +47,24 @@ def calibration():
     """The truth: solution in V2, V3, tables, and the point it hangs on."""
     solution = solution_of("F606W", 1)
     reference = reference_of(solution)
-    o = orientation_from_idctab(
-        solution, reference, epoch=2004.5, reference_drift=False, scale_arcsec=0.05
-    )
+    o = laid_on(solution, reference, epoch=2004.5, reference_drift=False, scale_arcsec=0.05)
     rng = np.random.default_rng(31)
     tables = (*detector_tables(rng), *filter_tables("F606W", rng))
-    return solution, o, tables, oriented(solution, o)
+    return solution, o, tables, turned_by(solution, o)
 
 
 def observe(
     sky: np.ndarray,
     pointing: Pointing,
-    truth: Oriented,
+    truth: Calibration,
     tables: tuple[LookupTable, ...],
     sigma: np.ndarray,
     rng: np.random.Generator,
 ) -> Exposure:
     """Pixels of sky positions [deg]: the plane at CRVAL, and Newton's method back through it."""
     plane = gnomonic(sky, pointing.crval)
-    o, model, epoch = truth.orientation, truth.model, pointing.epoch
-    centre = model.predict(truth.mean, 2048.0, 1024.0, epoch=epoch, chip=2)[0]
+    o, model, epoch = truth.plane.orientation, truth.model, pointing.epoch
+    centre = model.predict(truth.solution.mean, 2048.0, 1024.0, epoch=epoch, chip=2)[0]
     v2v3 = (o.v2v3[0] + centre[0], o.v2v3[1] - centre[1])
     wanted = plane @ np.linalg.inv(plane_matrix(pointing, v2v3)).T / pointing.vafactor + centre
     xy, chips = np.full((len(sky), 2), np.nan), np.zeros(len(sky), int)
@@ -75,7 +73,7 @@ def observe(
 
         def seen(at: np.ndarray, chip: int = chip) -> np.ndarray:
             x, y = corrected(tables, *at.T, chip=chip, filter="F606W")
-            return model.predict(truth.mean, x, y, epoch=epoch, chip=chip)
+            return model.predict(truth.solution.mean, x, y, epoch=epoch, chip=chip)
 
         for _ in range(12):
             slope = np.stack(
@@ -112,13 +110,19 @@ def aligned(calibration, field, tmp_path_factory) -> dict[str, Alignment]:
     solution, o, tables, _ = calibration
     folder: Path = tmp_path_factory.mktemp("tweak")
     new = write_release(
-        folder, "new", {"F606W": solution}, o, [Period("pre", (2002.2, 2009.39))], tables=tables
+        folder,
+        "new",
+        {"F606W": calibration_of(solution)},
+        o,
+        [Period("pre", (2002.2, 2009.39))],
+        tables=tables,
     )
     stale = solution.mean.copy()
     for chip in (1, 2):
         stale[solution.model.tdd_slice(chip)] = 0.0
     old = write_release(
-        folder, "old", {"F606W": type(solution)(solution.model, stale, solution.cov)}, o,
+        folder, "old",
+        {"F606W": calibration_of(type(solution)(solution.model, stale, solution.cov))}, o,
         [Period("pre", (2002.2, 2009.39))],
     )  # fmt: skip
     (a, b), _ = field

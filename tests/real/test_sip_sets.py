@@ -10,6 +10,8 @@ from astropy.table import Table
 from numpy.testing import assert_allclose
 from scipy import stats
 
+from bayesdist.calibration.inverse import detector_grid, fit_inverse
+from bayesdist.calibration.rotation import pixel_matrix
 from bayesdist.products import (
     read_sip,
     sip_from_solution,
@@ -17,8 +19,7 @@ from bayesdist.products import (
     worst_closure,
     write_sip,
 )
-from bayesdist.products.sip_inverse import detector_grid, fit_inverse
-from bayesdist.products.sip_rotate import pixel_matrix, rotated_sip
+from bayesdist.products.formats.sip.rotate import rotated_sip
 from bayesdist.simulate.wise import wise_solution
 
 from ..products.support import StandIn, astropy_wcs, random_pixels

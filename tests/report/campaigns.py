@@ -12,7 +12,6 @@ from bayesdist.app.campaign.overlap import _aligned, _binned
 from bayesdist.assess import binned_residuals
 from bayesdist.data import MagnitudeErrors
 from bayesdist.model import LookupTable
-from bayesdist.report import ReportInput
 from bayesdist.report.campaign import (
     CampaignResults,
     CatalogStars,
@@ -22,6 +21,7 @@ from bayesdist.report.campaign import (
     LinearSeries,
     OverlapTest,
 )
+from bayesdist.report.context import ReportInput
 
 from .runs import report_input
 

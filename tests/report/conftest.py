@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from bayesdist.report import ReportInput, all_figures, drawn
-from bayesdist.report.html import render_report
+from bayesdist.report.context import ReportInput
+from bayesdist.report.run_report import render_report
 
+from .plots import drawings_of, plots_of
 from .runs import report_input
 
 
@@ -21,21 +22,26 @@ def not_converged() -> ReportInput:
 
 
 @pytest.fixture(scope="session")
-def figures(converged):
-    return all_figures(converged)
+def plots(converged):
+    return plots_of(converged)
 
 
 @pytest.fixture(scope="session")
-def images(figures):
-    return drawn(figures)
+def figures(plots):
+    return {name: plot.figure for name, plot in plots.items()}
 
 
 @pytest.fixture(scope="session")
-def page(converged, images) -> str:
-    return render_report(converged, images)
+def drawings(plots):
+    return drawings_of(plots)
 
 
 @pytest.fixture(scope="session")
-def bad_page(not_converged, images) -> str:
+def page(converged, drawings) -> str:
+    return render_report(converged, drawings)
+
+
+@pytest.fixture(scope="session")
+def bad_page(not_converged, drawings) -> str:
     # the pictures are those of the other run: only the words are looked at
-    return render_report(not_converged, images)
+    return render_report(not_converged, drawings)

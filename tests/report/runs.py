@@ -24,18 +24,17 @@ from bayesdist.assess import (
     star_sums,
     uncertainty_map,
 )
-from bayesdist.assess.detector_budget import detector_budget
+from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.labelled.convergence import Convergence, Limits
 from bayesdist.infer.linear import LinearFit, fit_linear, residuals
-from bayesdist.infer.mixture import OutlierMixture
 from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.shards import load
+from bayesdist.infer.sampler.convergence import Convergence, Limits
+from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.infer.stars.shards import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.report import Check, Product, ReportInput
-from bayesdist.report.context import ChipResults
+from bayesdist.report.context import Check, ChipResults, Product, ReportInput
 
 SIZE = (1016.0, 1016.0)
 CENTRE = (508.5, 508.5)

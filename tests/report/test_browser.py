@@ -14,18 +14,17 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm
-from bayesdist.assess.budget_surface import budget_surface
-from bayesdist.assess.detector_budget import detector_budget
-from bayesdist.assess.linear_term import LinearTerm
-from bayesdist.assess.place_budget import place_budget
-from bayesdist.assess.position_errors import position_errors
-from bayesdist.assess.product_terms import ProductTerm
-from bayesdist.assess.terms import LocalTerm
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.assess.terms.parameters import LinearTerm
+from bayesdist.assess.terms.product_terms import ProductTerm
 from bayesdist.data.magnitude_errors import estimate
-from bayesdist.report import drawn
-from bayesdist.report.html import write_report
-from bayesdist.report.margins import margins_against_limits
+from bayesdist.report.run_report import write_report
 
+from .plots import drawings_of, plots_of
 from .runs import TERMS, report_input
 
 selenium = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
@@ -96,8 +95,7 @@ def browser(tmp_path_factory):
 @pytest.fixture(scope="module")
 def opened(asked, browser, tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "report.html"
-    images = drawn({"margins": margins_against_limits(asked.run.margins)})
-    write_report(path, asked.run, images)
+    write_report(path, asked.run, drawings_of(plots_of(asked.run, "margins")))
     browser.get(path.as_uri())
     return browser
 

@@ -14,18 +14,18 @@ from bayesdist.app.campaign.report import held_parameters
 from bayesdist.assess import Misfit
 from bayesdist.infer import GaussianPriors, fit_linear
 from bayesdist.model import Chip, TimeDependence
-from bayesdist.report import all_figures, drawn
-from bayesdist.report.campaign import PARTS, campaign_checks, campaign_figures, campaign_tables
-from bayesdist.report.campaign.published import LINES, published_lines
-from bayesdist.report.campaign.residuals import binned_of, largest_cell, rms_of_cells
-from bayesdist.report.campaign.series import _band, course_of
-from bayesdist.report.captions import caption
-from bayesdist.report.figures import mosaic_of, plan_of_campaign
-from bayesdist.report.html import render_report
-from bayesdist.report.tables import coefficient_tables, fit_tables
+from bayesdist.report.run_report import render_report
+from bayesdist.report.sections import REPORT
+from bayesdist.report.sections.campaign.checks import campaign_checks
+from bayesdist.report.sections.campaign.lookup import binned_of, largest_cell, rms_of_cells
+from bayesdist.report.sections.campaign.published import LINES, published_lines
+from bayesdist.report.sections.campaign.terms import course_of, line_error
+from bayesdist.report.sections.run.coefficients import coefficient_tables
+from bayesdist.report.sections.run.fit import fit_tables
 from bayesdist.simulate.acs.distortion import DRIFT
 
 from . import campaigns
+from .plots import drawings_of, plot_of, plots_of, tables_of
 from .runs import simulated, wise_model
 from .test_html import parsed, words
 
@@ -38,18 +38,20 @@ def run():
 
 
 @pytest.fixture(scope="module")
-def plan(run):
-    return plan_of_campaign(run)
+def plots(run):
+    return plots_of(run)
 
 
 @pytest.fixture(scope="module")
-def figures(run):
-    return all_figures(run)
+def plan(run, plots):
+    """The figures that a campaign adds."""
+    items = REPORT.items(run, "figure")
+    return {one.name: plots[one.name] for one in items if one.section.startswith("campaign-")}
 
 
 @pytest.fixture(scope="module")
-def page(run, figures):
-    return render_report(run, drawn(figures))
+def page(run, plots):
+    return render_report(run, drawings_of(plots, speck=True))
 
 
 def number_in(text: str) -> float:
@@ -60,9 +62,10 @@ def number_in(text: str) -> float:
 # -- the page -------------------------------------------------------------------------------------
 
 
-def test_every_figure_of_the_plan_is_drawn_and_placed(plan, figures, page):
-    assert set(plan) <= set(figures)
-    assert {one.part for one in plan.values()} == set(PARTS)
+def test_every_figure_of_the_plan_is_drawn_and_placed(run, plots, plan, page):
+    parts = {s.name for s in REPORT.sections if s.parent == "campaign"}
+    items = REPORT.items(run, "figure")
+    assert {one.section for one in items if one.name in plan} == parts
     tree = lxml_html.fromstring(page)
     section = tree.get_element_by_id("campaign")
     shown = [f.get("id") for f in section.xpath(".//figure")]
@@ -72,7 +75,7 @@ def test_every_figure_of_the_plan_is_drawn_and_placed(plan, figures, page):
         assert png.startswith(b"\x89PNG") and png.endswith(b"IEND\xaeB`\x82")
         assert len(image.get("alt")) > 20
     every = tree.xpath("//figure/@id")
-    assert sorted(every) == sorted(f"figure-{name}" for name in figures)
+    assert sorted(every) == sorted(f"figure-{name}" for name in plots)
 
 
 def test_the_page_is_well_formed_and_its_links_lead_somewhere(page):
@@ -85,18 +88,18 @@ def test_the_page_is_well_formed_and_its_links_lead_somewhere(page):
     assert not re.search(r"\b(nan|None|inf)\b", words(page), re.IGNORECASE)
 
 
-def test_binned_residuals_of_rolled_exposures_say_along_which_axes(run, figures):
-    assert "residual_vectors" in figures
-    text = caption("residual_vectors", run).text
+def test_binned_residuals_of_rolled_exposures_say_along_which_axes(run, plots):
+    text = plots["residual_vectors"].text
     assert "cells of the test for structure" in text
     assert "axes of the polynomials" not in text  # frames that only shift turn nothing
     turning = replace(run.fit, model=replace(run.fit.model, frames="shift_rotation"))
-    assert "axes of the polynomials" in caption("residual_vectors", replace(run, fit=turning)).text
+    text = plot_of(replace(run, fit=turning), "residual_vectors").text
+    assert "axes of the polynomials" in text
 
 
-def test_no_figure_has_more_markers_than_a_reader_can_tell_apart(plan, figures):
-    for name in plan:
-        n = sum(len(line.get_xdata()) for ax in figures[name].axes for line in ax.get_lines())
+def test_no_figure_has_more_markers_than_a_reader_can_tell_apart(plan):
+    for name, plot in plan.items():
+        n = sum(len(line.get_xdata()) for ax in plot.figure.axes for line in ax.get_lines())
         assert n <= MOST_MARKERS, name
 
 
@@ -106,16 +109,16 @@ def test_no_figure_has_more_markers_than_a_reader_can_tell_apart(plan, figures):
 def test_captions_say_the_numbers_of_the_summary(run, plan):
     found = run.campaign.summary
     matching, tables = found["matching"], found["tables"]
-    text = plan["matching"].caption.text
+    text = plan["matching"].text
     assert f"{100 * matching['completeness']['median']:.1f}" in text
     assert f"{100 * matching['completeness']['least']:.1f}" in text
     assert "3.2\u202f×\u202f10⁻⁵" in text and "43\u202f210" in text
-    text = plan["table_residuals"].caption.text
+    text = plan["table_residuals"].text
     assert f"from {tables['rms_before']:.4f}" in text and f"to {tables['rms_after']:.4f}" in text
-    assert "4\u202f964 of 5\u202f390" in plan["catalogue_errors"].caption.text
-    assert "51\u202f234 of 98\u202f765" in plan["fit_quality"].caption.text
+    assert "4\u202f964 of 5\u202f390" in plan["catalogue_errors"].text
+    assert "51\u202f234 of 98\u202f765" in plan["fit_quality"].text
     for row in tables["chips"]:
-        assert f"{row['sigma_median']:.3g}" in plan["table_errors"].caption.text
+        assert f"{row['sigma_median']:.3g}" in plan["table_errors"].text
 
 
 def test_maps_of_residuals_tell_the_pattern_from_noise(run, plan):
@@ -128,7 +131,7 @@ def test_maps_of_residuals_tell_the_pattern_from_noise(run, plan):
     n = 2 * sum(b.count.size for b in with_tables)
     assert abs((mean / noise) ** 2 - 1) < 5 * np.sqrt(2 / n)  # chi-square of n cells
     for which, binned in (("without", without), ("with", with_tables)):
-        text = plan[f"residuals_{which}_tables"].caption.text
+        text = plan[f"residuals_{which}_tables"].text
         assert f"{largest_cell(*binned):.3g}" in text
 
 
@@ -141,14 +144,14 @@ def test_the_overlap_shows_what_the_old_files_leave(run, plan):
     assert np.sqrt(np.mean(test.old.rms**2)) > 1.5 * sigma
     assert test.new.scale == pytest.approx(1 / 1.00003, abs=1e-5)
     assert abs(test.new.rotation) == pytest.approx(1.2, abs=1e-4)
-    assert f"{rms:.3g}" in plan["overlap"].caption.text
+    assert f"{rms:.3g}" in plan["overlap"].text
 
 
 # -- tables against summary.json ------------------------------------------------------------------
 
 
 def lines_of(run, term):
-    for table in campaign_tables(run.campaign)["time"]:
+    for table in tables_of(run, "campaign-time"):
         if table.caption.startswith(f"{term} "):
             return table
     raise AssertionError(term)
@@ -181,7 +184,7 @@ def test_rows_of_the_lines_are_those_of_the_summary(run, term):
 
 
 def test_what_the_gauge_fixes_is_no_row(run):
-    captions = [t.caption for t in campaign_tables(run.campaign)["time"]]
+    captions = [t.caption for t in tables_of(run, "campaign-time")]
     assert not any(c.startswith("A_1") for c in captions)
 
 
@@ -206,7 +209,7 @@ def test_published_lines_stand_beside_acs_in_f606w_only():
 
 
 def test_files_and_their_dates(run):
-    (table,) = campaign_tables(run.campaign)["release"]
+    (table,) = tables_of(run, "campaign-release")
     assert [row[0] for row in table.rows] == ["acs_pre_idc.fits", "acs_d2i.fits"]
     assert table.rows[0][2] == "2002 to 2009.4" and number_in(table.rows[0][3]) == 0.012
 
@@ -236,9 +239,10 @@ def test_bands_are_exact_between_the_dates_of_the_file():
     for s, t in ((0, [2002.5, 2006.1, 2009.4]), (1, [2009.4, 2011.7, 2014.4])):
         for label in campaigns.LABELS:
             sigma = campaigns.line_sigma(label, t, s)
-            np.testing.assert_allclose(_band(series, f"sigma_{label}", s, np.array(t)), sigma)
             new = np.hypot(sigma, campaigns.unit_of(label))
-            np.testing.assert_allclose(_band(series, f"sigma_new_{label}", s, np.array(t)), new)
+            for column, expected in (("sigma", sigma), ("sigma_new", new)):
+                found = line_error(series, f"{column}_{label}", s, np.array(t))
+                np.testing.assert_allclose(found, expected)
 
 
 def test_outlying_exposures_are_marked_and_do_not_count():
@@ -264,11 +268,11 @@ def _believed(table):
 def test_tables_of_a_filter_have_figures_of_their_own(run):
     chips = run.campaign.chips
     both = tuple(campaigns.pattern(c.number, f) for f in ("", "F814W") for c in chips)
-    plan = campaign_figures(replace(run.campaign, tables=both), mosaic_of(run))
+    plan = plots_of(replace(run, campaign=replace(run.campaign, tables=both)))
     assert {"table_nodes", "table_nodes_F814W", "table_errors_F814W"} <= set(plan)
-    assert "detector's tables alone" in plan["residuals_without_tables"].caption.title
+    assert "detector's tables alone" in plan["residuals_without_tables"].title
     for name in ("table_nodes_F814W", "table_errors_F814W"):
-        assert plan[name].draw().axes
+        assert plan[name].figure.axes
 
 
 def test_a_campaign_without_tables_drift_and_overlap(run):
@@ -280,8 +284,7 @@ def test_a_campaign_without_tables_drift_and_overlap(run):
         series=None, overlap=None, catalog=None, detections=None,
     )  # fmt: skip
     small = replace(run, campaign=less)
-    figures = {name: one.draw() for name, one in plan_of_campaign(small).items()}
-    page = render_report(small, drawn(figures))
+    page = render_report(small, drawings_of(plots_of(small), speck=True))
     parsed(page)
     shown = lxml_html.fromstring(page).get_element_by_id("campaign").xpath(".//figure/@id")
     assert shown == [f"figure-{n}" for n in ("matching", "footprints", "residuals_without_tables")]
@@ -290,9 +293,9 @@ def test_a_campaign_without_tables_drift_and_overlap(run):
 def test_series_without_rolls_are_drawn_against_time_only(run):
     series = run.campaign.series
     bare = replace(series, pa_v3=np.full(len(series.pa_v3), np.nan))
-    plan = campaign_figures(replace(run.campaign, series=bare), mosaic_of(run))
-    assert len(plan["series_A_2"].draw().axes) == 6  # three states of two chips
-    assert "PA_V3" not in plan["series_A_2"].caption.text
+    plot = plot_of(replace(run, campaign=replace(run.campaign, series=bare)), "series_A_2")
+    assert len(plot.figure.axes) == 6  # three states of two chips
+    assert "PA_V3" not in plot.text
 
 
 def test_many_chips_have_several_figures(run):
@@ -312,8 +315,7 @@ def test_many_chips_have_several_figures(run):
         summary=run.campaign.summary | {"time_dependence": time},
         chips=(*run.campaign.chips, Chip(3, "WFC3", campaigns.SIZE, (1.0, 1.0))),
     )
-    plan = campaign_figures(more, mosaic_of(run))
-    assert plan["series_A_2_2"].draw().axes
+    assert plot_of(replace(run, campaign=more), "series_A_2_2").figure.axes
 
 
 # -- status ---------------------------------------------------------------------------------------
@@ -453,7 +455,7 @@ def test_small_ratios_are_shown_by_the_million(run):
 
 def test_every_table_says_in_which_system_it_is(run, page):
     text = words(page)
-    for table in campaign_tables(run.campaign)["time"]:
+    for table in tables_of(run, "campaign-time"):
         if "TIME − RDATE" in table.caption:
             assert "in the system of WFC2" in table.caption
     for table in coefficient_tables(run):
@@ -463,5 +465,5 @@ def test_every_table_says_in_which_system_it_is(run, page):
 
 
 def test_two_errors_side_by_side_are_explained_once(run):
-    notes = [t.note for t in campaign_tables(run.campaign)["time"]]
+    notes = [t.note for t in tables_of(run, "campaign-time")]
     assert sum("two σ of this run may differ" in note for note in notes) == 1

@@ -1,20 +1,19 @@
 """Figures as files: nothing cut, numbers as matplotlib sets them, the same whoever draws."""
 
 import io
+import os
 import re
-import sys
-import time
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from bayesdist.report import drawing, two_hands
-from bayesdist.report.drawing import DPI, PAD, drawing_of, png_of
-from bayesdist.report.figures import plan_of_figures
-from bayesdist.report.style import figure_style, new_figure
-from bayesdist.report.ticks import plain_ticks
+from bayesdist.report import drawing
+from bayesdist.report.drawing import DPI, PAD, png_of, render
+from bayesdist.report.registry import Plot
+from bayesdist.report.sections import REPORT
+from bayesdist.report.style import figure_style, new_figure, plain_ticks
 
 
 def pixels(png: bytes) -> np.ndarray:
@@ -47,8 +46,9 @@ def test_a_picture_is_cut_to_what_is_drawn_and_no_more(at):
 
 def test_the_same_figure_gives_the_same_files():
     first, second = (square(0.1, 0.1, 0.5) for _ in range(2))
-    assert drawing_of(first) == drawing_of(second)
-    assert drawing_of(first).png == png_of(second)
+    one, other = (render(Plot(figure, "", "", "")) for figure in (first, second))
+    assert one == other
+    assert one.png == png_of(second)
 
 
 # -- numbers at ticks ------------------------------------------------------------------------------
@@ -93,60 +93,42 @@ def test_numbers_are_those_of_matplotlib(limits, scale):
     assert any(found[1]) and not any("$" in t for t in found[1])
 
 
-# -- two processes ---------------------------------------------------------------------------------
+# -- several processes ----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def alone(converged):
-    return two_hands.drawn_report(converged)
+    return drawing.draw_all(REPORT, converged)
 
 
-def test_two_processes_draw_what_one_draws(converged, alone, monkeypatch):
-    monkeypatch.setattr(two_hands.os, "cpu_count", lambda: 2)
-    made = []
-    real = two_hands.drawing_of
-    monkeypatch.setattr(two_hands, "drawing_of", lambda f: made.append(f) or real(f))
-    with two_hands.second_hand(True) as hand:
-        hand.give(plan_of_figures, converged)
-        end = time.monotonic() + 60
-        while not (hand.folder / list(alone)[-1]).exists() and time.monotonic() < end:
-            time.sleep(0.01)
-        both = two_hands.drawn_report(converged, hand)
-    assert hand.process.poll() is not None and not hand.folder.exists()
+def test_several_processes_draw_what_one_draws(converged, alone, monkeypatch):
+    monkeypatch.setattr(drawing, "MIN_FIGURES_SHARED", 1)
+    monkeypatch.setattr(drawing, "render", lambda plot: pytest.fail("it was drawn here"))
+    both = drawing.draw_all(REPORT, converged, processes=2)
     assert list(both) == list(alone) and both == alone
-    assert 0 < len(made) < len(alone)  # the others were not drawn here
 
 
-def test_a_process_that_is_not_wanted_is_none(monkeypatch):
-    for wanted, processors in ((False, 2), (True, 1)):
-        monkeypatch.setattr(two_hands.os, "cpu_count", lambda n=processors: n)
-        with two_hands.second_hand(wanted) as hand:
-            assert hand is None
+def test_processes_that_fail_are_made_up_for(converged, alone, monkeypatch, caplog):
+    monkeypatch.setattr(drawing, "MIN_FIGURES_SHARED", 1)
+    monkeypatch.setattr(drawing, "_receive", _end)
+    assert drawing.draw_all(REPORT, converged, processes=2) == alone
+    assert "drawn by one process" in caplog.text
 
 
-def test_a_process_that_fails_is_made_up_for(converged, alone, monkeypatch, tmp_path, caplog):
-    monkeypatch.setattr(two_hands.os, "cpu_count", lambda: 2)
-    broken = tmp_path / "python"
-    broken.write_text(f"#!{sys.executable}\nraise SystemExit(3)\n")
-    broken.chmod(0o755)
-    monkeypatch.setattr(two_hands.sys, "executable", str(broken))
-    with two_hands.second_hand(True) as hand:
-        (hand.folder / next(iter(alone))).touch()  # it has claimed a figure, and ends
-        assert two_hands.drawn_report(converged, hand) == alone
-    assert "the other failed: it ended with exit code 3" in caplog.text
+def _end(results):
+    """End the process that begins with this."""
+    os._exit(3)
 
 
-def test_a_process_that_cannot_be_started_is_made_up_for(converged, monkeypatch, tmp_path, caplog):
-    monkeypatch.setattr(two_hands.os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(two_hands.sys, "executable", str(tmp_path / "nowhere"))
-    with two_hands.second_hand(True) as hand:
-        assert hand is None
-    assert "the other failed" in caplog.text
+def test_words_come_with_the_files(plots, alone):
+    assert list(alone) == list(plots)
+    for name, one in alone.items():
+        words = plots[name].title, plots[name].text, plots[name].alt
+        assert (one.title, one.text, one.alt) == words and all(words)
 
 
 def test_both_kinds_are_saved(tmp_path):
-    fig = square(0.1, 0.1, 0.5)
-    one = drawing_of(fig)
+    one = render(Plot(square(0.1, 0.1, 0.5), "", "", ""))
     paths = drawing.save_drawings({"a": one}, tmp_path / "figures")
     assert [p.name for p in paths] == ["a.png", "a.pdf"]
     assert paths[0].read_bytes() == one.png and paths[1].read_bytes().startswith(b"%PDF")

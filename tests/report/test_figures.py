@@ -14,24 +14,17 @@ from matplotlib.quiver import Quiver
 
 from bayesdist.assess import VectorMap
 from bayesdist.errors import InputError
-from bayesdist.report import (
-    all_figures,
-    drawn,
-    formal_uncertainty,
-    residual_histogram,
-    residuals_by_magnitude,
-    save_images,
-    uncertainty_radius,
-    vector_flow,
-)
-from bayesdist.report.corners import correlated_parameters
+from bayesdist.report.arrows import Arrows, cross_map, square_cells
+from bayesdist.report.drawing import save_figures
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.residuals import MixtureCurve
+from bayesdist.report.panels import ChipPanels
+from bayesdist.report.sections.run.data import _density
+from bayesdist.report.sections.run.posterior import correlated_parameters, slowest_parameters
+from bayesdist.report.sections.run.residuals import MixtureCurve, _histograms
 from bayesdist.report.style import nice_below
-from bayesdist.report.traces import slowest_parameters
-from bayesdist.report.vectors import square_cells
 
-from .runs import report_input
+from .plots import figures_of
+from .runs import SIZE, report_input
 
 WITHOUT_UNIT = {"stars per bin", "stars per hexagon"}  # counts
 CATEGORIES = {"budget_terms", "margins"}  # names, not numbers, along y
@@ -50,7 +43,7 @@ WFC = {"size": (4096.0, 2048.0), "names": ("WFC2", "WFC1")}
 
 @pytest.fixture(scope="module", params=RUNS, ids=str)
 def every_figure(request):
-    return all_figures(report_input(**RUNS[request.param]))
+    return figures_of(report_input(**RUNS[request.param]))
 
 
 def test_every_axis_names_its_unit(every_figure):
@@ -123,7 +116,7 @@ def _drawn_lengths(quiver):
 @pytest.mark.parametrize("unit, size", [("pix", (1016.0, 1016.0)), ("arcsec", (4096.0, 2048.0))])
 def test_key_has_the_length_that_arrows_of_that_value_are_drawn_with(unit, size):
     run = report_input(size=size, unit=unit, scale=1.0 if unit == "pix" else 0.05)
-    figs = all_figures(run)
+    figs = figures_of(run)
     mas = {"mas": 1e-3, "arcsec": 1.0, "pix": 1.0}
     for name in ("distortion", "distortion_non_linear", "residual_vectors"):
         fig = figs[name]
@@ -138,8 +131,16 @@ def test_key_has_the_length_that_arrows_of_that_value_are_drawn_with(unit, size)
             np.testing.assert_allclose(drawn, expected, rtol=0.01)
 
 
+def crosses(maps):
+    """Crosses of the maps of one chip, 2000 times larger than the chip."""
+    panels = ChipPanels(Mosaic((SIZE,)), len(maps))
+    panels.frame(100.0)
+    cross_map(panels, maps, [m.kind for m in maps], magnification=2000.0, key=0.01)
+    return panels.figure
+
+
 def test_key_of_the_crosses_is_to_their_scale(converged):
-    fig = formal_uncertainty(*converged.chips[0].maps, magnification=2000.0)
+    fig = crosses(converged.chips[0].maps)
     fig.canvas.draw()
     for ax, m in zip(fig.axes, converged.chips[0].maps, strict=True):
         stated, _, paper, words = _key(ax)
@@ -157,7 +158,7 @@ MAPS = ("distortion", "distortion_non_linear", "formal_uncertainty", "uncertaint
 def test_each_chip_has_a_panel_where_it_lies():
     """WFC1, the second chip, lies above WFC2; one scale of pixels, vectors and colours for both."""
     run = report_input(**WFC)
-    figs = all_figures(run)
+    figs = figures_of(run)
     for name in MAPS:
         fig = figs[name]
         fig.canvas.draw()
@@ -189,9 +190,10 @@ def test_each_chip_has_a_panel_where_it_lies():
 
 
 def test_chips_of_several_sizes_share_one_scale():
-    m = report_input(**WFC).chips[0].formal_map
-    small = replace(m, x=np.linspace(1, 1014, 33), y=np.linspace(1, 1014, 17), chip=7)
-    fig = formal_uncertainty(m, small)
+    sizes = ((4096.0, 2048.0), (1014.0, 1014.0))
+    panels = ChipPanels(Mosaic(sizes, ("A", "B"), ((0, 0), (1, 0))))
+    panels.frame()
+    fig = panels.figure
     fig.canvas.draw()
     scales = [np.diff(ax.transData.transform([[0, 0], [1, 1]]), axis=0)[0] for ax in fig.axes]
     np.testing.assert_allclose(scales, scales[0][0], rtol=1e-6)
@@ -201,13 +203,14 @@ def test_a_wide_detector_is_drawn_row_by_row_in_panels_that_can_be_read():
     names = tuple("ABCDEFGH")
     places = tuple((1 - k // 4, k % 4) for k in range(8))  # A to D below E to H
     mosaic = Mosaic(8 * ((100.0, 100.0),), names, places)
-    fig, panels = mosaic.panels()
-    for k, (ax,) in enumerate(panels):
-        mosaic.draw(ax, k)
-        ax.set_title(mosaic.title(k, "", ""))
+    panels = ChipPanels(mosaic)
+    panels.frame()
+    fig = panels.figure
+    for k, (ax,) in enumerate(panels.axes):
+        ax.set_title(panels.title(k, "", ""))
     fig.canvas.draw()
     assert len(fig.axes) == 8
-    labelled = [names[k] for k, (ax,) in enumerate(panels) if ax.get_xlabel()]
+    labelled = [names[k] for k, (ax,) in enumerate(panels.axes) if ax.get_xlabel()]
     assert labelled == ["B", "C", "D"]  # rows EFG, HAB, CD: under B there is no panel
     boxes = [ax.bbox for ax in fig.axes]
     assert min(b.width for b in boxes) > 1.5 * fig.dpi
@@ -218,7 +221,7 @@ def test_a_wide_detector_is_drawn_row_by_row_in_panels_that_can_be_read():
 
 def test_bars_of_each_chip_stand_beside_those_of_all():
     run = report_input(**WFC)
-    fig = all_figures(run)["budget_terms"]
+    fig = figures_of(run)["budget_terms"]
     assert [ax.get_xlabel().split(" [")[0] for ax in fig.axes] == [
         "rms over all chips",
         "rms over WFC2",
@@ -233,7 +236,7 @@ def test_bars_of_each_chip_stand_beside_those_of_all():
 
 def test_crosses_reach_all_four_combinations_of_one_sigma(converged):
     m = converged.chips[0].formal_map
-    fig = formal_uncertainty(m, magnification=2000.0)
+    fig = crosses((m,))
     (lines,) = [c for c in fig.axes[0].collections if isinstance(c, LineCollection)]
     steps = np.array([s[1] - s[0] for s in lines.get_segments()]) / 2000.0
     rows, columns = square_cells(m.x, m.y)
@@ -242,16 +245,16 @@ def test_crosses_reach_all_four_combinations_of_one_sigma(converged):
     np.testing.assert_allclose(sorted(map(tuple, steps)), sorted(wanted), atol=1e-12)
 
 
-def test_the_largest_radius_is_printed(converged):
-    fig = formal_uncertainty(*converged.chips[0].maps)
+def test_the_largest_radius_is_printed(converged, figures):
+    fig = figures["formal_uncertainty"]
     for ax, m in zip(fig.axes, converged.chips[0].maps, strict=True):
         printed = float(re.search(r"max radius ([\d.]+)", ax.get_title(loc="left")).group(1))
         assert printed == pytest.approx(m.radius_max, rel=6e-3)
         assert m.kind in ax.get_title(loc="left")
 
 
-def test_maps_of_one_figure_share_their_colours(converged):
-    fig = uncertainty_radius(*converged.chips[0].maps)
+def test_maps_of_one_figure_share_their_colours(figures):
+    fig = figures["uncertainty_radius"]
     limits = {
         c.get_clim()
         for ax in fig.axes[:2]
@@ -274,24 +277,26 @@ def test_vectors_of_a_rotated_frame_are_drawn_along_the_detector():
     x = y = np.linspace(1.0, 100.0, 5)
     turn = 0.1 * np.array([[0.0, -1.0], [1.0, 0.0]])
     du, dv = np.zeros((5, 5)), np.full((5, 5), 0.1)
-    fig = vector_flow(VectorMap(x, y, du, dv, "arcsec", "no_constant", similarity=turn))
-    (quiver,) = [c for c in fig.axes[0].collections if isinstance(c, Quiver)]
-    np.testing.assert_allclose(quiver.U, 1.0)
-    np.testing.assert_allclose(quiver.V, 0.0, atol=1e-12)
+    arrows = Arrows.of_map(VectorMap(x, y, du, dv, "arcsec", "no_constant", similarity=turn))
+    np.testing.assert_allclose(arrows.du, 1.0)
+    np.testing.assert_allclose(arrows.dv, 0.0, atol=1e-12)
 
 
 def test_a_map_without_variation_or_vectors_is_drawn(converged):
     m = converged.chips[0].formal_map
     flat = replace(m, sigma_u=np.full_like(m.sigma_u, 0.01), sigma_v=np.full_like(m.sigma_v, 0.01))
-    uncertainty_radius(flat).canvas.draw()
     v = converged.chips[0].displacement
-    vector_flow(replace(v, du=0.0 * v.du, dv=0.0 * v.dv)).canvas.draw()
+    still = replace(v, du=0.0 * v.du, dv=0.0 * v.dv)
+    chip = replace(converged.chips[0], formal_map=flat, posterior_map=None, displacement=still)
+    run = replace(converged, chips=(chip,))
+    for fig in figures_of(run, "uncertainty_radius", "distortion").values():
+        fig.canvas.draw()
 
 
 def test_the_callers_matplotlib_is_left_alone(converged, tmp_path):
     with matplotlib.rc_context({"font.size": 23.0, "axes.linewidth": 3.0}):
         before = dict(matplotlib.rcParams)
-        save_images(drawn(all_figures(converged)), tmp_path)
+        save_figures(figures_of(converged), tmp_path)
         assert dict(matplotlib.rcParams) == before
     assert pyplot.get_fignums() == []
 
@@ -303,8 +308,8 @@ def test_a_million_stars_are_drawn_as_counts():
     residual = rng.normal(size=(n, 2)) * sigma[:, None]
     curve = MixtureCurve(sigma)
     for fig in (
-        residual_histogram(residual, (curve, curve), unit="pix"),
-        residuals_by_magnitude(rng.uniform(10, 20, n), residual, unit="pix"),
+        _histograms(residual, (curve, curve), unit="pix", sampled=False, things="stars"),
+        _density(rng.uniform(10, 20, n), residual, unit="pix", errors=None, shown="stars"),
     ):
         for ax in fig.axes:
             sizes = [len(line.get_xydata()) for line in ax.lines]
@@ -312,8 +317,8 @@ def test_a_million_stars_are_drawn_as_counts():
             assert max(sizes, default=0) < 10_000
 
 
-def test_every_star_of_a_histogram_is_counted(converged):
-    fig = all_figures(converged)["residual_histogram"]
+def test_every_star_of_a_histogram_is_counted(converged, figures):
+    fig = figures["residual_histogram"]
     bars = fig.axes[2].patches[0]  # all stars of u
     assert bars.get_data().values.sum() == converged.stars.n_total == 6000
 
@@ -333,7 +338,7 @@ def test_residuals_are_the_data_minus_the_model(converged):
 def test_figures_of_some_stars_say_so_and_show_no_others():
     run = report_input(shown=1500)
     assert run.stars.partial and len(run.stars) == 1500
-    figs = all_figures(run)
+    figs = figures_of(run)
     histogram = figs["residual_histogram"]
     bars, curve = histogram.axes[2].patches[0].get_data(), histogram.axes[2].lines[0]
     assert bars.values.sum() == 1500
@@ -386,4 +391,4 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     with pytest.raises(InputError, match="file"):
-        save_images({}, blocked / "figures")
+        save_figures({}, blocked / "figures")

@@ -8,10 +8,10 @@ from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose
 
 from bayesdist.assess.detector_numbers import detector_numbers
-from bayesdist.assess.residuals import binned_sums
 from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.diagnose.residuals.binned import binned_sums
 from bayesdist.products import read_idctab
-from bayesdist.products.chips_in_frame import chips_of_idctab
+from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.report.handbook_numbers import handbook_rows
 from bayesdist.report.whole_detector import area_figure, non_linear_figure, residual_figure
 
@@ -21,7 +21,7 @@ from ..products.siaf_acs import SCALE, siaf_calibration
 @pytest.fixture(scope="module")
 def wfc(data_dir) -> WholeDetector:
     tab = read_idctab(data_dir / "hst_reference" / "0461802ej_idc.fits")
-    return WholeDetector(chips_of_idctab(tab, filter="F475W,CLEAR2L"), 0.05)
+    return WholeDetector(idctab_calibration(tab, "F475W,CLEAR2L").in_frame(), 0.05)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def hrc() -> WholeDetector:
 def test_delivered_tables_of_the_wfc_give_the_printed_numbers(data_dir, name):
     """82 pixels or about 4 arcsec, 85 degrees, 8 %, areas from 0.89 to 1.08: to their digits."""
     tab = read_idctab(data_dir / "hst_reference" / f"{name}_idc.fits")
-    n = detector_numbers(WholeDetector(chips_of_idctab(tab, filter="F475W,CLEAR2L"), 0.05))
+    n = detector_numbers(WholeDetector(idctab_calibration(tab, "F475W,CLEAR2L").in_frame(), 0.05))
     assert round(n.non_linear_max) == 82
     assert round(0.05 * n.non_linear_max) == 4
     assert round(n.angle) == 85

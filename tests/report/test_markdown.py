@@ -9,12 +9,12 @@ from dataclasses import replace
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.report.html import render_markdown, render_report, write_report
+from bayesdist.report.run_report import render_markdown, render_report, write_report
 
 
 @pytest.fixture(scope="module")
-def text(converged, images) -> str:
-    return render_markdown(converged, images)
+def text(converged, drawings) -> str:
+    return render_markdown(converged, drawings)
 
 
 def cells(line: str) -> list[str]:
@@ -55,23 +55,23 @@ def test_every_row_of_a_table_has_as_many_cells_as_its_head(text):
             assert below.startswith("|") and len(cells(below)) == width
 
 
-def test_what_a_user_writes_does_not_become_markup(converged, images):
+def test_what_a_user_writes_does_not_become_markup(converged, drawings):
     evil = "a|b *c* <script> [x](y)"
-    out = render_markdown(replace(converged, name=evil, warnings=(evil,)), images)
+    out = render_markdown(replace(converged, name=evil, warnings=(evil,)), drawings)
     assert "<script" not in out and "[x](y)" not in out.replace("\\[x](y)", "")
     assert "a\\|b \\*c\\*" in out
 
 
-def test_doubts_are_marked(not_converged, images):
-    out = render_markdown(not_converged, images)
+def test_doubts_are_marked(not_converged, drawings):
+    out = render_markdown(not_converged, drawings)
     assert "**NOT CONVERGED.**" in out and "†" in out
 
 
-def test_it_lies_beside_the_page(converged, images, tmp_path):
-    write_report(tmp_path / "report.html", converged, images)
+def test_it_lies_beside_the_page(converged, drawings, tmp_path):
+    write_report(tmp_path / "report.html", converged, drawings)
     assert (tmp_path / "report.md").read_text(encoding="utf-8") == render_markdown(
-        converged, images
+        converged, drawings
     )
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == render_report(
-        converged, images
+        converged, drawings
     )

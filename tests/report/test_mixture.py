@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import norm
 
 from bayesdist.assess import binned_residuals
-from bayesdist.report.residuals import MixtureCurve
-from bayesdist.report.vectors import CHANCE, significant_cells
+from bayesdist.report.arrows import CHANCE, significant_cells
+from bayesdist.report.sections.run.residuals import MixtureCurve
 
 
 def test_counts_add_up_to_the_stars():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from bayesdist.assess.patterns import Beforehand, Camera, PlannedStars, compare_patterns
+from bayesdist.assess.planning.dithers import Beforehand, Camera, PlannedStars, compare_patterns
 from bayesdist.model import Chip
-from bayesdist.report import drawn
+from bayesdist.report.drawing import png_of
 from bayesdist.report.patterns import pattern_maps
 from bayesdist.simulate.patterns import DitherPattern, flat_coefficients
 
@@ -46,4 +46,4 @@ def test_footprints_and_maps_at_one_scale(planned):
     values = np.concatenate([np.ravel(m.get_array()) for m in meshes])
     assert np.isfinite(values).all() and meshes[0].norm.vmax >= values.max()
     assert len({(ax.get_xlim(), ax.get_ylim()) for ax in panels[:, 0]}) == 1
-    assert drawn({"patterns": fig})["patterns"].startswith(b"\x89PNG")
+    assert png_of(fig).startswith(b"\x89PNG")

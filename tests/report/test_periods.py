@@ -13,13 +13,15 @@ from matplotlib.quiver import Quiver
 from bayesdist.assess.periods import time_variation
 from bayesdist.data import MatchTable
 from bayesdist.infer import fit_linear
-from bayesdist.infer.order import select_order
+from bayesdist.infer.compare.order import select_order
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.report.html import render_report
-from bayesdist.report.mosaic import Mosaic
 from bayesdist.report.order import order_comparison
-from bayesdist.report.periods import PALE, period_caption, period_differences, period_tables
-from bayesdist.report.style import INK
+from bayesdist.report.run_report import render_report
+from bayesdist.report.sections.run.periods import period_tables
+from bayesdist.report.style import INK, PALE
+
+from .plots import plot_of
+from .runs import report_input
 
 SIZE = (1000.0, 800.0)
 MODEL = DistortionModel(2, (Chip(1, "A", SIZE, (500.5, 400.5)),))
@@ -58,7 +60,7 @@ def test_vectors_are_the_difference_of_the_two_models(found, pairs):
         inside = (pairs.epoch >= start) & (pairs.epoch < stop)
         A = designed(pairs.x[inside], pairs.y[inside])
         cov = cov + (0.05 * found.comparison.error_scale) ** 2 * np.linalg.inv(A.T @ A)
-    figure = period_differences(found, Mosaic((SIZE,)))
+    figure = plot_of(replace(report_input(size=SIZE), periods=found), "period_differences").figure
     drawn = [one for ax in figure.axes for one in ax.collections if isinstance(one, Quiver)]
     late, early = (found.comparison.means[k] for k in (2, 0))
     colors = set()
@@ -78,7 +80,7 @@ def test_vectors_are_the_difference_of_the_two_models(found, pairs):
     assert title.startswith("MJD 55312.5 − 55212.5")
 
 
-def test_the_section_has_what_was_found(converged, images, found):
+def test_the_section_has_what_was_found(converged, drawings, found):
     inputs = replace(converged, periods=found)
     tables = period_tables(inputs)
     assert [t.caption.split(":")[0] for t in tables] == [
@@ -92,11 +94,11 @@ def test_the_section_has_what_was_found(converged, images, found):
     assert tables[0].rows[0][1] == found.verdict and found.significant and not found.matters
     names = [row[k] for k in (0, 5) for row in tables[2].rows]
     assert names == list(MODEL.names)
-    page = lxml_html.fromstring(render_report(inputs, images))
+    page = lxml_html.fromstring(render_report(inputs, drawings))
     sections = page.xpath("//section/@id")
     assert sections.index("periods") == sections.index("maps") + 1
     assert [h[1:] for h in page.xpath("//section[@id='status']//nav//a/@href")] == sections[1:]
-    caption = period_caption(inputs)
+    caption = plot_of(inputs, "period_differences")
     assert f"({found.ends.at[0]:.0f}, {found.ends.at[1]:.0f})" in caption.text
 
 

@@ -16,9 +16,10 @@ from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.errors import InputError
 from bayesdist.products import sip_from_solution, write_wise_meta
-from bayesdist.report import drawing_of, save_drawings
-from bayesdist.report.bands import BandsInput, band_figures, write_bands
+from bayesdist.report.bands.context import BandsInput
 from bayesdist.report.bands.findings import overview_table
+from bayesdist.report.bands.page import draw_bands, write_bands
+from bayesdist.report.drawing import save_drawings
 from bayesdist.simulate.wise import WISE_BANDS
 
 __all__ = ["bands_of_runs"]
@@ -88,13 +89,11 @@ def bands_of_runs(
             provenance={"command": command, **versions()},
         )
         files = [*write_tables(inputs, folder), *_meta(bands, folder)]
-        figures = band_figures(inputs)
-        drawings = {name: drawing_of(figure) for name, figure in figures.items()}
+        drawings = draw_bands(inputs)
         save_drawings(drawings, folder / "figures")
-        images = {name: one.png for name, one in drawings.items()}
-        write_bands(folder / "bands.html", inputs, images)
-        files += ["bands.html", *(f"figures/{name}.png" for name in figures)]
-        files += [f"figures/{name}.pdf" for name in figures]
+        write_bands(folder / "bands.html", inputs, drawings)
+        files += ["bands.html", *(f"figures/{name}.png" for name in drawings)]
+        files += [f"figures/{name}.pdf" for name in drawings]
         write_json(folder / "bands.json", record_of(inputs) | {"files": files})
     return _text(Path(output), inputs)
 

@@ -9,11 +9,6 @@ import numpy as np
 from bayesdist.app.bands.inputs import BandRun
 from bayesdist.app.bands.optical import OpticalModel
 from bayesdist.assess import uncertainty_map
-from bayesdist.assess.distortion_field import DistortionField, field_of_solution
-from bayesdist.assess.formal_radii import implied_sigma
-from bayesdist.assess.histograms import band_sums
-from bayesdist.assess.residual_correlation import residual_correlation
-from bayesdist.assess.residual_structure import residual_partition
 from bayesdist.assess.wise import (
     BandBins,
     StatisticsTable,
@@ -22,7 +17,12 @@ from bayesdist.assess.wise import (
     multiframe_table,
 )
 from bayesdist.assess.wise.account import PRINTED_BINS, accounts
+from bayesdist.assess.wise.distortion_field import DistortionField, field_of_solution
+from bayesdist.assess.wise.formal_radii import implied_sigma
+from bayesdist.assess.wise.histograms import band_sums
 from bayesdist.assess.wise.partition_parts import partition_parts
+from bayesdist.assess.wise.residual_correlation import residual_correlation
+from bayesdist.assess.wise.residual_structure import residual_partition
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.report.bands.context import BandResult, BandsInput, Printed
 from bayesdist.simulate.wise import FORMAL_RADII, LONGEST_VECTORS, SAMPLE_SIZES, WISE_BANDS

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.assess.distortion_field import DistortionField
+from bayesdist.assess.wise.distortion_field import DistortionField
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.products import SipHeader, read_sip, read_wise_meta, rotated_sip
-from bayesdist.products.wise_meta import holds_wise_meta
+from bayesdist.products.registry import open_document
 
 __all__ = ["OpticalModel", "optical_models"]
 
@@ -134,7 +134,7 @@ def _sip_of(path: Path, band: str) -> SipHeader:
             where=f"--optical {path}",
             do="name a SIP header, or WISE meta-data that hold this band",
         )
-    if not holds_wise_meta(path):
+    if open_document(path).format.key != "wise_meta":
         return read_sip(path)
     entries = {f"W{one.band}": one.sip for one in read_wise_meta(path)}
     if band not in entries:

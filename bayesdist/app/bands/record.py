@@ -9,8 +9,8 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.session import write_table
-from bayesdist.assess.histograms import ResidualHistogram
 from bayesdist.assess.wise.account import RowAccount
+from bayesdist.assess.wise.histograms import ResidualHistogram
 from bayesdist.report.bands.context import BandResult, BandsInput
 
 __all__ = ["SCHEMA", "record_of", "write_tables"]

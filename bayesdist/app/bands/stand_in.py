@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.products import SipHeader, write_sip
-from bayesdist.products.cards import text_card
+from bayesdist.products.formats.common.cards import text_card
 from bayesdist.simulate.bringup import optical_model
 from bayesdist.simulate.wise import WISE_ARRAYS
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.assess.field_terms import EXPOSURE_SCATTER
-from bayesdist.assess.linear_term import LinearTerm
 from bayesdist.assess.solution import Solution
+from bayesdist.assess.terms.field_terms import EXPOSURE_SCATTER
+from bayesdist.assess.terms.parameters import LinearTerm
 
 if TYPE_CHECKING:
     from bayesdist.app.campaign.session import CampaignSession

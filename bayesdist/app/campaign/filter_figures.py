@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.assess.solution import Solution
-from bayesdist.infer.views import lines, reference_gauge, without_frames
+from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 
 __all__ = ["draw_filters"]
 
@@ -32,8 +32,8 @@ def draw_filters(
         As they are released.
     """
     # figures take seconds to import
-    from bayesdist.report import drawn, save_images
-    from bayesdist.report.campaign.filters import FilterTerm, filters_figure
+    from bayesdist.report.drawing import save_figures
+    from bayesdist.report.filters import FilterTerm, filters_figure
 
     first = next(iter(sessions.values()))
     time = first.posterior.model.time
@@ -72,5 +72,5 @@ def draw_filters(
                 )
         if courses:
             figures[f"filters_{term}"] = filters_figure(term, courses, time.breaks)
-    save_images(drawn(figures), folder)
+    save_figures(figures, folder)
     return tuple(f"{name}.png" for name in figures)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.series import Course, FilterDependence, Series, filter_dependence
-from bayesdist.infer.views import linear_terms, reference_gauge
+from bayesdist.infer.transforms import linear_terms, reference_gauge
 from bayesdist.model import TimeDependence
 
 __all__ = ["FilterComparison", "compare_filters", "comparison_table"]

@@ -18,10 +18,10 @@ from bayesdist.app.session import ERROR_COLUMNS, write_table
 from bayesdist.app.stages.fit import summarise_fit
 from bayesdist.data import MatchTable, centroid_errors
 from bayesdist.infer import load, save_fit
-from bayesdist.infer.checkpoints import write_arrays
-from bayesdist.infer.deviation_trends import trend_p_values
-from bayesdist.infer.exposures_alone import ExposureSolutions, fit_exposures
-from bayesdist.infer.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
+from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
+from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
+from bayesdist.infer.exposures.trends import trend_p_values
+from bayesdist.infer.sampler.checkpoints import write_arrays
 from bayesdist.infer.series import Series
 from bayesdist.model import Chip
 from bayesdist.model.frames import RIGID
@@ -113,7 +113,7 @@ def _trends(joint: HierarchicalFit, matches: MatchTable) -> list[str]:
     """Deviations that go with time although they are taken to scatter, each as a clause.
 
     Those of scale and shears: how the chips move against each other has a test of its own
-    (`bayesdist.diagnose.gap`).
+    (`bayesdist.diagnose.score.gap`).
     """
     model = joint.model
     assert matches.epoch is not None

@@ -9,10 +9,10 @@ import numpy as np
 
 from bayesdist.app.campaign.systematics import errors_by_star
 from bayesdist.app.holdout import local_errors, whole_exposures
-from bayesdist.assess.holdout_predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.data import MatchTable
 from bayesdist.data.holdout import refuse_strangers
-from bayesdist.infer.star_influence import star_influence
+from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
+from bayesdist.infer.catalogue.star_influence import star_influence
 
 if TYPE_CHECKING:
     from bayesdist.app.campaign.session import CampaignSession

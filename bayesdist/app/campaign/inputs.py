@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.config import CampaignBlock, StarListsBlock
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import (
     ExposureLog,
     ReferenceCatalog,
@@ -24,7 +25,8 @@ from bayesdist.data.tables import read_table
 from bayesdist.data.tangent import mean_direction, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products import IdcTab, read_idctab
-from bayesdist.products.parity import parity_of
+from bayesdist.products.formats.idctab.calibration import idctab_calibration
+from bayesdist.products.formats.idctab.hst import parity_of
 
 __all__ = [
     "Inputs",
@@ -233,20 +235,20 @@ def start_of(
     filter : str or None
         The table's only one, or any of it, by default.
     """
-    known = read_idctab(tab) if isinstance(tab, Path) else tab
-    names = {name for row in known.filters() for name in row}
-    row = filter if filter in names else None
-    numbers = np.asarray(known.rows["DETCHIP"], int)
-    v2v3 = np.column_stack([known.rows["V2REF"], known.rows["V3REF"]]).astype(float)
-    parity = np.array(parity_of(known.instrument, known.detector))
-    offsets = {n: (v2v3[numbers == n][0] - v2v3[0]) * parity for n in np.unique(numbers)}
+    known = known_calibration(tab, filter)
 
     def start(x: Float, y: Float, chip: NDArray[np.int64], epoch: float) -> Float:
         out = np.empty((len(x), 2))
         for number in np.unique(chip):
             rows = chip == number
-            found = known.evaluate(int(number), x[rows], y[rows], filter=row)
-            out[rows] = np.column_stack(found) + offsets[number]
+            out[rows] = known.forward(x[rows], y[rows], chip=int(number))
         return out / unit_arcsec
 
     return start
+
+
+def known_calibration(tab: IdcTab | Path, filter: str | None) -> Calibration:
+    """The calibration of an IDCTAB in a filter, or in any where it does not name that one."""
+    known = read_idctab(tab) if isinstance(tab, Path) else tab
+    names = {name for row in known.filters() for name in row}
+    return idctab_calibration(known, filter if filter in names else None)

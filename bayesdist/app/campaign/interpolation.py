@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.between_nodes import BetweenNodes, between_nodes
-from bayesdist.assess.grid import grid_pixels, mesh
-from bayesdist.assess.mean_square import MeanSquare
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms import MEASURED, LocalTerm
+from bayesdist.assess.terms.given import MEASURED, LocalTerm
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.tables.between_nodes import BetweenNodes, between_nodes
+from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit
 from bayesdist.infer.nodes import TablePosterior, pixel_shifts
@@ -21,6 +20,7 @@ from bayesdist.infer.nodes.alternation import with_columns
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.nodes.trust import Trust, fitted_trust
 from bayesdist.model import Chip, LookupTable, corrected
+from bayesdist.model.grid import grid_pixels, mesh
 
 __all__ = ["INTERPOLATION", "interpolation_term", "measured_between"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.infer.views import (
+from bayesdist.infer.transforms import (
     LinearTerms,
     Solution,
     View,

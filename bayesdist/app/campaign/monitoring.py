@@ -14,10 +14,10 @@ from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
-from bayesdist.infer.monitoring import NewFit, fit_new
-from bayesdist.infer.monitoring_stars import with_star_errors_of
+from bayesdist.infer.catalogue.star_influence import StarErrors
+from bayesdist.infer.compare.monitoring import NewFit, fit_new
+from bayesdist.infer.compare.monitoring_stars import with_star_errors_of
 from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
-from bayesdist.infer.star_influence import StarErrors
 from bayesdist.model import corrected
 
 __all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]

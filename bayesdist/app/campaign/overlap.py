@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from bayesdist.app.campaign.inputs import known_calibration
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.assess.alignment import Alignment, alignment_residuals
-from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
 from bayesdist.data import MatchTable
-from bayesdist.infer.views import without_frames
+from bayesdist.diagnose.alignment import Alignment, alignment_residuals
+from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
+from bayesdist.infer.transforms import without_frames
 from bayesdist.model import corrected
-from bayesdist.products import read_idctab
-from bayesdist.products.parity import parity_of
-
-if TYPE_CHECKING:
-    from bayesdist.report.campaign import OverlapTest
+from bayesdist.report.campaign import OverlapTest
 
 __all__ = ["chosen_exposures", "overlap_test"]
 
@@ -44,8 +39,6 @@ def overlap_test(session: CampaignSession) -> OverlapTest | None:
     OverlapTest or None
         None where no two exposures share enough stars.
     """
-    from bayesdist.report.campaign import OverlapTest  # figures take seconds to import
-
     pairs = session.pairs
     chosen = chosen_exposures(pairs)
     if chosen is None:
@@ -131,21 +124,14 @@ def _numbers(pairs: MatchTable, rows: Int) -> Int:
 
 def _known_plane(session: CampaignSession, pairs: MatchTable, rows: Int, epoch: float) -> Float:
     """Positions (N, 2) through the known distortion, its drift included; arcseconds."""
-    known = read_idctab(session.base / session.block.start)
-    names = {name for row in known.filters() for name in row}
-    filter = session.block.filter if session.block.filter in names else None
-    then = epoch if known.tdd_scheme == "2015" else None
-    of_chip = np.asarray(known.rows["DETCHIP"], int)
-    zero = np.column_stack([known.rows["V2REF"], known.rows["V3REF"]]).astype(float)
-    parity = np.array(parity_of(known.instrument, known.detector))
+    known = known_calibration(session.base / session.block.start, session.block.filter)
+    then = None if known.no_date else epoch
     chips = _numbers(pairs, rows)
     out = np.empty((len(rows), 2))
     for number in np.unique(chips):
         here = chips == number
         x, y = pairs.x[rows[here]], pairs.y[rows[here]]
-        found = known.evaluate(int(number), x, y, filter=filter, epoch=then)
-        offset = (zero[of_chip == number][0] - zero[0]) * parity
-        out[here] = np.column_stack(found) + offset
+        out[here] = known.forward(x, y, chip=int(number), epoch=then)
     return out
 
 

@@ -10,7 +10,7 @@ from bayesdist.app.campaign.gap import with_gap
 from bayesdist.app.campaign.table_file import read_tables
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior
-from bayesdist.infer.shared_drift import drift_priors
+from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
 from bayesdist.products import read_d2im
 

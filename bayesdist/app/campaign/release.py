@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.assess.solution import Solution
-from bayesdist.infer.views import reference_gauge, without_frames
+from bayesdist.calibration.calibration import calibration_of
+from bayesdist.calibration.orientation import lay_on
+from bayesdist.infer.transforms import Solution, reference_gauge, without_frames
 from bayesdist.model import LookupTable
 from bayesdist.products import (
     Period,
     lint_idctab,
     lint_lookup_file,
-    orientation_from_idctab,
+    read_calibration,
     read_idctab,
     read_lookup_file,
     write_release,
@@ -70,15 +71,17 @@ def write_files(
     block = session.config.products.release
     assert block is not None
     number = session.reference_chip
-    views = {
-        filter: reference_gauge(without_frames(solution), number)
+    calibrations = {
+        filter: calibration_of(
+            reference_gauge(without_frames(solution), number), filter, filter=filter
+        )
         for filter, solution in solutions.items()
     }
-    first = next(iter(views.values()))
+    first = next(iter(calibrations.values()))
     time = first.model.time
-    orientation = orientation_from_idctab(
+    orientation = lay_on(
         first,
-        read_idctab(session.base / block.reference),
+        read_calibration(session.base / block.reference),
         chip=number,
         epoch=None if time is None else time.epoch0[0],
         scale_arcsec=block.scale_arcsec,
@@ -86,7 +89,7 @@ def write_files(
     written = write_release(
         folder,
         block.name,
-        views,
+        calibrations,
         orientation,
         [Period(**one.model_dump()) for one in block.period],
         tables=tables,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
@@ -13,24 +11,22 @@ from bayesdist.app.campaign.inputs import cuts_of, read_campaign_catalog
 from bayesdist.app.campaign.overlap import overlap_test
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import as_json
-from bayesdist.assess.grid import outline_pixels
-from bayesdist.assess.residuals import BinnedResiduals, binned_residuals
 from bayesdist.data import MatchTable, with_centroid_errors
 from bayesdist.data.motions import motion_error_line
+from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.infer.nodes import pixel_shifts
 from bayesdist.infer.nodes.alternation import inside_chips, with_columns
 from bayesdist.model import corrected
-
-if TYPE_CHECKING:
-    from bayesdist.report.campaign import (
-        CampaignResults,
-        CatalogStars,
-        ChipResiduals,
-        Detections,
-        Footprints,
-        LinearSeries,
-    )
+from bayesdist.model.grid import outline_pixels
+from bayesdist.report.campaign import (
+    CampaignResults,
+    CatalogStars,
+    ChipResiduals,
+    Detections,
+    Footprints,
+    LinearSeries,
+)
 
 __all__ = ["campaign_results", "held_parameters"]
 
@@ -55,8 +51,6 @@ def campaign_results(session: CampaignSession) -> CampaignResults:
     -------
     CampaignResults
     """
-    from bayesdist.report.campaign import CampaignResults  # figures take seconds to import
-
     run = session.run
     matching = Table.read(run / "matching.ecsv")
     return CampaignResults(
@@ -109,8 +103,6 @@ def _some(n: int, most: int) -> slice:
 
 
 def _catalog_stars(session: CampaignSession, matching: Table) -> CatalogStars | None:
-    from bayesdist.report.campaign import CatalogStars
-
     catalog, _ = read_campaign_catalog(session.block, session.base, session.inputs.log)
     if catalog.mag is None or (catalog.sigma_u is None and catalog.sigma_pm_u is None):
         return None
@@ -136,8 +128,6 @@ def _catalog_stars(session: CampaignSession, matching: Table) -> CatalogStars | 
 
 def _detections(session: CampaignSession) -> Detections | None:
     """Quality against magnitude, of some detections of every exposure."""
-    from bayesdist.report.campaign import Detections
-
     lists, cuts = session.inputs.lists, cuts_of(session.block)
     if any(one.mag is None or one.q is None for one in lists):
         return None
@@ -161,8 +151,6 @@ def _detections(session: CampaignSession) -> Detections | None:
 
 
 def _footprints(session: CampaignSession) -> Footprints:
-    from bayesdist.report.campaign import Footprints
-
     model, theta, catalog = session.posterior.model, session.posterior.mean, session.inputs.catalog
     outlines, epochs = [], []
     for name in model.exposures:
@@ -182,8 +170,6 @@ def _footprints(session: CampaignSession) -> Footprints:
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
     """Pairs of each chip without the tables and with them, along the detector's axes."""
-    from bayesdist.report.campaign import ChipResiduals
-
     pairs, moved, model = session.pairs, session.matches, session.plain_model
     assert isinstance(moved, MatchTable)
     errors, farthest = session.magnitude_errors, session.config.fit.clip_abs
@@ -238,8 +224,6 @@ def _binned(
 
 
 def _series(session: CampaignSession, matching: Table) -> LinearSeries | None:
-    from bayesdist.report.campaign import LinearSeries
-
     time, run = session.model.time, session.run
     if time is None or "time_dependence" not in run.summary:
         return None

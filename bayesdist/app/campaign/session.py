@@ -27,16 +27,16 @@ from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
 from bayesdist.assess import SAMPLE, LocalTerm
-from bayesdist.assess.between_nodes import BetweenNodes
-from bayesdist.assess.holdout_predictive import Predictive
-from bayesdist.assess.terms import GIVEN, MEASURED
+from bayesdist.assess.terms.given import GIVEN, MEASURED
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
+from bayesdist.diagnose.holdout.predictive import Predictive
+from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, fit_by_magnitude
-from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
+from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.nodes.alternation import inside_chips, on_the_chips, with_columns
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.series import Series
-from bayesdist.infer.settling import Settling
 from bayesdist.model import DistortionModel, LookupTable, corrected
 
 __all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession"]

@@ -16,7 +16,7 @@ from bayesdist.app.campaign.inputs import cuts_of
 from bayesdist.data import StarList
 from bayesdist.data.campaign_faults import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
-from bayesdist.infer.catalogue_shear import one_roll_angle
+from bayesdist.infer.catalogue.catalogue_shear import one_roll_angle
 from bayesdist.model import Chip, TimeDependence
 
 if TYPE_CHECKING:

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.aberration import aberration_term
 from bayesdist.app.fingerprint import fingerprint_of
 from bayesdist.app.systematics import Systematics
-from bayesdist.assess.field_terms import MOTIONS, CatalogueTerm, ExposureScatter, FieldTerm
-from bayesdist.assess.terms import GIVEN
+from bayesdist.assess.terms.field_terms import MOTIONS, CatalogueTerm, ExposureScatter, FieldTerm
+from bayesdist.assess.terms.given import GIVEN
 from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
-from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
+from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.infer.recoloured import with_spread
-from bayesdist.infer.star_errors import StarCovariance, star_covariance
-from bayesdist.infer.star_influence import StarErrors
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 if TYPE_CHECKING:
     from bayesdist.app.campaign.session import CampaignSession

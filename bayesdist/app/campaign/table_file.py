@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.between_nodes import BetweenNodes
-from bayesdist.infer.checkpoints import read_arrays, write_arrays
+from bayesdist.diagnose.tables.between_nodes import BetweenNodes
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.model import LookupTable
 
 __all__ = ["KeptTables", "read_tables", "write_tables"]

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.interpolation import measured_between
 from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.assess.between_nodes import BetweenNodes
-from bayesdist.assess.grid import grid_pixels, mesh
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import LinearFit
 from bayesdist.infer.nodes import Round, TableFit, fit_with_tables, pixel_jacobian
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.model import LookupTable, corrected
+from bayesdist.model.grid import grid_pixels, mesh
 
 __all__ = ["fit_tables", "tables_summary"]
 

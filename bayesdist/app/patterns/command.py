@@ -14,8 +14,8 @@ from bayesdist.app.patterns.config import PlanConfig, load_plan
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
-from bayesdist.assess.pattern_words import lacking, nearly_free
-from bayesdist.assess.patterns import KINDS, PlannedPattern, compare_patterns
+from bayesdist.assess.planning.dithers import KINDS, PlannedPattern, compare_patterns
+from bayesdist.assess.planning.words import lacking, nearly_free
 
 __all__ = ["plan_patterns"]
 
@@ -109,12 +109,12 @@ def _sentences(one: PlannedPattern) -> list[str]:
 
 
 def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:
-    from bayesdist.report import drawn, save_images  # figures take seconds to import
+    from bayesdist.report.drawing import save_figures  # figures take seconds to import
     from bayesdist.report.patterns import pattern_maps
 
     with whole_folder(output) as folder:
         write_table(_table(found), folder / "patterns.ecsv")
-        save_images(drawn({"patterns": pattern_maps(found)}), folder / "figures")
+        save_figures({"patterns": pattern_maps(found)}, folder / "figures")
         record = {
             "schema": SCHEMA,
             "command": command,

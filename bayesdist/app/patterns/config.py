@@ -20,7 +20,7 @@ from bayesdist.app.config import (
     validated,
 )
 from bayesdist.app.section import Section
-from bayesdist.assess.patterns import Beforehand, Camera, PlannedStars
+from bayesdist.assess.planning.dithers import Beforehand, Camera, PlannedStars
 from bayesdist.model import Chip
 from bayesdist.simulate.dithers import dither_pattern
 from bayesdist.simulate.patterns import (

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from bayesdist.app.config import Config
 from bayesdist.app.selfcal.inputs import Commanded
 from bayesdist.errors import InputError
-from bayesdist.infer.prior import GaussianPriors
+from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
 from bayesdist.infer.selfcal.information import (
     Information,

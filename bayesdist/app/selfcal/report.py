@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.selfcal.session import SelfcalSession
-from bayesdist.assess.grid import outline_pixels
-
-if TYPE_CHECKING:
-    from bayesdist.report.selfcal import SelfcalResults
+from bayesdist.model.grid import outline_pixels
+from bayesdist.report.context import SelfcalResults
 
 __all__ = ["selfcal_results"]
 
@@ -24,8 +20,6 @@ def selfcal_results(session: SelfcalSession) -> SelfcalResults:
     session : SelfcalSession
         Of a run that has been assessed.
     """
-    from bayesdist.report.selfcal import SelfcalResults  # figures take seconds to import
-
     run, model, theta = session.run, session.model, session.posterior.mean
     outlines = []
     for e in range(len(model.exposures)):

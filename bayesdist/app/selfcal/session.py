@@ -27,19 +27,19 @@ from bayesdist.app.selfcal.matching import TURN_BACK, half_turned
 from bayesdist.app.selfcal.start import started
 from bayesdist.app.session import Session
 from bayesdist.assess import StarSample, UncertaintyMap, uncertainty_map
-from bayesdist.assess.dithered_misfit import dithered_misfit
 from bayesdist.assess.maps import with_local
-from bayesdist.assess.misfit import Misfit
 from bayesdist.assess.solution import Solution as Assessed
 from bayesdist.data import MagnitudeErrors, MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.parallax import parallax_factors
 from bayesdist.diagnose import ScoreTest
-from bayesdist.diagnose.dithered import selfcal_score_tests
+from bayesdist.diagnose.residuals.misfit import Misfit
+from bayesdist.diagnose.selfcal.misfit import dithered_misfit
+from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer import GaussianPriors, Matches
-from bayesdist.infer.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.discrepancy import Discrepancy
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, ReferenceStars, SelfCalibration, Solution, gauge_free
 from bayesdist.infer.selfcal.calibrate import self_calibrate
 from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy

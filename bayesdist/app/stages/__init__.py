@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 
 from bayesdist.app.judging import budget_of, margins_of
-from bayesdist.app.made_files import idctab_of, sip_of, wise_sip_of
+from bayesdist.app.made_files import made_files
 from bayesdist.app.periods import check_pairs
 from bayesdist.app.session import Session
 from bayesdist.app.stages.assess import run_assess
@@ -15,7 +15,7 @@ from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.report import run_report
 from bayesdist.app.stages.sample import run_sample
 from bayesdist.assess import SAMPLE, star_sample
-from bayesdist.assess.centroid import centroid_scatter
+from bayesdist.assess.terms.centroid import centroid_scatter
 from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit
@@ -78,13 +78,7 @@ def rehearse_solution(session: Session, fit: LinearFit) -> None:
     config = session.config
     budget_of(session, fit, REHEARSAL_DRAWS)
     margins_of(session, config.requirements(), fit, REHEARSAL_DRAWS)
-    if config.products.sip is not None:
-        for chip in fit.model.chips:
-            sip_of(session, fit, chip.number)
-    if config.products.idctab is not None:
-        idctab_of(session, fit)
-    if config.products.wise_meta:
-        wise_sip_of(session, fit)
+    made_files(session, fit)
 
 
 def _check_residuals(session: Session, fit: LinearFit, errors: MagnitudeErrors | None) -> None:

@@ -10,7 +10,7 @@ from astropy.table import Table
 from bayesdist.app.added_errors import added_errors_rows, grouping_sentence
 from bayesdist.app.session import ERROR_COLUMNS, Session, write_table
 from bayesdist.app.trust import frames_doubt
-from bayesdist.assess.majority import majority_sentence
+from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.infer import LinearFit, save_fit
 from bayesdist.infer.skew import Skew, skew_of
 

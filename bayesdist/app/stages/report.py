@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import os
+import sys
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from bayesdist.app.campaign.report import campaign_results
 from bayesdist.app.campaign.session import CampaignSession
@@ -27,15 +29,11 @@ from bayesdist.assess import (
     flagged_by_exposure,
     uncertainty_map,
 )
-from bayesdist.assess.budget_surface import BudgetSurface, budget_surface
+from bayesdist.assess.budget.surface import BudgetSurface, budget_surface
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.errors import InputError
-
-if TYPE_CHECKING:
-    from bayesdist.report.campaign import CampaignResults
-    from bayesdist.report.context import ChipResults, ReportInput
-    from bayesdist.report.two_hands import Hand
+from bayesdist.report.context import Check, ChipResults, Product, ReportInput
 
 __all__ = ["run_report", "title_of"]
 
@@ -47,26 +45,29 @@ VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide 
 
 def run_report(session: Session) -> None:
     # figures take seconds to import
-    from bayesdist.report import drawn_report, save_drawings, second_hand, write_report
+    from bayesdist.report.drawing import save_drawings
+    from bayesdist.report.run_report import draw_report, write_report
 
-    run = session.run
-    with second_hand(isinstance(session, CampaignSession)) as hand:  # they have most figures
-        inputs = _inputs(session, hand)
-        drawings = drawn_report(inputs, hand)
+    run, inputs = session.run, _inputs(session)
+    drawings = draw_report(inputs, processes=2 if _is_command_line() else 1)
     names = [f"{name}.{kind}" for name in drawings for kind in ("png", "pdf")]
     save_drawings(drawings, run / "figures")
     for stale in set(run.summary.get("figures", [])) - set(names):
         (run / "figures" / stale).unlink(missing_ok=True)
     run.summarise(figures=names)  # what is there, should the disk be full
-    images = {name: one.png for name, one in drawings.items()}
-    write_report(run / "report.html", inputs, images)
+    write_report(run / "report.html", inputs, drawings)
     log.info("report: %s", run / "report.html")
 
 
-def _inputs(session: Session, hand: Hand | None) -> ReportInput:
-    """All that the report shows; another process may begin to draw what is found first."""
-    from bayesdist.report import Check, Product, ReportInput
+def _is_command_line() -> bool:
+    """Whether other processes may import the main module: a user's own may not be guarded."""
+    path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+    name = path.parent.stem if path.name == "__main__.py" else path.stem
+    return name == "bayesdist" and (os.cpu_count() or 1) > 1
 
+
+def _inputs(session: Session) -> ReportInput:
+    """All that the report shows."""
     run, config = session.run, session.config
     fit, posterior = session.fit, session.posterior
     several = len(fit.model.exposures) > 1
@@ -75,12 +76,12 @@ def _inputs(session: Session, hand: Hand | None) -> ReportInput:
         Product(
             path=p["path"],
             what=p["kind"],
-            checks=tuple(_product_checks(p, Check)),
+            checks=_product_checks(p),
         )
         for p in run.summary.get("products", [])
     )
     judged = judged_requirements(run)
-    campaign = _campaign(session, hand) if isinstance(session, CampaignSession) else None
+    campaign = campaign_results(session) if isinstance(session, CampaignSession) else None
     inputs = ReportInput(
         name=title_of(config) or folder,
         config=as_json(config.model_dump(exclude_none=True)),
@@ -113,18 +114,6 @@ def _inputs(session: Session, hand: Hand | None) -> ReportInput:
     return inputs
 
 
-def _campaign(session: CampaignSession, hand: Hand | None) -> CampaignResults:
-    from bayesdist.report.campaign import campaign_draws
-    from bayesdist.report.mosaic import Mosaic
-
-    results = campaign_results(session)
-    if hand is not None:  # half of all figures
-        posterior = session.posterior
-        places = chip_places(posterior, epoch=session.epoch)
-        hand.give(campaign_draws, results, Mosaic.of_chips(posterior.model.chips, places))
-    return results
-
-
 def title_of(config: Config) -> str:
     """What was calibrated: detector, or chips, and the filter of a campaign; may be empty."""
     detector = config.detector.name or " and ".join(chip.name for chip in config.chip)
@@ -154,8 +143,6 @@ def _surface(session: Session) -> BudgetSurface | None:
 
 
 def _chip_results(session: Session) -> tuple[ChipResults, ...]:
-    from bayesdist.report.context import ChipResults
-
     fit, posterior, epoch = session.fit, session.solution, session.epoch
     out = []
     places = [
@@ -189,22 +176,23 @@ def _chip_results(session: Session) -> tuple[ChipResults, ...]:
     return tuple(out)
 
 
-def _product_checks(product: dict[str, Any], check: Callable[..., Any]) -> list[Any]:
+def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
+    """What was verified on a file as written."""
     out = []
     if product.get("closure_pix") is not None:
-        out.append(check("worst closure of the inverse (pix)", product["closure_pix"]))
-        out.append(check("A_DMAX (pix)", product["a_dmax"]))
-        out.append(check("B_DMAX (pix)", product["b_dmax"]))
+        out.append(Check("worst closure of the inverse (pix)", product["closure_pix"]))
+        out.append(Check("A_DMAX (pix)", product["a_dmax"]))
+        out.append(Check("B_DMAX (pix)", product["b_dmax"]))
     if product.get("sky"):
         sky = product["sky"]
         name = f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"
-        out.append(check(name, sky["rms_arcsec"]))
-        out.append(check("largest distance from the solution (arcsec)", sky["solution_arcsec"]))
+        out.append(Check(name, sky["rms_arcsec"]))
+        out.append(Check("largest distance from the solution (arcsec)", sky["solution_arcsec"]))
     levels = {"error": "fail", "warning": "warn", "note": "note"}
     for finding in product["findings"]:
         level, _, text = finding.partition(": ")
-        out.append(check(text, level, "", levels.get(level, "note")))
-    return out
+        out.append(Check(text, level, "", levels.get(level, "note")))
+    return tuple(out)
 
 
 def _vector_grid(size: tuple[float, float]) -> tuple[int, int]:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.assess.names import require_known
-from bayesdist.assess.residuals import BinnedSums, binned_sums
 from bayesdist.assess.wise.rows import BinValues
+from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
 from bayesdist.infer.linear import Clip
-from bayesdist.infer.stars import Stars
+from bayesdist.infer.stars.stars import Stars
 
 __all__ = ["BAND_AXES", "WISE_ARCSEC", "BandBins", "band_bins", "band_bins_of_stars"]
 

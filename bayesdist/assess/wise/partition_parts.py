@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bayesdist.assess.residual_structure import ResidualPartition
+from bayesdist.assess.wise.residual_structure import ResidualPartition
 
 __all__ = ["partition_parts"]
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.scores import Scores
-from bayesdist.infer.stars import Stars
+from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import Groups, merge_groups
 
 __all__ = ["CellSums", "cell_sums", "cells_per_side"]

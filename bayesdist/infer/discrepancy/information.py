@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.cells import CellSums
-from bayesdist.infer.normal import NormalEquations
-from bayesdist.infer.prior import GaussianPriors
+from bayesdist.infer.equations.normal import NormalEquations
+from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.model import DistortionModel
 
 __all__ = ["GroupCells", "Information"]

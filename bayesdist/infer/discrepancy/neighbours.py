@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.scores import Scores
-from bayesdist.infer.stars import prepare
+from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 
 __all__ = ["SharedVariance", "shared_variances"]

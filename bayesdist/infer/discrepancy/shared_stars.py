@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
-from bayesdist.infer.scores import Scores
-from bayesdist.infer.stars import Stars, prepare
+from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
 __all__ = ["SharedStars", "shared_stars"]

@@ -22,12 +22,12 @@ from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_stars
 from bayesdist.infer.discrepancy.structure import chip_structure
-from bayesdist.infer.prior import GaussianPriors
-from bayesdist.infer.scores import Scores, scores_of
-from bayesdist.infer.settling import Settling
-from bayesdist.infer.shards import Compute, Matches, Shards, opened
-from bayesdist.infer.stars import prepare
-from bayesdist.infer.views import Solution
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.stars.likelihood import Scores, scores_of
+from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.stars import prepare
+from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 
 __all__ = ["estimate_discrepancy"]

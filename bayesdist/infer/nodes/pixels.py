@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.stars import errors_of, groups_of
+from bayesdist.infer.stars.stars import errors_of, groups_of
 from bayesdist.model import DistortionModel, Groups
 
 __all__ = ["PixelShifts", "Solved", "pixel_jacobian", "pixel_shifts"]

@@ -1,7 +1,7 @@
 """How far each star is to be trusted: the outlier mixture on residuals that are given.
 
-The mixture of `bayesdist.infer.mixture`, with its priors, fitted by EM.  It sees residuals only, so
-that the polynomial and the tables can be fitted in turn with the weights that it gives.
+The mixture of `bayesdist.infer.stars.mixture`, with its priors, fitted by EM.  It sees residuals
+only, so that the polynomial and the tables can be fitted in turn with the weights that it gives.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.mixture import OUTLIER_MODE, OUTLIER_SHAPE, OutlierMixture
 from bayesdist.infer.nodes.jitter import jitter_variance
+from bayesdist.infer.stars.mixture import OUTLIER_MODE, OUTLIER_SHAPE, OutlierMixture
 
 __all__ = ["Trust", "fitted_trust"]
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.arrow import Arrow
-from bayesdist.infer.coordinates import Split
-from bayesdist.infer.laplace import Node
-from bayesdist.infer.proposal import GridProposal
+from bayesdist.infer.density.coordinates import Split
+from bayesdist.infer.density.laplace import Node
+from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.target import SelfTarget
 
@@ -117,8 +117,9 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
     theta, stars = solution.theta.copy(), solution.stars
     held = float(np.exp(at[0])) if len(at) else float(target.jitter or 0.0)
     middles = problem.middles(theta)
+    observed = True
     for _ in range(MOST_STEPS):
-        found = expand(problem, theta, Mixture(held, z**3), stars)
+        found = expand(problem, theta, Mixture(held, z**3), stars, observed=observed)
         gradient = (found.gradient + target.information.pull(theta))[free]
         H = np.zeros((len(free) + 1,) * 2)
         H[:-1, :-1] = (found.curvature + target.information.precision)[np.ix_(free, free)]
@@ -126,6 +127,9 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
         try:
             factor = Arrow(H, np.zeros((0, len(H), 0)), np.zeros((0, 0, 0)), n_tail=1).factor()
         except np.linalg.LinAlgError as error:
+            if observed:  # a star between two modes: with EM weights the curvature is positive
+                observed = False
+                continue
             raise DegenerateError(
                 "the detections do not determine the parameters that are free",
                 where="self-calibration",

@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.mixture import Hyper, OutlierMixture
 from bayesdist.infer.selfcal.information import Information
 from bayesdist.infer.selfcal.normal import Anchor, log_marginal
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 
 __all__ = ["SelfTarget"]
 

@@ -1,4 +1,4 @@
-"""What a comparison of bands is shown from."""
+"""What a comparison of bands is shown from, and the sections of its page."""
 
 from __future__ import annotations
 
@@ -6,15 +6,31 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from bayesdist.report.registry import Registry, Section
+
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
-    from bayesdist.assess.histograms import BandSums
-    from bayesdist.assess.residual_correlation import ResidualCorrelation
-    from bayesdist.assess.residual_structure import ResidualPartition
     from bayesdist.assess.wise import StatisticsTable
     from bayesdist.assess.wise.account import RowAccount
+    from bayesdist.assess.wise.histograms import BandSums
+    from bayesdist.assess.wise.residual_correlation import ResidualCorrelation
+    from bayesdist.assess.wise.residual_structure import ResidualPartition
 
-__all__ = ["BandResult", "BandsInput", "Printed"]
+__all__ = ["BANDS", "BandResult", "BandsInput", "Printed"]
+
+BANDS = Registry(
+    "bands",
+    (
+        Section("overview", "Overview"),
+        Section("vectors", "Distortion"),
+        Section("histograms", "Residuals with and without calibration"),
+        Section("tables", "Residuals in bins"),
+        Section("structure", "Structure left in the residuals"),
+        Section("formal", "Formal uncertainties"),
+        Section("coverage", "Coverage"),
+        Section("provenance", "Provenance"),
+    ),
+)
 
 
 @dataclass(frozen=True)

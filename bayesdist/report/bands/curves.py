@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
 import numpy as np
-from matplotlib.figure import Figure
 
-from bayesdist.assess.residual_correlation import DRAWS
-from bayesdist.report.numerals import probability
+from bayesdist.assess.wise.residual_correlation import DRAWS
+from bayesdist.report.bands.context import BANDS, BandsInput
+from bayesdist.report.numbers import probability
+from bayesdist.report.registry import Plot
 from bayesdist.report.style import INK, PALETTE, WIDTH, figure_style, new_figure
 
-if TYPE_CHECKING:
-    from bayesdist.assess.histograms import ResidualHistogram
-    from bayesdist.report.bands.context import BandResult
-
-__all__ = ["CASES", "chance_of", "correlation_curves", "histograms"]
+__all__ = [
+    "CASES",
+    "chance_of",
+    "correlation",
+    "histograms",
+]
 
 # colour, width and dashes by case, drawn in this order
 CASES = {
@@ -26,22 +25,14 @@ CASES = {
 }
 
 
-def histograms(bands: Mapping[str, Mapping[str, ResidualHistogram]]) -> Figure:
-    """Residuals along x and y of all pairs, on a logarithmic scale of counts.
-
-    Parameters
-    ----------
-    bands : mapping of str to mapping of str to ResidualHistogram
-        By band and by case, as in `CASES`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+@BANDS.figure("histograms", printed=True)
+def histograms(inputs: BandsInput) -> Plot:
+    """Residuals along x and y of all pairs, on a logarithmic scale of counts."""
     with figure_style():
-        fig = new_figure(WIDTH, 0.5 + 1.75 * len(bands))
-        axes = fig.subplots(len(bands), 2, sharey="row", sharex="row", squeeze=False)
-        for (name, cases), row in zip(bands.items(), axes, strict=True):
+        fig = new_figure(WIDTH, 0.5 + 1.75 * len(inputs.bands))
+        axes = fig.subplots(len(inputs.bands), 2, sharey="row", sharex="row", squeeze=False)
+        for band, row in zip(inputs.bands, axes, strict=True):
+            name, cases = band.name, band.sums.histograms
             for k, (ax, axis) in enumerate(zip(row, "XY", strict=True)):
                 for case, (color, width, dashes) in CASES.items():
                     if case not in cases:
@@ -60,20 +51,22 @@ def histograms(bands: Mapping[str, Mapping[str, ResidualHistogram]]) -> Figure:
             ax.set_xlabel("residual [pix]")
         handles, labels = axes[0, 0].get_legend_handles_labels()
         fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
-    return fig
+    said = "Without correction (blue)"
+    if inputs.optical:
+        said += ", corrected by the optical model (green, dashed)"
+    return Plot(
+        fig,
+        "Residuals of all pairs",
+        f"{said} and by this calibration (red); counts are logarithmic. In all cases the constant"
+        " is the calibrated one. What is alike in all, far from zero, are false matches.",
+        "Histograms of the residuals in X and Y for each band: calibration makes a narrow peak.",
+    )
 
 
-def correlation_curves(bands: tuple[BandResult, ...]) -> Figure:
-    """Correlation of mean residuals of bins against their separation, with what noise gives.
-
-    Parameters
-    ----------
-    bands : tuple of BandResult
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+@BANDS.figure("structure", printed=True)
+def correlation(inputs: BandsInput) -> Plot:
+    """Correlation of mean residuals of bins against their separation, with what noise gives."""
+    bands = inputs.bands
     columns = min(2, len(bands))
     rows = -(-len(bands) // columns)
     with figure_style():
@@ -111,7 +104,13 @@ def correlation_curves(bands: tuple[BandResult, ...]) -> Figure:
             ax.set_ylabel("mean product [10⁻⁶ pix²]")
         handles, labels = axes[0].get_legend_handles_labels()
         fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
-    return fig
+    return Plot(
+        fig,
+        "Correlation of mean residuals",
+        "Mean product of the residuals of two bins by their separation; what noise makes of it is"
+        " subtracted. Points beyond the shaded bands are structure that the polynomial leaves.",
+        "Curves of the correlation of residuals against separation for each band.",
+    )
 
 
 def chance_of(p: float) -> str:

@@ -7,17 +7,17 @@ from collections.abc import Iterator
 import numpy as np
 
 from bayesdist.assess.wise.account import LONGEST_DIFFERENCES
-from bayesdist.report.bands.context import BandResult, BandsInput
+from bayesdist.report.bands.context import BANDS, BandResult, BandsInput
 from bayesdist.report.bands.curves import CASES, chance_of
-from bayesdist.report.numerals import MISSING, count, number, percent, probability
-from bayesdist.report.scales import display_scale
-from bayesdist.report.tables.text import TextTable
+from bayesdist.report.numbers import MISSING, count, number, percent, probability, size_of
+from bayesdist.report.texttable import TextTable, listing
 
 __all__ = [
     "coverage_table",
     "formal_table",
     "histogram_table",
     "overview_table",
+    "provenance_table",
     "structure_table",
     "vector_table",
 ]
@@ -25,6 +25,7 @@ __all__ = [
 SAME_VECTOR = 0.005  # of the printed maximum
 
 
+@BANDS.table("overview")
 def overview_table(inputs: BandsInput) -> TextTable:
     """A line for each band, what matters most."""
     columns = ["Band", "Converged", "Pairs", "Structure", "Longest vector (pix)"]
@@ -61,7 +62,7 @@ def _overview(b: BandResult, *, wise: bool) -> Iterator[str]:
 
 def _length(b: BandResult, value: float) -> str:
     unit = b.formal_map.unit
-    return number(value, 3) if unit == "pix" else display_scale(unit, value).text(value)
+    return number(value, 3) if unit == "pix" else size_of(value, unit)
 
 
 def _structure(b: BandResult) -> str:
@@ -79,6 +80,7 @@ def _counted_out(b: BandResult) -> bool:
     return chance_of(b.correlation.p_value).startswith("p <")
 
 
+@BANDS.table("structure")
 def structure_table(inputs: BandsInput) -> TextTable:
     """Structure left in the residuals, by band and axis."""
     rows: list[tuple[str, ...]] = []
@@ -123,6 +125,7 @@ def structure_table(inputs: BandsInput) -> TextTable:
     )
 
 
+@BANDS.table("vectors")
 def vector_table(inputs: BandsInput) -> TextTable | None:
     """Longest difference vectors; None for one band without an optical model."""
     first = inputs.bands[0]
@@ -156,6 +159,7 @@ def _three(value: float | None) -> str:
     return MISSING if value is None else f"{value:.3f}"
 
 
+@BANDS.table("histograms")
 def histogram_table(inputs: BandsInput) -> TextTable:
     """Half widths of the histograms, and what lies beyond them."""
     rows = []
@@ -191,6 +195,7 @@ def histogram_table(inputs: BandsInput) -> TextTable:
     )
 
 
+@BANDS.table("coverage")
 def coverage_table(inputs: BandsInput) -> TextTable:
     """Pairs in bins against even coverage."""
     rows = []
@@ -218,6 +223,7 @@ def coverage_table(inputs: BandsInput) -> TextTable:
     )
 
 
+@BANDS.table("formal")
 def formal_table(inputs: BandsInput) -> TextTable:
     """Largest formal radii, and what printed ones imply."""
     columns = ["Band", "least squares", "posterior"]
@@ -240,3 +246,9 @@ def formal_table(inputs: BandsInput) -> TextTable:
         )
     unit = "pix" if inputs.bands[0].formal_map.unit == "pix" else "unit as given"
     return TextTable(f"Largest formal radius ({unit})", tuple(columns), tuple(rows), note=note)
+
+
+@BANDS.table("provenance")
+def provenance_table(inputs: BandsInput) -> TextTable:
+    """What made the page."""
+    return listing("", {key: str(value) for key, value in inputs.provenance.items()})

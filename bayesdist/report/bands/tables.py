@@ -9,9 +9,9 @@ import numpy as np
 from bayesdist.assess.wise import STATISTICS
 from bayesdist.assess.wise.account import RowAccount
 from bayesdist.assess.wise.published import PrintedRow
-from bayesdist.report.bands.context import BandsInput
-from bayesdist.report.numerals import MISSING, number, rounded
-from bayesdist.report.tables.text import TextTable
+from bayesdist.report.bands.context import BANDS, BandsInput
+from bayesdist.report.numbers import MISSING, number, rounded
+from bayesdist.report.texttable import TextTable
 
 __all__ = ["account_table", "as_printed", "contradiction_table", "statistics_table", "tables_of"]
 
@@ -23,6 +23,7 @@ TITLES = {
 _HEADS = ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile")
 
 
+@BANDS.table("tables")
 def tables_of(inputs: BandsInput) -> Sequence[TextTable]:
     """Tables 5-1 to 5-3 with their accounts."""
     return [
@@ -116,6 +117,7 @@ def _why(one: RowAccount) -> str:
     return f"{where} has systematic errors of its own"
 
 
+@BANDS.table("tables")
 def contradiction_table(inputs: BandsInput) -> TextTable | None:
     """Where printed rows contradict themselves or each other; None where nothing is printed."""
     rows = [

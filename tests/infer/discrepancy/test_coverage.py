@@ -7,10 +7,10 @@ import os
 import numpy as np
 import pytest
 
-from bayesdist.assess.discrepancy_terms import structure_term
-from bayesdist.assess.grid import grid_pixels, mesh
+from bayesdist.assess.terms.correlated import structure_term
 from bayesdist.errors import InputError
 from bayesdist.infer.discrepancy import DiscrepancyPriors, estimate_discrepancy
+from bayesdist.model.grid import grid_pixels, mesh
 from tests.infer.discrepancy.skies import SIZE, matched, smooth
 
 FULL = "BAYESDIST_FULL" in os.environ

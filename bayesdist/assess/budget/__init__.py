@@ -1,0 +1,1 @@
+"""The error budget: of a detector, of a position, and as a function of where one looks."""

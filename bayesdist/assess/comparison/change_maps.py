@@ -1,0 +1,193 @@
+"""A change of a released solution as maps over the detector, and in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as fisher
+
+from bayesdist.assess.comparison.compare import SIGNIFICANT, Comparison, compare
+from bayesdist.assess.comparison.sentences import probability
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.diagnose.residuals.misfit import Misfit
+from bayesdist.infer.compare.change_date import ChangeDate
+from bayesdist.infer.compare.monitoring import Change
+from bayesdist.model.grid import DEFAULT_GRID
+
+__all__ = ["Monitored", "change_maps", "is_late"]
+
+
+@dataclass(frozen=True, eq=False)
+class Monitored:
+    """What new matches say of a release.
+
+    Parameters
+    ----------
+    change : Change
+    maps : tuple of Comparison
+        New minus released, one for each chip, in pixels: the mean change, or that from its date on.
+    date : ChangeDate, optional
+        None for matches without epochs.
+    misfit : Misfit
+        Structure that even the fit of the new matches leaves.
+    pixel_mas : float, optional
+    """
+
+    change: Change
+    maps: tuple[Comparison, ...]
+    date: ChangeDate | None
+    misfit: Misfit
+    pixel_mas: float | None = None
+
+    @property
+    def scatters(self) -> bool:
+        """Whether periods scatter more than their errors, so that these are not independent."""
+        return self.date is not None and self.date.p_scatter < SIGNIFICANT
+
+    @property
+    def p_value(self) -> float:
+        """Probability that chance makes as large a mean change.
+
+        By the scatter of the periods in place of the errors where it is significantly larger.
+        """
+        test = self.change.test
+        return self._judged(test.chi2, test.dof, test.p_value)
+
+    @property
+    def p_since(self) -> float | None:
+        """Probability that chance makes as large a change at one of several dates."""
+        if self.date is None or len(self.date.gain) == 1:
+            return None
+        gain, n = float(self.date.gain.max()), len(self.date.gain)
+        alone = self.date.p_value / n
+        return min(1.0, n * self._judged(gain, self.date.dof, alone))
+
+    def _judged(self, chi2: float, dof: int, p: float) -> float:
+        if not self.scatters or self.date is None:
+            return p
+        return float(fisher.sf(chi2 / dof / self.date.scatter, dof, self.date.scatter_dof))
+
+    @property
+    def p_either(self) -> float:
+        """Probability of both tests together: twice the smaller one."""
+        return (
+            self.p_value if self.p_since is None else min(1.0, 2 * min(self.p_value, self.p_since))
+        )
+
+    @property
+    def changed(self) -> bool:
+        """Whether the release no longer describes the matches."""
+        return self.p_either < SIGNIFICANT
+
+    @property
+    def since_a_date(self) -> bool:
+        """Whether the change is told from a date on, which is more significant than the mean."""
+        return is_late(self.change, self.date)
+
+    @property
+    def worst(self) -> Comparison:
+        """The chip with the largest change."""
+        return max(self.maps, key=lambda m: m.largest)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        m, late = self.worst, self.since_a_date
+        test = self.date.change.test if late and self.date is not None else self.change.test
+        x, y = m.position_of_largest
+        chip = f" of chip {m.a.chip}" if len(self.maps) > 1 else ""
+        mas = "" if self.pixel_mas is None else f" ({m.largest * self.pixel_mas:.3g} mas)"
+        size = (
+            f"{m.rms:.3g} pix rms where errors alone make {m.noise_rms:.2g}, at most "
+            f"{m.largest:.3g} +- {m.sigma_of_largest:.2g} pix{mas} at ({x:.0f}, {y:.0f}){chip}"
+        )
+        told = (
+            f"chi-square {test.chi2:.4g} for {test.dof} degrees of freedom, "
+            f"{probability(self.p_either)}"
+        )
+        if self.date is not None and len(self.date.gain) > 1:
+            told += " with the search over dates"
+        if not self.changed:
+            return f"The released solution still describes the new matches: change {size} ({told})."
+        return (
+            f"The released solution no longer describes the new matches: change {size} ({told})"
+            f"{self._since}."
+        )
+
+    @property
+    def _since(self) -> str:
+        date = self.date
+        if date is None:
+            return "; since when is not known without epochs"
+        if not np.isfinite(date.after):
+            when = "from the first new exposure on or before"
+        else:
+            when = f"since a date between {date.after:.3f} and {date.before:.3f}"
+        low, high = date.interval
+        if np.isfinite(low):
+            return f"; {when} (95 %: {low:.3f} to {high:.3f})"
+        return f"; {when} (95 %: not after {high:.3f})"
+
+    @property
+    def doubts(self) -> list[str]:
+        """What else a reader has to know."""
+        out = []
+        if self.scatters and self.date is not None:
+            out.append(
+                f"periods scatter {np.sqrt(self.date.scatter):.2g} times their errors: errors are "
+                "correlated or too small, and the probabilities rest on the scatter instead"
+            )
+        if self.misfit.significant:
+            out.append(self.misfit.sentence)
+        return out
+
+
+def is_late(change: Change, date: ChangeDate | None) -> bool:
+    """Whether a change within the new matches is significant, and more so than the mean change."""
+    if date is None or not np.isfinite(date.after):
+        return False
+    return date.p_value < min(SIGNIFICANT / 2, change.test.p_value)
+
+
+def change_maps(
+    change: Change,
+    *,
+    rng: np.random.Generator,
+    names: tuple[str, str] = ("new matches", "release"),
+    grid: tuple[int, int] = DEFAULT_GRID,
+) -> tuple[Comparison, ...]:
+    """The change of each chip over its grid.
+
+    Parameters
+    ----------
+    change : Change
+    rng : numpy.random.Generator
+    names : tuple of str
+        Of the new matches and of the release.
+    grid : tuple of int
+
+    Returns
+    -------
+    tuple of Comparison
+        New minus released; whose errors are both in the covariance of the first.
+    """
+    model, out = change.model, []
+    size = 2 * model.n_terms
+    for c, chip in enumerate(model.chips):
+        basis = model.basis(chip.number)
+        rows = slice(c * size, (c + 1) * size)
+        cov = change.cov[rows, rows]
+        old = change.released[c]
+        shared = {"unit": model.unit, "chip": chip.number, "epoch": change.epoch}
+        new = ChipMap(names[0], basis, coefficients=old + change.difference[c], cov=cov, **shared)
+        out.append(
+            compare(
+                new,
+                ChipMap(names[1], basis, coefficients=old, **shared),
+                rng=rng,
+                grid=grid,
+                keep=True,
+            )
+        )
+    return tuple(out)

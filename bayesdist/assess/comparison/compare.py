@@ -1,0 +1,244 @@
+"""Do two calibrations differ, where, by how much, and is it more than their errors?
+
+The chi-square of the whole field needs no choice of how shift, rotation and scale are taken out:
+with the covariance of what remains, every linear way gives the same value, with four degrees of
+freedom fewer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.comparison.frame import CommonFrame, Similarity, common_frame
+from bayesdist.calibration.chip_map import ChipMap, position_moments
+from bayesdist.infer.equations.field_test import FieldTest, field_test, known_terms
+from bayesdist.model.basis import point_blocks
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
+
+__all__ = ["SIGNIFICANT", "Comparison", "compare", "term_sigmas"]
+
+Float = NDArray[np.float64]
+
+SIGNIFICANT = 0.01  # probability under which a difference is called one
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What remains between two calibrations, in pixels of A without distortion.
+
+    Parameters
+    ----------
+    a, b : ChipMap
+    frame : CommonFrame
+        The difference A - B as a polynomial, and what was taken out.
+    x : ndarray, shape (nx,)
+    y : ndarray, shape (ny,)
+        Grid, FITS 1-based pixels.
+    du, dv : ndarray, shape (ny, nx)
+        The difference along x and y.
+    sigma_u, sigma_v, correlation : ndarray, shape (ny, nx), optional
+        Its errors; None without covariance.
+    chi2 : ndarray, shape (ny, nx), optional
+        Of both axes, two degrees of freedom; NaN where the errors are zero.
+    field : FieldTest, optional
+        Of all terms whose errors are known.
+    unknown_rms : float
+        Rms over the detector of the terms that no covariance speaks of; 0 where there are none.
+    largest_z : float, optional
+        Of the Legendre coefficients, in units of their errors.
+    p_largest_z, p_largest_chi2 : float, optional
+        Share of noise fields whose largest ``|z|``, and whose largest chi-square on the grid, is as
+        large: they account for the search.
+    """
+
+    a: ChipMap
+    b: ChipMap
+    frame: CommonFrame
+    x: Float
+    y: Float
+    du: Float
+    dv: Float
+    sigma_u: Float | None
+    sigma_v: Float | None
+    correlation: Float | None
+    chi2: Float | None
+    field: FieldTest | None
+    unknown_rms: float
+    largest_z: float | None
+    p_largest_z: float | None
+    p_largest_chi2: float | None
+
+    @property
+    def similarity(self) -> Similarity:
+        """Shift, rotation and scale between both."""
+        return self.frame.similarity
+
+    @property
+    def length(self) -> Float:
+        """Length of the difference, (ny, nx)."""
+        return np.hypot(self.du, self.dv)
+
+    @property
+    def largest(self) -> float:
+        """Largest difference on the grid."""
+        return float(self.length.max())
+
+    @property
+    def position_of_largest(self) -> tuple[float, float]:
+        """Pixel (x, y) of the largest difference."""
+        return position_of_largest(self.length, self.x, self.y)
+
+    @property
+    def sigma_of_largest(self) -> float | None:
+        """Standard error of the largest difference, along its direction."""
+        if self.sigma_u is None or self.sigma_v is None or self.correlation is None:
+            return None
+        k = np.unravel_index(int(self.length.argmax()), self.length.shape)
+        along = np.array([self.du[k], self.dv[k]]) / max(self.length[k], 1e-300)
+        su, sv, rho = self.sigma_u[k], self.sigma_v[k], self.correlation[k]
+        cov = np.array([[su**2, rho * su * sv], [rho * su * sv, sv**2]])
+        return float(np.sqrt(along @ cov @ along))
+
+    @property
+    def rms(self) -> float:
+        """Rms length of the difference over the detector."""
+        return float(np.sqrt(self.frame.norm @ self.frame.difference.ravel() ** 2))
+
+    @property
+    def noise_rms(self) -> float | None:
+        """Rms length that the errors alone would make."""
+        if self.sigma_u is None or self.frame.cov is None:
+            return None
+        return float(np.sqrt(self.frame.norm @ np.diag(self.frame.cov)))
+
+    @property
+    def errors_of(self) -> str:
+        """Whose errors the significance rests on: 'both', 'A', 'B' or 'none'."""
+        has = [c.cov is not None for c in (self.a, self.b)]
+        return {(True, True): "both", (True, False): "A", (False, True): "B"}.get(
+            (has[0], has[1]), "none"
+        )
+
+    @property
+    def differs(self) -> bool | None:
+        """Whether the difference is more than the errors; None where these are not known."""
+        return None if self.field is None else self.field.p_value < SIGNIFICANT
+
+
+def compare(
+    a: ChipMap,
+    b: ChipMap,
+    *,
+    rng: np.random.Generator,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    keep: bool = False,
+    n_draws: int = 2000,
+) -> Comparison:
+    """Compare two calibrations of one detector.
+
+    Parameters
+    ----------
+    a, b : ChipMap
+        With independent errors.
+    rng : numpy.random.Generator
+        For the probabilities that account for a search.
+    grid : tuple of int
+        Points on x and y.
+    keep : bool
+        Leave shift, rotation and scale in.
+    n_draws : int
+        Noise fields.  No share of them is told below 1 / (n_draws + 1).
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        As `common_frame`; for a bad grid.
+    """
+    frame = common_frame(a, b, keep=keep)
+    basis, d = frame.basis, frame.difference
+    x, y = grid_pixels(basis.size, grid)
+    X, Y = mesh(x, y)
+    shape = (y.size, x.size)
+    phi = np.concatenate([basis.evaluate(X[rows], Y[rows]) for rows in point_blocks(X.size)])
+    du, dv = d @ phi.T
+    tested = frame.cov is not None and a.correlated and b.correlated
+    sigma_u = sigma_v = correlation = chi2 = field = None
+    z_max = p_z = p_chi2 = None
+    unknown = 0.0
+    if tested and frame.cov is not None and frame.raw_cov is not None:
+        K = basis.n_terms
+        uu, vv, uv = position_moments(frame.cov.reshape(2, K, 2, K), basis, X, Y)
+        chi2 = _of_two(du, dv, uu, vv, uv)
+        sigma_u, sigma_v = np.sqrt(uu).reshape(shape), np.sqrt(vv).reshape(shape)
+        product = (sigma_u * sigma_v).ravel()
+        correlation = np.divide(uv, product, out=np.zeros_like(uv), where=product > 0)
+        correlation = np.clip(correlation, -1.0, 1.0).reshape(shape)
+        # of a sum of estimates as Welch and Satterthwaite count them
+        lost = sum(share**2 / c.draws for share, c in zip(frame.shares, (a, b), strict=True))
+        draws = 1.0 / lost if lost > 0 else np.inf
+        field = field_test(d.ravel(), frame.raw_cov, frame.taken, frame.norm, draws=draws)
+        rest = ~known_terms(frame.raw_cov)
+        rest[[0, K]] &= not frame.taken.shape[1]
+        unknown = float(np.sqrt(frame.norm[rest] @ d.ravel()[rest] ** 2))
+        sigma = term_sigmas(frame)
+        noise = rng.standard_normal((n_draws, 2 * K)) @ _root(frame.cov).T
+        z_max, p_z = _largest(d.ravel()[None], noise, sigma)
+        others = np.array([_of_two(*(phi @ n.reshape(2, K).T).T, uu, vv, uv) for n in noise])
+        top = float(np.nanmax(chi2, initial=0.0))
+        p_chi2 = _share(np.nanmax(others, axis=1, initial=0.0), top)
+        chi2 = chi2.reshape(shape)
+    return Comparison(
+        a=a,
+        b=b,
+        frame=frame,
+        x=x,
+        y=y,
+        du=du.reshape(shape),
+        dv=dv.reshape(shape),
+        sigma_u=sigma_u,
+        sigma_v=sigma_v,
+        correlation=correlation,
+        chi2=chi2,
+        field=field,
+        unknown_rms=unknown,
+        largest_z=z_max,
+        p_largest_z=p_z,
+        p_largest_chi2=p_chi2,
+    )
+
+
+def term_sigmas(frame: CommonFrame) -> Float:
+    """Standard deviations (2 K,) of the difference; 0 for terms that were taken out."""
+    assert frame.cov is not None and frame.raw_cov is not None
+    variance = np.diag(frame.cov)
+    return np.sqrt(np.where(variance > 1e-16 * np.diag(frame.raw_cov), variance, 0.0))
+
+
+def _of_two(du: Float, dv: Float, uu: Float, vv: Float, uv: Float) -> Float:
+    """Chi-square of both axes at each point."""
+    det = uu * vv - uv**2
+    value = vv * du**2 - 2 * uv * du * dv + uu * dv**2
+    return np.divide(value, det, out=np.full(det.shape, np.nan), where=det > 1e-12 * uu * vv)
+
+
+def _root(cov: Float) -> Float:
+    values, vectors = np.linalg.eigh(cov)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _largest(difference: Float, noise: Float, sigma: Float) -> tuple[float, float]:
+    """Largest |z|, and the share of noise that has one as large."""
+    known = sigma > 0
+    z = [np.abs(d[:, known] / sigma[known]).max(axis=1, initial=0.0) for d in (difference, noise)]
+    return float(z[0][0]), _share(z[1], float(z[0][0]))
+
+
+def _share(noise: Float, value: float) -> float:
+    return float((1 + (noise >= value).sum()) / (len(noise) + 1))

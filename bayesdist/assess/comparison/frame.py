@@ -1,0 +1,253 @@
+"""Two calibrations laid on each other: the similarity between them, told apart from the rest.
+
+With w = u + i v, mean over the area of the detector,
+
+    w_A = shift + turn w_B + d        (or the conjugate of w_B, where one of them is mirrored)
+
+is solved for shift and turn by least squares over the whole detector.  d is what no shift, rotation
+or scale explains.  It is stated along the axes of the detector, in pixels of A without distortion:
+divided by the linear part of A.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.units import convert
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
+from bayesdist.errors import InputError
+from bayesdist.infer.compare.frame_fields import term_squares
+from bayesdist.model import PolynomialBasis
+
+__all__ = [
+    "CommonFrame",
+    "Similarity",
+    "common_frame",
+    "linear_part",
+]
+
+Float = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+NEAR = 0.1  # radians, or of the scale: axes that lie alike
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """By what shift, rotation and scale A lies off B: w_A = shift + turn w_B.
+
+    Parameters
+    ----------
+    shift : tuple of float
+        Mean over the detector of A minus B, along x and y, pixels; None unless the axes of both lie
+        alike and their units agree.
+    rotation : float
+        Radians, from u towards v.
+    scale : float
+        Of A against B; without meaning where one is in pixels and the other in angles.
+    mirrored : bool
+    same_unit : bool
+        Whether both are in pixels or both in angles.
+    sigma_shift : tuple of float, optional
+    sigma_rotation, sigma_scale : float, optional
+        Standard errors; None where neither side has a covariance, or one has no correlations.
+    """
+
+    shift: tuple[float, float] | None
+    rotation: float
+    scale: float
+    mirrored: bool
+    same_unit: bool
+    sigma_shift: tuple[float, float] | None
+    sigma_rotation: float | None
+    sigma_scale: float | None
+
+    @property
+    def alike(self) -> bool:
+        """Whether the axes of both lie alike, so that shift and scale are a difference."""
+        turned = np.hypot(self.rotation, self.scale - 1.0)
+        return self.same_unit and not self.mirrored and bool(turned < NEAR)
+
+
+@dataclass(frozen=True, eq=False)
+class CommonFrame:
+    """The difference A - B in pixels of A, and what was taken out of it.
+
+    Parameters
+    ----------
+    basis : PolynomialBasis
+        Of the higher of both orders, with the reference pixel of A.
+    difference : ndarray, shape (2, K)
+        Legendre coefficients.
+    cov : ndarray, shape (2 K, 2 K), optional
+        Of the difference, u before v.
+    raw_cov : ndarray, shape (2 K, 2 K), optional
+        The same before anything was taken out.
+    taken : ndarray, shape (2 K, q)
+        Fields that were taken out: of the shift, the scale and the rotation; none where they are
+        kept.
+    shares : tuple of float
+        Share of A and of B in the variances.
+    similarity : Similarity
+    pixel_mas : float or None
+        Size of a pixel of A, where one side tells it.
+    """
+
+    basis: PolynomialBasis
+    difference: Float
+    cov: Float | None
+    raw_cov: Float | None
+    taken: Float
+    shares: tuple[float, float]
+    similarity: Similarity
+    pixel_mas: float | None
+
+    @property
+    def norm(self) -> Float:
+        """Mean square over the detector of each Legendre product, shape (2 K,), u before v."""
+        return term_squares(self.basis)
+
+
+def common_frame(a: ChipMap, b: ChipMap, *, keep: bool = False) -> CommonFrame:
+    """Bring two calibrations to one frame.
+
+    Parameters
+    ----------
+    a, b : ChipMap
+        Of one detector; of any order, reference pixel, orientation, parity and unit.  Their errors
+        are taken as independent.
+    keep : bool
+        Leave shift, rotation and scale in the difference.
+
+    Returns
+    -------
+    CommonFrame
+
+    Raises
+    ------
+    InputError
+        For detectors of different size, a calibration without linear part, or where shift, rotation
+        and scale are to be kept between frames that do not lie alike.
+    """
+    if a.basis.size != b.basis.size:
+        sizes = " and ".join(f"{c.basis.size[0]:g} x {c.basis.size[1]:g}" for c in (a, b))
+        raise InputError(
+            f"the detectors have {sizes} pixels",
+            where=f"{a.name}, {b.name}",
+            do="compare calibrations of one detector",
+        )
+    order = max(a.basis.order, b.basis.order)
+    basis = PolynomialBasis(order, a.basis.size, a.basis.reference_pixel)
+    same_unit = (a.unit == "pix") == (b.unit == "pix")
+    factor = convert(1.0, b.unit, a.unit) if same_unit else 1.0
+    wa, cov_a = a.padded(basis.n_terms)
+    wb, cov_b = b.padded(basis.n_terms)
+    za, zb = wa[0] + 1j * wa[1], factor * (wb[0] + 1j * wb[1])
+    turn, mirrored = turn_between(za, zb, basis, b.name)
+    if mirrored:
+        zb = zb.conj()
+    linear = linear_part(basis, wa, a)
+    to_pixels = np.kron(np.linalg.inv(linear), np.eye(basis.n_terms))
+
+    lies_alike = same_unit and not mirrored and abs(turn - 1.0) < NEAR
+    if keep and not lies_alike:
+        raise InputError(
+            "shift, rotation and scale are no difference between frames "
+            + ("of other axes" if same_unit else f"in {a.unit} and in {b.unit}"),
+            where=f"{a.name}, {b.name}",
+            do="leave out --keep-linear",
+        )
+    used = 1.0 if keep else turn
+    moved = used * zb
+    of_b = np.array([[used.real, -used.imag], [used.imag, used.real]]) * factor
+    if mirrored:
+        of_b = of_b * np.array([1.0, -1.0])
+    parts = [] if cov_a is None else [cov_a]
+    if cov_b is not None:
+        change = np.kron(of_b, np.eye(basis.n_terms))
+        parts.append(change @ cov_b @ change.T)
+    cov = sum(parts[1:], parts[0]) if parts else None
+    shares = (float(cov_a is not None), float(cov_b is not None))
+    if cov is not None and len(parts) == 2:
+        known = np.diag(cov) > 0
+        of_a = float(np.mean(np.diag(parts[0])[known] / np.diag(cov)[known]))
+        shares = (of_a, 1.0 - of_a)
+
+    fields = similarity_fields(moved)
+    weighted = fields * term_squares(basis)[:, None]
+    estimate = np.linalg.solve(fields.T @ weighted, weighted.T)
+    raw = as_real(za - moved)
+    found = estimate @ raw
+    errors = None
+    if cov is not None and a.correlated and b.correlated:
+        errors = estimate @ cov @ estimate.T
+    taken = fields[:, :0] if keep else fields
+    projector = np.eye(len(raw)) - (0.0 if keep else fields @ estimate)
+    out = to_pixels @ projector
+    return CommonFrame(
+        basis=basis,
+        difference=(out @ raw).reshape(2, -1),
+        cov=None if cov is None else _symmetric(out @ cov @ out.T),
+        raw_cov=None if cov is None else _symmetric(to_pixels @ cov @ to_pixels.T),
+        taken=to_pixels @ taken,
+        shares=shares,
+        similarity=_similarity(
+            turn, mirrored, same_unit, lies_alike, linear, za, zb, found, errors
+        ),
+        pixel_mas=_pixel_mas(a, b, linear, turn),
+    )
+
+
+def linear_part(basis: PolynomialBasis, coefficients: Float, a: ChipMap) -> Float:
+    """Derivatives (2, 2) of A's positions by the pixel, at its reference pixel."""
+    linear = basis.to_monomials(coefficients)[:, 1:3]
+    if abs(np.linalg.det(linear)) <= 1e-9 * np.abs(linear).max() ** 2:
+        raise InputError("has a singular linear part", where=a.name, do="check its coefficients")
+    return linear
+
+
+def _symmetric(cov: Float) -> Float:
+    return (cov + cov.T) / 2
+
+
+def _similarity(
+    turn: complex,
+    mirrored: bool,
+    same_unit: bool,
+    lies_alike: bool,
+    linear: Float,
+    za: Complex,
+    zb: Complex,
+    found: Float,
+    errors: Float | None,
+) -> Similarity:
+    inverse = np.linalg.inv(linear)
+    shift = inverse @ as_real((za - zb)[:1])
+    sigma = sigma_shift = None
+    if errors is not None:
+        sigma = np.sqrt(np.maximum(np.diag(errors), 0.0))
+        own = inverse @ errors[:2, :2] @ inverse.T
+        sigma_shift = tuple(np.sqrt(np.maximum(np.diag(own), 0.0)).tolist())
+    return Similarity(
+        shift=(float(shift[0]), float(shift[1])) if lies_alike else None,
+        rotation=float(np.angle(turn)),
+        scale=abs(turn),
+        mirrored=mirrored,
+        same_unit=same_unit,
+        sigma_shift=sigma_shift if lies_alike else None,  # type: ignore[arg-type]
+        sigma_rotation=None if sigma is None else float(sigma[3]),
+        sigma_scale=None if sigma is None else float(sigma[2] * abs(turn)),
+    )
+
+
+def _pixel_mas(a: ChipMap, b: ChipMap, linear: Float, turn: complex) -> float | None:
+    pixel = float(np.sqrt(abs(np.linalg.det(linear))))  # in the unit of A
+    if a.unit != "pix":
+        return convert(pixel, a.unit, "mas")
+    if b.unit != "pix":
+        return convert(pixel / abs(turn), b.unit, "mas")
+    return None

@@ -1,0 +1,204 @@
+"""The gap between chips: does one lie elsewhere against another in A than in B?
+
+Chips are compared one by one, each after its own best shift, rotation and scale.  What these do to
+one chip they have to do to all of them: with the similarity of the reference chip taken out of the
+whole detector, w = u + i v of another chip is
+
+    w_A = shift + (1 + scale + i rotation) (turn w_B - its mean) + d
+
+in which shift, rotation and scale are those of the chip against the reference chip.  They are
+linear in the coefficients of both chips, and so are their errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.comparison.frame import linear_part
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
+from bayesdist.errors import InputError
+from bayesdist.infer.compare.frame_fields import term_squares
+from bayesdist.infer.equations.field_test import FieldTest, field_test
+from bayesdist.model import PolynomialBasis
+
+__all__ = ["ChipPair", "GapDifference", "gap_difference", "pair_of_chips"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ChipPair:
+    """Two chips of one calibration in one plane.
+
+    Parameters
+    ----------
+    reference, other : ChipMap
+        Of one order, in one system of u, v.
+    cov : ndarray, shape (4 K, 4 K), optional
+        Joint covariance of their coefficients: u and v of the reference chip, then of the other.
+    """
+
+    reference: ChipMap
+    other: ChipMap
+    cov: Float | None
+
+
+@dataclass(frozen=True, eq=False)
+class GapDifference:
+    """By what another chip lies off, A minus B, where the reference chips lie on each other.
+
+    Parameters
+    ----------
+    chip, reference : int
+        Chip numbers.
+    values : ndarray, shape (4,)
+        Mean shift over the chip along its x and y, in pixels of A without distortion; scale;
+        rotation from u towards v, radians.
+    cov : ndarray, shape (4, 4), optional
+    test : FieldTest, optional
+        Of all four at once; None without errors on either side.
+    errors_of : str
+        As in `Comparison`.
+    """
+
+    chip: int
+    reference: int
+    values: Float
+    cov: Float | None
+    test: FieldTest | None
+    errors_of: str
+
+    @property
+    def sigma(self) -> Float | None:
+        """Standard errors (4,)."""
+        return None if self.cov is None else np.sqrt(np.maximum(np.diag(self.cov), 0.0))
+
+
+def pair_of_chips(
+    calibration: Calibration, reference: int, other: int, *, epoch: float | None = None
+) -> ChipPair:
+    """Two chips of a calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    reference, other : int
+        Chip numbers.
+    epoch : float, optional
+        Decimal years, for what depends on time.
+
+    Returns
+    -------
+    ChipPair
+        With a covariance where the calibration has one.
+    """
+    maps = calibration.at(epoch, origin="stated")
+    cov = calibration.joint_covariance((reference, other), epoch, origin="stated")
+    return ChipPair(maps[reference], maps[other], cov)
+
+
+def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
+    """Compare where two calibrations have a chip against another one.
+
+    Parameters
+    ----------
+    a, b : ChipPair
+        Of the same chips; of any order, reference pixel, orientation, parity and unit.  Their
+        errors are taken as independent.
+
+    Returns
+    -------
+    GapDifference
+
+    Raises
+    ------
+    InputError
+        For chips of different size, or without linear part.
+    """
+    bases = []
+    for of_a, of_b in ((a.reference, b.reference), (a.other, b.other)):
+        if of_a.basis.size != of_b.basis.size:
+            raise InputError(
+                f"chip {of_a.chip} has another size in each",
+                where=f"{a.other.name}, {b.other.name}",
+                do="compare calibrations of one detector",
+            )
+        order = max(of_a.basis.order, of_b.basis.order)
+        bases.append(PolynomialBasis(order, of_a.basis.size, of_a.basis.reference_pixel))
+    K = bases[0].n_terms
+    both = [[c.padded(K)[0] for c in (pair.reference, pair.other)] for pair in (a, b)]
+    za, zb = ([c[0] + 1j * c[1] for c in one] for one in both)
+    turn, mirrored = turn_between(za[0], zb[0], bases[0], b.reference.name)
+    moved = [turn * (z.conj() if mirrored else z) for z in zb]
+    raw = [as_real(x - y) for x, y in zip(za, moved, strict=True)]
+    fits = [_estimate(similarity_fields(z), basis) for z, basis in zip(moved, bases, strict=True)]
+    # what the similarity of the reference chip does to the other one
+    about = moved[1].copy()
+    about[0] -= moved[0][0]
+    one = np.zeros_like(about)
+    one[0] = 1.0
+    carried = np.stack([as_real(f) for f in (one, 1j * one, about, 1j * about)], axis=1)
+    linear = np.eye(4)
+    linear[:2, :2] = np.linalg.inv(linear_part(bases[1], both[0][1], a.other))
+    estimate = linear @ np.hstack([-fits[1] @ carried @ fits[0], fits[1]])
+    values = estimate @ np.concatenate(raw)
+
+    turned = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
+    if mirrored:
+        turned = turned * np.array([1.0, -1.0])
+    change = np.kron(np.eye(2), np.kron(turned, np.eye(K)))
+    errors = [
+        by @ _padded_pair(pair, K) @ by.T
+        for pair, by in ((a, estimate), (b, estimate @ change))
+        if pair.cov is not None
+    ]
+    has = (a.cov is not None, b.cov is not None)
+    names = {(True, True): "both", (True, False): "A", (False, True): "B"}
+    assert a.other.chip is not None and a.reference.chip is not None
+    cov = sum(errors[1:], errors[0]) if errors else None
+    return GapDifference(
+        a.other.chip,
+        a.reference.chip,
+        values,
+        cov,
+        None if cov is None else _test(values, cov, errors, (a, b), bases[1]),
+        names.get(has, "none"),
+    )
+
+
+def _test(
+    values: Float,
+    cov: Float,
+    errors: list[Float],
+    pairs: tuple[ChipPair, ChipPair],
+    basis: PolynomialBasis,
+) -> FieldTest:
+    """Chi-square of all four, each as what it does to a star at the edge of the chip."""
+    lever = float(np.hypot(*basis.half_size))
+    norm = np.array([1.0, 1.0, lever, lever]) ** 2
+    with_errors = [pair.other for pair in pairs if pair.cov is not None]
+    # of a sum of estimates as Welch and Satterthwaite count them
+    shares = [float(np.mean(np.diag(e) / np.diag(cov))) for e in errors]
+    lost = sum(share**2 / c.draws for share, c in zip(shares, with_errors, strict=True))
+    draws = 1.0 / lost if lost > 0 else np.inf
+    return field_test(values, cov, np.zeros((4, 0)), norm, draws=draws)
+
+
+def _estimate(fields: Float, basis: PolynomialBasis) -> Float:
+    """Least squares over the chip: matrix (4, 2 K) from a difference to what fields explain."""
+    weighted = fields * term_squares(basis)[:, None]
+    return np.asarray(np.linalg.solve(fields.T @ weighted, weighted.T))
+
+
+def _padded_pair(pair: ChipPair, n_terms: int) -> Float:
+    """Joint covariance with zeros for terms that are not there."""
+    assert pair.cov is not None
+    K = pair.reference.basis.n_terms
+    out = np.zeros((4, n_terms, 4, n_terms))
+    out[:, :K, :, :K] = pair.cov.reshape(4, K, 4, K)
+    return out.reshape(4 * n_terms, -1)

@@ -1,0 +1,220 @@
+"""A comparison in words: the verdict, what was taken out, and on whose errors it rests."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import norm
+
+from bayesdist.assess.comparison.compare import SIGNIFICANT, Comparison
+from bayesdist.assess.comparison.gap import GapDifference
+from bayesdist.assess.comparison.tables import comparison_table
+
+__all__ = ["comparison_lines", "gap_lines", "gap_verdict", "probability", "verdict"]
+
+IDENTICAL = 1e-9  # pixels
+
+
+def probability(p: float) -> str:
+    """A probability as it is read."""
+    return "p < 1e-12" if p < 1e-12 else f"p = {p:.2g}"
+
+
+def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
+    """One sentence: whether the calibrations differ, by how much, and how sure that is.
+
+    Parameters
+    ----------
+    found : Comparison
+    pixel_mas : float, optional
+        Size of a pixel, where neither side tells it.
+
+    Returns
+    -------
+    str
+    """
+    size = (
+        f"{_length(found.rms, found, pixel_mas)} rms, at most "
+        f"{_length(found.largest, found, pixel_mas)}"
+    )
+    if found.sigma_of_largest is not None and found.sigma_of_largest > 0:
+        size += f" +- {found.sigma_of_largest:.2g} pix"
+    x, y = found.position_of_largest
+    size += f" at ({x:.0f}, {y:.0f})"
+    if found.largest < IDENTICAL:
+        return "The calibrations agree to rounding."
+    if found.field is None:
+        return f"The calibrations differ by {size}; {_why_untested(found)}."
+    test = (
+        f"chi-square {found.field.chi2:.4g} for {found.field.dof} degrees of freedom, "
+        f"{probability(found.field.p_value)}"
+    )
+    if found.differs:
+        return f"The calibrations differ significantly: {size} ({test})."
+    return f"No significant difference: {size}, which is within the errors ({test})."
+
+
+def comparison_lines(found: Comparison) -> list[str]:
+    """What stands below the verdict.
+
+    Parameters
+    ----------
+    found : Comparison
+
+    Returns
+    -------
+    list of str
+    """
+    kept = not found.frame.taken.shape[1]
+    lines = [
+        f"{letter}  {c.name}: order {c.basis.order}, in {c.unit}"
+        + (f", chip {c.chip}" if c.chip is not None else "")
+        + (f", at {c.epoch:g}" if c.epoch is not None else "")
+        + f", errors: {_errors(c.errors)}"
+        + "".join(f"; {note}" for note in c.notes)
+        for letter, c in (("A", found.a), ("B", found.b))
+    ]
+    lines.append("kept in the difference:" if kept else "taken out of the difference:")
+    lines += [f"  {line}" for line in _similarity(found)]
+    if found.errors_of in ("A", "B"):
+        other = "B" if found.errors_of == "A" else "A"
+        lines.append(f"only {found.errors_of} has errors: the significance takes {other} for exact")
+    if found.noise_rms is not None:
+        lines.append(f"the errors alone would make {found.noise_rms:.2g} pix rms")
+    if found.p_largest_z is not None and found.p_largest_chi2 is not None:
+        lines.append(
+            f"largest |z| of the coefficients {found.largest_z:.3g}: as large somewhere by chance "
+            f"with {_share(found.p_largest_z)}; largest chi-square on the grid "
+            f"{np.nanmax(found.chi2, initial=0.0):.3g}: {_share(found.p_largest_chi2)}"
+        )
+    if found.field is None and found.errors_of != "none":
+        lines.append(_singly(found))
+    if found.unknown_rms > IDENTICAL:
+        lines.append(
+            f"not tested: {found.unknown_rms:.3g} pix rms in terms that only one side has, "
+            "and of which no covariance speaks"
+        )
+    return lines
+
+
+def _singly(found: Comparison) -> str:
+    """The most significant coefficient, where each can only be tested by itself."""
+    table = comparison_table(found)
+    z = np.abs(np.asarray(table["z"], float))
+    tested = int(np.isfinite(z).sum())
+    if not tested:
+        return "no coefficient can be tested"
+    k = int(np.nanargmax(z))
+    row = table[k]
+    p = min(1.0, tested * 2 * float(norm.sf(z[k])))  # Bonferroni: correlations are not known
+    return (
+        f"most significant of {tested} coefficients: x^{row['i']} y^{row['j']} of {row['axis']}, "
+        f"{z[k]:.3g} sigma, {_share(p)} for the largest of so many"
+    )
+
+
+def _similarity(found: Comparison) -> list[str]:
+    s = found.similarity
+    out = []
+    if s.shift is not None:
+        for axis in (0, 1):
+            sigma = None if s.sigma_shift is None else s.sigma_shift[axis]
+            out.append(f"shift in {'xy'[axis]}  {_measured(s.shift[axis], sigma)} pix")
+    else:
+        out.append("shift       not comparable: the axes or units are different")
+    if s.mirrored:
+        out.append("parity      A and B are mirrored against each other")
+    degrees = np.degrees(s.rotation)
+    sigma = None if s.sigma_rotation is None else float(np.degrees(s.sigma_rotation))
+    out.append(f"rotation    {_measured(float(degrees), sigma)} deg")
+    if s.same_unit:
+        out.append(f"scale - 1   {_measured(s.scale - 1.0, s.sigma_scale)}")
+    else:
+        out.append(
+            f"scale       {s.scale:.8g} {found.a.unit} of A for one {found.b.unit} of B: "
+            "no difference can be told"
+        )
+    return out
+
+
+def _measured(value: float, sigma: float | None) -> str:
+    """A value with its error and significance."""
+    if sigma is None:
+        return f"{value:+.4g} (no errors given)"
+    if not sigma > 0:
+        return f"{value:+.4g}"
+    return f"{value:+.4g} +- {sigma:.2g} ({abs(value) / sigma:.1f} sigma)"
+
+
+def gap_verdict(gap: GapDifference) -> str:
+    """One sentence: whether a chip lies elsewhere against the reference chip.
+
+    Parameters
+    ----------
+    gap : GapDifference
+
+    Returns
+    -------
+    str
+    """
+    chips, d = f"against chip {gap.reference}", float(np.hypot(*gap.values[:2]))
+    if np.abs(gap.values).max() < IDENTICAL:
+        return f"Chip {gap.chip} lies alike {chips}, to rounding."
+    size = f"{d:.3g} pix from where B has it"
+    if gap.test is None:
+        return f"Chip {gap.chip} lies {size} {chips}; neither gives errors of the gap."
+    test = (
+        f"shift, rotation and scale together: chi-square {gap.test.chi2:.4g} for {gap.test.dof} "
+        f"degrees of freedom, {probability(gap.test.p_value)}"
+    )
+    if gap.errors_of != "both":
+        test += f", on the errors of {gap.errors_of} alone"
+    if gap.test.p_value < SIGNIFICANT:
+        return f"Chip {gap.chip} lies elsewhere {chips}, significantly: {size} ({test})."
+    return f"Chip {gap.chip} lies alike {chips} within the errors: {size} ({test})."
+
+
+def gap_lines(gap: GapDifference) -> list[str]:
+    """What stands below it: A minus B, the reference chips laid on each other.
+
+    Parameters
+    ----------
+    gap : GapDifference
+
+    Returns
+    -------
+    list of str
+    """
+    sigma = [None] * 4 if gap.sigma is None else gap.sigma.tolist()
+    shift_x, shift_y, scale, turn = zip(gap.values.tolist(), sigma, strict=True)
+    degrees = [None if part is None else float(np.degrees(part)) for part in turn]
+    assert degrees[0] is not None
+    return [
+        f"  shift in x  {_measured(*shift_x)} pix",
+        f"  shift in y  {_measured(*shift_y)} pix",
+        f"  rotation    {_measured(degrees[0], degrees[1])} deg",
+        f"  scale - 1   {_measured(*scale)}",
+    ]
+
+
+def _errors(kind: str) -> str:
+    return {
+        "none": "none given",
+        "sigma": "standard deviations without correlations",
+        "covariance": "full covariance",
+    }[kind]
+
+
+def _why_untested(found: Comparison) -> str:
+    if found.errors_of == "none":
+        return "neither gives errors, so that nothing can be said of significance"
+    return "errors are given without their correlations: only single coefficients can be tested"
+
+
+def _share(p: float) -> str:
+    return f"p = {p:.2g}" + (" (significant)" if p < SIGNIFICANT else "")
+
+
+def _length(value: float, found: Comparison, pixel_mas: float | None) -> str:
+    scale = pixel_mas or found.frame.pixel_mas
+    text = f"{value:.3g} pix"
+    return text if scale is None else f"{text} ({value * scale:.3g} mas)"

@@ -1,0 +1,350 @@
+"""Dither patterns compared by the covariance that a self-calibration from them would have.
+
+Nothing is detected and no noise is drawn: only where stars fall, by the density of a field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
+from bayesdist.data.detections import Detections
+from bayesdist.errors import InputError
+from bayesdist.infer.selfcal.expected import ExpectedSolution, expected_solution
+from bayesdist.infer.selfcal.information import (
+    Information,
+    frame_information,
+    pointing_information,
+    tie,
+)
+from bayesdist.infer.selfcal.moves import POINTS, functionals, moves
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.grid import outline_pixels
+from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
+from bayesdist.simulate.patterns import DitherPattern
+
+__all__ = [
+    "KINDS",
+    "Beforehand",
+    "Camera",
+    "PlannedPattern",
+    "PlannedStars",
+    "compare_patterns",
+]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+KINDS = ("gauge-free", "shape", "absolute")
+LEAST_SHARED = 3  # stars that two exposures share at least, if they overlap at all
+MOST_STARS = 2_000_000  # of the sky that all patterns see together
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A detector as it is planned for.
+
+    Parameters
+    ----------
+    chips : tuple of Chip
+    coefficients : ndarray, shape (chips, 2, K)
+        Legendre coefficients of its distortion, in pixels: how chips lie matters most.
+    frames : str
+        What is free in each exposure.
+    """
+
+    chips: tuple[Chip, ...]
+    coefficients: Float
+    frames: str = "shift_rotation"
+
+    @property
+    def pixels(self) -> float:
+        """Number of pixels."""
+        return float(sum(np.prod(chip.size) for chip in self.chips))
+
+    @cached_property
+    def side(self) -> float:
+        """The smaller side of what all chips cover, pixels."""
+        one = np.zeros((1, 2)), np.zeros(1)
+        model, theta = dithered_model(self.chips, self.coefficients, *one)
+        points = np.concatenate(
+            [model.predict(theta, *outline_pixels(c.size), chip=c.number) for c in self.chips]
+        )
+        return float(np.ptp(points, axis=0).min())
+
+
+@dataclass(frozen=True)
+class PlannedStars:
+    """A field of stars, and how well they are detected.
+
+    Parameters
+    ----------
+    per_detector : float
+        Detections of one exposure, on average.
+    sigma : float
+        Error of a detection on one axis, pixels.
+    false : float
+        Share of the detections that are false: they say nothing.
+    least : int
+        Fewest detections of a star that is used.
+    seed : int
+    """
+
+    per_detector: float
+    sigma: float
+    false: float = 0.0
+    least: int = 2
+    seed: int = 1
+
+
+@dataclass(frozen=True)
+class Beforehand:
+    """What will be known beside the detections; None for what is not.
+
+    Parameters
+    ----------
+    offset_sigma : float, optional
+        Error of a commanded offset on one axis, pixels.
+    roll_sigma : float, optional
+        Of a commanded roll, radians.
+    exposure_scale_sigma : float, optional
+        Scatter of the exposures' scales.
+    scale_sigma : float, optional
+        Relative error of the size of a pixel.
+    """
+
+    offset_sigma: float | None = None
+    roll_sigma: float | None = None
+    exposure_scale_sigma: float | None = None
+    scale_sigma: float | None = None
+
+    def information(
+        self, model: DistortionModel, theta: Float, pattern: DitherPattern
+    ) -> Information:
+        """All of it, at a truth."""
+        out, n = Information.none(theta), len(pattern)
+        if self.offset_sigma is not None:
+            # rolls are about the middle of all chips: a pixel elsewhere moves with the roll
+            middles = [(c.number, (c.size[0] + 1) / 2, (c.size[1] + 1) / 2) for c in model.chips]
+            sigma = np.full(n, self.offset_sigma)
+            out = out + pointing_information(model, theta, pattern.offsets, sigma, pixels=middles)
+        if self.roll_sigma is not None:
+            rolls = pattern.rolls
+            out = out + frame_information(model, theta, "rotation", rolls, self.roll_sigma)
+        if self.exposure_scale_sigma is not None:
+            scatter = self.exposure_scale_sigma
+            out = out + frame_information(model, theta, "scale", np.zeros(n), scatter)
+        if self.scale_sigma is not None:
+            out = out + tie(theta, functionals(model, theta)["scale"], 0.0, self.scale_sigma)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPattern:
+    """What a pattern would give.
+
+    Parameters
+    ----------
+    pattern : DitherPattern
+    camera : Camera
+    solution : ExpectedSolution
+    maps : dict of str to tuple of UncertaintyMap, or None
+        Of each chip, by kind:
+
+        'gauge-free'   without whatever the detections of this pattern leave free;
+        'shape'        without shift, rotation and scale of the sky: the same for all patterns;
+        'absolute'     without the zero point alone.
+
+        None where nothing bounds the errors.
+    """
+
+    pattern: DitherPattern
+    camera: Camera
+    solution: ExpectedSolution
+    maps: dict[str, tuple[UncertaintyMap, ...] | None]
+
+    def radii(self, kind: str) -> Float:
+        """Radial errors (1 sigma) at all places of the grid, pixels; infinite where unbounded."""
+        maps = self.maps[kind]
+        return (
+            np.array([np.inf]) if maps is None else np.concatenate([m.radius.ravel() for m in maps])
+        )
+
+    def rms(self, kind: str) -> float:
+        """Root mean square of these."""
+        return float(np.sqrt(np.mean(self.radii(kind) ** 2)))
+
+    def largest(self, kind: str) -> float:
+        """The largest of these."""
+        return float(self.radii(kind).max())
+
+    @property
+    def n_free(self) -> int:
+        """Directions that detections leave free."""
+        return self.solution.gauge.null.shape[1]
+
+    @property
+    def rank(self) -> tuple[bool, float, int, float]:
+        """By which patterns are sorted: shape, where it is bounded, then what is free."""
+        shape = self.rms("shape")
+        return (not np.isfinite(shape), shape, self.n_free, self.rms("gauge-free"))
+
+    @cached_property
+    def by_degree(self) -> dict[int, float]:
+        """Gauge-free rms over the detector of the polynomials of each degree, pixels.
+
+        Legendre polynomials are orthogonal over a chip, and the mean square of P_i P_j is
+        1 / ((2 i + 1) (2 j + 1)).
+        """
+        solution = self.solution
+        model, gauge = solution.model, solution.gauge
+        cov = solution.up_to(gauge.null)
+        assert cov is not None  # what is open is free
+        variance = np.diag(cov)
+        terms = np.array(model.basis().terms)
+        mean_square = 1.0 / np.prod(2 * terms + 1, axis=1)
+        degree = terms.sum(axis=1)
+        of_term = np.zeros(len(terms))
+        for chip in model.chips:
+            share = np.prod(chip.size) / self.camera.pixels
+            for axis in (0, 1):
+                of_term += (
+                    share * variance[model.coefficient_slice(chip.number, axis)] * mean_square
+                )
+        return {
+            int(k): float(np.sqrt(of_term[degree == k].sum())) for k in range(1, model.order + 1)
+        }
+
+    @cached_property
+    def chips_share_stars(self) -> bool:
+        """Whether some star is seen on two chips."""
+        p = self.solution.problem
+        chip = p.groups.chip[p.groups.index]
+        low, high = (f.reduceat(chip, p.starts[:-1]) for f in (np.minimum, np.maximum))
+        return bool((low != high).any())
+
+
+def compare_patterns(
+    patterns: Sequence[DitherPattern],
+    camera: Camera,
+    stars: PlannedStars,
+    known: Beforehand,
+) -> tuple[PlannedPattern, ...]:
+    """What each of some patterns would give, on one sky, the best one first.
+
+    Parameters
+    ----------
+    patterns : sequence of DitherPattern
+    camera : Camera
+    stars : PlannedStars
+    known : Beforehand
+
+    Returns
+    -------
+    tuple of PlannedPattern
+
+    Raises
+    ------
+    InputError
+        For a pattern whose exposures do not overlap, and for too many stars.
+    """
+    truths = [
+        dithered_model(camera.chips, camera.coefficients, p.offsets, p.rolls, frames=camera.frames)
+        for p in patterns
+    ]
+    sky = _sky([sky_seen(*truth) for truth in truths], stars, camera)
+    found = [
+        _planned(pattern, camera, *truth, sky, stars, known)
+        for pattern, truth in zip(patterns, truths, strict=True)
+    ]
+    return tuple(sorted(found, key=lambda one: one.rank))
+
+
+def _sky(corners: Sequence[tuple[Float, Float]], stars: PlannedStars, camera: Camera) -> Float:
+    """Positions (S, 2) over the rectangle that all patterns together see."""
+    low = np.min([c[0] for c in corners], axis=0)
+    high = np.max([c[1] for c in corners], axis=0)
+    mean = stars.per_detector * float(np.prod(high - low)) / camera.pixels
+    if mean > MOST_STARS:
+        raise InputError(
+            f"the patterns together see {mean:.3g} stars",
+            where="stars.per_detector",
+            do=f"give fewer stars or smaller offsets ({MOST_STARS:.0g} stars at most)",
+        )
+    rng = np.random.default_rng(stars.seed)
+    return np.asarray(low + rng.uniform(size=(rng.poisson(mean), 2)) * (high - low))
+
+
+def _planned(
+    pattern: DitherPattern,
+    camera: Camera,
+    model: DistortionModel,
+    truth: Float,
+    sky: Float,
+    stars: PlannedStars,
+    known: Beforehand,
+) -> PlannedPattern:
+    x, y, exposure, chip, star = stars_on_detector(model, truth, sky)
+    # a false detection says nothing, as if it were not there
+    true = np.random.default_rng([stars.seed, 1]).uniform(size=len(x)) >= stars.false
+    x, y, exposure, chip, star = (a[true] for a in (x, y, exposure, chip, star))
+    _require_overlap(pattern, exposure, star)
+    sigma = np.full(len(x), stars.sigma)
+    detections = Detections(
+        x, y, exposure, model.exposures, chip, sigma=sigma, star=star, source=pattern.name
+    )
+    information = known.information(model, truth, pattern)
+    solution = expected_solution(model, truth, detections, information, least=stars.least)
+    move = moves(model, truth)
+    without = {
+        "gauge-free": solution.gauge.null,
+        "shape": _columns(move, *POINTS, "rotation", "scale"),
+        "absolute": _columns(move, *POINTS),
+    }
+    maps = {kind: _maps(solution, directions) for kind, directions in without.items()}
+    return PlannedPattern(pattern, camera, solution, maps)
+
+
+def _columns(move: dict[str, Float], *names: str) -> Float:
+    return np.stack([move[name] for name in names], axis=1)
+
+
+def _maps(solution: ExpectedSolution, directions: Float) -> tuple[UncertaintyMap, ...] | None:
+    cov = solution.up_to(directions)
+    if cov is None:
+        return None
+    seen = replace(solution, cov=cov)
+    return tuple(uncertainty_map(seen, chip=chip.number) for chip in solution.model.chips)
+
+
+def _require_overlap(pattern: DitherPattern, exposure: Int, star: Int) -> None:
+    """Refuse exposures that no stars tie to the others."""
+    E = len(pattern)
+    seen = coo_array(
+        (np.ones(len(star)), (exposure, star)), shape=(E, int(star.max(initial=0)) + 1)
+    ).tocsr()
+    shared = (seen @ seen.T).tocoo()
+    tied = shared.data >= LEAST_SHARED
+    graph = coo_array((tied[tied], (shared.row[tied], shared.col[tied])), shape=(E, E))
+    n, group = connected_components(graph, directed=False)
+    if n == 1:
+        return
+    groups = [np.flatnonzero(group == g) + 1 for g in range(n)]
+    listed = " | ".join(_numbers(g) for g in groups)
+    raise InputError(
+        f"its exposures fall into {n} groups that share no stars: {listed} (numbers of exposures)",
+        where=f"pattern {pattern.name!r}",
+        do="take smaller offsets, or exposures between them",
+    )
+
+
+def _numbers(values: Int, most: int = 6) -> str:
+    text = ", ".join(str(v) for v in values[:most])
+    return text if len(values) <= most else f"{text}, ... ({len(values)} in all)"

@@ -1,0 +1,124 @@
+"""How many more exposures, and when, would meet a requirement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.solution import Solution
+from bayesdist.infer.compare.planning import with_information
+
+__all__ = ["Need", "Schedule", "exposures_needed"]
+
+Float = NDArray[np.float64]
+
+MOST = 4096  # exposures beyond which more are no plan
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """When exposures would be taken.
+
+    Parameters
+    ----------
+    name : str
+    information : ndarray, shape (d, d)
+        Of one exposure about polynomials and drift, on average over the dates of the schedule.
+    """
+
+    name: str
+    information: Float
+
+
+@dataclass(frozen=True)
+class Need:
+    """What a schedule takes.
+
+    Parameters
+    ----------
+    schedule : str
+    exposures : int or None
+        Fewest that meet the requirement; None where even very many would not.
+    probability : float
+        Of meeting the limit, with so many; with very many where none suffice.
+    """
+
+    schedule: str
+    exposures: int | None
+    probability: float
+
+    @property
+    def sentence(self) -> str:
+        """The need in words."""
+        if self.exposures is None:
+            return (
+                f"{self.schedule}: {MOST} exposures would still miss the limit (probability "
+                f"{self.probability:.3g}): what more data do not make smaller is too large"
+            )
+        if not self.exposures:
+            return f"{self.schedule}: met as it is (probability {self.probability:.3g})"
+        return (
+            f"{self.schedule}: {self.exposures} more "
+            f"{'exposure' if self.exposures == 1 else 'exposures'} (probability then "
+            f"{self.probability:.3g})"
+        )
+
+
+def exposures_needed(
+    solution: Solution,
+    schedules: Sequence[Schedule],
+    probability_met: Callable[[Solution], float],
+    asked: float,
+) -> tuple[Need, ...]:
+    """The fewest exposures of each schedule with which a requirement is met.
+
+    Parameters
+    ----------
+    solution : Solution
+        As it is now.
+    schedules : sequence of Schedule
+    probability_met : callable
+        Probability of meeting the requirement with a solution; with the same random numbers each
+        time, so that it rises with the number of exposures.
+    asked : float
+
+    Returns
+    -------
+    tuple of Need
+    """
+    now = probability_met(solution)
+    if now >= asked:
+        return tuple(Need(one.name, 0, now) for one in schedules)
+    return tuple(_need(solution, one, probability_met, asked) for one in schedules)
+
+
+def _need(
+    solution: Solution,
+    schedule: Schedule,
+    probability_met: Callable[[Solution], float],
+    asked: float,
+) -> Need:
+    def reached(n: int) -> float:
+        return probability_met(with_information(solution, n * schedule.information))
+
+    few, many, found = 0, MOST, reached(MOST)
+    if found < asked:
+        return Need(schedule.name, None, found)
+    n = 1
+    while n < many:  # doubling: most needs are small
+        p = reached(n)
+        if p >= asked:
+            many, found = n, p
+            break
+        few, n = n, 2 * n
+    while many - few > 1:
+        middle = (few + many) // 2
+        p = reached(middle)
+        if p >= asked:
+            many, found = middle, p
+        else:
+            few = middle
+    return Need(schedule.name, many, found)

@@ -1,0 +1,1 @@
+"""Requirements, margins with their probabilities, verdicts, and how long they hold."""

@@ -1,0 +1,366 @@
+"""Requirements on the position error, and by what margin a solution meets them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.drawn import Judged, Place, PositionErrors, position_errors
+from bayesdist.assess.requirements.remedy import Remedy, find_remedy
+from bayesdist.assess.requirements.requirement import Requirement
+from bayesdist.assess.requirements.verdict import (
+    Caveat,
+    counting_error,
+    effective_draws,
+    verdict_of,
+)
+from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.terms.field_terms import FieldTerm
+from bayesdist.assess.terms.given import LocalTerm, UserTerm
+from bayesdist.assess.units import convert, pixel_scale_of
+from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.errors import InputError
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.grid import DEFAULT_GRID
+
+__all__ = ["Margin", "Requirement", "check_requirements", "judged_places"]
+
+Float = NDArray[np.float64]
+
+EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
+
+
+@dataclass(frozen=True, eq=False)
+class Margin:
+    """How a solution stands against a requirement.  All lengths are in `unit`.
+
+    Parameters
+    ----------
+    requirement : Requirement
+    value : float
+        Median of the statistic over the draws.
+    interval : tuple of float
+        Central 95 % of the statistic over the draws.
+    margin : float
+        The limit minus the value that the statistic stays at or under with the probability asked
+        for: not negative exactly where `probability_met` is at least that probability.
+    probability_met : float
+        Fraction of draws at or under the limit.
+    mc_error : float
+        Monte-Carlo standard error of `probability_met`.
+    verdict : str
+        'met', 'missed' or 'undecided'.
+    reason : str
+        Why, in words.
+    unit : str
+        The requirement's.
+    epoch : float or None
+        At which it was judged; of a range of epochs the worst one.
+    n_effective : float
+        Independent draws that the draws are worth.
+    draws : ndarray, shape (n,)
+        The statistic of every draw; over a range of epochs the largest.
+    worst : Place
+        Where the error is largest, at that epoch; its size in `unit`.
+    rests_on : tuple of str
+        What the verdict takes for granted or has measured, as clauses.
+    remedy : Remedy or None
+        The term that would have to shrink, and how far, for the requirement to be met; None where
+        it is met, and where there is doubt about all numbers.
+    """
+
+    requirement: Requirement
+    value: float
+    interval: tuple[float, float]
+    margin: float
+    probability_met: float
+    mc_error: float
+    verdict: str
+    reason: str
+    unit: str
+    epoch: float | None
+    n_effective: float
+    draws: Float
+    worst: Place
+    remedy: Remedy | None = None
+    rests_on: tuple[str, ...] = ()
+
+    @property
+    def percent(self) -> float:
+        """The margin in percent of the limit."""
+        return 100.0 * self.margin / self.requirement.limit
+
+
+def check_requirements(
+    solution: Solution,
+    requirements: Sequence[Requirement],
+    *,
+    terms: Sequence[UserTerm] = (),
+    fields: Sequence[FieldTerm] = (),
+    aligned: bool = False,
+    local: Sequence[LocalTerm] = (),
+    centroid: MagnitudeErrors | None = None,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chip: int | None = None,
+    n_draws: int = 2000,
+    rng: np.random.Generator,
+    pixel_scale: float | None = None,
+    converged: bool | None = None,
+    caveats: Sequence[Caveat] = (),
+) -> tuple[Margin, ...]:
+    """Judge requirements on draws of the position error.
+
+    Each draw is an error field over the grid: a draw of the solution minus its mean (all parts of
+    the model jointly, so with the correlation between positions), plus a draw of every field term
+    that is not among the solution's errors, plus for the systematic terms one Gaussian offset of
+    each axis for the whole field, plus for the random and the local terms an independent Gaussian
+    error at every grid point.  The statistic of each field gives a
+    distribution, and the fraction of draws at or under the limit is compared with the probability
+    asked for.
+
+    The field is that of all chips: the same grid on each of them, so that each has the same weight.
+    A draw of the solution and an offset are common to all chips.
+
+    Of a relative error the statistic is that of the differences between two places, over all pairs
+    of points.  Over a range of epochs the draws of everything are the same throughout, and that of
+    the statistic is the largest over nine epochs and the breaks between them.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    requirements : sequence of Requirement
+    terms : sequence of UserTerm
+    fields : sequence of FieldTerm
+    aligned : bool
+        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`:
+        over all chips, also where one is judged.  The user's terms stay as they are given.
+    local : sequence of LocalTerm
+        Measured beside the solution, on this grid.
+    centroid : MagnitudeErrors, optional
+        Errors of centroids, in the unit of the solution: for requirements that name a magnitude.
+    grid : tuple of int
+        Points on x and y.
+    epoch : float, optional
+        For requirements that name none; decimal years.
+    chip : int, optional
+        Chip number, for requirements that name none; all chips by default.
+    n_draws : int
+    rng : numpy.random.Generator
+    pixel_scale : float, optional
+        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+    converged : bool, optional
+        Whether the posterior may be trusted; by default what its convergence says.  If not, every
+        verdict is 'undecided'.
+    caveats : sequence of Caveat
+        Other reasons why the errors may not be as stated.
+
+    Returns
+    -------
+    tuple of Margin
+        In the order of the requirements.
+
+    Raises
+    ------
+    InputError
+        For a requirement without an epoch where the model depends on time, units that need a pixel
+        scale that is not known, an unknown chip, a bad grid, a region without points of the grid, a
+        magnitude without errors by magnitude, or fewer than two draws.
+    """
+    unit = solution.model.unit
+    if pixel_scale is None:
+        pixel_scale = pixel_scale_of(solution, chip)
+    for r in requirements:
+        convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
+    for t in terms:
+        t.sigma(unit, pixel_scale)
+    if not requirements:
+        return ()
+    cases = [judged_places(r, solution.model, epoch=epoch, chip=chip) for r in requirements]
+    errors = position_errors(
+        solution,
+        terms=terms,
+        fields=[term for term in fields if term.without is None],
+        aligned=aligned,
+        local=local,
+        centroid=centroid,
+        grid=grid,
+        n_draws=n_draws,
+        rng=rng,
+        pixel_scale=pixel_scale,
+    )
+    wanted: dict[Judged, set[str]] = {}
+    for r, case in zip(requirements, cases, strict=True):
+        for judged in case:
+            wanted.setdefault(judged, set()).add(r.statistic)
+    ways, found = (errors, *errors.varied()), {}
+    for judged, names in wanted.items():
+        owner = next(r for r, case in zip(requirements, cases, strict=True) if judged in case)
+        try:
+            found[judged] = [one.statistics(judged, sorted(names)) for one in ways]
+        except InputError as error:  # of its region, separation or magnitude
+            raise InputError(
+                error.cause, where=f"{owner.where}, {error.where}", do=error.do
+            ) from None
+
+    caveats = (*_not_converged(solution, converged), *caveats)
+    n_effective = effective_draws(solution, n_draws)
+    margins = []
+    for r, case in zip(requirements, cases, strict=True):
+        factor = convert(1.0, unit, r.unit, pixel_scale)
+        extremes = [
+            _margin(r, case, draws, way, factor, n_effective, caveats)
+            for way, *draws in zip(
+                ways,
+                *([factor * one[r.statistic] for one in found[judged]] for judged in case),
+                strict=True,
+            )
+        ]
+        margins.append(_of_extremes(extremes, [t.name for t in terms if t.varies], caveats))
+    return tuple(margins)
+
+
+def judged_places(
+    requirement: Requirement,
+    model: DistortionModel,
+    *,
+    epoch: float | None = None,
+    chip: int | None = None,
+) -> tuple[Judged, ...]:
+    """Where and when a requirement is judged: one for each epoch.
+
+    Parameters
+    ----------
+    requirement : Requirement
+    model : DistortionModel
+    epoch, chip
+        For a requirement that names none.
+
+    Returns
+    -------
+    tuple of Judged
+
+    Raises
+    ------
+    InputError
+        For an unknown chip, a missing epoch, a range of epochs where nothing depends on time, and a
+        polygon that is not said to lie on one of several chips.
+    """
+    r = requirement
+    epochs: list[float | None] = [r.epoch if r.epoch is not None else epoch]
+    if r.epochs is not None:
+        if model.time is None:
+            raise InputError(
+                "it names a range of epochs, and the model does not depend on time",
+                where=r.where,
+                do="leave epochs out, or give the model time-dependent terms",
+            )
+        first, last = r.epochs
+        inner = [b for b in model.time.breaks if first < b < last]
+        # a break belongs to what follows it: just before it the earlier drift has run longest
+        before = [np.nextafter(b, first) for b in inner]
+        epochs = sorted({*np.linspace(first, last, EPOCHS).tolist(), *inner, *before})
+    elif epochs[0] is None and model.time is not None:
+        raise InputError(
+            "the model depends on time and no epoch is given",
+            where=r.where,
+            do="give the requirement an epoch, or set assess.epoch",
+        )
+    chips = _chips_of(r, model, chip, epochs[0])
+    if not isinstance(r.region, str) and len(chips) > 1:
+        raise InputError(
+            "a polygon lies on one chip, and all chips are judged",
+            where=r.where,
+            do=f"name its chip, one of {', '.join(str(c.number) for c in chips)}",
+        )
+    return tuple(Judged(chips, t, r.region, r.relative, r.separation, r.magnitude) for t in epochs)
+
+
+def _chips_of(
+    requirement: Requirement, model: DistortionModel, chip: int | None, epoch: float | None
+) -> tuple[Chip, ...]:
+    """The chips whose field is judged."""
+    number = chip if requirement.chip is None else requirement.chip
+    if requirement.chip is not None and number not in [c.number for c in model.chips]:
+        raise InputError(
+            f"there is no chip {number}",
+            where=requirement.where,
+            do=f"name one of {', '.join(str(c.number) for c in model.chips)}, or leave chip out "
+            "for all of them",
+        )
+    if number is None:
+        return model.chips
+    return (place_of(model, epoch=epoch, chip=number).chip,)
+
+
+def _of_extremes(
+    margins: Sequence[Margin], names: Sequence[str], caveats: Sequence[Caveat]
+) -> Margin:
+    """The less favourable margin, with a verdict that holds for all of them."""
+    worse = min(margins, key=lambda m: m.probability_met)
+    if worse.verdict != "missed" or all(m.verdict == "missed" for m in margins):
+        return worse
+    better = max(margins, key=lambda m: m.probability_met)
+    vary = "varies" if len(names) == 1 else "vary"
+    reason = (
+        f"it depends on how {' and '.join(names)} {vary} over the field: as one offset, a smooth "
+        f"field, or independent errors, P(met) is {worse.probability_met:.3g} to "
+        f"{better.probability_met:.3g}"
+    )
+    texts = [*(one.text for one in caveats), reason]
+    return replace(worse, verdict="undecided", reason="; ".join(texts))
+
+
+def _not_converged(solution: Solution, converged: bool | None) -> tuple[Caveat, ...]:
+    """Why draws cannot be trusted, where they cannot."""
+    convergence = getattr(solution, "convergence", None)
+    if converged is None:
+        converged = convergence is None or bool(convergence.converged)
+    if converged:
+        return ()
+    reasons = "; ".join(getattr(convergence, "reasons", ()))
+    text = "the posterior is not converged" + (f": {reasons}" if reasons else "")
+    return (Caveat(text, larger=False),)
+
+
+def _margin(
+    requirement: Requirement,
+    case: Sequence[Judged],
+    by_epoch: Sequence[Float],
+    errors: PositionErrors,
+    factor: float,
+    n_effective: float,
+    caveats: Sequence[Caveat],
+) -> Margin:
+    asked = requirement.probability
+    draws = np.max(by_epoch, axis=0)
+    worst_epoch = case[int(np.argmax([np.quantile(d, asked) for d in by_epoch]))]
+    met = float(np.mean(draws <= requirement.limit))
+    low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
+    # the empirical quantile without interpolation, so that its side of the limit agrees with `met`
+    reached = np.quantile(draws, asked, method="inverted_cdf")
+    verdict, reason = verdict_of(met, n_effective, asked, caveats)
+    axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""
+    place = errors.worst(worst_epoch, axis)
+    remedy = None
+    if verdict == "missed" and not caveats:
+        remedy = find_remedy(errors, requirement, worst_epoch, factor)
+    return Margin(
+        requirement=requirement,
+        value=float(median),
+        interval=(float(low), float(high)),
+        margin=float(requirement.limit - reached),
+        probability_met=met,
+        mc_error=counting_error(met, n_effective),
+        verdict=verdict,
+        reason=reason,
+        unit=requirement.unit,
+        epoch=worst_epoch.epoch,
+        n_effective=n_effective,
+        draws=draws,
+        worst=replace(place, rms=factor * place.rms),
+        remedy=remedy,
+    )

@@ -1,0 +1,99 @@
+"""Which term of the error would have to shrink, and how far, for a requirement to be met."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesdist.assess.drawn import Judged, PositionErrors
+from bayesdist.assess.requirements.requirement import Requirement
+
+__all__ = ["Remedy", "find_remedy"]
+
+DRAWS = 1000  # a factor is wanted to a percent or two
+STEPS = 9  # halvings of the interval in which the factor lies
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """What would have to shrink.
+
+    Parameters
+    ----------
+    term : str
+        Where one term can do it alone, that which has to shrink least; else the largest one.
+    factor : float
+        By which its error must be multiplied; 0 where it cannot do it alone.
+    now, needed : float
+        Its radial rms over the places that are judged, in the requirement's unit.
+    enough : bool
+        Whether the requirement is met then, the other terms being as they are.
+    unit : str
+    """
+
+    term: str
+    factor: float
+    now: float
+    needed: float
+    enough: bool
+    unit: str
+
+    @property
+    def sentence(self) -> str:
+        """The remedy in words."""
+        if not self.enough:
+            return (
+                f"no term can do it alone: the largest, {self.term} ({self.now:.3g} {self.unit} "
+                "rms), could vanish and the limit would still be missed"
+            )
+        return (
+            f"it would be met if {self.term} fell from {self.now:.3g} to {self.needed:.3g} "
+            f"{self.unit} rms, all else being as it is"
+        )
+
+
+def find_remedy(
+    errors: PositionErrors, requirement: Requirement, judged: Judged, factor: float
+) -> Remedy:
+    """The term of which the least shrinking meets a requirement.
+
+    Each term by itself is multiplied by a number between 0 and 1, with the same draws throughout.
+
+    Parameters
+    ----------
+    errors : PositionErrors
+    requirement : Requirement
+    judged : Judged
+        Where, and at the worst epoch.
+    factor : float
+        Unit of the solution, in the unit of the requirement.
+
+    Returns
+    -------
+    Remedy
+    """
+    n = min(DRAWS, errors.n_draws)
+    statistic = requirement.statistic
+
+    def met(term: str, size: float) -> bool:
+        found = errors.statistics(judged, [statistic], shrink={term: size}, n_draws=n)
+        return bool(
+            np.mean(factor * found[statistic] <= requirement.limit) >= requirement.probability
+        )
+
+    sizes = {name: factor * errors.size(judged, name) for name in errors.names(judged)}
+    largest = max(sizes, key=lambda name: sizes[name])
+    alone = {}
+    for name in sizes:
+        if sizes[name] > 0 and met(name, 0.0):
+            low, high = 0.0, 1.0
+            for _ in range(STEPS):
+                middle = (low + high) / 2
+                low, high = (middle, high) if met(name, middle) else (low, middle)
+            alone[name] = low
+    if not alone:
+        return Remedy(largest, 0.0, sizes[largest], 0.0, False, requirement.unit)
+    best = max(alone, key=lambda name: alone[name])
+    now = sizes[best]
+    return Remedy(best, alone[best], now, alone[best] * now, True, requirement.unit)

@@ -1,0 +1,123 @@
+"""A requirement on the position error: which statistic, where, when, and how surely."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from bayesdist.assess.names import require_known
+from bayesdist.assess.requirements.regions import WHOLE, Region, check_region, region_words
+from bayesdist.assess.statistics import STATISTICS
+from bayesdist.assess.units import UNITS
+from bayesdist.errors import InputError
+
+__all__ = ["Requirement"]
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """A limit on a statistic of the position error over the detector, which is all of its chips.
+
+    Parameters
+    ----------
+    name : str
+    statistic : str
+        One of `STATISTICS`.
+    limit : float
+        Positive, in `unit`.
+    unit : str
+        'pix', 'arcsec', 'mas' or 'deg'.
+    probability : float
+        With which the statistic must be at or under the limit, between 0 and 1.
+    epoch : float, optional
+        Decimal years.
+    chip : int, optional
+        Number of the one chip that is judged; all chips together by default.
+    region : str or sequence of (x, y)
+        The part of each chip that counts: see `check_region`.
+    epochs : tuple of float, optional
+        First and last epoch of a range, in place of `epoch`: the limit must hold throughout.
+    relative : bool
+        Whether the error is that of the difference of two positions in one image, over all pairs of
+        places, in place of that of a position.
+    separation : float, optional
+        Pairs on one chip that are not farther apart than so many pixels; for relative errors.
+    magnitude : float, optional
+        Of the star whose error is meant: its centroid's error counts in.
+
+    Raises
+    ------
+    InputError
+        For an unknown statistic, unit or region, and for numbers out of range or at odds.
+    """
+
+    name: str
+    statistic: str
+    limit: float
+    unit: str = "pix"
+    probability: float = 0.95
+    epoch: float | None = None
+    chip: int | None = None
+    region: Region = WHOLE
+    epochs: tuple[float, float] | None = None
+    relative: bool = False
+    separation: float | None = None
+    magnitude: float | None = None
+
+    def __post_init__(self) -> None:
+        require_known(self.statistic, STATISTICS, "statistic", where=self.where)
+        require_known(self.unit, UNITS, "unit", where=self.where)
+        object.__setattr__(self, "region", check_region(self.region, self.where))
+        if self.epochs is not None:
+            object.__setattr__(self, "epochs", tuple(self.epochs))
+        for wrong, cause, do in (
+            (
+                not (math.isfinite(self.limit) and self.limit > 0),
+                f"the limit is {self.limit}",
+                "give a positive number",
+            ),
+            (
+                not 0 < self.probability < 1,
+                f"the probability is {self.probability}",
+                "give a number between 0 and 1, without the ends",
+            ),
+            (
+                self.epochs is not None and self.epoch is not None,
+                "it names an epoch and a range of epochs",
+                "give one of the two",
+            ),
+            (
+                self.epochs is not None
+                and not (len(self.epochs) == 2 and self.epochs[0] < self.epochs[1]),
+                f"the range of epochs is {self.epochs}",
+                "give the first and the last, in decimal years",
+            ),
+            (
+                self.separation is not None and not self.relative,
+                "a separation is of two positions, and the error is that of one",
+                "set relative = true, or leave separation out",
+            ),
+            (
+                self.separation is not None and not self.separation > 0,
+                f"the separation is {self.separation}",
+                "give a positive number of pixels",
+            ),
+        ):
+            if wrong:
+                raise InputError(cause, where=self.where, do=do)
+
+    @property
+    def where(self) -> str:
+        """How messages name it."""
+        return f"requirement {self.name!r}"
+
+    @property
+    def scope(self) -> str:
+        """What the statistic is taken of, beside chip and epoch, in words; may be empty."""
+        words = region_words(self.region)
+        if self.relative:
+            apart = "" if self.separation is None else f" up to {self.separation:g} px apart"
+            words += f" between two positions{apart}"
+        if self.magnitude is not None:
+            words += f" of a star of magnitude {self.magnitude:g}"
+        return words.strip()

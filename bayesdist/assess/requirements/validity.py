@@ -1,0 +1,149 @@
+"""Until when a requirement is met: the probability as the drift is extrapolated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.assess.drawn import PositionErrors
+from bayesdist.assess.requirements.margins import judged_places
+from bayesdist.assess.requirements.requirement import Requirement
+from bayesdist.assess.requirements.verdict import clopper_pearson
+from bayesdist.assess.units import convert
+from bayesdist.errors import InputError
+
+__all__ = ["Horizon", "horizon_of"]
+
+Float = NDArray[np.float64]
+
+BAND = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Horizon:
+    """The probability of meeting a requirement, epoch by epoch.
+
+    Parameters
+    ----------
+    requirement : Requirement
+    epoch : ndarray, shape (n,)
+        Decimal years, rising.
+    probability : ndarray, shape (n,)
+        Fraction of draws that meet the limit.
+    low, high : ndarray, shape (n,)
+        Its central 95 % interval from the number of draws (Clopper-Pearson).
+    value : ndarray, shape (n,)
+        Median of the statistic, in the unit of the requirement.
+    """
+
+    requirement: Requirement
+    epoch: Float
+    probability: Float
+    low: Float
+    high: Float
+    value: Float
+
+    @property
+    def date(self) -> float | None:
+        """When the probability falls below what is asked; None if it does not."""
+        return self._fall(self.probability)
+
+    @property
+    def interval(self) -> tuple[float | None, float | None]:
+        """The same for both ends of the probability's interval, the earlier date first."""
+        return self._fall(self.low), self._fall(self.high)
+
+    @property
+    def sentence(self) -> str:
+        """The date in words."""
+        name, asked = self.requirement.name, self.requirement.probability
+        first, last = float(self.epoch[0]), float(self.epoch[-1])
+        if self.date is None:
+            return f"{name}: the probability stays at {asked:g} or more until {last:.1f}"
+        if self.date == first:
+            found = float(self.probability[0])
+            return (
+                f"{name}: the probability is below {asked:g} already at {first:.1f} ({found:.2g})"
+            )
+        early, late = self.interval
+        until = f"{late:.1f}" if late is not None else f"after {last:.1f}"
+        since = first if early is None else early
+        return f"{name}: recalibrate before {self.date:.1f} ({since:.1f} to {until})"
+
+    def _fall(self, probability: Float) -> float | None:
+        below = probability < self.requirement.probability
+        if not below.any():
+            return None
+        k = int(np.argmax(below))
+        if k == 0:
+            return float(self.epoch[0])
+        ends = slice(k - 1, k + 1)
+        return float(
+            np.interp(
+                -self.requirement.probability,  # `interp` wants rising values
+                -probability[ends],
+                self.epoch[ends],
+            )
+        )
+
+
+def horizon_of(
+    errors: PositionErrors,
+    requirement: Requirement,
+    epochs: ArrayLike,
+    *,
+    n_effective: float | None = None,
+    chip: int | None = None,
+    pixel_scale: float | None = None,
+) -> Horizon:
+    """Follow a requirement through time.
+
+    The error at each epoch is that of the drift as the model has it, extrapolated with its
+    covariance, and with the curvature that the data and its prior leave open, where the errors hold
+    it.
+
+    Parameters
+    ----------
+    errors : PositionErrors
+        One set of draws for all epochs: the curve has no noise of its own between them.
+    requirement : Requirement
+        Its own epoch is not used.
+    epochs : array_like, shape (n,)
+        Decimal years, rising.
+    n_effective : float, optional
+        Independent draws that the draws are worth; their number by default.
+    chip, pixel_scale
+        As `check_requirements`.
+
+    Returns
+    -------
+    Horizon
+
+    Raises
+    ------
+    InputError
+        For a model that does not depend on time, and epochs that do not rise.
+    """
+    model = errors.fields.whole.solution.model
+    at = np.atleast_1d(np.asarray(epochs, float))
+    if model.time is None:
+        raise InputError(
+            "the model does not depend on time, so that no date can be given",
+            where=requirement.where,
+            do="give the model time-dependent terms",
+        )
+    if at.size < 2 or not (np.diff(at) > 0).all():
+        raise InputError("the epochs do not rise", where="epochs", do="give two or more in order")
+    factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
+    n = n_effective or float(errors.n_draws)
+    (judged,) = judged_places(
+        replace(requirement, epoch=float(at[0]), epochs=None), model, chip=chip
+    )
+    cases = [replace(judged, epoch=float(epoch)) for epoch in at]
+    name = requirement.statistic
+    draws = factor * np.array([found[name] for found in errors.course(cases, [name])])
+    met, value = np.mean(draws <= requirement.limit, axis=1), np.median(draws, axis=1)
+    low, high = np.array([clopper_pearson(p, n, BAND) for p in met]).T
+    return Horizon(requirement, at, met, low, high, value)

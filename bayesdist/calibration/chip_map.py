@@ -1,0 +1,395 @@
+"""One chip at one date: a polynomial from pixels to (u, v), with its covariance.
+
+Fits, posteriors and files of every format come down to this, so that any two can be compared,
+applied, inverted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.infer.transforms import Solution
+from bayesdist.model import PolynomialBasis
+from bayesdist.model.basis import point_blocks
+
+__all__ = ["ChipMap", "Monomials", "chip_map", "fitted_map", "position_moments", "sampling_of"]
+
+Float = NDArray[np.float64]
+
+# Newton's method has converged when a step is this short in pixels, which rounding allows.
+STEP, MAX_STEPS = 1e-9, 30
+SINGULAR = 1e-12  # of the largest slope squared: below that a linear part has no inverse
+
+
+@dataclass(frozen=True, eq=False)
+class Monomials:
+    """A map as products write it: coefficients of (x - xref)^i (y - yref)^j.
+
+    Parameters
+    ----------
+    basis : PolynomialBasis
+        For its order, size and reference pixel.
+    values : ndarray, shape (2, K)
+        Of u and v, in the order of `terms`.
+    cov : ndarray, shape (2 K, 2 K), optional
+        u before v.
+    """
+
+    basis: PolynomialBasis
+    values: Float
+    cov: Float | None = None
+
+    @property
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """Powers (i, j), length K."""
+        return self.basis.terms
+
+    def index(self, i: int, j: int) -> int:
+        """Position of a term."""
+        return self.terms.index((i, j))
+
+    @property
+    def constant(self) -> Float:
+        """(u, v) at the reference pixel, shape (2,)."""
+        return self.values[:, 0]
+
+    @property
+    def linear(self) -> Float:
+        """d(u, v) / d(x, y) at the reference pixel, shape (2, 2)."""
+        return self.values[:, 1:3]
+
+
+@dataclass(frozen=True, eq=False)
+class ChipMap:
+    """What one calibration says of one chip at one date.
+
+    Parameters
+    ----------
+    name : str
+        Of the calibration, for messages.
+    basis : PolynomialBasis
+    unit : str
+        Of u and v.
+    coefficients : ndarray, shape (2, K)
+        Legendre coefficients of u and v.
+    cov : ndarray, shape (2 K, 2 K), optional
+        Of the coefficients, u before v; None where the source gives no errors.
+    correlated : bool
+        False where the source gives a standard deviation of each monomial and no correlations.
+    draws : float
+        Effective number of draws that `cov` was estimated from; infinite where it is computed.
+    chip : int, optional
+        None where the source numbers no chips.
+    epoch : float, optional
+        Decimal years.
+    notes : tuple of str
+        What else a reader has to know.
+    """
+
+    name: str
+    basis: PolynomialBasis
+    unit: str
+    coefficients: Float
+    cov: Float | None = None
+    correlated: bool = True
+    draws: float = np.inf
+    chip: int | None = None
+    epoch: float | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        known = [self.coefficients] if self.cov is None else [self.coefficients, self.cov]
+        if not all(np.isfinite(values).all() for values in known):
+            raise InputError(
+                "holds coefficients or errors that are not finite",
+                where=self.name,
+                do="check the file",
+            )
+
+    @property
+    def errors(self) -> str:
+        """What is known of its errors: 'none', 'sigma' or 'covariance'."""
+        if self.cov is None:
+            return "none"
+        return "covariance" if self.correlated else "sigma"
+
+    def at(self, x: ArrayLike, y: ArrayLike) -> Float:
+        """Positions (2, N) of pixels (N,), FITS 1-based."""
+        x, y = np.atleast_1d(np.asarray(x, float)), np.atleast_1d(np.asarray(y, float))
+        out = np.empty((2, x.size))
+        for rows in point_blocks(x.size):
+            out[:, rows] = self.coefficients @ self.basis.evaluate(x[rows], y[rows]).T
+        return out
+
+    def slope(self, x: ArrayLike, y: ArrayLike) -> Float:
+        """Derivatives d(u, v) / d(x, y) at pixels (N,), shape (N, 2, 2)."""
+        x, y = np.atleast_1d(np.asarray(x, float)), np.atleast_1d(np.asarray(y, float))
+        out = np.empty((x.size, 2, 2))
+        for rows in point_blocks(x.size):
+            out[rows] = self._values_and_slopes(np.stack([x[rows], y[rows]]))[1]
+        return out
+
+    def covariance_at(self, x: Float, y: Float) -> Float | None:
+        """Covariances (N, 2, 2) of positions at pixels (N,); NaN stays NaN, None without errors."""
+        if self.cov is None:
+            return None
+        K = self.basis.n_terms
+        uu, vv, uv = position_moments(self.cov.reshape(2, K, 2, K), self.basis, x, y)
+        out = np.empty((x.size, 2, 2))
+        out[:, 0, 0], out[:, 1, 1], out[:, 0, 1], out[:, 1, 0] = uu, vv, uv, uv
+        return out
+
+    @property
+    def linear(self) -> Float:
+        """Derivatives (2, 2) at the reference pixel."""
+        x, y = self.basis.reference_pixel
+        return self.slope([x], [y])[0]
+
+    def pixels(self, w: Float) -> tuple[Float, Float]:
+        """Pixels whose positions are given, by Newton's method.
+
+        Parameters
+        ----------
+        w : ndarray, shape (2, N)
+            In `unit`.
+
+        Returns
+        -------
+        pixels : ndarray, shape (2, N)
+            Also beyond the edges of the chip; NaN where the iteration does not end.
+        slope : ndarray, shape (N, 2, 2)
+            d(u, v) / d(x, y) there.
+
+        Raises
+        ------
+        InputError
+            When the linear part at the reference pixel is singular.
+        """
+        linear = self.linear
+        if abs(np.linalg.det(linear)) <= SINGULAR * np.abs(linear).max() ** 2:
+            raise InputError(
+                "maps its zero point to a line, so that it has no inverse",
+                where=f"{self.name}, chip {self.chip}",
+                do="check the linear coefficients",
+            )
+        found, slope = np.empty((2, w.shape[1])), np.empty((w.shape[1], 2, 2))
+        for rows in point_blocks(w.shape[1]):
+            found[:, rows], slope[rows] = self._newton(w[:, rows], linear)
+        return found, slope
+
+    def _newton(self, w: Float, linear: Float) -> tuple[Float, Float]:
+        zero = np.array(self.basis.reference_pixel)[:, None]
+        pixels = zero + np.linalg.solve(linear, w - self._values_and_slopes(zero)[0])
+        moving = np.isfinite(pixels).all(axis=0)
+        pixels[:, ~moving] = np.nan
+        far = 3.0 * max(self.basis.size)  # where a polynomial means nothing any more
+        for _ in range(MAX_STEPS):
+            if not moving.any():
+                break
+            value, slope = self._values_and_slopes(pixels[:, moving])
+            with np.errstate(all="ignore"):
+                step = _solved(slope, w[:, moving] - value)
+            at = pixels[:, moving] + step
+            lost = ~np.isfinite(at).all(axis=0) | (np.abs(at - zero).max(axis=0) > far)
+            at[:, lost] = np.nan
+            pixels[:, moving] = at
+            moving[moving] = ~lost & (np.hypot(*step) > STEP)
+        pixels[:, moving] = np.nan
+        slope = np.full((w.shape[1], 2, 2), np.nan)
+        good = np.isfinite(pixels[0])
+        if good.any():
+            slope[good] = self._values_and_slopes(pixels[:, good])[1]
+        return pixels, slope
+
+    def _values_and_slopes(self, pixels: Float) -> tuple[Float, Float]:
+        """Values (2, N) and derivatives (N, 2, 2) by the pixel."""
+        phi = self.basis.evaluate(*pixels)
+        by_x, by_y = self.basis.derivatives
+        along = [phi @ (by @ self.coefficients.T) for by in (by_x, by_y)]
+        return (phi @ self.coefficients.T).T, np.stack(along, axis=-1)
+
+    def monomials(self) -> Monomials:
+        """The map in powers of offsets from the reference pixel."""
+        values = self.basis.to_monomials(self.coefficients)
+        cov = None
+        if self.cov is not None:
+            change = np.kron(np.eye(2), self.basis.monomial_matrix)
+            cov = change @ self.cov @ change.T
+        return Monomials(self.basis, values, cov)
+
+    def padded(self, n_terms: int) -> tuple[Float, Float | None]:
+        """Coefficients (2, n) and covariance (2 n, 2 n) with zeros for terms that are not there."""
+        K = self.basis.n_terms
+        coefficients = np.zeros((2, n_terms))
+        coefficients[:, :K] = self.coefficients
+        if self.cov is None:
+            return coefficients, None
+        cov = np.zeros((2, n_terms, 2, n_terms))
+        cov[:, :K, :, :K] = self.cov.reshape(2, K, 2, K)
+        return coefficients, cov.reshape(2 * n_terms, 2 * n_terms)
+
+    def transformed(self, linear: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> ChipMap:
+        """The map to linear (u, v) + shift, both taken as exact."""
+        L = np.asarray(linear, float)
+        coefficients = L @ self.coefficients
+        coefficients[:, 0] += np.asarray(shift, float)  # the first basis function is 1
+        cov = None
+        if self.cov is not None:
+            by = np.kron(L, np.eye(self.basis.n_terms))
+            cov = by @ self.cov @ by.T
+        return replace(self, coefficients=coefficients, cov=cov)
+
+
+def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:
+    """Effective number of draws behind a solution's covariance, and what has to be said of them."""
+    convergence = getattr(solution, "convergence", None)
+    if convergence is None:
+        return np.inf, ()
+    notes = () if convergence.converged else ("has not converged",)
+    return float(convergence.ess_bulk_min), notes
+
+
+def chip_map(
+    solution: Solution,
+    *,
+    name: str = "",
+    chip: int | None = None,
+    epoch: float | None = None,
+    exposure: int | str | None = None,
+) -> ChipMap:
+    """A chip of a fit or a posterior.
+
+    Parameters
+    ----------
+    solution : Solution
+    name : str
+        What to call it.
+    chip : int, optional
+        Chip number; the first chip by default.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    exposure : int or str, optional
+        Code or name; without it there are no frames of exposures.
+
+    Returns
+    -------
+    ChipMap
+
+    Raises
+    ------
+    InputError
+        For an unknown chip or exposure, or a missing or infinite epoch.
+    """
+    model = solution.model
+    if epoch is not None and not np.isfinite(epoch):
+        raise InputError(f"the epoch is {epoch}", do="give it in decimal years")
+    if chip is not None:
+        model.chip_code(chip)  # a model of one chip would accept any number
+    group = model.groups(1, epoch=epoch, exposure=exposure, chip=chip)
+    number = model.chips[int(group.chip[0])].number
+    [(columns, d)] = model.effective_jacobian(solution.mean, group)
+    d = d.reshape(2 * model.n_terms, -1)
+    cov = d @ np.asarray(solution.cov, float)[np.ix_(columns, columns)] @ d.T
+    draws, notes = sampling_of(solution)
+    return ChipMap(
+        name=name,
+        basis=model.basis(number),
+        unit=model.unit,
+        coefficients=model.effective(solution.mean, group)[0],
+        cov=cov,
+        draws=draws,
+        chip=number,
+        epoch=None if epoch is None else float(epoch),
+        notes=notes,
+    )
+
+
+def fitted_map(
+    positions: Callable[[Float, Float], tuple[Float, Float]],
+    name: str,
+    *,
+    order: int,
+    size: tuple[float, float],
+    reference_pixel: tuple[float, float],
+    unit: str,
+    monomial_cov: Float | None = None,
+    correlated: bool = True,
+    chip: int | None = None,
+    epoch: float | None = None,
+    notes: tuple[str, ...] = (),
+) -> ChipMap:
+    """Whatever maps pixels to (u, v) by a polynomial.
+
+    Parameters
+    ----------
+    positions : callable
+        From FITS 1-based pixels x, y (N,) to u, v (N,): a polynomial of total order `order`.
+    name : str
+    order : int
+    size, reference_pixel : tuple of float
+        As in `PolynomialBasis`.
+    unit : str
+    monomial_cov : ndarray, shape (2 K, 2 K), optional
+        Covariance of the coefficients of (x - xref)^i (y - yref)^j, u before v.
+    correlated, chip, epoch, notes
+        As in `ChipMap`.
+
+    Returns
+    -------
+    ChipMap
+    """
+    basis = PolynomialBasis(order, size, reference_pixel)
+    # products of two terms have twice the order, for which this many nodes are exact
+    nodes, weights = legendre.leggauss(order + 1)
+    X, Y = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
+    (sx, sy), (nx, ny) = basis.half_size, size
+    values = np.stack(positions(X * sx + (nx + 1) / 2, Y * sy + (ny + 1) / 2))
+    i, j = np.array(basis.terms).T
+    norm = (2 * i + 1) * (2 * j + 1) / 4
+    weight = np.outer(weights, weights).ravel()
+    coefficients = (values * weight) @ basis.evaluate_scaled(X, Y) * norm
+    cov = None
+    if monomial_cov is not None:
+        back = np.kron(np.eye(2), basis.from_monomials(np.eye(basis.n_terms)).T)
+        cov = back @ monomial_cov @ back.T
+        cov = (cov + cov.T) / 2
+    return ChipMap(name, basis, unit, coefficients, cov, correlated, np.inf, chip, epoch, notes)
+
+
+def position_moments(
+    coefficients: Float, basis: PolynomialBasis, x: Float, y: Float
+) -> tuple[Float, Float, Float]:
+    """Variances and covariance of (u, v) at pixels, from second moments of coefficients.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (2, K, 2, K)
+    basis : PolynomialBasis
+    x, y : ndarray, shape (N,)
+        FITS 1-based pixels.
+
+    Returns
+    -------
+    uu, vv, uv : ndarray, shape (N,)
+    """
+    out = np.empty((3, x.size))
+    for rows in point_blocks(x.size):
+        phi = basis.evaluate(x[rows], y[rows])
+        for k, (a, b) in enumerate(((0, 0), (1, 1), (0, 1))):
+            out[k, rows] = np.einsum("nk,nk->n", phi @ coefficients[a, :, b, :], phi)
+    # rounding may leave a variance of zero slightly below it
+    return np.maximum(out[0], 0.0), np.maximum(out[1], 0.0), out[2]
+
+
+def _solved(a: Float, b: Float) -> Float:
+    """Solutions (2, N) of 2 x 2 systems (N, 2, 2) for (2, N); infinite where one is singular."""
+    det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+    x = a[:, 1, 1] * b[0] - a[:, 0, 1] * b[1]
+    y = a[:, 0, 0] * b[1] - a[:, 1, 0] * b[0]
+    return np.stack([x, y]) / det

@@ -1,0 +1,413 @@
+"""A calibration laid on another one, or on an aperture, with the error of that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
+from bayesdist.calibration.similarity import correlations
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.compare.frame_fields import term_squares
+from bayesdist.infer.transforms import Derived, Solution
+from bayesdist.model import DistortionModel, PolynomialBasis
+from bayesdist.model.similarity import turned, turned_model
+
+__all__ = ["Aperture", "lay_on", "lay_on_aperture", "oriented"]
+
+Float = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+GRID = (33, 17)  # points on which the largest distance is looked for
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """Where an aperture lies, in the terms of the Science Instrument Aperture File.
+
+    Parameters
+    ----------
+    name : str
+        As "JWFC2FIX".
+    v2_ref, v3_ref : float
+        V2Ref and V3Ref, arcseconds.
+    v3_idl_y_angle : float
+        V3IdlYAngle: of the ideal Y axis from V3 towards V2, degrees.
+    v_idl_parity : int
+        VIdlParity, 1 or -1.
+    reference_pixel : tuple of float
+        Pixel of the chip that lies at (V2Ref, V3Ref), FITS 1-based.
+    source : str
+        Where the numbers are from.
+    """
+
+    name: str
+    v2_ref: float
+    v3_ref: float
+    v3_idl_y_angle: float
+    v_idl_parity: int
+    reference_pixel: tuple[float, float]
+    source: str = "given as numbers"
+
+
+def lay_on(
+    calibration: Calibration,
+    reference: Calibration,
+    *,
+    chip: int = 2,
+    epoch: float | None = None,
+    reference_drift: bool = True,
+    scale_arcsec: float | None = None,
+    scale_sigma: float = 0.0,
+) -> Orientation:
+    """The similarity that lays a calibration on an existing one.
+
+    Shift, rotation and, for u, v in pixels, scale make the mean square distance between the two
+    maps smallest over the area of the chip.  A fit over the whole chip is used, not the linear
+    terms at the reference pixel: each pixel then counts alike, and a term that one calibration has
+    and the other has not, or a poorly measured fifth order, cannot tilt the whole.  Where the two
+    maps differ by a similarity only, both ways give the same.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    reference : Calibration
+        In an aperture, arcseconds.
+    chip : int
+        The chip that is laid on its counterpart; the others follow.
+    epoch : float, optional
+        Decimal years at which the two are compared; needed by a model with time dependence.
+    reference_drift : bool
+        Whether the reference's time-dependent terms are applied at `epoch`.
+    scale_arcsec : float, optional
+        Arcseconds in one unit of u, v, held.  Without it the scale is fitted for u, v in pixels,
+        and is that of the unit for others.
+    scale_sigma : float
+        Standard deviation of a held scale, arcseconds in one unit of u, v.
+
+    Returns
+    -------
+    Orientation
+
+    Raises
+    ------
+    InputError
+        For a chip that is not there, a chip of another size, a missing epoch, a drift of the
+        reference that cannot be evaluated, a scale that is not positive, or u, v mirrored against
+        x, y.
+    DegenerateError
+        When the calibration maps the chip to one point.
+
+    Notes
+    -----
+    What the fit leaves is a field of 2 K - 4 free coefficients (K terms of one axis).  The
+    four that it cannot see are given the mean variance of those it can: the reference may be as
+    wrong in its roll and scale as it is, on average, in any other single term.  White noise on the
+    same pixels would make them known far too well.
+    """
+    _check_epoch(calibration, epoch)
+    model = calibration.model
+    size = model.chips[model.chip_code(chip)].size
+    other = reference.model.chips[reference.model.chip_code(chip)].size
+    if tuple(size) != tuple(other):
+        raise InputError(
+            f"chip {chip} has {other[0]:g} x {other[1]:g} pixels and the solution "
+            f"{size[0]:g} x {size[1]:g}",
+            where=reference.name,
+            do="give a reference of the same detector",
+        )
+    dated = reference.model.time is not None or reference.no_date
+    then = epoch if reference_drift and dated else None
+    order = max(model.order, reference.model.order)
+    basis = PolynomialBasis(order, size, model.chips[0].reference_pixel)
+    z, slopes = _complex(*calibration.coefficients(chip, epoch), basis.n_terms)
+    w, _ = _complex(*reference.coefficients(chip, then), basis.n_terms)
+    weight = term_squares(basis)[: basis.n_terms].copy()
+    weight[0] = 0.0  # the shift takes the mean
+    S, flipped, Q = correlations(w, z, basis)
+    if Q == 0 or S == 0:
+        raise DegenerateError(
+            "the solution maps the chip to one point",
+            where=reference.name,
+            do="check its linear terms",
+        )
+    if abs(flipped) > abs(S):
+        raise _mirrored(reference.name)
+    dS = (weight * w) @ slopes.conj()
+    held = _held_scale(model.unit, scale_arcsec)
+    if held is None:
+        b = S / Q
+        d_log = (dS / Q - b * 2 * np.real((weight * z.conj()) @ slopes) / Q) / b
+    else:
+        b = complex(held * S / abs(S))
+        d_log = np.asarray(1j * np.imag(dS / S), complex)
+    shift = complex(w[0] - b * z[0])
+    d_shift = -b * d_log * z[0] - b * slopes[0]
+
+    left = np.asarray(w - b * z, complex)
+    left[0] -= shift
+    agreement = _agreement(left, basis)
+    n_free = 2 * basis.n_terms - (4 if held is None else 3)
+    variance = (1e-3 * agreement.rms) ** 2 / n_free
+    angular = variance / (abs(b) ** 2 * Q)
+    log_scale = angular if held is None else (scale_sigma / held) ** 2
+    return Orientation(
+        angle=float(np.angle(b)),
+        scale=float(abs(b)) if held is None else held,
+        shift=np.array([shift.real, shift.imag]),
+        v2v3=reference.plane.v2v3 or (0.0, 0.0),
+        reference_cov=_cov_about(b * z[0], variance, log_scale, angular),
+        derivative=np.stack([d_shift.real, d_shift.imag, d_log.real, d_log.imag]),
+        base=calibration.solution,
+        source=f"chip {chip} laid on {reference.name.rpartition('/')[2]}"
+        + ("" if epoch is None else f" at {epoch:g}"),
+        agreement=agreement,
+    )
+
+
+def lay_on_aperture(
+    calibration: Calibration,
+    aperture: Aperture,
+    *,
+    parity: tuple[int, int],
+    chip: int = 2,
+    epoch: float | None = None,
+    scale_arcsec: float | None = None,
+    scale_sigma: float = 0.0,
+    sigma_position: float,
+    sigma_angle_deg: float,
+) -> Orientation:
+    """The similarity that lays a calibration on an aperture.
+
+    The aperture's reference point goes to (V2Ref, V3Ref), and the detector's y axis there lies
+    along the ideal Y axis, which is at V3IdlYAngle from V3 towards V2.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    aperture : Aperture
+    parity : tuple of int
+        Sense of V2 and V3 against the axes of the aperture.
+    chip : int
+        The chip on which the aperture's reference pixel lies.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    scale_arcsec, scale_sigma : float
+        As in `lay_on`; needed for u, v in pixels.
+    sigma_position, sigma_angle_deg : float
+        Standard deviations of V2Ref and V3Ref [arcsec] and of V3IdlYAngle [deg].  The aperture file
+        does not state them.
+
+    Returns
+    -------
+    Orientation
+
+    Raises
+    ------
+    InputError
+        For a missing epoch or scale, a parity other than the aperture's, or u, v mirrored against
+        x, y.
+    """
+    _check_epoch(calibration, epoch)
+    where = f"aperture {aperture.name}"
+    if aperture.v_idl_parity != parity[0] * parity[1]:
+        raise InputError(
+            f"VIdlParity is {aperture.v_idl_parity}, and that of the detector is "
+            f"{parity[0] * parity[1]}",
+            where=where,
+            do="give an aperture of that detector",
+        )
+    held = _held_scale(calibration.unit, scale_arcsec)
+    if held is None:
+        raise InputError(
+            "an aperture gives no scale for u and v in pixels",
+            where="scale_arcsec",
+            do="give the arcseconds of one pixel of u, v",
+        )
+    basis = calibration.model.basis(chip)
+    z, slopes = _complex(*calibration.coefficients(chip, epoch), basis.n_terms)
+    x, y = ([v] for v in aperture.reference_pixel)
+    phi, (by_x, by_y) = basis.evaluate(x, y)[0], (g[0] for g in basis.gradient(x, y))
+    point, along_x, along_y = z @ phi, z @ by_x, z @ by_y
+    if (np.conj(along_x) * along_y).imag <= 0:
+        raise _mirrored(where)
+    a = np.deg2rad(aperture.v3_idl_y_angle)
+    wanted = complex(parity[0] * np.sin(a), parity[1] * np.cos(a))
+    angle = float(np.angle(wanted / along_y))
+    b = held * np.exp(1j * angle)
+    d_log = -1j * np.imag(by_y @ slopes / along_y)
+    shift = -b * point
+    d_shift = -b * d_log * point - b * (phi @ slopes)
+    return Orientation(
+        angle=angle,
+        scale=held,
+        shift=np.array([shift.real, shift.imag]),
+        v2v3=(aperture.v2_ref, aperture.v3_ref),
+        reference_cov=_cov_about(
+            b * point,
+            sigma_position**2,
+            (scale_sigma / held) ** 2,
+            np.deg2rad(sigma_angle_deg) ** 2,
+        ),
+        derivative=np.stack([d_shift.real, d_shift.imag, d_log.real, d_log.imag]),
+        base=calibration.solution,
+        source=f"chip {chip} laid on aperture {aperture.name} ({aperture.source})",
+    )
+
+
+def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
+    """A calibration turned into the plane of an aperture.
+
+    Every term of both axes is rotated together, those that depend on time as well: where (u, i, j)
+    drifts, (v, i, j) does after the turn, so that the model of the result has both.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        That on which the orientation rests, or that of another filter in the same system, which is
+        taken as independent of it.
+    orientation : Orientation
+
+    Returns
+    -------
+    Calibration
+        In arcseconds; its covariance holds the error of the orientation.
+
+    Raises
+    ------
+    InputError
+        For another unit than the orientation's.
+    """
+    solution, base, model = calibration.solution, orientation.base, calibration.model
+    if model.unit != base.model.unit:
+        raise InputError(
+            f"the solution is in {model.unit} and the orientation is for {base.model.unit}",
+            where="model.unit",
+            do="orient solutions of one system only",
+        )
+    mean, cov = np.asarray(solution.mean, float), np.asarray(solution.cov, float)
+    turn = orientation.scale * np.exp(1j * orientation.angle)
+    linear = turned(model, np.eye(model.n_params), turn, 0.0).T
+    moved = turned(model, mean, turn, complex(*orientation.shift))
+    # derivatives by shift_x, shift_y, log_scale, angle
+    by = np.stack(
+        [
+            turned(model, 0 * mean, turn, 1.0),
+            turned(model, 0 * mean, turn, 1j),
+            turned(model, mean, turn, 0.0),
+            turned(model, mean, 1j * turn, 0.0),
+        ],
+        axis=1,
+    )
+    if solution is base:
+        total = linear + by @ orientation.derivative
+        with_plane = total @ cov @ orientation.derivative.T + by @ orientation.reference_cov
+        own = total @ cov @ total.T + by @ orientation.reference_cov @ by.T
+    else:
+        with_plane = by @ orientation.cov
+        own = linear @ cov @ linear.T + with_plane @ by.T
+    new = replace(turned_model(model), unit="arcsec")
+    return replace(
+        calibration,
+        solution=_Oriented(new, moved, (own + own.T) / 2, solution, orientation),
+        plane=Plane("aperture", v2v3=orientation.v2v3, orientation=orientation),
+        with_plane=with_plane,
+        scale=None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Oriented(Derived):
+    """A solution in the plane of an aperture: each draw turned by a draw of the orientation."""
+
+    model: DistortionModel
+    mean: Float
+    cov: Float
+    source: Solution
+    orientation: Orientation
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Parameter vectors, shape (n, D)."""
+        o = self.orientation
+        theta = np.asarray(self.source.draws(n, rng), float)
+        if self.source is o.base:
+            moved = (theta - np.asarray(o.base.mean)) @ o.derivative.T
+            spread = o.reference_cov
+        else:
+            moved, spread = np.zeros((n, 4)), o.cov
+        moved = moved + rng.multivariate_normal(np.zeros(4), spread, size=n, method="eigh")
+        turn = o.scale * np.exp(moved[:, 2] + 1j * (o.angle + moved[:, 3]))
+        shift = complex(*o.shift) + moved[:, 0] + 1j * moved[:, 1]
+        return turned(self.source.model, theta, turn, shift)
+
+
+# -- what both ways share -------------------------------------------------------------------------
+
+
+def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Complex, Complex]:
+    """Coefficients (n,) of u + i v and their derivatives (n, D), with zeros for terms not there."""
+    K = coefficients.shape[1]
+    z = np.zeros(n_terms, complex)
+    z[:K] = coefficients[0] + 1j * coefficients[1]
+    slopes = np.zeros((n_terms, jacobian.shape[1]), complex)
+    slopes[:K] = jacobian[:K] + 1j * jacobian[K:]
+    return z, slopes
+
+
+def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
+    """Of a difference [arcsec] in Legendre coefficients, over the chip."""
+    x, y = (
+        grid.ravel()
+        for grid in np.meshgrid(
+            *(np.linspace(1, n, m) for n, m in zip(basis.size, GRID, strict=True))
+        )
+    )
+    weight = term_squares(basis)[: basis.n_terms]
+    return Agreement(
+        rms=1e3 * float(np.sqrt(weight @ np.abs(left) ** 2)),
+        worst=1e3 * float(np.abs(basis.evaluate(x, y) @ left).max()),
+    )
+
+
+def _check_epoch(calibration: Calibration, epoch: float | None) -> None:
+    if calibration.model.time is not None and epoch is None:
+        raise InputError(
+            "the solution depends on time and no epoch is given",
+            where="epoch",
+            do="give the decimal year at which it is laid on the reference",
+        )
+
+
+def _held_scale(unit: str, scale_arcsec: float | None) -> float | None:
+    """Arcseconds in one unit of u, v, or None where it is to be fitted."""
+    if scale_arcsec is None:
+        return None if unit == "pix" else ARCSEC[unit]
+    if not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
+        raise InputError(
+            f"the scale is {scale_arcsec}", where="scale_arcsec", do="give a positive number"
+        )
+    return float(scale_arcsec)
+
+
+def _mirrored(where: str) -> InputError:
+    """The error for (u, v) that no rotation brings onto the axes of the aperture."""
+    return InputError(
+        "u, v are mirrored against the detector's x, y",
+        where=where,
+        do="let u run with x and v with y, or change the sign of one of them",
+    )
+
+
+def _cov_about(arm: complex, variance: float, log_scale: float, angular: float) -> Float:
+    """Covariance of the four parameters from independent errors at a point.
+
+    The shift holds at (u, v) = (0, 0), which lies at -`arm` from the point where position, scale
+    and angle are independent.
+    """
+    to_origin = np.eye(4)
+    to_origin[:2, 2] = -arm.real, -arm.imag
+    to_origin[:2, 3] = arm.imag, -arm.real
+    return to_origin @ np.diag([variance, variance, log_scale, angular]) @ to_origin.T

@@ -1,0 +1,194 @@
+"""Subarrays: pixels of a part of a chip, and those of the whole chip that a distortion is for.
+
+    image = LTM chip + LTV
+
+in FITS 1-based pixels, which is how stwcs, too, brings an image to its chip.  CENTERA and SIZAXIS
+serve for raw images only: they count overscan, and calibration changes SIZAXIS but not CENTERA, so
+that in calibrated images their corner is no longer that of the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import FormatError, InputError
+
+__all__ = [
+    "FULL",
+    "Subarray",
+    "subarray_at_corner",
+    "subarray_of_centre",
+    "subarray_of_header",
+    "subarrays_of_image",
+]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Subarray:
+    """Where an image lies on its chip.
+
+    Parameters
+    ----------
+    ltv : tuple of float
+        LTV1, LTV2: pixel of the image less that of the chip (0 for the whole chip).
+    ltm : tuple of float
+        LTM1_1, LTM2_2: pixels of the image in one of the chip; 0.5 for images binned 2 by 2.
+    size : tuple of int, optional
+        Columns and rows of the image.
+    """
+
+    ltv: tuple[float, float] = (0.0, 0.0)
+    ltm: tuple[float, float] = (1.0, 1.0)
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([*self.ltv, *self.ltm]).all() and min(self.ltm) > 0):
+            raise InputError(
+                f"LTV is {self.ltv} and LTM {self.ltm}",
+                where="subarray",
+                do="give finite numbers, and LTM above zero",
+            )
+
+    def to_chip(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
+        """Pixels of the image to pixels of the chip, FITS 1-based both."""
+        return (
+            (np.asarray(x, float) - self.ltv[0]) / self.ltm[0],
+            (np.asarray(y, float) - self.ltv[1]) / self.ltm[1],
+        )
+
+    def from_chip(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
+        """Pixels of the chip to pixels of the image."""
+        return (
+            np.asarray(x, float) * self.ltm[0] + self.ltv[0],
+            np.asarray(y, float) * self.ltm[1] + self.ltv[1],
+        )
+
+
+FULL = Subarray()
+
+
+def subarray_at_corner(x: float, y: float) -> Subarray:
+    """The subarray whose first pixel is pixel (x, y) of the chip, FITS 1-based."""
+    return Subarray((1.0 - x, 1.0 - y))
+
+
+def subarray_of_centre(
+    centre: tuple[float, float],
+    size: tuple[int, int],
+    overscan: tuple[int, int] = (0, 0),
+) -> Subarray:
+    """A subarray from CENTERA and SIZAXIS of a raw image.
+
+    Parameters
+    ----------
+    centre : tuple of float
+        CENTERA1, CENTERA2: pixel size // 2 + 1 of the image, counted on the raw chip.
+    size : tuple of int
+        SIZAXIS1, SIZAXIS2.
+    overscan : tuple of int
+        Columns and rows of overscan in front of the chip's first pixel.
+
+    Returns
+    -------
+    Subarray
+        Of the raw image.
+    """
+    corner = [c - n // 2 - o for c, n, o in zip(centre, size, overscan, strict=True)]
+    return Subarray((1.0 - corner[0], 1.0 - corner[1]), size=size)
+
+
+def subarray_of_header(
+    header: fits.Header | Mapping[str, Any], size: tuple[float, float]
+) -> Subarray:
+    """A subarray from the header of a calibrated image.
+
+    Parameters
+    ----------
+    header : astropy.io.fits.Header
+        Of the image extension.
+    size : tuple of float
+        Columns and rows (XSIZE, YSIZE) that the distortion is defined for.
+
+    Returns
+    -------
+    Subarray
+
+    Raises
+    ------
+    InputError
+        Without LTV1 and LTV2, unless the image is as large as the chip.
+
+    Notes
+    -----
+    An image as large as XSIZE, YSIZE is the whole field of its distortion, whatever its LTV: so are
+    those behind a polariser, whose own rows are for less than the chip.
+    """
+    found = tuple(int(header.get(f"NAXIS{k}", 0)) for k in (1, 2))
+    given = (found[0], found[1]) if min(found) > 1 else None
+    if given == (int(size[0]), int(size[1])):
+        return Subarray(size=given)
+    if "LTV1" not in header or "LTV2" not in header:
+        raise InputError(
+            f"has no LTV1, LTV2, and its {found[0]} x {found[1]} pixels are not the whole chip's "
+            f"{size[0]:g} x {size[1]:g}",
+            where="image header",
+            do="give the first pixel by --corner",
+        )
+    return Subarray(
+        (float(header["LTV1"]), float(header["LTV2"])),
+        (float(header.get("LTM1_1", 1.0)), float(header.get("LTM2_2", 1.0))),
+        given,
+    )
+
+
+def subarrays_of_image(
+    headers: Iterable[fits.Header], sizes: Mapping[int, tuple[float, float]], name: str = "image"
+) -> dict[int, Subarray]:
+    """Subarrays of all science extensions of an image, by chip number.
+
+    Parameters
+    ----------
+    headers : iterable of astropy.io.fits.Header
+        Of all HDUs of a calibrated image; those named SCI count, with CCDCHIP.
+    sizes : mapping of int to tuple of float
+        Columns and rows of each chip of the distortion.
+    name : str
+        Of the image, for messages.
+
+    Returns
+    -------
+    dict of int to Subarray
+
+    Raises
+    ------
+    InputError
+        When it has no such extension, or as `subarray_of_header`.
+    """
+    out = {}
+    for header in headers:
+        if str(header.get("EXTNAME", "")).strip().upper() != "SCI":
+            continue
+        chip = int(header.get("CCDCHIP", 1))
+        if chip not in sizes:
+            raise InputError(
+                f"shows chip {chip}, which the distortion does not have",
+                where=name,
+                do=f"give an image of chip {' or '.join(map(str, sizes))}",
+            )
+        try:
+            out[chip] = subarray_of_header(header, sizes[chip])
+        except InputError as error:
+            raise InputError(error.cause, where=f"{name}, chip {chip}", do=error.do) from None
+    if not out:
+        raise FormatError(
+            "has no extension SCI", where=name, do="give a calibrated image (flt or flc)"
+        )
+    return out

@@ -1,0 +1,1 @@
+"""Stars held out of the fit, against their predictive distribution."""

@@ -1,0 +1,314 @@
+"""What a solution predicts of a star that it has not seen: mean, covariance, and false matches.
+
+    p(r) = (1 - f) N(r; 0, S) + f p_out(r)      S = diag(s_u^2 + j^2, s_v^2 + j^2) + J C J^T
+
+with the star's quoted errors s, the jitter j, and the solution's own covariance C at its place.
+Of a campaign S has, beside these, what the errors of the look-up tables leave at the place; and
+more is known: how exposures scatter, and which part of s is an error of the star in the catalogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from bayesdist.infer.catalogue.star_influence import StarInfluence
+from bayesdist.infer.posterior import Posterior
+from bayesdist.model import DistortionModel, LookupTable
+
+__all__ = [
+    "ExposureDeviations",
+    "Predictive",
+    "Scores",
+    "marginals_of",
+    "predictive_of",
+    "scores_of",
+    "uniforms_of",
+]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+NEVER = 1e-300
+SCALES = np.geomspace(0.5, 4.0, 13)  # of the errors, at which scores are taken
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureDeviations:
+    """How the exposures of a campaign deviate from what they have in common.
+
+    Parameters
+    ----------
+    kinds : tuple of str, length k
+        As an exposure's parameters are named: 'scale', ...
+    tau : ndarray, shape (m, k)
+        Draws of the scatter of each.
+    """
+
+    kinds: tuple[str, ...]
+    tau: Float
+
+    def precision(self, names: tuple[str, ...]) -> Float:
+        """Inverse variances (q,) of an exposure's parameters; zero for those that are free."""
+        variance = dict(zip(self.kinds, (self.tau**2).mean(axis=0), strict=True))
+        return np.array([1 / variance[name] if name in variance else 0.0 for name in names])
+
+
+@dataclass(frozen=True, eq=False)
+class Predictive:
+    """A solution as it predicts.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    mean : ndarray, shape (D,)
+    cov : ndarray, shape (D, D)
+    outliers : str
+        'none', 'gaussian' or 'uniform'.
+    fraction : float
+        Of false matches.
+    jitter2 : float
+        Squared jitter.
+    scale : float
+        Standard deviation of false matches on each axis, or the radius of the match circle.
+    free : tuple of str
+        Those of 'j', 'f', 's_out' that are not known exactly.
+    free_cov : ndarray, shape (h, h)
+        Their covariance, as squared jitter, fraction and log scale.
+    deviations : ExposureDeviations or None
+        None where exposures that were held out whole have frames of which nothing is known.
+    stars : StarInfluence or None
+        Errors of the catalogue, which the quoted errors contain; None where each match has an
+        error of its own.
+    local : tuple of LookupTable
+        Standard errors of positions that belong to places on the detector, in the unit of u and v:
+        of look-up tables, or what the model leaves out.
+    cell : tuple of float or None
+        Pixels along x and y over which stars share these errors.
+    local_in_noise : bool
+        Whether quoted errors and jitter hold them already.
+    """
+
+    model: DistortionModel
+    mean: Float
+    cov: Float
+    outliers: str = "none"
+    fraction: float = 0.0
+    jitter2: float = 0.0
+    scale: float = 1.0
+    free: tuple[str, ...] = ()
+    free_cov: Float = field(default_factory=lambda: np.zeros((0, 0)))
+    deviations: ExposureDeviations | None = None
+    stars: StarInfluence | None = None
+    local: tuple[LookupTable, ...] = ()
+    cell: tuple[float, float] | None = None
+    local_in_noise: bool = False
+
+    def local_variance(self, x: Float, y: Float, chip: Int) -> Float:
+        """Variance (n,) on each axis of positions by errors that belong to places."""
+        out = np.zeros(len(x))
+        for table in self.local:
+            here = chip == table.chip
+            # frames turn the axes, and the errors on both are nearly equal
+            out[here] = (table.evaluate(x[here], y[here]) ** 2).mean(axis=1)
+        return out
+
+    def hyper(self) -> Float:
+        """Squared jitter, fraction and log scale."""
+        return np.array([self.jitter2, self.fraction, np.log(self.scale)])
+
+    def outlier_density(self, r2: Float, scale: float) -> Float:
+        """Density of false matches at squared distances."""
+        if self.outliers == "gaussian":
+            return np.exp(-0.5 * r2 / scale**2) / (2 * np.pi * scale**2)
+        if self.outliers == "uniform":
+            # without an edge, as in the likelihood: a pair at the rim, seen from a prediction
+            # that is a little off, is no true match
+            return np.full_like(r2, 1 / (np.pi * scale**2))
+        return np.zeros_like(r2)
+
+
+def predictive_of(posterior: Posterior) -> Predictive:
+    """A posterior as it predicts: means and covariances of its draws.
+
+    Parameters
+    ----------
+    posterior : Posterior
+
+    Returns
+    -------
+    Predictive
+    """
+    mixture, hyper = posterior.mixture, posterior.hyper
+    as_sampled: dict[str, Callable[[Float], Float]] = {
+        "j": np.square,
+        "f": np.asarray,
+        "s_out": np.log,
+    }
+    values = {key: as_sampled[key](hyper[key].ravel()) for key in mixture.hyper}
+    mean = {key: float(value.mean()) for key, value in values.items()}
+    several = np.stack(list(values.values())) if values else np.zeros((0, 2))
+    scale = np.exp(mean["s_out"]) if "s_out" in mean else mixture.match_radius or 1.0
+    return Predictive(
+        posterior.model,
+        posterior.mean,
+        posterior.cov,
+        outliers=mixture.model,
+        fraction=mean.get("f", 0.0),
+        jitter2=mean.get("j", (mixture.jitter or 0.0) ** 2),
+        scale=float(scale),
+        free=tuple(values),
+        free_cov=np.atleast_2d(np.cov(several)) if values else np.zeros((0, 0)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Derivatives of the log predictive density of some stars.
+
+    Parameters
+    ----------
+    place : ndarray, shape (n, 2)
+        By the predicted position.
+    spread : ndarray, shape (n, SCALES)
+        By the logarithm of a factor on the errors of true matches, at each of several factors.
+    one : ndarray, shape (n,)
+        The same at the factor 1.
+    axes : ndarray, shape (n, 2)
+        By the logarithm of a factor on the errors along one axis alone.
+    axes_spread : ndarray, shape (n, 2, SCALES)
+        The same at each of several factors.
+    free : ndarray, shape (n, h)
+        By what is not known exactly of the mixture.
+    """
+
+    place: Float
+    spread: Float
+    one: Float
+    axes: Float
+    axes_spread: Float
+    free: Float
+
+
+def scores_of(predictive: Predictive, residual: Float, cov: Float) -> Scores:
+    """Scores of stars.
+
+    Parameters
+    ----------
+    predictive : Predictive
+    residual : ndarray, shape (n, 2)
+        Data minus prediction.
+    cov : ndarray, shape (n, 3)
+        uu, vv and uv of S.
+    """
+    a, b, c = cov.T
+    det = a * b - c * c
+    u, v = residual.T
+    white = np.stack([(b * u - c * v) / det, (a * v - c * u) / det], axis=1)
+    q = (residual * white).sum(axis=1)
+    r2, f, scale = u * u + v * v, predictive.fraction, predictive.scale
+    far = f * predictive.outlier_density(r2, scale)
+    height = (1 - f) / (2 * np.pi * np.sqrt(det))
+
+    def member(factor: float | Float) -> Float:
+        core = np.outer(height, factor**-2.0) * np.exp(-0.5 * np.outer(q, factor**-2.0))
+        return core / np.maximum(core + far[:, None], NEVER)
+
+    w = member(np.ones(1))[:, 0]
+    w = np.where(far > 0, w, 1.0)
+    several = np.where(far[:, None] > 0, member(SCALES), 1.0)
+    of_axis = residual**2 / cov[:, :2]
+    gaussian = predictive.outliers == "gaussian"
+    outer = (1 - w) / scale**2 if gaussian else np.zeros_like(w)
+    by = {
+        "j": 0.5 * w * ((white**2).sum(axis=1) - (a + b) / det),
+        "f": (1 - w) / max(f, 1e-12) - w / (1 - f),
+        "s_out": (1 - w) * (r2 / scale**2 - 2),
+    }
+    return Scores(
+        place=w[:, None] * white + outer[:, None] * residual,
+        spread=several * (np.outer(q, SCALES**-2.0) - 2),
+        one=w * (q - 2),
+        axes=w[:, None] * (of_axis - 1),
+        axes_spread=_along_each(np.log(np.maximum(height, NEVER)) - 0.5 * q, of_axis, far),
+        free=np.stack([by[k] for k in predictive.free], axis=1)
+        if predictive.free
+        else np.zeros((len(q), 0)),
+    )
+
+
+def _along_each(log_core: Float, of_axis: Float, far: Float) -> Float:
+    """Scores (n, 2, SCALES) of factors on the errors of true matches along one axis alone."""
+    q = of_axis[:, :, None] * SCALES**-2.0
+    here = np.exp(log_core[:, None, None] + 0.5 * (of_axis[:, :, None] - q)) / SCALES
+    far = far[:, None, None]
+    w = np.where(far > 0, here / np.maximum(here + far, NEVER), 1.0)
+    return np.asarray(w * (q - 1))
+
+
+def marginals_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
+    """Predictive probabilities (2, n) of less in u and in v, whatever the other is.
+
+    Parameters
+    ----------
+    predictive, residual, cov
+        As of `scores_of`.
+    """
+    f, s = predictive.fraction, predictive.scale
+    out = []
+    for r, var in zip(residual.T, cov[:, :2].T, strict=True):
+        far = np.zeros_like(r)
+        if predictive.outliers == "gaussian":
+            far = ndtr(r / s)
+        elif predictive.outliers == "uniform":
+            x = np.clip(r / s, -1.0, 1.0)
+            far = 0.5 + (x * np.sqrt(1 - x * x) + np.arcsin(x)) / np.pi
+        out.append((1 - f) * ndtr(r / np.sqrt(var)) + f * far)
+    return np.stack(out)
+
+
+def uniforms_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
+    """Predictive probabilities of less, uniform where the prediction is right.
+
+    Parameters
+    ----------
+    predictive, residual, cov
+        As of `scores_of`.
+
+    Returns
+    -------
+    ndarray, shape (3, n)
+        Of u; of v where u is what it is (Rosenblatt 1952), which is independent of the first; and
+        of the distance that both make once they are brought to normal variables.
+    """
+    a, b, c = cov.T
+    u, v = residual.T
+    f, s = predictive.fraction, predictive.scale
+    core = np.exp(-0.5 * u * u / a) / np.sqrt(2 * np.pi * a)
+    if predictive.outliers == "gaussian":
+        far = np.exp(-0.5 * (u / s) ** 2) / (np.sqrt(2 * np.pi) * s)
+        below_u, below_v = ndtr(u / s), ndtr(v / s)
+    elif predictive.outliers == "uniform":
+        x = np.clip(u / s, -1.0, 1.0)
+        half = np.sqrt(1 - x * x)
+        far = 2 * half / (np.pi * s)
+        below_u = 0.5 + (x * half + np.arcsin(x)) / np.pi
+        below_v = np.clip(0.5 + 0.5 * v / np.maximum(s * half, NEVER), 0.0, 1.0)
+    else:
+        far, below_u, below_v = np.zeros_like(u), np.zeros_like(u), np.zeros_like(u)
+    w = (1 - f) * core
+    w = np.where(f * far > 0, w / np.maximum(w + f * far, NEVER), 1.0)
+    first = (1 - f) * ndtr(u / np.sqrt(a)) + f * below_u
+    rest = np.sqrt(b - c * c / a)
+    second = w * ndtr((v - c / a * u) / rest) + (1 - w) * below_v
+    return np.stack([first, second, _radial(first, second)])
+
+
+def _radial(first: Float, second: Float) -> Float:
+    """Of the sum of squares of the two normal variables that two uniform ones make."""
+    z = ndtri(np.clip(np.stack([first, second]), 1e-300, 1 - 1e-16))
+    return np.asarray(-np.expm1(-0.5 * (z**2).sum(axis=0)))

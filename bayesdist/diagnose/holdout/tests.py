@@ -1,0 +1,351 @@
+"""Tests of held-out stars, from their sums.
+
+All statistics are sums of scores, whose mean is zero where the prediction is right.  They vary with
+the stars themselves, and together through what all predictions share: the solution's parameters and
+those of the mixture, whose covariances are carried through (the scores are the derivatives).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betainc, erf
+from scipy.stats import beta, chi2
+
+from bayesdist.diagnose.holdout.bins import ALL, Partition
+from bayesdist.diagnose.holdout.predictive import Predictive
+from bayesdist.diagnose.holdout.spread import scale_of, sum_tails
+from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
+
+__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of", "holm"]
+
+Float = NDArray[np.float64]
+
+AXIS = "axis"  # a part: the stars along one axis
+
+LEAST_STARS = 20  # of a bin that is judged by itself
+STARS_PER_PIT_BIN = 20
+SINGULAR = 0.05  # of a variance: what is left where frames have taken up nearly all
+RATIO = 1.05  # of predicted errors: less does not matter, however significant
+DEPARTURE = 0.02  # of a distribution function
+EXCESS = 1.5  # of stars in the tails
+
+
+@dataclass(frozen=True)
+class HeldTest:
+    """One question that held-out stars were asked.
+
+    Parameters
+    ----------
+    name : str
+        'offset', 'spread', 'distribution', 'tails' or 'deviation'.
+    part : str
+        'all', 'axis', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'.
+    where : str
+        In words.
+    index : int
+        Of the bin in its partition; -1 for all bins together.
+    n : int
+        Stars.
+    value : float
+        Distance from the prediction in the unit of u, v; factor on the predicted errors; largest
+        difference of distribution functions; fraction of stars beyond the limit; deviation of an
+        exposure.
+    expected : float
+        0, 1, 0, the expected fraction, or 0.
+    interval : tuple of float
+        Of a fraction, 95 %; else NaN.
+    p_value : float
+    p_corrected : float
+        For the number of tests (Holm 1979).
+    limit : float
+        Of the tails, in sigma; else NaN.
+    wider : bool
+        Of distributions: whether stars lie farther out than predicted.
+    """
+
+    name: str
+    part: str
+    where: str
+    index: int
+    n: int
+    value: float
+    expected: float
+    p_value: float
+    p_corrected: float = 1.0
+    interval: tuple[float, float] = (np.nan, np.nan)
+    limit: float = np.nan
+    wider: bool = True
+
+    @property
+    def together(self) -> bool:
+        """Whether all bins of the part are tested at once; `where` and `value` are of the worst."""
+        return self.index < 0
+
+    @property
+    def matters(self) -> bool:
+        """Whether errors would be larger than predicted, if it is no chance."""
+        if self.name == "spread":
+            return self.value > RATIO
+        if self.name == "distribution":
+            return self.wider and self.value > DEPARTURE
+        return self.name in ("offset", "deviation") or self.value > EXCESS * self.expected
+
+
+@dataclass(frozen=True)
+class AxisCoverage:
+    """How many held-out stars lie in the middle of what is predicted of them along an axis.
+
+    Parameters
+    ----------
+    axis : str
+        'u' or 'v'.
+    level : float
+        In sigma of a normal variable.
+    n : int
+        Stars.
+    value, expected : float
+        Fraction of them, and the predicted one.
+    interval : tuple of float
+        Of the fraction, 95 %.
+    """
+
+    axis: str
+    level: float
+    n: int
+    value: float
+    expected: float
+    interval: tuple[float, float]
+
+
+def coverage_of(sums: HeldSums) -> tuple[AxisCoverage, ...]:
+    """Coverage along u and v at each level."""
+    return tuple(
+        AxisCoverage(
+            axis,
+            level,
+            sums.n,
+            float(sums.axes.within[a, k]) / sums.n,
+            float(erf(level / np.sqrt(2))),
+            _interval(int(sums.axes.within[a, k]), sums.n),
+        )
+        for a, axis in enumerate("uv")
+        for k, level in enumerate(LEVELS)
+    )
+
+
+def all_tests(
+    sums: HeldSums, predictive: Predictive, partitions: Sequence[Partition]
+) -> list[HeldTest]:
+    """Every test that there are enough stars for, without correction.
+
+    Parameters
+    ----------
+    sums : HeldSums
+    predictive : Predictive
+    partitions : sequence of Partition
+
+    Returns
+    -------
+    list of HeldTest
+    """
+    out = []
+    for partition in partitions:
+        found = sums.bins[partition.kind]
+        out += _offsets(found, sums, predictive, partition)
+        out += _spreads(found, predictive, partition)
+    out += _axes(sums, predictive)
+    return [*out, *_distributions(sums, predictive), *_tails(sums, predictive)]
+
+
+def holm(p_values: Float) -> Float:
+    """Probabilities corrected for their number (Holm 1979).
+
+    Parameters
+    ----------
+    p_values : ndarray, shape (m,)
+
+    Returns
+    -------
+    ndarray, shape (m,)
+    """
+    order = np.argsort(p_values, kind="stable")
+    steps = np.arange(len(p_values), 0, -1) * p_values[order]
+    out = np.empty(len(p_values))
+    out[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return out
+
+
+def _of_clusters(t: float, dof: int, n: int) -> float:
+    """Probability of a larger chi-square whose covariance is the sum of squares of n stars.
+
+    Hotelling 1931, for squares about zero.
+    """
+    return float(beta.sf(min(t / n, 1.0), dof / 2, max(n - dof, 1) / 2))
+
+
+def _offsets(
+    found: BinSums, sums: HeldSums, predictive: Predictive, partition: Partition
+) -> list[HeldTest]:
+    """Whether stars lie about their predictions: each bin, then all together."""
+    n_bins = len(found.n)
+    by = found.place_by.reshape(2 * n_bins, -1)
+    common = found.place_with.reshape(2 * n_bins, -1) @ by.T
+    cov = by @ predictive.cov @ by.T - common - common.T + found.own_cov
+    for name, lost in found.lost.items():
+        along = lost.reshape(2 * n_bins, -1)
+        cov -= along @ sums.frames[name].spent @ along.T
+    out, good = [], []
+    for b in range(n_bins):
+        pair = slice(2 * b, 2 * b + 2)
+        least = np.linalg.eigvalsh(cov[pair, pair])[0]
+        n = found.independent[b]
+        if n < LEAST_STARS or least < 2 * SINGULAR * np.trace(found.place_2[b]):
+            continue
+        good.append(b)
+        score = found.place[b]
+        t = float(score @ np.linalg.solve(cov[pair, pair], score))
+        # their variance is their own, as in Hotelling's test about zero
+        p = _of_clusters(t, 2, int(n))
+        size = float(np.hypot(*(score / found.weight[b])))
+        bin_ = partition.bins[b]
+        out.append(HeldTest("offset", partition.kind, bin_.words, b, int(found.n[b]), size, 0.0, p))
+    if len(good) > 1:
+        rows = np.ravel([[2 * b, 2 * b + 1] for b in good])
+        root = np.sqrt(np.diag(cov)[rows])
+        values, vectors = np.linalg.eigh(cov[np.ix_(rows, rows)] / np.outer(root, root))
+        along = vectors.T @ (found.place.ravel()[rows] / root)
+        known = values > SINGULAR
+        t, dof = float((along[known] ** 2 / values[known]).sum()), int(known.sum())
+        p = float(chi2.sf(t, dof))
+        if sums.shared is not None:
+            p = _of_clusters(t, dof, sums.shared.n_stars)
+        worst = min(out, key=lambda one: (one.p_value, -one.value))
+        out.append(
+            HeldTest(
+                "offset", partition.kind, worst.where, -1, int(found.n.sum()), worst.value, 0.0, p
+            )
+        )
+    return out
+
+
+def _spreads(found: BinSums, predictive: Predictive, partition: Partition) -> list[HeldTest]:
+    """Whether true matches scatter as predicted, in each bin."""
+    out = []
+    for b, bin_ in enumerate(partition.bins):
+        if found.n[b] < LEAST_STARS:
+            continue
+        g = found.spread_by[b]
+        variance = float(found.spread_2[b] + g @ predictive.free_cov @ g)
+        p = sum_tails(float(found.spread[b]), variance, float(found.spread_3[b]))
+        out.append(
+            HeldTest(
+                "spread",
+                partition.kind,
+                bin_.words,
+                b,
+                int(found.n[b]),
+                scale_of(found.scales[b]),
+                1.0,
+                p,
+            )
+        )
+    return out
+
+
+def _axes(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
+    """Whether true matches scatter as predicted along each axis by itself."""
+    out, axes = [], sums.axes
+    for a, axis in enumerate("uv"):
+        g = axes.by_free[a]
+        variance = float(axes.second[a] + g @ predictive.free_cov @ g)
+        p = sum_tails(float(axes.score[a]), variance, float(axes.third[a]))
+        scale = scale_of(axes.scales[a])
+        out.append(HeldTest("spread", AXIS, f"along {axis}", a, sums.n, scale, 1.0, p))
+    return out
+
+
+def _distributions(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
+    """Whether the predictive probabilities are uniform."""
+    merge, shared = 1, sums.shared
+    n = sums.n if shared is None else shared.n_stars
+    while merge < PIT_BINS // 4 and n * merge < STARS_PER_PIT_BIN * PIT_BINS:
+        merge = {1: 2, 2: 4, 4: 5}[merge]
+    m = PIT_BINS // merge
+    wider = bool(sums.pit[2] @ (np.arange(PIT_BINS) + 0.5) > sums.n * PIT_BINS / 2)
+    out = []
+    for k, what in enumerate(("of u", "of v", "of their distances")):
+        counts = sums.pit[k].reshape(m, merge).sum(axis=1)
+        by = sums.pit_by[k].reshape(m, merge, -1).sum(axis=1)
+        free = sums.pit_free[k].reshape(m, merge, -1).sum(axis=1)
+        cov = sums.n * (np.eye(m) / m - 1 / m**2)
+        if shared is not None:
+            cov = shared.pit_covariance(k, merge)
+        cov += by @ predictive.cov @ by.T + free @ predictive.free_cov @ free.T
+        for name, several in sums.pit_lost.items():
+            along = several[k].reshape(m, merge, -1).sum(axis=1)
+            cov -= along @ sums.frames[name].spent @ along.T
+        rest = (counts - sums.n / m)[:-1]
+        t = float(rest @ np.linalg.solve(cov[:-1, :-1], rest))
+        p = float(chi2.sf(t, m - 1))
+        if shared is not None and shared.stars_repeat:
+            p = _of_clusters(t, m - 1, n)
+        size = float(np.abs(np.cumsum(sums.pit[k]) / sums.n - np.arange(1, 21) / PIT_BINS).max())
+        out.append(HeldTest("distribution", ALL, what, k, sums.n, size, 0.0, p, wider=wider))
+    return out
+
+
+def _tails(sums: HeldSums, predictive: Predictive) -> list[HeldTest]:
+    """Whether as many stars lie far out as predicted, false matches among them."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+    weights = weights / weights.sum()
+    sd = np.sqrt(np.diag(predictive.free_cov))
+    out = []
+    for k, limit in enumerate(TAILS):
+        middle = max(sums.expected[k, 0], 1e-300)
+        low, high = np.maximum(sums.expected[k, 1:].reshape(-1, 2).T, 1e-300)
+        slope = np.divide(np.log(high / low), 2 * STEP * sd, out=np.zeros_like(sd), where=sd > 0)
+        spread = np.sqrt(max(slope @ predictive.free_cov @ slope, 0.0))
+        share = np.minimum(middle * np.exp(spread * nodes) / sums.n, 1.0)
+        seen = int(sums.beyond[k])
+        more = 1.0 if sums.shared is None else sums.shared.overdispersion(limit)
+        below = float(weights @ _at_most(seen / more, sums.n / more, share))
+        above = float(weights @ _at_least(seen / more, sums.n / more, share))
+        interval = _interval(seen, sums.n)
+        p = float(min(1.0, 2 * min(below, above)))
+        out.append(
+            HeldTest(
+                "tails",
+                ALL,
+                f"beyond {limit:g} sigma",
+                k,
+                sums.n,
+                seen / sums.n,
+                middle / sums.n,
+                p,
+                interval=interval,
+                limit=limit,
+            )
+        )
+    return out
+
+
+def _interval(seen: int, n: int) -> tuple[float, float]:
+    """Of a fraction, 95 % (Clopper and Pearson 1934)."""
+    return (
+        float(beta.ppf(0.025, seen, n - seen + 1)) if seen else 0.0,
+        float(beta.ppf(0.975, seen + 1, n - seen)) if seen < n else 1.0,
+    )
+
+
+def _at_least(k: float, n: float, share: Float) -> Float:
+    """Probability of k or more of n, of which neither need be whole."""
+    return np.asarray(betainc(k, n - k + 1, share)) if k > 0 else np.ones_like(share)
+
+
+def _at_most(k: float, n: float, share: Float) -> Float:
+    """Probability of k or fewer of n."""
+    return np.asarray(1 - betainc(k + 1, n - k, share)) if k < n else np.ones_like(share)

@@ -1,0 +1,215 @@
+"""Held-out truth: stars that were set aside before the fit, against what it predicts of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.diagnose.holdout.bins import Bin, partitions_of
+from bayesdist.diagnose.holdout.deviations import deviation_tests
+from bayesdist.diagnose.holdout.frames import frames_for
+from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
+from bayesdist.diagnose.holdout.spread import scale_of
+from bayesdist.diagnose.holdout.sums import held_sums
+from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, coverage_of, holm
+from bayesdist.errors import InputError
+from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.stars.shards import Matches
+
+__all__ = ["DOUBTFUL", "LEAST_HELD", "UNUSUAL", "HeldOutTruth", "held_out_truth"]
+
+Float = NDArray[np.float64]
+
+LEAST_HELD = 50  # stars, without which nothing can be said
+SAMPLE = 200_000  # stars that say where bins end
+UNUSUAL, DOUBTFUL = 0.01, 1e-3  # probability, over all tests together
+ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what tells most
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutTruth:
+    """What held-out stars say of a solution.
+
+    Parameters
+    ----------
+    unit : str
+        Of u and v.
+    n : int
+        Stars that were predicted.
+    n_left_out : int
+        Of exposures with too few stars for a frame of their own.
+    exposures : tuple of str
+        Held out whole.
+    tests : tuple of HeldTest
+        The most telling first.
+    pit : ndarray, shape (3, bins)
+        Counts of the predictive probabilities: of u, of v given u, of the distance.
+    regions : tuple of Bin
+    region_n : ndarray, shape (B,)
+    region_scale : ndarray, shape (B,)
+        Factor on the predicted errors in each region; NaN where there are too few stars.
+    region_offset : ndarray, shape (B, 2)
+        Mean offset from the prediction, in units of its own predicted error.
+    coverage : tuple of AxisCoverage
+        Along each axis.
+    """
+
+    unit: str
+    n: int
+    n_left_out: int
+    exposures: tuple[str, ...]
+    tests: tuple[HeldTest, ...]
+    pit: Float
+    regions: tuple[Bin, ...]
+    region_n: Float
+    region_scale: Float
+    region_offset: Float
+    coverage: tuple[AxisCoverage, ...] = ()
+
+    @property
+    def coverage_words(self) -> str:
+        """Fractions within one sigma along both axes, as a clause."""
+        found = [one for one in self.coverage if one.level == 1.0]
+        return " and ".join(f"{one.value:.3f} along {one.axis}" for one in found) + (
+            f" of held-out stars lie within 1 sigma of their prediction, {found[0].expected:.3f} "
+            "are predicted"
+        )
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so much disagreement by chance, over all tests together."""
+        return self.tests[0].p_corrected
+
+    @property
+    def level(self) -> str:
+        """'pass', 'warn' or 'fail'."""
+        if self.doubtful:
+            return "fail"
+        return "warn" if self.p_value < UNUSUAL else "pass"
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether errors are larger than the solution says, beyond chance."""
+        return self._telling(DOUBTFUL) is not None
+
+    @property
+    def verdict(self) -> str:
+        """One clause."""
+        found = self._telling(DOUBTFUL)
+        if found is None and self.p_value < UNUSUAL:
+            found = self.tests[0]
+        if found is None:
+            return f"held-out stars agree with the prediction (p = {self.p_value:.2g})"
+        return f"{self._words(found)} ({_chance(found.p_corrected)})"
+
+    def _telling(self, level: float) -> HeldTest | None:
+        """The test that tells most of those that matter."""
+        found = [t for t in self.tests if t.p_corrected < level and t.matters]
+        places = [t for t in found if t.name in ("offset", "spread", "deviation")]
+        return min(places or found, key=_rank, default=None)
+
+    def _words(self, test: HeldTest) -> str:
+        where = f"{test.where}," if "held out whole" in test.where else test.where
+        if test.name == "offset":
+            return (
+                f"{where} held-out stars lie {test.value:.2g} {self.unit} from where they are "
+                "predicted"
+            )
+        if test.name == "spread":
+            return (
+                f"{where} the residuals of held-out stars are {test.value:.2g} times as large "
+                "as predicted"
+            )
+        if test.name == "deviation":
+            return (
+                f"{where} deviates by {test.value:.2g} from the other exposures, which scatter"
+                f" by {test.limit:.2g}"
+            )
+        if test.name == "tails":
+            return (
+                f"{test.value * test.n:.0f} of {test.n} held-out stars lie {test.where}, and "
+                f"{test.expected * test.n:.2g} are predicted"
+            )
+        return f"the residuals {test.where} of held-out stars are not distributed as predicted"
+
+
+def _rank(test: HeldTest) -> tuple[float, int, float, bool]:
+    """Where a test stands among others: tails of distributions underflow together.
+
+    Of an exposure that is alone at its date it is the exposure that is told.
+    """
+    size = -abs(test.value - test.expected)
+    return test.p_value, ORDER.index(test.name), size, test.part == "epoch"
+
+
+def _chance(p: float) -> str:
+    return "p < 1e-300" if p < 1e-300 else f"p = {p:.1g}"
+
+
+def held_out_truth(
+    solution: Posterior | Predictive, held: Matches, *, whole: Sequence[str] = ()
+) -> HeldOutTruth:
+    """Judge a solution by stars that it has not seen.
+
+    Parameters
+    ----------
+    solution : Posterior or Predictive
+    held : MatchTable or PartitionedMatches
+        Held-out stars, with errors.
+    whole : sequence of str
+        Exposures all of whose stars were held out.
+
+    Returns
+    -------
+    HeldOutTruth
+
+    Raises
+    ------
+    InputError
+        For too few stars, and for a campaign's posterior of which only the draws are given.
+    """
+    predictive = solution if isinstance(solution, Predictive) else predictive_of(solution)
+    where = ", ".join(held.sources)
+    if predictive.model.gauge != "first" and predictive.deviations is None:
+        raise InputError(
+            "the posterior of a campaign does not say how exposures scatter",
+            where=where,
+            do="give a Predictive with deviations",
+        )
+    pieces = held.pieces()
+    partitions = partitions_of(predictive.model, held, held.sample(SAMPLE), whole)
+    frames = frames_for(predictive, pieces, held.exposure_names)
+    sums = held_sums(predictive, pieces, partitions, frames)
+    if sums.n < LEAST_HELD:
+        raise InputError(
+            f"{sums.n} held-out stars say too little of the solution",
+            where=where,
+            do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
+        )
+    tests = [*all_tests(sums, predictive, partitions), *deviation_tests(predictive, frames)]
+    corrected = holm(np.array([t.p_value for t in tests]))
+    tests = [replace(t, p_corrected=float(p)) for t, p in zip(tests, corrected, strict=True)]
+    regions = next(p for p in partitions if p.kind == "region")
+    found = sums.bins["region"]
+    seen = found.n >= 1
+    error = np.sqrt(np.einsum("bii->bi", found.place_2))
+    return HeldOutTruth(
+        unit=predictive.model.unit,
+        n=sums.n,
+        n_left_out=sums.n_left_out,
+        exposures=tuple(whole),
+        tests=tuple(sorted(tests, key=_rank)),
+        pit=sums.pit,
+        regions=regions.bins,
+        region_n=found.n,
+        region_scale=np.array(
+            [scale_of(s) if n else np.nan for s, n in zip(found.scales, seen, strict=True)]
+        ),
+        region_offset=np.divide(
+            found.place, error, out=np.full_like(error, np.nan), where=error > 0
+        ),
+        coverage=coverage_of(sums),
+    )

@@ -1,0 +1,1 @@
+"""Residuals in bins and samples, and whether they are those of noise."""

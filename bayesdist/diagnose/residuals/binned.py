@@ -1,0 +1,294 @@
+"""What is left after the fit: residuals averaged over the detector, and their statistics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import InputError
+
+__all__ = [
+    "BinnedResiduals",
+    "BinnedSums",
+    "binned_residuals",
+    "binned_sums",
+    "residual_statistics",
+]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+_BLOCK = 2**16  # stars
+
+
+@dataclass(frozen=True, eq=False)
+class BinnedResiduals:
+    """Mean residuals on a grid of equal bins that cover the detector.
+
+    Parameters
+    ----------
+    x : ndarray, shape (nx,)
+    y : ndarray, shape (ny,)
+        Centres of the bins, FITS 1-based pixels.
+    mean_u, mean_v : ndarray, shape (ny, nx)
+        Weighted means; NaN in an empty bin.
+    count : ndarray of int, shape (ny, nx)
+        Stars of positive weight.
+    sem_u, sem_v : ndarray, shape (ny, nx)
+        Standard errors of the means from the scatter inside the bin; NaN below two stars.
+    n_outside : int
+        Stars of positive weight that lie on no pixel of the detector and went into no bin.
+    """
+
+    x: Float
+    y: Float
+    mean_u: Float
+    mean_v: Float
+    count: Int
+    sem_u: Float
+    sem_v: Float
+    n_outside: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class BinnedSums:
+    """Sums of residuals in equal bins that cover the detector; sums of pieces of the data add.
+
+    Parameters
+    ----------
+    size : tuple of float
+        Columns and rows of the detector.
+    count : ndarray of int, shape (ny, nx)
+        Stars of positive weight.
+    weight, weight_2 : ndarray, shape (ny, nx)
+        Sums of the weights and of their squares.
+    first, first_2, second_2 : ndarray, shape (2, ny, nx)
+        Of u and of v: sums of the residual times its weight and times its squared weight, and of
+        the squared residual times the squared weight.
+    n_outside : int
+        Stars of positive weight that lie on no pixel of the detector and went into no bin.
+    """
+
+    size: tuple[float, float]
+    count: Int
+    weight: Float
+    weight_2: Float
+    first: Float
+    first_2: Float
+    second_2: Float
+    n_outside: int = 0
+
+    def __add__(self, other: BinnedSums) -> BinnedSums:
+        if self.size != other.size or self.count.shape != other.count.shape:
+            raise ValueError("sums over different bins do not add")
+        names = ("count", "weight", "weight_2", "first", "first_2", "second_2", "n_outside")
+        return BinnedSums(self.size, *(getattr(self, n) + getattr(other, n) for n in names))
+
+    @property
+    def n(self) -> int:
+        """Stars in all bins."""
+        return int(self.count.sum())
+
+    def residuals(self) -> BinnedResiduals:
+        """Means, and their standard errors from the scatter inside the bins."""
+        mean = _ratio(self.first, self.weight)
+        about = np.nan_to_num(mean)
+        spread = self.second_2 - 2 * about * self.first_2 + about**2 * self.weight_2
+        # rounding may leave a spread of zero slightly below it; with equal weights this is the
+        # sample variance over n
+        variance = _ratio(np.maximum(spread, 0.0), self.weight**2)
+        count = self.count.astype(np.float64)
+        variance = variance * _ratio(count, count - 1.0)
+        sem = np.sqrt(variance)
+        ny, nx = self.count.shape
+        edges_x, edges_y = _edges(self.size[0], nx), _edges(self.size[1], ny)
+        return BinnedResiduals(
+            x=(edges_x[:-1] + edges_x[1:]) / 2,
+            y=(edges_y[:-1] + edges_y[1:]) / 2,
+            mean_u=mean[0],
+            mean_v=mean[1],
+            count=self.count,
+            sem_u=sem[0],
+            sem_v=sem[1],
+            n_outside=self.n_outside,
+        )
+
+
+def binned_residuals(
+    x: ArrayLike,
+    y: ArrayLike,
+    ru: ArrayLike,
+    rv: ArrayLike,
+    *,
+    bins: int | tuple[int, int],
+    size: tuple[float, float],
+    weights: ArrayLike | None = None,
+) -> BinnedResiduals:
+    """Residuals averaged in bins of the detector.
+
+    Parameters
+    ----------
+    x, y, ru, rv, bins, size, weights
+        As `binned_sums`.
+
+    Returns
+    -------
+    BinnedResiduals
+
+    Raises
+    ------
+    InputError
+        As `binned_sums`.
+    """
+    return binned_sums(x, y, ru, rv, bins=bins, size=size, weights=weights).residuals()
+
+
+def binned_sums(
+    x: ArrayLike,
+    y: ArrayLike,
+    ru: ArrayLike,
+    rv: ArrayLike,
+    *,
+    bins: int | tuple[int, int],
+    size: tuple[float, float],
+    weights: ArrayLike | None = None,
+) -> BinnedSums:
+    """Sums of residuals in bins of the detector.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (N,)
+        FITS 1-based pixels.
+    ru, rv : array_like, shape (N,)
+        Residuals, data minus model.
+    bins : int or tuple of int
+        Number of bins on x and on y (WSDC D-T033 uses 31 on each).
+    size : tuple of float
+        Columns and rows of the detector; the bins run from 0.5 to size + 0.5.
+    weights : array_like, shape (N,), optional
+        Not negative; a star of weight 0 (one that was rejected, say) is left out.
+
+    Returns
+    -------
+    BinnedSums
+
+    Raises
+    ------
+    InputError
+        For lengths that differ, values that are not finite where the weight is positive, negative
+        weights, or a bad number of bins.
+    """
+    nx, ny = (bins, bins) if isinstance(bins, int | np.integer) else bins
+    if min(nx, ny) < 1 or int(nx) != nx or int(ny) != ny:
+        raise InputError(f"the number of bins is {bins}", do="give whole numbers of at least 1")
+    x, y, ru, rv = (np.asarray(a, float) for a in (x, y, ru, rv))
+    w = None if weights is None else np.asarray(weights, float)
+    shapes = {a.shape for a in (x, y, ru, rv, *(() if w is None else (w,)))}
+    if x.ndim != 1 or len(shapes) != 1:
+        raise InputError("positions, residuals and weights differ in length")
+    if w is not None and (not (w >= 0).all() or not np.isfinite(w).all()):
+        raise InputError("weights must be finite and not negative", where="weights")
+    out: BinnedSums | None = None
+    # a block at a time: its scratch arrays stay in the cache, however many stars there are
+    for start in range(0, max(len(x), 1), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        block = tuple(a[rows] for a in (x, y, ru, rv))
+        here = None if w is None else w[rows]
+        if here is not None and not (here > 0).all():
+            block, here = tuple(a[here > 0] for a in block), here[here > 0]
+        if not all(np.isfinite(a).all() for a in block):
+            raise InputError(
+                "a position or residual is not finite", do="give that star the weight 0"
+            )
+        sums = _block_sums(block, here, int(nx), int(ny), (float(size[0]), float(size[1])))
+        out = sums if out is None else out + sums
+    assert out is not None
+    return out
+
+
+def _block_sums(
+    block: tuple[Float, ...], w: Float | None, nx: int, ny: int, size: tuple[float, float]
+) -> BinnedSums:
+    x, y, ru, rv = block
+    edges_x, edges_y = _edges(size[0], nx), _edges(size[1], ny)
+    inside = (x >= edges_x[0]) & (x <= edges_x[-1]) & (y >= edges_y[0]) & (y <= edges_y[-1])
+    n_outside = int(inside.size - inside.sum())
+    if n_outside:
+        x, y, ru, rv = (a[inside] for a in (x, y, ru, rv))
+        w = None if w is None else w[inside]
+    index = _bin(y, edges_y) * nx + _bin(x, edges_x)
+
+    def total(values: Float | None = None) -> NDArray[Any]:
+        return np.bincount(index, values, minlength=nx * ny).reshape(ny, nx)
+
+    count = total().astype(np.int64)
+    residuals = (ru, rv)
+    if w is None:
+        weight = weight_2 = count.astype(float)
+        first = first_2 = np.stack([total(r) for r in residuals])
+        second_2 = np.stack([total(r * r) for r in residuals])
+    else:
+        weight, weight_2 = total(w), total(w * w)
+        first = np.stack([total(w * r) for r in residuals])
+        first_2 = np.stack([total(w * w * r) for r in residuals])
+        second_2 = np.stack([total((w * r) ** 2) for r in residuals])
+    return BinnedSums(size, count, weight, weight_2, first, first_2, second_2, n_outside)
+
+
+def _edges(size: float, n: int) -> Float:
+    return np.linspace(0.5, size + 0.5, n + 1)
+
+
+def _bin(values: Float, edges: Float) -> Int:
+    """Bin of each value inside the edges; the last edge belongs to the last bin."""
+    n = edges.size - 1
+    guess = (values - edges[0]) * (n / (edges[-1] - edges[0]))
+    index = np.clip(guess.astype(np.int64), 0, n - 1)
+    # the edges themselves decide, not the rounding of the guess
+    index -= values < edges[index]
+    index += values >= edges[index + 1]
+    return np.minimum(index, n - 1)
+
+
+def _ratio(a: Float, b: Float) -> Float:
+    b = np.broadcast_to(b, a.shape)
+    return np.divide(a, b, out=np.full(a.shape, np.nan), where=b > 0)
+
+
+def residual_statistics(values: ArrayLike) -> dict[str, float]:
+    """Statistics of residuals: the columns of Table 5-1 of WSDC D-T033.
+
+    Parameters
+    ----------
+    values : array_like
+        Residuals of stars or means of bins, any shape; NaN (empty bins) is left out.
+
+    Returns
+    -------
+    dict
+        mean, sigma (about the mean, over n), min, max, median, p01, p99 (percentiles), and n, the
+        number of values.
+
+    Raises
+    ------
+    InputError
+        When there is no value or one is infinite.
+    """
+    r = np.asarray(values, float).ravel()
+    r = r[~np.isnan(r)]
+    if not r.size or np.isinf(r).any():
+        raise InputError("there are no residuals, or infinite ones", do="check the fit")
+    p01, median, p99 = np.percentile(r, [1, 50, 99])
+    return {
+        "mean": float(r.mean()),
+        "sigma": float(r.std()),
+        "min": float(r.min()),
+        "max": float(r.max()),
+        "median": float(median),
+        "p01": float(p01),
+        "p99": float(p99),
+        "n": int(r.size),
+    }

@@ -1,0 +1,171 @@
+"""Residuals that go with the proper motions of the stars: the epochs are not as they are taken.
+
+    r_i = -mu_i dt        mu_i the proper motion of star i, dt the same for all
+
+What the model can take up of both sides is taken from them by a polynomial of the model's order on
+each chip of each exposure.  A scan of dt finds the smallest median residual, whatever false matches
+and fast stars there are; a reweighted fit about it gives dt and, from the scores of single stars,
+its error.  Errors of the motions s_i would draw dt to 0: only stars whose motions are well known
+have a part, and of these
+
+    dt = -sum w r mu / sum w (mu^2 - s^2)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
+from bayesdist.infer.transforms import Solution
+from bayesdist.model.basis import polynomial_terms
+
+__all__ = ["EpochShift", "epoch_shift"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+SAMPLE = 20_000  # detections that are looked at
+FEWEST = 30  # stars with motions
+FARTHEST = 60.0  # years that are scanned
+STEPS = 481  # of the scan, a quarter of a year each
+SIGNIFICANT = 5.0  # standard errors
+ROUNDS = 30
+# error of a motion over the scatter of motions, at most: larger ones are often quoted too small
+WELL_KNOWN = 0.2
+BIWEIGHT = 4.685  # robust standard deviations, beyond which a star has no weight (Tukey)
+NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
+
+
+@dataclass(frozen=True)
+class EpochShift:
+    """An error of the epochs that explains residuals.
+
+    Parameters
+    ----------
+    years : float
+        From the epoch that the reference positions have to that of the exposures.
+    sigma : float
+        Its standard error.
+    before, after : float
+        Robust scatter of the residuals along an axis, as they are and with the shift, in `unit`; of
+        stars with well known motions.
+    unit : str
+        Of u and v.
+    significant : bool
+        More than five standard errors, and the scatter falls.
+    """
+
+    years: float
+    sigma: float
+    before: float
+    after: float
+    unit: str
+    significant: bool
+
+    @property
+    def sentence(self) -> str:
+        """What it means, and what to do about it."""
+        when = "after" if self.years > 0 else "before"
+        return (
+            f"the residuals go with the proper motions of the stars: the exposures were taken "
+            f"{abs(self.years):.2f} +- {self.sigma:.2f} years {when} the epoch that the reference "
+            f"positions have (the scatter falls from {self.before:.2g} to {self.after:.2g} "
+            f"{self.unit}); give data.epoch and data.catalogue_epoch"
+        )
+
+
+def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
+    """The error of the epochs that the residuals show.
+
+    Parameters
+    ----------
+    table : MatchTable
+        With proper motions; of more than `SAMPLE` rows, every k-th is taken.
+    solution : Posterior or LinearFit
+
+    Returns
+    -------
+    EpochShift or None
+        None without proper motions, or with too few.
+    """
+    if table.pm_u is None or table.pm_v is None:
+        return None
+    sample = scored_sample(table.sample(SAMPLE), solution)
+    motion = sample.motion
+    if motion is None:
+        return None
+    moving = np.any(motion != 0, axis=0)  # 0 on both axes is that none was measured
+    if moving.sum() < FEWEST:
+        return None
+    error = np.zeros_like(motion) if sample.motion_sigma is None else sample.motion_sigma
+    known = moving & (error < WELL_KNOWN * _scatter(motion[:, moving])).all(axis=0)
+    if known.sum() < FEWEST:
+        return None
+    residual, P = _left_over(sample, known * sample.inlier, sample.residual, motion)
+    grid = np.linspace(-FARTHEST, FARTHEST, STEPS)
+    sizes = [float(np.median(np.abs((residual + dt * P)[:, known]))) for dt in grid]
+    dt = float(grid[int(np.argmin(sizes))])
+    before = _scatter(residual[:, known])
+    weight = information = np.zeros(0)
+    for _ in range(ROUNDS):
+        scale = np.sqrt(_scatter((residual + dt * P)[:, known]) ** 2 + (dt * error) ** 2)
+        if not (scale > 0).all():
+            return None
+        z2 = (((residual + dt * P) / scale) ** 2).sum(axis=0) / (2 * BIWEIGHT**2)
+        single = np.where(known & (z2 < 1), (1 - np.minimum(z2, 1)) ** 2, 0.0)
+        weight = single / scale**2
+        residual, P = _left_over(sample, single, sample.residual, motion)
+        information = (weight * (P**2 - error**2)).sum()
+        if not information > 0:
+            return None
+        new = -float((weight * residual * P).sum() / information)
+        if abs(new - dt) < 1e-6:
+            break
+        dt = new
+    left = residual + dt * P
+    # a star has one motion in all of its detections, and its error is in both factors
+    _, star = np.unique(motion, axis=1, return_inverse=True)
+    score = (weight * (left * P - dt * error**2)).sum(axis=0)
+    scores = np.bincount(star.ravel(), score)
+    sigma = float(np.sqrt((scores**2).sum()) / information)
+    after = _scatter(left[:, known])
+    found = abs(dt) > SIGNIFICANT * sigma and after < before
+    return EpochShift(dt, sigma, before, after, sample.model.unit, bool(found))
+
+
+def _scatter(values: Float) -> float:
+    """Robust standard deviation about the median of each axis, both together."""
+    middle = np.median(values, axis=1, keepdims=True)
+    return NORMAL * float(np.median(np.abs(values - middle)))
+
+
+def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[Float]:
+    """What polynomials on each chip of each exposure leave of vectors (2, N)."""
+    out = [field.copy() for field in fields]
+    order = sample.model.order
+    i, j = np.array(polynomial_terms(order)).T
+    for rows in _together(sample):
+        X, Y = sample.X[rows], sample.Y[rows]
+        basis = legendre.legvander(X, order)[:, i] * legendre.legvander(Y, order)[:, j]
+        w = np.sqrt(weight[rows])
+        if (w > 0).sum() < 2 * basis.shape[1]:  # too few for a polynomial: a shift
+            basis = basis[:, :1]
+        for field in out:
+            found = np.linalg.lstsq(w[:, None] * basis, (w * field[:, rows]).T)[0]
+            field[:, rows] -= (basis @ found).T
+    yield from out
+
+
+def _together(sample: ScoredSample) -> list[Int]:
+    """Rows of each chip of each exposure."""
+    rows: dict[tuple[int, int], list[Int]] = {}
+    for block in sample.blocks:
+        own = np.arange(block.rows.start, block.rows.stop)
+        rows.setdefault((block.chip, block.exposure), []).append(own)
+    return [np.concatenate(parts) for parts in rows.values()]

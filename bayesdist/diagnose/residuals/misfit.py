@@ -1,0 +1,188 @@
+"""Does the model describe the stars?  Structure left in the residuals, and errors that do not fit.
+
+The posterior is that of the model: where the model leaves structure behind, its uncertainty says
+nothing of it, and no requirement can be called met.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
+from bayesdist.model import Chip
+from bayesdist.model.basis import polynomial_terms
+
+__all__ = [
+    "MOST_BINS",
+    "STARS_PER_BIN",
+    "Misfit",
+    "bin_means",
+    "misfit_of",
+    "partitions_for",
+    "worst_misfit",
+]
+
+Float = NDArray[np.float64]
+
+STARS_PER_BIN = 25
+MOST_BINS = 32  # along each side
+SEEN = 0.5  # of all patterns, below which that none is found says little
+SIGNIFICANT = 1e-4  # probability of as much structure by chance, over all tests together
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Structure in binned residuals.
+
+    Parameters
+    ----------
+    p_value : float
+        Probability of as much structure by chance, of the most telling of three partitions: cells,
+        columns, rows; multiplied by three, and by the number of chips where the worst of several is
+        named.
+    partition : str
+        Which one that is.
+    structure : float
+        Rms over that partition of the mean residual, its noise subtracted (both axes together).
+    unit : str
+    chip : Chip or None
+        The chip, where the detector has several.
+    told : float
+        Share of the patterns over the partitions that would have been seen: below 1 where fitted
+        stars hide some.
+    """
+
+    p_value: float
+    partition: str
+    structure: float
+    unit: str
+    chip: Chip | None = None
+    told: float = 1.0
+
+    @property
+    def significant(self) -> bool:
+        """Whether the structure is more than chance."""
+        return self.p_value < SIGNIFICANT
+
+    @property
+    def hidden(self) -> bool:
+        """Whether most structure would not have been seen."""
+        return self.told < SEEN
+
+    @property
+    def sentence(self) -> str:
+        """What it means, as a clause."""
+        return f"{self.finding}, so that errors are larger than the posterior says"
+
+    @property
+    def finding(self) -> str:
+        """The same without the consequence."""
+        part = "the detector" if self.chip is None else f"chip {self.chip.name}"
+        # tails underflow: no probability is zero
+        p = "p < 1e-300" if self.p_value < 1e-300 else f"p = {self.p_value:.1g}"
+        return (
+            f"the residuals hold structure that the model does not describe ({self.structure:.2g} "
+            f"{self.unit} rms in {self.partition} of {part}, {p})"
+        )
+
+
+def partitions_for(n: int) -> dict[str, tuple[int, int]]:
+    """The partitions of the detector that `misfit_of` looks at.
+
+    Parameters
+    ----------
+    n : int
+        Stars.
+
+    Returns
+    -------
+    dict of str to tuple of int
+        Bins on x and on y, by name.
+    """
+    side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 3, MOST_BINS))
+    strips = int(np.clip(n / STARS_PER_BIN, 3, 2 * MOST_BINS))
+    return {"cells": (side, side), "columns": (strips, 1), "rows": (1, strips)}
+
+
+def misfit_of(sums: Mapping[str, BinnedSums], *, order: int | None = None, unit: str) -> Misfit:
+    """Test residuals for structure over the detector.
+
+    Parameters
+    ----------
+    sums : mapping of str to BinnedSums
+        Of the residuals of the stars that were not rejected, in each of `partitions_for` so many.
+    order : int, optional
+        Of the polynomial that the fit has taken out of the residuals of both axes.
+    unit : str
+        Of the residuals.
+
+    Returns
+    -------
+    Misfit
+    """
+    found = []
+    for name, one in sums.items():
+        p, structure = _test(one.residuals(), _absorbed(one, order))
+        found.append(Misfit(p, name, structure, unit))
+    return worst_misfit(found)
+
+
+def worst_misfit(found: Sequence[Misfit]) -> Misfit:
+    """The most telling of several chips or partitions, its probability corrected for their number.
+
+    Parameters
+    ----------
+    found : sequence of Misfit
+        One for each.
+
+    Returns
+    -------
+    Misfit
+    """
+    # many p-values are zero in double precision: then the larger structure is the worse
+    worst = min(found, key=lambda m: (m.p_value, -m.structure))
+    return replace(worst, p_value=min(1.0, len(found) * worst.p_value))
+
+
+def _absorbed(sums: BinnedSums, order: int | None) -> float:
+    """Degrees of freedom, of both axes, that means over these bins have lost to the polynomial.
+
+    A term takes from the bins what it keeps when it is averaged over them: nothing where it
+    oscillates within a bin, as all that vary along a column do in columns.
+    """
+    if order is None:
+        return 0.0
+    kept_y, kept_x = (_kept(n, order) for n in sums.count.shape)
+    return 2.0 * sum(kept_x[i] * kept_y[j] for i, j in polynomial_terms(order))
+
+
+def _kept(n: int, order: int) -> Float:
+    """Mean square of each Legendre polynomial, averaged over n equal bins, over its mean square."""
+    means = bin_means(n, order)
+    return (2 * np.arange(order + 1) + 1) * np.mean(means**2, axis=1)
+
+
+def bin_means(n: int, order: int) -> Float:
+    """Means of each Legendre polynomial over n equal bins, (order + 1, n)."""
+    edges = np.linspace(-1.0, 1.0, n + 1)
+    integrals = [legendre.Legendre.basis(k).integ()(edges) for k in range(order + 1)]
+    return np.asarray(np.diff(integrals, axis=1) * n / 2)
+
+
+def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:
+    good = cells.count >= 5
+    n = cells.count[good]
+    # the square of a t variable is larger than that of a normal one
+    shrink = np.sqrt((n - 3) / (n - 1))
+    mean = np.stack([cells.mean_u[good], cells.mean_v[good]])
+    sem = np.stack([cells.sem_u[good], cells.sem_v[good]]) / shrink
+    total = float(((mean / sem) ** 2).sum())
+    dof = max(mean.size - absorbed * n.size / cells.count.size, 1.0)
+    excess = (mean**2 - sem**2).sum(axis=0).mean() if n.size else 0.0
+    return float(chi2.sf(total, dof)), float(np.sqrt(max(excess, 0.0)))

@@ -1,0 +1,66 @@
+"""Quoted errors that are far too small: how many times, and what is said of it.
+
+Jitter takes up errors that are a few times too small.  Where they are far smaller, what they say of
+single stars would be lost beside it, so all of them are multiplied by what the residuals show.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from bayesdist.data import MatchTable
+from bayesdist.infer import LinearFit
+from bayesdist.infer.stars.stars import prepare
+
+__all__ = ["error_scale", "error_scale_sentence"]
+
+FEW = 0.1  # of the matches
+FAR = 20.0  # times the quoted errors, beyond which jitter would be nearly all there is
+
+
+def error_scale(fit: LinearFit, table: MatchTable) -> float:
+    """Factor on all errors that makes small residuals what they say; 1 where it is not large.
+
+    A low quantile of chi-square is compared with its expectation: most matches may be false.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    table : MatchTable
+        The matches, or some of them.
+
+    Returns
+    -------
+    float
+    """
+    stars, _ = prepare(fit.model, table)
+    r = stars.residuals(np.asarray(fit.mean))
+    found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, FEW)
+    factor = float(np.sqrt(found / chi2.ppf(FEW, 2)))
+    return factor if factor > FAR else 1.0
+
+
+def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude: bool) -> str:
+    """What has been done to the errors, and what else may help, as a clause.
+
+    Parameters
+    ----------
+    factor : float
+    sigma : float
+        Median error after it.
+    unit : str
+    by_magnitude : bool
+        There are magnitudes to estimate errors by.
+
+    Returns
+    -------
+    str
+    """
+    do = "check their unit and the order of the model"
+    if by_magnitude:
+        do += ', or set data.sigma = "by_magnitude"'
+    return (
+        f"the residuals scatter {factor:.3g} times as widely as the quoted errors say (median "
+        f"{sigma / factor:.3g} {unit}), and all errors were multiplied by that: {do}"
+    )

@@ -1,0 +1,97 @@
+"""Some of the stars with what the solutions say of them: for figures that draw single stars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.density.memberships import memberships_of
+from bayesdist.infer.stars.stars import in_table_order, prepare
+
+__all__ = ["SAMPLE", "StarSample", "star_sample"]
+
+Float = NDArray[np.float64]
+
+SAMPLE = 200_000  # stars that show what all of them look like
+
+
+@dataclass(frozen=True, eq=False)
+class StarSample:
+    """Evenly spread stars of the data, or all of them.
+
+    Parameters
+    ----------
+    table : MatchTable
+        N stars.
+    fit_residual : ndarray, shape (N, 2)
+        Data minus the least-squares fit, in the unit of u and v.
+    used : ndarray of bool, shape (N,)
+        Whether the fit used the star.
+    n_total : int
+        Stars that there are in all.
+    posterior_residual : ndarray, shape (N, 2), or None
+        Data minus the model at the posterior mean; None where nothing was sampled.
+    outlier_probability : ndarray, shape (N,), or None
+    taken : ndarray, shape (N,), or None
+        Share of the variance that fitted places of the stars take out of the residuals; None where
+        places are known.
+    """
+
+    table: MatchTable
+    fit_residual: Float
+    used: NDArray[np.bool_]
+    n_total: int
+    posterior_residual: Float | None = None
+    outlier_probability: Float | None = None
+    taken: Float | None = None
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @property
+    def partial(self) -> bool:
+        """Whether there are more stars than these."""
+        return len(self.table) < self.n_total
+
+    @property
+    def residual(self) -> Float:
+        """Residuals at the posterior mean where there is one, else at the fit."""
+        return self.fit_residual if self.posterior_residual is None else self.posterior_residual
+
+
+def star_sample(
+    table: MatchTable, n_total: int, fit: LinearFit, posterior: Posterior | None = None
+) -> StarSample:
+    """What a fit and a posterior say of some stars.
+
+    Parameters
+    ----------
+    table : MatchTable
+        With errors: as of ``matches.sample(SAMPLE)``.
+    n_total : int
+        Stars that there are in all.
+    fit : LinearFit
+    posterior : Posterior, optional
+
+    Returns
+    -------
+    StarSample
+    """
+    stars, order = prepare(fit.model, table)
+    said = None if posterior is None else memberships_of(posterior, stars).in_table_order(order)
+
+    def residual(solution: LinearFit | Posterior) -> Float:
+        return in_table_order(stars.residuals(solution.mean), order)
+
+    return StarSample(
+        table=table,
+        fit_residual=residual(fit),
+        used=in_table_order(fit.clip.keeps_of(stars), order),
+        n_total=n_total,
+        posterior_residual=None if posterior is None else residual(posterior),
+        outlier_probability=None if said is None else said.outlier_probability,
+    )

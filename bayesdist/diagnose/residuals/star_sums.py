@@ -1,0 +1,158 @@
+"""What is to be known of all stars at a solution, as sums that take one pass over the data.
+
+The functions that go over a shard are those of a module, so that they can be sent to other
+processes; what they return adds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
+from bayesdist.infer.density.memberships import averaged_draws, star_averages
+from bayesdist.infer.kernel import Constants
+from bayesdist.infer.linear import Clip
+from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.stars.shards import Shards
+from bayesdist.infer.stars.stars import Stars
+
+__all__ = ["ExposureSums", "StarSums", "flagged_by_exposure", "star_sums"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bins = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureSums:
+    """Counts and residuals of each exposure.
+
+    Parameters
+    ----------
+    n, n_used : ndarray of int, shape (E,)
+        Stars, and those that the least-squares fit used.
+    uu, vv : ndarray, shape (E,)
+        Sums of the squared residuals of the stars used.
+    """
+
+    n: Int
+    n_used: Int
+    uu: Float
+    vv: Float
+
+    def __add__(self, other: ExposureSums) -> ExposureSums:
+        names = ("n", "n_used", "uu", "vv")
+        return ExposureSums(*(getattr(self, n) + getattr(other, n) for n in names))
+
+    @property
+    def rms(self) -> tuple[Float, Float]:
+        """Rms residuals in u and in v of the stars used; NaN where there are none."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.sqrt(self.uu / self.n_used), np.sqrt(self.vv / self.n_used)
+
+
+@dataclass(frozen=True, eq=False)
+class StarSums:
+    """Sums over stars at a solution.
+
+    Parameters
+    ----------
+    binned : mapping of (int, (int, int)) to BinnedSums
+        Residuals of the stars used, by the chip's number and the numbers of bins on x and y.  Where
+        exposures have frames that turn, they are along the axes of the polynomials: what belongs to
+        the detector would cancel along those of the sky.
+    exposures : ExposureSums
+    """
+
+    binned: Mapping[tuple[int, Bins], BinnedSums]
+    exposures: ExposureSums
+
+    def __add__(self, other: StarSums) -> StarSums:
+        binned = {key: sums + other.binned[key] for key, sums in self.binned.items()}
+        return StarSums(binned, self.exposures + other.exposures)
+
+
+def star_sums(
+    stars: Stars, theta: Float, clip: Clip, partitions: Mapping[int, tuple[Bins, ...]]
+) -> StarSums:
+    """Sums over some stars: a task for `Shards.sum`.
+
+    Parameters
+    ----------
+    stars : Stars
+    theta : ndarray, shape (D,)
+        Where the residuals are taken.
+    clip : Clip
+        Says which stars are used.
+    partitions : mapping of int to tuple of (int, int)
+        Bins on x and on y, by the number of the chip.
+
+    Returns
+    -------
+    StarSums
+    """
+    used = clip.keeps_of(stars)
+    residual = stars.residuals(theta)
+    exposures = _exposure_sums(stars, used, residual)
+    code = _of_groups(stars, stars.groups.chip)
+    arrays = (*stars.pixels(), *_along_gauge(stars, theta, residual).T)
+    binned = {}
+    for number, several in partitions.items():
+        k = stars.model.chip_code(number)
+        good = used & (code == k)
+        here = arrays if good.all() else tuple(a[good] for a in arrays)
+        size = stars.model.chips[k].size
+        for bins in several:
+            binned[number, bins] = binned_sums(*here, bins=bins, size=size)
+    return StarSums(binned, exposures)
+
+
+def _along_gauge(stars: Stars, theta: Float, residual: Float) -> Float:
+    """Residuals along the axes of the polynomials, before the frames."""
+    if not stars.model.n_frame:
+        return residual
+    out = residual.copy()
+    for g, e in enumerate(stars.groups.exposure):
+        matrix, _ = stars.model.frame(theta, int(e))
+        rows = slice(stars.starts[g], stars.starts[g + 1])
+        out[rows] = np.linalg.solve(matrix, residual[rows].T).T
+    return out
+
+
+def flagged_by_exposure(shards: Shards, posterior: Posterior) -> Int:
+    """Stars (E,) of each exposure that are more likely false matches than not.
+
+    Parameters
+    ----------
+    shards : Shards
+        Of all stars; one pass over them is made.
+    posterior : Posterior
+    """
+    return shards.sum(_flagged, *averaged_draws(posterior))
+
+
+def _flagged(stars: Stars, theta: Float, constants: Constants) -> Int:
+    p = star_averages(stars, theta, constants)[0]
+    exposure = _of_groups(stars, stars.groups.exposure)
+    return np.bincount(exposure[p > 0.5], minlength=len(stars.model.exposures))
+
+
+def _of_groups(stars: Stars, codes: Int) -> Int:
+    """What belongs to each star's group."""
+    return np.repeat(codes, np.diff(stars.starts))
+
+
+def _exposure_sums(stars: Stars, used: NDArray[np.bool_], residual: Float) -> ExposureSums:
+    exposure, n = _of_groups(stars, stars.groups.exposure), len(stars.model.exposures)
+    of_used = exposure[used]
+    u, v = residual[used].T
+    return ExposureSums(
+        n=np.bincount(exposure, minlength=n),
+        n_used=np.bincount(of_used, minlength=n),
+        uu=np.bincount(of_used, u * u, minlength=n).astype(np.float64),
+        vv=np.bincount(of_used, v * v, minlength=n).astype(np.float64),
+    )

@@ -1,0 +1,1 @@
+"""Score tests of what a model may lack, each with its size and its power."""

@@ -1,0 +1,309 @@
+"""Test of linear deviations of single exposures that their frames do not fit.
+
+Every exposure e has a statistic T_e of its own, of the shift, rotation, scale and shears that are
+no parameters of its frame: a chi-square of the same probability as Hotelling's statistic, with the
+covariance of the scores from its own stars.  Exposures deviate in ways of their own, and the sum of
+the T_e is what is tested: it does not need the covariance of hundreds of scores.  Through the
+polynomials, which all fit together, the T_e are slightly dependent; mean and variance of the sum
+are those of a scaled chi-square (Satterthwaite 1946).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.linalg import cho_solve
+
+from bayesdist.diagnose.score.projection import Projection
+from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.sample import Block
+from bayesdist.diagnose.score.score import independent_directions, smallest_pattern
+from bayesdist.model.frames import frame_names
+
+__all__ = ["exposure_test"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+LEAST_P = 1e-300
+STARS_PER_DIRECTION = 4  # of an exposure that is tested
+MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
+INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
+
+_LINEAR = {
+    "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
+    "rotation": np.array([[0.0, -1.0], [1.0, 0.0]]),
+    "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
+    "shear_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Deviations:
+    """One exposure's deviations, all parameters projected out.
+
+    Parameters
+    ----------
+    score : ndarray, shape (n,)
+    information : ndarray, shape (n, n)
+        Beside all parameters.
+    own : ndarray, shape (n, n)
+        Beside those of the exposure alone.
+    cross : ndarray, shape (n, G)
+        With the global parameters.
+    covariance : ndarray, shape (n, n)
+        Of the score, from those of single detections.
+    square : ndarray, shape (n, n)
+        Mean square of the deviations over the detector.
+    n_stars : float
+        Stars that the covariance is known from, those of other exposures by what they add to it.
+    """
+
+    score: Float
+    information: Float
+    own: Float
+    cross: Float
+    covariance: Float
+    square: Float
+    n_stars: float
+
+    @property
+    def statistic(self) -> float:
+        """Chi-square of the same probability as Hotelling's statistic about zero."""
+        n, t = len(self.score), float(self.score @ np.linalg.solve(self.covariance, self.score))
+        p = stats.beta.sf(min(t / self.n_stars, 1.0), n / 2, (self.n_stars - n) / 2)
+        return float(stats.chi2.isf(max(p, LEAST_P), n))
+
+    def along(self, N: Float) -> _Deviations:
+        """Some directions of them."""
+        return _Deviations(
+            N.T @ self.score,
+            N.T @ self.information @ N,
+            N.T @ self.own @ N,
+            N.T @ self.cross,
+            N.T @ self.covariance @ N,
+            N.T @ self.square @ N,
+            self.n_stars,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Meat:
+    """Scores of the global parameters, by stars.
+
+    Parameters
+    ----------
+    by_star : ndarray, shape (stars, G)
+        Sums over the detections of each.
+    total : ndarray, shape (G, G)
+        Sum of their squares, and what the priors add.
+    """
+
+    by_star: Float
+    total: Float
+
+    @classmethod
+    def of(cls, projection: Projection) -> _Meat:
+        """Those of all stars."""
+        sample, G = projection.sample, projection.n_global
+        by_star = np.zeros((int(sample.star.max()) + 1, G))
+        for block in sample.blocks:
+            F = projection.functions.polynomials(block.rows)
+            psi = projection.star_scores(F, block, projection.through(block, np.eye(G)))
+            np.add.at(by_star, sample.star[block.rows], psi)
+        total = by_star.T @ by_star + np.diag(projection.precision[:G])
+        for one in projection.exposures.values():
+            gain = one.gain[:, :G]
+            total += gain.T @ (one.precision[:, None] * gain)
+        return cls(by_star, total)
+
+    def covariance(self, nuisance: Float, star: Int, own: Float) -> tuple[Float, Float]:
+        """Covariance (n, n) of an exposure's scores: of its own stars, and of all others.
+
+        Parameters
+        ----------
+        nuisance : ndarray, shape (G, n)
+            Parameters that the deviations are taken for.
+        star : ndarray of int, shape (N,)
+            Stars of the exposure's detections.
+        own : ndarray, shape (N, n)
+            Scores of the detections before the parameters are projected out.
+        """
+        which, of = np.unique(star, return_inverse=True)
+        direct = np.zeros((len(which), own.shape[1]))
+        np.add.at(direct, of, own)
+        # a star is one, in this exposure and in all others
+        through = self.by_star[which] @ nuisance
+        left = direct - through
+        rest = nuisance.T @ self.total @ nuisance - through.T @ through
+        return left.T @ left, rest
+
+
+def exposure_test(projection: Projection) -> Outcome | None:
+    """Test of the exposures' own deviations.
+
+    Parameters
+    ----------
+    projection : Projection
+
+    Returns
+    -------
+    Outcome or None
+        None where there is one exposure, where the frames fit all linear terms, and where no two
+        exposures have stars enough.
+    """
+    model = projection.sample.model
+    names = [name for name in frame_names("affine") if name not in frame_names(model.frames)]
+    if not names or len({block.exposure for block in projection.sample.blocks}) < 2:
+        return None
+    found = list(_deviations(projection, names))
+    if len(found) < 2:
+        return None
+    T, n, size2, noise2 = 0.0, 0, 0.0, 0.0
+    shared, apart = np.zeros((projection.n_global, projection.n_global)), 0.0
+    for one in found:
+        T += one.statistic
+        n += len(one.score)
+        shared += one.cross.T @ np.linalg.solve(one.information, one.cross)
+        alone = np.linalg.solve(
+            one.information, one.cross @ cho_solve(projection.root, one.cross.T)
+        )
+        apart += float(np.trace(alone @ alone))
+        back = np.linalg.inv(one.own)
+        step = back @ one.score
+        noise = float(np.trace(one.square @ back @ one.covariance @ back))
+        size2 += (float(step @ one.square @ step) - noise) / len(found)
+        noise2 += noise / len(found)
+    together = cho_solve(projection.root, shared)
+    # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
+    stretch = 1.0 + (float((together * together.T).sum()) - apart) / n
+    dof = n / stretch
+    return Outcome(
+        name="exposures",
+        statistic=T / stretch,
+        dof=dof,
+        dof_residual=None,
+        p_value=float(stats.chi2.sf(T / stretch, dof)),
+        size=float(np.sqrt(max(size2, 0.0))),
+        smallest=partial(smallest_pattern, float(np.sqrt(noise2)), dof, None),
+        unit=model.unit,
+        remedy=_remedy(model.frames),
+        present="exposures deviate from each other in linear terms that their frames do not fit",
+        absent="no deviations of single exposures are left in the residuals",
+    )
+
+
+def _remedy(frames: str) -> str:
+    hierarchy = "use a campaign, whose exposures have a hierarchy of deviations"
+    return hierarchy if frames == "affine" else f"set model.frames to 'affine', or {hierarchy}"
+
+
+def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
+    """Deviations of every exposure with stars enough, along the directions that it has left."""
+    meat = None
+    if len(projection.sample) * projection.n_global**2 < MOST_PRODUCTS:
+        meat = _Meat.of(projection)
+    by_exposure: dict[int, list[Block]] = {}
+    for block in projection.sample.blocks:
+        by_exposure.setdefault(block.exposure, []).append(block)
+    for blocks in by_exposure.values():
+        n = sum(int(projection.sample.used[block.rows].sum()) for block in blocks)
+        if n < STARS_PER_DIRECTION * len(names):
+            continue
+        whole, one = _of_exposure(projection, blocks, names, meat)
+        N = independent_directions(whole, one.information, INDEPENDENT)
+        if N.shape[1]:
+            yield one.along(N)
+
+
+def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Float:
+    """What each deviation does to the polynomial of a block, (2, K, n)."""
+    out = np.zeros((*block.effective.shape, len(names)))
+    about = block.effective.copy()
+    about[:, 0] -= origin
+    for k, name in enumerate(names):
+        if name in _LINEAR:
+            out[..., k] = _LINEAR[name] @ about
+        else:
+            out["uv".index(name[-1]), 0, k] = 1.0
+    return out
+
+
+def _of_exposure(
+    projection: Projection, blocks: list[Block], names: list[str], meat: _Meat | None
+) -> tuple[Float, _Deviations]:
+    """Information before anything is projected out, and one exposure's deviations.
+
+    Without the scores of the global parameters, the part of other exposures in the covariance is
+    taken to be as wrong as errors are on average.
+    """
+    sample, model, G = projection.sample, projection.sample.model, projection.n_global
+    n = len(names)
+    local = projection.exposures.get(blocks[0].frame_exposure)
+    whole, cross, score = np.zeros((n, n)), np.zeros((n, G)), np.zeros(n)
+    square = np.zeros((n, n))
+    to_local = np.zeros((0 if local is None else len(local.index), n))
+    area = np.array([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in model.basis().terms])
+    fields = [_fields(block, names, model.origin) for block in blocks]
+    parts = [projection.parts(block) for block in blocks]
+    for block, Z, (by_global, by_local) in zip(blocks, fields, parts, strict=True):
+        F = projection.functions.polynomials(block.rows)
+        WZ = projection.weighted(F, block, Z)
+        whole += np.einsum("akm,akn->mn", Z, WZ)
+        columns = block.columns[: by_global.shape[2]]
+        cross[:, columns] += np.einsum("akn,akm->nm", WZ, by_global)
+        score += np.einsum("akn,ak->n", Z, sample.score[:, block.rows] @ F.T)
+        square += np.einsum("akm,k,akn->mn", Z, area, Z) / len(blocks)
+        if local is not None:
+            at = np.searchsorted(local.index, block.columns[by_global.shape[2] :])
+            to_local[at] += np.einsum("akl,akn->ln", by_local, WZ)
+    own, own_gain = whole, np.zeros((0, n))
+    if local is not None:
+        own_gain = local.inverse @ to_local
+        own = whole - to_local.T @ own_gain
+        cross = cross - to_local.T @ local.gain[:, :G]
+        score = score - own_gain.T @ local.score
+    nuisance = cho_solve(projection.root, cross.T)
+    information = own - cross @ nuisance
+    others, psi = information.copy(), []
+    for block, Z, (_, by_local) in zip(blocks, fields, parts, strict=True):
+        F = projection.functions.polynomials(block.rows)
+        through = projection.through(block, nuisance)
+        direct = Z - through
+        if local is not None:
+            at = np.searchsorted(local.index, block.columns[block.columns >= G])
+            direct -= by_local @ own_gain[at]
+        if meat is None:
+            others -= np.einsum("akm,akn->mn", direct, projection.weighted(F, block, direct))
+        else:
+            direct += through
+        psi.append(projection.star_scores(F, block, direct))
+    own_scores = np.concatenate(psi)
+    n_own = sum(int(sample.used[block.rows].sum()) for block in blocks)
+    if meat is None:
+        of_own, of_others = own_scores.T @ own_scores, projection.score_ratio * others
+    else:
+        star = np.concatenate([sample.star[block.rows] for block in blocks])
+        of_own, of_others = meat.covariance(nuisance, star, own_scores)
+        if local is not None:
+            before = local.gain[:, :G] @ nuisance
+            after = own_gain - before
+            P = local.precision[:, None]
+            of_others += after.T @ (P * after) - before.T @ (P * before)
+    covariance = of_own + of_others
+    share = float(np.trace(of_own) / np.trace(covariance))
+    n_others = max(int(sample.used.sum()) - n_own, 1)
+    return whole, _Deviations(
+        score - nuisance.T @ projection.score[:G],
+        (information + information.T) / 2,
+        (own + own.T) / 2,
+        cross,
+        (covariance + covariance.T) / 2,
+        square,
+        1.0 / (share**2 / n_own + (1.0 - share) ** 2 / n_others),
+    )

@@ -1,0 +1,203 @@
+"""Test for stars that move in ways that nobody has told: do a star's residuals go with time?
+
+Of each star the square of the slope's score is compared with those of its single detections, after
+position and slope, so that nothing is assumed of the size of the errors.  With the slope b_s of
+star s, its information S_s beside the star's position, the scores p_i of detections for the slope,
+given back what position and slope have taken (HC2), and the covariance C_s of the errors that the
+catalogue states for the motion,
+
+    D_s = [b_s^T S_s b_s - sum_i p_i^T S_s^-1 p_i - tr(S_s C_s)] / 2
+
+is zero on the mean of stars that move as they are said to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesdist.diagnose.score.projection import Projection
+from bayesdist.diagnose.score.result import Outcome, noncentrality
+
+__all__ = ["StarResiduals", "motion_outcome", "motion_test"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+FEWEST_DETECTIONS = 4  # of a star: of fewer nothing is left
+FEWEST_STARS = 100
+SHORTEST = 0.1  # years in which motions are looked for
+MOST_TAKEN = 0.95  # of one detection, by position and slope
+MOVING = 1e-6  # of the determinant of the slope's information, that the position leaves
+
+
+@dataclass(frozen=True, eq=False)
+class StarResiduals:
+    """What detections say of the places of their stars.
+
+    Parameters
+    ----------
+    star : ndarray of int, shape (N,)
+    epoch : ndarray, shape (N,)
+    gradient : ndarray, shape (N, 2)
+        Of the log-likelihood by the star's place.
+    curvature : ndarray, shape (N, 2, 2)
+        Minus the second derivatives.
+    precision : ndarray, shape (2, 2), (stars, 2, 2) or ()
+        Of what is known of the places beforehand.
+    stated : ndarray, shape (stars, 2), or None
+        Errors of the motions that the catalogue has.
+    """
+
+    star: Int
+    epoch: Float
+    gradient: Float
+    curvature: Float
+    precision: Float
+    stated: Float | None = None
+
+
+def motion_test(projection: Projection) -> Outcome | None:
+    """Test of matched stars for motions that the catalogue does not have.
+
+    Parameters
+    ----------
+    projection : Projection
+
+    Returns
+    -------
+    Outcome or None
+        None without dates, and where too few stars are seen at several of them.
+    """
+    sample = projection.sample
+    if sample.epoch is None or np.ptp(sample.epoch) < SHORTEST:
+        return None
+    uu, uv, vv = sample.curvature
+    g = projection.whole_score.T
+    stated = None
+    if sample.motion_sigma is not None:
+        stated = np.zeros((int(sample.star.max()) + 1, 2))
+        stated[sample.star] = sample.motion_sigma.T
+    return motion_outcome(
+        StarResiduals(
+            sample.star,
+            sample.epoch,
+            g,
+            np.moveaxis(np.array([[uu, uv], [uv, vv]]), 2, 0),
+            np.zeros(()),
+            stated,
+        ),
+        sample.model.unit,
+        remedy="give the catalogue proper motions, or larger errors of those that it has, or leave "
+        "out the stars that move",
+        present="stars move between the dates of the exposures in ways that the catalogue does not "
+        "have",
+    )
+
+
+def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str) -> Outcome | None:
+    """Test of residuals of stars.
+
+    Parameters
+    ----------
+    data : StarResiduals
+    unit : str
+        Of u and v.
+    remedy, present : str
+        As of `Outcome`.
+
+    Returns
+    -------
+    Outcome or None
+        None for too few stars.
+    """
+    star, g, H = data.star, data.gradient, data.curvature
+    S = int(star.max()) + 1
+    good = (H[:, 0, 0] > 0) & (H[:, 1, 1] > 0)
+
+    def summed(values: Float) -> Float:
+        flat = values.reshape(len(values), -1)
+        out = np.stack([np.bincount(star, column, S) for column in flat.T], axis=1)
+        return np.asarray(out.reshape(S, *values.shape[1:]), float)
+
+    g, H = g * good[:, None], H * good[:, None, None]
+    members = summed(good.astype(float)[:, None])[:, 0]
+    A = summed(H) + data.precision
+    many = np.flatnonzero(members >= FEWEST_DETECTIONS)
+    mean = summed((good * data.epoch)[:, None])[:, 0] / np.maximum(members, 1)
+    t = data.epoch - mean[star]
+    cross, square = summed(t[:, None, None] * H)[many], summed(t[:, None, None] ** 2 * H)[many]
+    if len(many):
+        back = np.linalg.solve(A[many], cross)
+        left = square - np.swapaxes(cross, 1, 2) @ back
+        moving = np.linalg.det(left) > MOVING * np.linalg.det(square)
+        many, back, left = many[moving], back[moving], left[moving]
+    if len(many) < FEWEST_STARS:
+        return None
+    of = np.full(S, -1)
+    of[many] = np.arange(len(many))
+    rows = np.flatnonzero(good & (of[star] >= 0))
+    of, t, g, H = of[star[rows]], t[rows], g[rows], H[rows]
+    # the slope's derivative beside the position, of each detection
+    T = t[:, None, None] * np.eye(2) - back[of]
+    slope, whole = np.zeros((len(many), 2)), np.zeros((len(many), 2))
+    np.add.at(slope, of, np.einsum("nba,nb->na", T, g))
+    np.add.at(whole, of, g)
+    inside, outside = np.linalg.inv(left), np.linalg.inv(A[many])
+    step = np.einsum("nab,nb->na", inside, slope)
+    place = np.einsum("nab,nb->na", outside, whole)
+    follows = np.einsum("nab,nbc,ndc->nad", T, inside[of], T) + outside[of]
+    taken = np.einsum("nab,nba->n", H, follows) / 2
+    moved = np.einsum("nab,nb->na", T, step[of]) + place[of]
+    psi = np.einsum("nba,nb->na", T, g - np.einsum("nab,nb->na", H, moved))
+    each = np.einsum("na,nab,nb->n", psi, inside[of], psi) / (1 - np.minimum(taken, MOST_TAKEN))
+    difference = (np.einsum("na,na->n", slope, step) - np.bincount(of, each)) / 2
+    if data.stated is not None:
+        difference -= np.einsum("naa,na->n", left, data.stated[many] ** 2) / 2
+    # motions of mean square m^2, both axes together, add m^2 tr(S_s) / 4 to each
+    unit_square = 4 / float(np.trace(left, axis1=1, axis2=2).sum())
+    statistic, p = _above_zero(difference)
+    noise = float(each.sum()) / (2 * len(many)), float(np.var(difference)), len(many)
+    return Outcome(
+        name="motions",
+        statistic=max(statistic, 0.0) ** 2,
+        dof=1,
+        dof_residual=None,
+        p_value=p,
+        # of a motion in a year, rms over the stars and both axes together
+        size=float(np.sqrt(max(unit_square * difference.sum(), 0.0))),
+        smallest=partial(_smallest, unit_square, *noise),
+        unit=f"{unit}/yr",
+        remedy=remedy,
+        present=present,
+        absent="no motions of the stars are left in the residuals",
+    )
+
+
+def _above_zero(values: Float) -> tuple[float, float]:
+    """Student's t of the mean, with what a skew distribution does to it, and its probability.
+
+    Squares are skew: then t is too small where it is large, and too large where it is small
+    (Johnson 1978, Journal of the American Statistical Association 73, 536).
+    """
+    n, mean, s = len(values), float(values.mean()), float(values.std(ddof=1))
+    skew = float(((values - mean) ** 3).mean())
+    t = (mean + skew / (6 * s**2 * n) + skew * mean**2 / (3 * s**4)) * np.sqrt(n) / s
+    return t, float(stats.t.sf(t, n - 1))
+
+
+def _smallest(unit_square: float, own: float, variance: float, n: int, level: float) -> float:
+    """Rms of motions that all of n stars have, in a year.
+
+    They add a multiple of an exponential number to each D_s, whose mean is found with the scatter
+    that it makes itself.
+    """
+    k = noncentrality(2 * level, 1) / n
+    if k >= 1:
+        return float("inf")
+    mean = (k * own + np.sqrt((k * own) ** 2 + (1 - k) * k * variance)) / (1 - k)
+    return float(np.sqrt(unit_square * n * mean))

@@ -1,0 +1,254 @@
+"""Tests of the noise: is it described equally well in all parts of the data?
+
+Where a likelihood is right, the squares of its scores have the mean of its curvature (information
+identity).  The ratio of their sums is one over all stars, or whatever the errors are wrong by as a
+whole; tested is that it is the same in all parts.  How much a ratio scatters is taken from the
+squares themselves, whose distribution has longer tails than that of Gaussian noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.sample import ScoredSample
+from bayesdist.diagnose.score.score import smallest_pattern
+
+__all__ = ["Scored", "noise_tests"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+LARGEST_LEVERAGE = 0.5
+STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
+STARS_PER_CELL = 60
+STARS_PER_BIN = 150  # of magnitudes
+MOST_CELLS = 8  # along each side of a chip
+MOST_MAGNITUDES = 10
+
+
+class Scored(Protocol):
+    """Detections with scores to which has been given back what the fit has taken of them."""
+
+    @property
+    def sample(self) -> ScoredSample: ...
+
+    @property
+    def whole_score(self) -> Float: ...
+
+    @property
+    def leverage(self) -> Float: ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Squares:
+    """Squared scores and curvatures of the detections that say anything, in units of their errors.
+
+    Parameters
+    ----------
+    rows : ndarray of int, shape (N,)
+        Where the detections stand in the sample.
+    square, expected : ndarray, shape (2, N)
+        Along u and v.
+    star : ndarray of int, shape (N,)
+    sigma : float
+        Typical standard deviation along an axis.
+    free : float
+        Degrees of freedom of the residuals, over their number: what the fit takes from all of them
+        together makes their squares scatter more than each by itself tells.
+    unit : str
+    """
+
+    rows: Int
+    square: Float
+    expected: Float
+    star: Int
+    sigma: float
+    free: float
+    unit: str
+
+    @property
+    def ratio(self) -> float:
+        """Ratio of the sums."""
+        return float(self.square.sum() / self.expected.sum())
+
+
+def noise_tests(projection: Scored) -> list[Outcome]:
+    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go.
+
+    Parameters
+    ----------
+    projection : Projection, or what else has sample and scores
+
+    Returns
+    -------
+    list of Outcome
+    """
+    sample = projection.sample
+    # what the fit has taken of a residual says nothing of its noise
+    rows = np.flatnonzero(sample.used & (projection.leverage.max(axis=0) < LARGEST_LEVERAGE))
+    if len(rows) < STARS_PER_PART:
+        return []
+    variance = sample.variance[:, rows]
+    square = projection.whole_score[:, rows] ** 2 * variance
+    expected = sample.curvature[0::2, rows] * variance
+    ratio = float(square.sum() / expected.sum())
+    squares = _Squares(
+        rows,
+        square,
+        expected,
+        np.unique(sample.star[rows], return_inverse=True)[1],
+        float(np.sqrt(ratio * np.median(variance))),
+        1.0 - float(projection.leverage[:, rows].mean()),
+        sample.model.unit,
+    )
+    parts = {"position": _cells(projection, rows)}
+    if sample.mag is not None:
+        n_stars = int(squares.star.max(initial=0)) + 1
+        parts["magnitude"] = _magnitudes(sample.mag[rows], n_stars)
+    exposure = np.concatenate(
+        [np.full(one.rows.stop - one.rows.start, one.exposure) for one in sample.blocks]
+    )
+    parts["exposure"] = exposure[rows]
+    out = [_by_part(squares, name, code) for name, code in parts.items()]
+    return [one for one in (*out, _by_axis(squares)) if one is not None]
+
+
+def _cells(projection: Scored, rows: Int) -> Int:
+    """Coarse cells of each chip."""
+    sample = projection.sample
+    chip = np.empty(len(sample), np.int64)
+    for block in sample.blocks:
+        chip[block.rows] = block.chip
+    chip = chip[rows]
+    code = np.zeros(len(rows), np.int64)
+    for c in np.unique(chip):
+        here = chip == c
+        n = len(np.unique(sample.star[rows[here]]))
+        side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MOST_CELLS))
+        ix, iy = (
+            np.clip(((z[rows[here]] + 1) * side / 2).astype(np.int64), 0, side - 1)
+            for z in (sample.X, sample.Y)
+        )
+        # boustrophedon: cells with few stars are joined to neighbours
+        code[here] = c * MOST_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
+    return code
+
+
+def _magnitudes(mag: Float, n_stars: int) -> Int:
+    """Bins with equal numbers of detections."""
+    n = int(np.clip(n_stars // STARS_PER_BIN, 1, MOST_MAGNITUDES))
+    edges = np.quantile(mag, np.linspace(0, 1, n + 1)[1:-1])
+    return np.searchsorted(np.unique(edges), mag)
+
+
+def _joined(code: Int, star: Int) -> Int:
+    """Codes from 0 of parts that have stars enough: each takes its successors until it has."""
+    values, index = np.unique(code, return_inverse=True)
+    pairs = np.unique(index * (int(star.max()) + 1) + star)
+    count = np.bincount(pairs // (int(star.max()) + 1))
+    out, total, part = np.zeros(len(values), np.int64), 0, 0
+    for k, n in enumerate(count):
+        out[k] = part
+        total += n
+        if total >= STARS_PER_PART:
+            part, total = part + 1, 0
+    if total:  # the last ones go to the part before them
+        out[out == part] = max(part - 1, 0)
+    return out[index]
+
+
+def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
+    """Test by parts of the data; None where there is but one."""
+    code = _joined(code, squares.star)
+    m = int(code.max(initial=0)) + 1
+    if m < 2:
+        return None
+    y, c = squares.square.mean(axis=0), squares.expected.mean(axis=0)
+    expected = np.bincount(code, c)
+    if (expected <= 0).any():
+        return None
+    ratio = np.bincount(code, y) / expected
+    # detections of one star in one part are one
+    left = y - ratio[code] * c
+    pair, of = np.unique(code * (int(squares.star.max()) + 1) + squares.star, return_inverse=True)
+    sums2 = np.bincount(of, left) ** 2
+    part = pair // (int(squares.star.max()) + 1)
+    own = np.bincount(part, sums2) / (ratio * expected) ** 2
+    n = np.bincount(code)
+    pooled = float(own @ n**2) / n.sum() / n
+    # of the means of so many squares, the cube root is all but Gaussian (Wilson and Hilferty 1931)
+    shape = squares.free / np.maximum(own, pooled)
+    root = np.cbrt(ratio / squares.ratio) - 1.0 + 1.0 / (9.0 * shape)
+    weight = 9.0 * shape
+    root = root - np.average(root, weights=weight)
+    T = float(weight @ root**2)
+    # a cube root of the variance: half its logarithm's change is that of the standard deviation
+    step = 1.5 * root * squares.sigma
+    noise = float(np.average(0.25 / shape, weights=n)) * squares.sigma**2 * (m - 1) / m
+    size2 = float(np.average(step**2, weights=n)) - noise
+    low, high = np.sqrt(ratio.min() / squares.ratio), np.sqrt(ratio.max() / squares.ratio)
+    words = {"position": "cell to cell", "magnitude": "bright to faint stars"}
+    over = words.get(name, f"{name} to {name}")
+    return Outcome(
+        name=f"noise by {name}",
+        statistic=T,
+        dof=m - 1,
+        dof_residual=None,
+        p_value=float(stats.chi2.sf(T, m - 1)),
+        size=float(np.sqrt(max(size2, 0.0))),
+        smallest=partial(smallest_pattern, float(np.sqrt(noise)), m - 1, None),
+        unit=squares.unit,
+        remedy=_REMEDIES[name],
+        present=f"the noise differs from {over}, from {low * squares.sigma:.2g} to "
+        f"{high * squares.sigma:.2g} {squares.unit} along an axis where errors are typical",
+        absent=f"the noise is described equally well from {over}",
+    )
+
+
+_REMEDIES = {
+    "position": "give errors that go with position",
+    "magnitude": "give errors that go with magnitude, or finer ones if they do",
+    "exposure": "give each exposure errors of its own, or leave out exposures",
+    "axis": "give errors sigma_u and sigma_v of their own",
+}
+
+
+def _by_axis(squares: _Squares) -> Outcome | None:
+    """Test of u against v, star by star."""
+    ratio = squares.ratio
+    left = squares.square - ratio * squares.expected
+    d = np.bincount(squares.star, left[0] - left[1])
+    n = len(d)
+    if n < STARS_PER_PART:
+        return None
+    T = squares.free * float(d.sum() ** 2 / (d**2).sum())
+    of_each = squares.square.sum(axis=1) / squares.expected.sum(axis=1)
+    scale = np.sqrt(of_each / ratio)
+    # standard deviations differ by half of what variances do, each from its mean by half of that
+    noise = (
+        squares.sigma
+        * float(np.sqrt((d**2).sum() / squares.free))
+        / (2 * ratio * squares.expected.sum())
+    )
+    size2 = (squares.sigma * float(scale[0] - scale[1]) / 2) ** 2 - noise**2
+    larger = "u" if scale[0] > scale[1] else "v"
+    return Outcome(
+        name="noise by axis",
+        statistic=T,
+        dof=1,
+        dof_residual=float(n - 1),
+        p_value=float(stats.beta.sf(min(T / n, 1.0), 0.5, (n - 1) / 2)),
+        size=float(np.sqrt(max(size2, 0.0))),
+        smallest=partial(smallest_pattern, noise, 1, None),
+        unit=squares.unit,
+        remedy=_REMEDIES["axis"],
+        present=f"the noise along {larger} is larger than along the other axis, beside its errors",
+        absent="the noise is described equally well along u and v",
+    )

@@ -1,0 +1,355 @@
+"""Score tests of regressors: would the fit be better with these terms?
+
+    T = U^T V^-1 U        U = sum of Z_i^T g_i        V = sum of (Z_i^T g'_i) (Z_i^T g'_i)^T
+
+Z is what the parameters leave of the regressors, g the score of a detection, g' what is left of it
+when the fit has moved by one step along Z, given back what fit and step have taken (HC2).  No more
+is assumed of the noise than that stars are independent; detections of one star are not, and are
+added up first.  V scatters as a Wishart matrix of fewer degrees of freedom than there are stars, as
+those at the edge count most, and T as Hotelling's statistic (Bell and McCaffrey 2002; Pustejovsky
+and Tipton 2018).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.linalg import block_diag
+
+from bayesdist.diagnose.score.projection import LARGEST_LEVERAGE, Projection
+from bayesdist.diagnose.score.regressors import Regressors
+from bayesdist.diagnose.score.result import Outcome, noncentrality
+from bayesdist.diagnose.score.sample import Block
+
+__all__ = ["independent_directions", "regressor_tests", "smallest_pattern"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+MOST_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
+LEAST_DOF = 3  # of the noise: below, its covariance says nothing
+LEAST_P = 1e-300
+MOST_CHIPS = 4  # that are tested together, with the covariance of all their scores
+SQUARES = ("size2", "noise2")
+
+
+def regressor_tests(projection: Projection, meat: str = "robust") -> list[Outcome]:
+    """Outcomes of all regressor tests that there are stars enough for.
+
+    Parameters
+    ----------
+    projection : Projection
+    meat : str
+        'robust', or 'homoscedastic': all errors are wrong by one factor, as an F test has it.  For
+        least squares only.
+
+    Returns
+    -------
+    list of Outcome
+    """
+    found: dict[str, list[_Part]] = {}
+    for chips in _chips_together(projection):
+        for name, part in _parts_of(projection, chips, meat):
+            found.setdefault(name, []).append(part)
+    families = {one.name: one for one in projection.functions.regressors}
+    return [_outcome(projection, families[name], parts) for name, parts in found.items()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One test on one chip, or on a few together.
+
+    Parameters
+    ----------
+    statistic, p_value : float
+    dof, dof_residual : float
+    size2, noise2 : float
+        Mean square of the pattern over these chips, noise included, and of the noise.
+    """
+
+    statistic: float
+    p_value: float
+    dof: float
+    dof_residual: float
+    size2: float
+    noise2: float
+
+
+def _chips_together(projection: Projection) -> list[list[int]]:
+    """Codes of the chips that are tested together: all, or each of many by itself."""
+    chips = sorted({block.chip for block in projection.sample.blocks})
+    return [chips] if len(chips) <= MOST_CHIPS else [[one] for one in chips]
+
+
+def _outcome(projection: Projection, family: Regressors, parts: Sequence[_Part]) -> Outcome:
+    """Outcome of one family, from its parts."""
+    T, dof = (float(sum(getattr(one, name) for one in parts)) for name in ("statistic", "dof"))
+    size2, noise2 = (float(np.mean([getattr(p, name) for p in parts])) for name in SQUARES)
+    residual: float | None = parts[0].dof_residual
+    p = parts[0].p_value
+    if len(parts) > 1:  # chi-square of the same probabilities, which can be added up
+        T = float(sum(stats.chi2.isf(max(one.p_value, LEAST_P), one.dof) for one in parts))
+        residual, p = None, float(stats.chi2.sf(T, dof))
+    return Outcome(
+        name=family.name,
+        statistic=T,
+        dof=dof,
+        dof_residual=residual,
+        p_value=p,
+        size=float(np.sqrt(max(size2 - noise2, 0.0))),
+        smallest=partial(smallest_pattern, float(np.sqrt(noise2)), dof, residual),
+        unit=projection.sample.model.unit,
+        remedy=family.remedy,
+        present=family.present,
+        absent=family.absent,
+    )
+
+
+def _parts_of(projection: Projection, chips: list[int], meat: str) -> Iterator[tuple[str, _Part]]:
+    """Tests of all families on some chips, with the names of the families."""
+    tried = []
+    for family in projection.functions.regressors:
+        columns = np.concatenate([projection.columns(family.every, chip) for chip in chips])
+        own = np.tile(np.repeat(family.own, 2), len(chips))
+        one = _Directions.of(projection, family, columns, own)
+        if one.q:
+            tried.append(one)
+    if meat == "robust":
+        sums = _star_sums(projection, chips, tried)
+    else:
+        sums = [(np.eye(one.q), 0.0, 0.0) for one in tried]
+    for one, (V, spread, taken) in zip(tried, sums, strict=True):
+        if taken > MOST_TAKEN:
+            continue
+        if meat == "robust":
+            # as a Wishart matrix that scatters as much
+            dof = one.q * (one.q + 1) / spread
+            dof_residual = dof - one.q + 1
+            shrink = dof_residual / dof
+        else:
+            dof_residual, scale = _scale(projection, float(one.score @ one.score), one.q)
+            V, shrink = V * scale, 1.0
+        if dof_residual < LEAST_DOF:
+            continue
+        T = shrink * float(one.score @ np.linalg.solve(V, one.score))
+        p = float(stats.f.sf(T / one.q, one.q, dof_residual))
+        square = np.repeat(projection.functions.mean_square[one.family.every], 2)
+        Q = (one.basis.T * np.tile(square, len(chips)) / len(chips)) @ one.basis
+        size2, noise2 = float(one.score @ Q @ one.score), float(np.trace(Q @ V))
+        yield one.family.name, _Part(T, p, one.q, dof_residual, size2, noise2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Directions:
+    """Regressors of one family that the parameters have left, in units of their information.
+
+    Parameters
+    ----------
+    family : Regressors
+    columns : ndarray of int, shape (n,)
+    basis : ndarray, shape (n, q)
+        With unit information beside all parameters.
+    score : ndarray, shape (q,)
+        Also the step by which the fit would move.
+    """
+
+    family: Regressors
+    columns: Int
+    basis: Float
+    score: Float
+
+    @property
+    def q(self) -> int:
+        """How many."""
+        return self.basis.shape[1]
+
+    @classmethod
+    def of(
+        cls, projection: Projection, family: Regressors, columns: Int, own: NDArray[np.bool_]
+    ) -> _Directions:
+        """Those of a family, of which some columns are tested beside the others."""
+        S = projection.efficient_information(columns)
+        # each of the tested ones without what the others say of it
+        A = np.zeros((len(columns), own.sum()))
+        A[own] = np.eye(own.sum())
+        A[~own] = -np.linalg.lstsq(S[np.ix_(~own, ~own)], S[np.ix_(~own, own)])[0]
+        S = A.T @ S @ A
+        N = independent_directions(projection.whole_information(columns[own]), S, family.least)
+        # eigenvectors: their information is diagonal
+        basis = A @ (N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True)))
+        return cls(family, columns, basis, basis.T @ projection.efficient_score[columns])
+
+
+def _star_sums(
+    projection: Projection, chips: list[int], tried: Sequence[_Directions]
+) -> list[tuple[Float, float, float]]:
+    """Covariance of the scores of each family, from those of single stars.
+
+    Also how it scatters, and the fraction of the noise that fit and step have taken from the stars
+    that it is made of.
+    """
+    if not tried:
+        return []
+    sample = projection.sample
+    n_stars = int(sample.star.max()) + 1
+    single = n_stars == len(sample)
+    together = _Together.of(tried)
+    parts = [slice(a, b) for a, b in pairwise([*together.starts, len(together.step)])]
+    V = [np.zeros((one.q, one.q)) for one in tried]
+    seen = [np.zeros((one.q, one.q)) for one in tried]
+    by_star = np.zeros((0 if single else n_stars, len(together.step)))
+    trace, norm = np.zeros((2, n_stars, len(tried)))
+    taken = np.zeros(len(tried))
+    blocks = [block for block in sample.blocks if block.chip in chips]
+    all_chips = len(blocks) == len(sample.blocks)
+    for block in blocks:
+        coefficients = projection.regressor_map(block, together.columns) @ together.basis
+        F = projection.functions.at(block.rows)
+        x = np.stack([F.T @ coefficients[axis] for axis in (0, 1)])
+        psi, both, lost = together.left_scores(projection, block, x)
+        taken += lost
+        star = sample.star[block.rows]
+        if single:
+            trace[star], norm[star] = both
+            for k, part in enumerate(parts):
+                V[k] += psi[:, part].T @ psi[:, part]
+        else:
+            np.add.at(by_star, star, psi)
+            np.add.at(trace, star, both[0])
+            np.add.at(norm, star, both[1])
+        if not all_chips:
+            uu, uv, vv = sample.curvature[:, block.rows]
+            for k, part in enumerate(parts):
+                u, v = x[..., part]
+                cross = (u.T * uv) @ v
+                seen[k] += (u.T * uu) @ u + (v.T * vv) @ v + cross + cross.T
+    for k, (one, part) in enumerate(zip(tried, parts, strict=True)):
+        if not single:
+            V[k] += by_star[:, part].T @ by_star[:, part]
+        if all_chips:
+            V[k] += one.basis.T @ projection.prior_meat(one.columns) @ one.basis
+        else:  # what other chips and priors say, through the frames: little
+            V[k] += projection.score_ratio * (np.eye(one.q) - seen[k])
+    spread = (trace**2 + norm**2).sum(axis=0)
+    taken /= trace.sum(axis=0)
+    return [(one, float(a), float(b)) for one, a, b in zip(V, spread, taken, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Together:
+    """Directions of several families, one after the other.
+
+    Parameters
+    ----------
+    columns : ndarray of int, shape (n,)
+    basis : ndarray, shape (n, q)
+    step : ndarray, shape (q,)
+    starts : ndarray of int, shape (families,)
+        Where the directions of each family begin.
+    """
+
+    columns: Int
+    basis: Float
+    step: Float
+    starts: Int
+
+    @classmethod
+    def of(cls, tried: Sequence[_Directions]) -> _Together:
+        """Those of some families."""
+        return cls(
+            np.concatenate([one.columns for one in tried]),
+            np.asarray(block_diag(*(one.basis for one in tried))),
+            np.concatenate([one.score for one in tried]),
+            np.cumsum([0, *(one.q for one in tried[:-1])]),
+        )
+
+    def left_scores(
+        self, projection: Projection, block: Block, x: Float
+    ) -> tuple[Float, Float, Float]:
+        """Scores (n, q) of detections when each family by itself is fitted too.
+
+        Also trace and norm (2, n, families) of the information that each detection has of the
+        directions x (2, n, q), and the sum (families,) of what fit and step take, times the trace.
+        """
+
+        def of_families(values: Float) -> Float:
+            return np.add.reduceat(values, self.starts, axis=1)
+
+        sample = projection.sample
+        uu, uv, vv = sample.curvature[:, block.rows, None]
+        moved = [of_families(one * self.step) for one in x]
+        g = sample.score[:, block.rows, None] - np.stack(
+            [uu * moved[0] + uv * moved[1], uv * moved[0] + vv * moved[1]]
+        )
+        G_uu, G_vv = np.abs(uu) * of_families(x[0] ** 2), np.abs(vv) * of_families(x[1] ** 2)
+        G_uv = np.sqrt(np.abs(uu * vv)) * of_families(x[0] * x[1])
+        leverage = projection.leverage[:, block.rows, None] + np.stack(
+            [np.where(uu > 0, G_uu, 0.0), np.where(vv > 0, G_vv, 0.0)]
+        )
+        leverage = np.minimum(leverage, LARGEST_LEVERAGE)
+        g = g / np.sqrt(1.0 - leverage)
+        family = np.repeat(np.arange(len(self.starts)), np.diff([*self.starts, len(self.step)]))
+        psi = g[0][:, family] * x[0] + g[1][:, family] * x[1]
+        lost = (leverage[0] * G_uu + leverage[1] * G_vv).sum(axis=0)
+        return psi, np.stack([G_uu + G_vv, np.sqrt(G_uu**2 + 2 * G_uv**2 + G_vv**2)]), lost
+
+
+def independent_directions(whole: Float, left: Float, least: float) -> Float:
+    """Directions of regressors that the parameters have left, (n, q).
+
+    Parameters
+    ----------
+    whole, left : ndarray, shape (n, n)
+        Information of the regressors before and after the parameters are projected out.
+    least : float
+        Fraction of it that a direction must have kept.
+
+    Returns
+    -------
+    ndarray, shape (n, q)
+        In units in which `whole` is the unit matrix.
+    """
+    diagonal = np.diag(whole)
+    scale = np.zeros(len(diagonal))
+    scale[diagonal > 0] = diagonal[diagonal > 0] ** -0.5
+    values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
+    good = values > 1e-8 * values.max(initial=1e-300)
+    basis = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
+    kept, turn = np.linalg.eigh(basis.T @ left @ basis)
+    return np.asarray(basis @ turn[:, kept > least])
+
+
+def _scale(projection: Projection, gain: float, q: int) -> tuple[float, float]:
+    """Degrees of freedom beside parameters and regressors, and the chi-square of each."""
+    sample = projection.sample
+    h = sample.curvature[[0, 2]]
+    good = h > 0
+    chi2 = float((sample.score[good] ** 2 / h[good]).sum())
+    informative = int((projection.precision > 0).sum())
+    dof = int(good.sum()) - projection.sample.model.n_params + informative - q
+    return float(dof), (chi2 - gain) / max(dof, 1)
+
+
+def smallest_pattern(noise: float, dof: float, dof_residual: float | None, level: float) -> float:
+    """Rms of a pattern that is found with the power `POWER`.
+
+    Parameters
+    ----------
+    noise : float
+        Rms of the pattern that noise makes.
+    dof, dof_residual : float
+        Of the test.
+    level : float
+
+    Returns
+    -------
+    float
+        Of a pattern that lies in any direction as noise does.
+    """
+    return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))

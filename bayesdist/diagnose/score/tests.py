@@ -1,0 +1,105 @@
+"""All tests of one solution, corrected for their number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.score.exposures import exposure_test
+from bayesdist.diagnose.score.gap import gap_test
+from bayesdist.diagnose.score.motions import motion_test
+from bayesdist.diagnose.score.noise import noise_tests
+from bayesdist.diagnose.score.pattern import pattern_test
+from bayesdist.diagnose.score.projection import projection_of
+from bayesdist.diagnose.score.regressors import EDGES, EDGES_BESIDE_ORDERS, functions_for
+from bayesdist.diagnose.score.result import FAMILY_LEVEL, Outcome, ScoreTest, corrected
+from bayesdist.diagnose.score.sample import scored_sample
+from bayesdist.diagnose.score.score import regressor_tests
+from bayesdist.diagnose.score.truncation import truncation_test
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.transforms import Solution
+
+__all__ = ["score_tests"]
+
+SAYS_NOTHING = 0.2  # probability by chance above which a second look has seen nothing
+OF_TIME = ("drift", "curvature in time", "motions")
+ORDERS, OF_PLACE = "order ", ("noise by position",)
+
+
+def score_tests(
+    table: MatchTable,
+    solution: Solution,
+    *,
+    priors: GaussianPriors | None = None,
+    match_radius: float | None = None,
+) -> tuple[ScoreTest, ...]:
+    """Targeted tests for what a model lacks, and for noise that is not as the errors say.
+
+    A test is left out where the data cannot be asked: without magnitudes or dates, of one exposure,
+    with too few stars.
+
+    Parameters
+    ----------
+    table : MatchTable
+        The matches that the solution was made from, or some of them; of more than `SAMPLE` rows,
+        every k-th is taken, and the tests are as strong as that sample is.
+    solution : Posterior or LinearFit
+    priors : GaussianPriors, optional
+        Those of the solution; flat by default.
+    match_radius : float, optional
+        Within which the stars were matched, in the unit of u and v.
+
+    Returns
+    -------
+    tuple of ScoreTest
+
+    Raises
+    ------
+    InputError
+        When the table does not go with the solution's model, or the solution does not say how it
+        was fitted.
+    """
+    projection = projection_of(
+        functions_for(scored_sample(table, solution)),
+        np.asarray(solution.mean, float),
+        priors or GaussianPriors.none(solution.model),
+    )
+    exposures = exposure_test(projection)
+    found = _edges_or_orders(regressor_tests(projection))
+    found += [one for one in (gap_test(projection), motion_test(projection)) if one is not None]
+    if exposures is not None and exposures.p_value < FAMILY_LEVEL:
+        found = [_doubtful(one) if one.name in OF_TIME else one for one in found]
+    orders = [one.p_value for one in found if one.name.startswith(ORDERS)]
+    truncation = truncation_test(projection, match_radius)
+    others = (exposures, pattern_test(projection), truncation)
+    found += noise_tests(projection)
+    if min(orders, default=1.0) < FAMILY_LEVEL:
+        found = [_after_orders(one) if one.name in OF_PLACE else one for one in found]
+    return corrected([*found, *(one for one in others if one is not None)])
+
+
+def _edges_or_orders(outcomes: list[Outcome]) -> list[Outcome]:
+    """Outcomes with one test of the edges: the weaker one beside the orders, if it says nothing.
+
+    A missing order rises towards the edges as well.  Beside the orders there is less to be seen of
+    what does so by itself, but something.
+    """
+    by_name = {one.name: one for one in outcomes}
+    beside = by_name.pop(EDGES_BESIDE_ORDERS, None)
+    if EDGES in by_name and beside is not None and beside.p_value > SAYS_NOTHING:
+        by_name[EDGES] = replace(beside, name=EDGES)
+    return list(by_name.values())
+
+
+def _after_orders(outcome: Outcome) -> Outcome:
+    """A test by place where orders are missing, which look the same."""
+    return replace(outcome, present=f"{outcome.present}, if it is not the missing order")
+
+
+def _doubtful(outcome: Outcome) -> Outcome:
+    """A test of time where exposures deviate by themselves: so few dates may go with time too."""
+    return replace(
+        outcome, present=f"{outcome.present}, if it is not single exposures that deviate"
+    )

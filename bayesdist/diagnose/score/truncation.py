@@ -1,0 +1,281 @@
+"""Test for matches that are missing at large radii: residuals that end too abruptly.
+
+Matching takes no pair beyond its radius.  Where that cuts into the true matches, their residuals
+are too small: the errors seem too large, chi-square is too small, and so is the scatter that
+everything else is judged by.  Errors that are merely quoted too large shrink all residuals alike;
+so the scale of the residuals is taken from themselves, and the question is how many of them should
+lie beyond the last ones that there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, special, stats
+
+from bayesdist.diagnose.score.projection import Projection
+from bayesdist.diagnose.score.result import Outcome
+
+__all__ = ["truncation_test"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+FEWEST_STARS = 50
+LEAST_P = 1e-300
+LARGEST_LEVERAGE = 0.5
+ENDS = 0.25  # of the expected number: with more, nothing ends at the match radius
+STARS_PER_PART = 150  # with errors alike, from which their scatter is measured
+MOST_PARTS = 12
+FEW = 0.5  # expected matches whose absence says nothing
+BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
+ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
+
+
+@dataclass(frozen=True, eq=False)
+class _Deficit:
+    """True matches expected beyond a radius, and detections that are there.
+
+    Parameters
+    ----------
+    expected : float
+    beyond : int
+    radius : float
+    unit : str
+    spread : float
+        Standard deviation of the logarithm of `expected`, as the scale is not known exactly.
+    """
+
+    expected: float
+    beyond: int
+    radius: float
+    unit: str
+    spread: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability of so few, over what the scale may be."""
+        if self.expected < FEW or self.beyond > ENDS * self.expected:
+            return 1.0
+        at = self.expected * np.exp(self.spread * NODES)
+        chance = special.gammaincc(self.beyond + 1, at)
+        return float(WEIGHTS @ chance / WEIGHTS.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Radii:
+    """Residuals in units of their own scatter.
+
+    Parameters
+    ----------
+    inlier : ndarray, shape (N,)
+        Probability of being a true match.
+    square : ndarray, shape (2, N)
+        Squared residuals over their quoted variance, by which they scatter as a whole.
+    relative : float
+        Relative error of that factor.
+    radius2 : ndarray, shape (N,)
+        Squared residuals of both axes, in the unit of u and v.
+    part : ndarray of int, shape (N,)
+        Stars of about equal quoted errors.
+    variance : ndarray, shape (2, P)
+        Of the residuals along each axis, in each part.
+    relative_of : ndarray, shape (P,)
+        Its relative error.
+    """
+
+    inlier: Float
+    square: Float
+    relative: float
+    radius2: Float
+    part: Int
+    variance: Float
+    relative_of: Float
+
+    @classmethod
+    def of(cls, projection: Projection) -> _Radii:
+        """Those of a sample."""
+        sample, inlier = projection.sample, _weights(projection)
+        n = inlier.sum()
+        # given back what the fit has taken of them
+        square = sample.residual**2 / (1.0 - projection.leverage)
+        part = _alike(sample.variance.sum(axis=0), inlier)
+        count = np.bincount(part, inlier)
+        # not by the quoted errors of single stars: where they are wrong, those with large ones
+        # would be expected far out
+        variance = np.stack([np.bincount(part, inlier * one) / count for one in square])
+        excess = square.sum(axis=0) / variance.sum(axis=0)[part] - 1.0
+        square = square / sample.variance
+        t = square.mean(axis=0)
+        scale = float(inlier @ t / n)
+        return cls(
+            inlier=inlier,
+            square=square / scale,
+            relative=float(np.sqrt(inlier @ (t / scale - 1.0) ** 2) / n),
+            radius2=(sample.residual**2).sum(axis=0),
+            part=part,
+            variance=variance,
+            relative_of=np.sqrt(np.bincount(part, inlier * excess**2)) / count,
+        )
+
+    def lost(self, end: Float) -> float:
+        """Rms scatter along an axis that was cut off; `end` (P,) as of `_lost`."""
+        count = np.bincount(self.part, self.inlier)
+        # where nothing is cut the largest of so many lies there
+        free = _lost(np.log(count.sum()))
+        excess = np.array([max(_lost(one) ** 2 - free**2, 0.0) for one in end])
+        return float(np.sqrt(np.average(self.variance.mean(axis=0) * excess, weights=count)))
+
+
+def _weights(projection: Projection) -> Float:
+    """Probabilities (N,) of true matches, without those whose residuals the fit has taken."""
+    own = projection.leverage.max(axis=0) < LARGEST_LEVERAGE
+    return np.asarray(projection.sample.inlier * own)
+
+
+def _alike(variance: Float, inlier: Float) -> Int:
+    """Parts (N,) with stars of about equal errors."""
+    n = int(np.clip(inlier.sum() // STARS_PER_PART, 1, MOST_PARTS))
+    edges = np.unique(np.quantile(variance, np.linspace(0, 1, n + 1)[1:-1]))
+    part = np.searchsorted(edges, variance, side="right")
+    count = np.bincount(part, inlier, minlength=len(edges) + 1)
+    # what equal errors leave with few stars goes to its neighbour
+    kept = np.flatnonzero(count >= STARS_PER_PART / 2)
+    if not len(kept):
+        return np.zeros(len(variance), np.int64)
+    return np.clip(np.searchsorted(kept, np.arange(len(count))), 0, len(kept) - 1)[part]
+
+
+def truncation_test(projection: Projection, match_radius: float | None = None) -> Outcome | None:
+    """Test for true matches missing beyond some radius.
+
+    Parameters
+    ----------
+    projection : Projection
+    match_radius : float, optional
+        In the unit of u and v.
+
+    Returns
+    -------
+    Outcome or None
+        None for less than `FEWEST_STARS` true matches.
+    """
+    sample, inlier = projection.sample, _weights(projection)
+    n = float(inlier.sum())
+    if n < FEWEST_STARS:
+        return None
+    radii = _Radii.of(projection)
+    found = [
+        *_in_sigmas(radii),
+        *_along_an_axis(radii),
+        *_in_units(radii, sample.model.unit, match_radius),
+    ]
+    worst = min(found, key=lambda one: (one.p_value, -one.expected))
+    both = radii.variance.sum(axis=0)
+    end = np.full(len(both), worst.radius**2 / 2)
+    if worst.unit == sample.model.unit:
+        end = worst.radius**2 / both
+    sigma = float(np.sqrt(np.median(both[radii.part]) / 2))
+    chi2 = sample.residual**2 / (sample.variance * (1.0 - projection.leverage))
+    p_value = min(1.0, len(found) * worst.p_value)
+    return Outcome(
+        name="truncation",
+        statistic=float(stats.chi2.isf(max(p_value, LEAST_P), 1)),  # of the same probability
+        dof=1,
+        dof_residual=None,
+        p_value=p_value,
+        size=radii.lost(end),
+        smallest=partial(_smallest, sigma, n, len(found)),
+        unit=sample.model.unit,
+        remedy="match again with a wider radius",
+        present=f"the residuals end too abruptly: {worst.expected:.3g} true matches are expected "
+        f"beyond {worst.radius:.3g} {worst.unit}, and there are {worst.beyond}, so that the "
+        "matching has cut the scatter, and chi-square "
+        f"({float(inlier @ chi2.mean(axis=0)) / n:.2g} of each degree of freedom) says "
+        "nothing of the quoted errors",
+        absent="the residuals do not end abruptly",
+    )
+
+
+def _in_sigmas(radii: _Radii) -> list[_Deficit]:
+    """Deficits by the radius in units of the errors: half its square is exponential."""
+    n = float(radii.inlier.sum())
+    return [
+        _Deficit(n * np.exp(-end), k, np.sqrt(2 * end), "sigma", radii.relative * end)
+        for k, end in _ends(radii.square.mean(axis=0))
+    ]
+
+
+def _along_an_axis(radii: _Radii) -> list[_Deficit]:
+    """Deficits by the larger of both axes, as a match in a square leaves them."""
+    out = []
+    for k, end in _ends(radii.square.max(axis=0)):
+        tail = float(special.erfc(np.sqrt(end / 2)))
+        expected = float(radii.inlier.sum()) * (2 * tail - tail**2)
+        spread = radii.relative * end / 2
+        out.append(_Deficit(expected, k, np.sqrt(end), "sigma along an axis", spread))
+    return out
+
+
+def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Deficit]:
+    """Deficits by the radius itself, whatever the errors of each star are."""
+    ends = _ends(radii.radius2)
+    if match_radius is not None:
+        outside = int((radii.radius2 > match_radius**2).sum())
+        ends.append((outside, match_radius**2))
+    out = []
+    for k, end in ends:
+        expected = np.bincount(radii.part, radii.inlier) * _tail(radii.variance, end)
+        # by how much the logarithm goes with that of the variance
+        slope = end / radii.variance.sum(axis=0)
+        spread = np.sqrt(((expected * slope * radii.relative_of) ** 2).sum())
+        total = float(expected.sum())
+        out.append(_Deficit(total, k, np.sqrt(end), unit, float(spread) / max(total, 1e-300)))
+    return out
+
+
+def _ends(values: Float) -> list[tuple[int, float]]:
+    """Where so many values lie beyond, for each number of `BEYOND`."""
+    return [(k, float(np.partition(values, -k - 1)[-k - 1])) for k in BEYOND]
+
+
+def _tail(variance: Float, radius2: float) -> Float:
+    """Probability (P,) of a residual beyond a radius, by the variances (2, P) along both axes."""
+    u, v = variance
+    out = np.zeros(len(u))
+    for angle in ANGLES:
+        inverse = np.cos(angle) ** 2 / u + np.sin(angle) ** 2 / v
+        out += np.exp(-radius2 / 2 * inverse) / inverse
+    return out / (len(ANGLES) * np.sqrt(u * v))
+
+
+def _lost(end: float) -> float:
+    """Scatter along an axis that was cut off, in units of what is left.
+
+    Parameters
+    ----------
+    end : float
+        Half the square of the radius in units of the scatter that is left.
+    """
+    # mean of an exponential of scale s cut at `end`: s - end / (exp(end / s) - 1) = 1
+    if end <= 2.0:  # as flat a distribution as there is
+        return 1.0
+
+    def mean(s: float) -> float:
+        return s - end / np.expm1(min(end / s, 700.0)) - 1.0
+
+    s = optimize.brentq(mean, 1.0, 50.0) if mean(50.0) > 0 else 50.0
+    return float(np.sqrt(max(s - 1.0, 0.0)))
+
+
+def _smallest(sigma: float, n: float, several: int, level: float) -> float:
+    """Scatter that is lost where just so many stars are as have to be missed."""
+    expected = -np.log(level / several)
+    if expected >= n:
+        return sigma
+    end = np.log(n / expected)
+    return float(sigma * np.sqrt(end / np.expm1(end)))

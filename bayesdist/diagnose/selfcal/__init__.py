@@ -1,0 +1,1 @@
+"""Tests of the residuals of self-calibrations, whose stars are eliminated."""

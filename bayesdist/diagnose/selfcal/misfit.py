@@ -1,0 +1,185 @@
+"""Does the model describe detections whose stars were fitted with it?
+
+A pattern that belongs to the detector is hidden as far as stars can take it up: all of it where the
+exposures do not move, next to nothing where a star's many detections lie far apart.  So what is
+tested is a shift of each cell that the model has left out, with the stars eliminated: with g the
+gradient of the log density by these shifts and C their curvature (Rao's score test),
+
+    g^T C^+ g
+
+over those patterns that the detections can tell, the polynomials' means over cells taken out; what
+it leaves of chi-square is the unit (an F test).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.stats import f as f_distribution
+
+from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
+from bayesdist.infer.selfcal import Solution
+from bayesdist.infer.selfcal.following import Following, following
+from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.model.basis import polynomial_terms
+
+__all__ = ["dithered_misfit"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+MOST_SIDE = 16  # cells along each side of a chip
+MOST_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
+TOLD = 0.05  # of what detections would say of a cell if stars were known: less is not told
+
+
+def dithered_misfit(solution: Solution) -> Misfit:
+    """Test the detections of a self-calibration for structure over the detector.
+
+    Parameters
+    ----------
+    solution : Solution
+
+    Returns
+    -------
+    Misfit
+        Of all chips together, since they share stars; `told` is the share of the patterns over
+        all partitions, polynomials apart, that the detections can tell from places of stars.
+    """
+    model, unit = solution.problem.model, solution.problem.model.pixel_size(solution.theta)
+    partitions = _partitions(len(solution.problem), len(model.chips))
+    found, told, patterns = [], 0, 0
+    for (name, bins), shifts in zip(
+        partitions.items(), _shifts(solution, list(partitions.values())), strict=True
+    ):
+        one = _test(shifts, _polynomials(model.order, len(model.chips), bins))
+        found.append(Misfit(one.p_value, name, one.pixels * unit, model.unit))
+        told, patterns = told + one.told, patterns + one.patterns
+    return replace(worst_misfit(found), told=told / patterns if patterns else 1.0)
+
+
+def _partitions(n: int, n_chips: int) -> dict[str, tuple[int, int]]:
+    """Bins on x and on y of each chip, by name."""
+    out, most = {}, MOST_CELLS // n_chips
+    for name, bins in partitions_for(n // n_chips).items():
+        side = min(MOST_SIDE, int(np.sqrt(most))) if name == "cells" else most
+        nx, ny = (min(b, max(side, 2)) for b in bins)
+        out[name] = nx, ny
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Shifts:
+    """What detections say of shifts of K cells in x and in y, pixels.
+
+    Parameters
+    ----------
+    gradient : ndarray, shape (2 K,)
+        Of the log density at no shift; x of all cells, then y.
+    curvature : ndarray, shape (2 K, 2 K)
+        With the stars eliminated.
+    weight : ndarray, shape (2 K,)
+        Its diagonal if the stars were known.
+    chi2, dof : float
+        Of the residuals; the rest of it is the unit: errors that are too large or too small as a
+        whole are no structure.
+    """
+
+    gradient: Float
+    curvature: Float
+    weight: Float
+    chi2: float = 0.0
+    dof: float = 1.0
+
+
+def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
+    """What detections say of shifts of the cells of each partition, in one pass over them."""
+    p, expansion = solution.problem, solution.expansion
+    out = []
+    for nx, ny in partitions:
+        n = 2 * len(p.model.chips) * nx * ny
+        out.append(_Shifts(np.zeros(n), np.zeros((n, n)), np.zeros(n)))
+    taken = float(len(solution.free))  # of the detections' numbers by distortion and stars
+    for some in following(solution):
+        taken += np.minimum(p.n_star, 2 * np.bincount(some.star, some.member)).sum()
+        for sums, bins in zip(out, partitions, strict=True):
+            _add(sums, some, _cells(p, some.rows, bins))
+    dof = max(2 * expansion.n_members - taken, 1.0)
+    for sums in out:
+        sums.curvature[np.diag_indices(len(sums.weight))] += sums.weight
+    return [replace(sums, chi2=expansion.chi2, dof=dof) for sums in out]
+
+
+def _add(sums: _Shifts, some: Following, cell: Int) -> None:
+    """Add some stars; of the curvature what they take of it."""
+    w, ties, n = some.weight, some.ties, len(sums.weight)
+    index = np.stack([cell, cell + n // 2], axis=1)
+    pull = w[:, None] * some.residual
+    sums.gradient[:] += np.bincount(index.ravel(), pull.ravel(), minlength=n)
+    sums.weight[:] += np.bincount(index.ravel(), np.repeat(w, 2), minlength=n)
+    q = ties.shape[1]
+    row = (some.star * q)[:, None, None] + np.arange(q)[:, None]
+    at = np.broadcast_arrays(row, index[:, None, :])
+    of_stars = csr_array(
+        (ties.ravel(), (at[0].ravel(), at[1].ravel())), shape=(q * (some.star[-1] + 1), n)
+    )
+    sums.curvature[:] -= (of_stars.T @ of_stars).toarray()
+
+
+def _cells(problem: Problem, rows: slice, bins: tuple[int, int]) -> Int:
+    """Cell (n,) of each detection, counted over all chips."""
+    nx, ny = bins
+    k, m = (
+        np.clip(((seen[rows] + 1) / 2 * n).astype(np.int64), 0, n - 1)
+        for seen, n in zip(problem.seen, bins, strict=True)
+    )
+    chip = problem.groups.chip[problem.groups.index[rows]]
+    return np.asarray((chip * ny + m) * nx + k, np.int64)
+
+
+def _polynomials(order: int, n_chips: int, bins: tuple[int, int]) -> Float:
+    """Means over the cells of what the polynomials of chips can do, (2 K, fields)."""
+    of_x, of_y = (bin_means(n, order) for n in bins)
+    one = np.stack([np.outer(of_y[j], of_x[i]).ravel() for i, j in polynomial_terms(order)], axis=1)
+    return np.kron(np.eye(2 * n_chips), one)
+
+
+@dataclass(frozen=True)
+class _Test:
+    """Outcome for one partition: structure is rms in pixels, `told` of how many `patterns`."""
+
+    p_value: float
+    pixels: float
+    told: int
+    patterns: int
+
+
+def _test(shifts: _Shifts, fields: Float) -> _Test:
+    seen = shifts.weight > 0
+    weight = shifts.weight[seen]
+    root = np.sqrt(weight)
+    g, C = shifts.gradient[seen] / root, shifts.curvature[np.ix_(seen, seen)] / np.outer(root, root)
+    # what is orthogonal by C to the polynomials' means over the cells: of those, and nearly of
+    # what is lost to the exposures' frames, the fit has taken the gradient
+    lost, singular, _ = np.linalg.svd(C @ (fields[seen] * root[:, None]), full_matrices=False)
+    lost = lost[:, singular > 1e-9 * max(singular[0], 1.0)]
+    free = np.linalg.svd(lost, full_matrices=True)[0][:, lost.shape[1] :]
+    values, vectors = np.linalg.eigh(free.T @ C @ free)
+    told = values > TOLD
+    if not told.any():
+        return _Test(1.0, 0.0, 0, free.shape[1])
+    values, vectors = values[told], free @ vectors[:, told]
+    along = vectors.T @ g
+    k, explained = len(values), float(np.sum(along**2 / values))
+    left = max(shifts.dof - k, 1.0)
+    rest = max(shifts.chi2 - explained, 0.0) / left
+    # shifts that explain g, in pixels, and their noise: a cell counts by what is seen in it
+    square = (vectors @ (along / values)) ** 2
+    noise = rest * np.einsum("kn,n->k", vectors**2, 1 / values)
+    excess = 2 * float(np.sum(square - noise) / np.sum(weight))  # both axes together
+    p = float(f_distribution.sf(explained / k / rest, k, left)) if rest > 0 else 1.0
+    return _Test(p, float(np.sqrt(max(excess, 0.0))), k, free.shape[1])

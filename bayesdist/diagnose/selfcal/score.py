@@ -1,0 +1,287 @@
+"""Score tests of self-calibrations: what a model lacks, with the stars eliminated.
+
+As for matched stars (`bayesdist.diagnose.score.score`), with the positions of stars among the
+parameters that are projected out, and with the scores of a star's detections added up.  What stars
+take up cannot be tested: directions in which known stars would say much more are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bayesdist.diagnose.score.motions import SHORTEST, StarResiduals, motion_outcome
+from bayesdist.diagnose.score.noise import noise_tests
+from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, noncentrality
+from bayesdist.diagnose.score.sample import Block, ScoredSample
+from bayesdist.diagnose.score.score import independent_directions
+from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
+from bayesdist.infer.discrepancy.linear import deviation_columns
+from bayesdist.infer.selfcal.discrepancy import MOST_EXPOSURES
+from bayesdist.infer.selfcal.eliminated import (
+    add_products,
+    even_stars,
+    pieces,
+    star_sums,
+    without_parameters,
+)
+from bayesdist.infer.selfcal.following import taken_by_stars
+from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.sandwich import star_scores
+from bayesdist.infer.selfcal.scores import scores_of_detections
+from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.model.basis import MAX_ORDER
+
+__all__ = ["selfcal_score_tests"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+MOST_DETECTIONS = 60_000  # that are looked at
+STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
+TOLD = 0.02  # of what known stars would say of a direction: less is not told from their places
+OUTSIDE = 0.5  # per cent of the magnitudes at either end that are moved to the others
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """What the detections say of the further columns of a problem.
+
+    Parameters
+    ----------
+    known : ndarray, shape (n, n)
+        Information if stars and parameters were known.
+    information, score : ndarray, shape (n, n), (n,)
+        With both eliminated.
+    covariance : ndarray, shape (n, n)
+        Of the score, by the scores of single stars.
+    square : ndarray, shape (n, n)
+        Mean products of displacements over the detections.
+    n_stars : int
+    unit : str
+    """
+
+    known: Float
+    information: Float
+    score: Float
+    covariance: Float
+    square: Float
+    n_stars: int
+    unit: str
+
+
+def selfcal_score_tests(
+    solution: Solution, *, mag: Float | None = None, epoch: Float | None = None
+) -> tuple[ScoreTest, ...]:
+    """Targeted tests of a self-calibration for what its model lacks, and for its noise.
+
+    A test is left out where the data cannot be asked.
+
+    Parameters
+    ----------
+    solution : Solution
+    mag, epoch : ndarray, shape (N,), optional
+        Of each detection of its problem; decimal years.
+
+    Returns
+    -------
+    tuple of ScoreTest
+    """
+    whole = solution.problem
+    some = even_stars(whole, MOST_DETECTIONS)
+    rows = np.isin(whole.star, some)
+    problem, model = whole.of_stars(some), whole.model
+    varied = None
+    if mag is not None and np.ptp(mag) > 0:
+        low, high = np.percentile(mag, [OUTSIDE, 100 - OUTSIDE])
+        inside = np.clip(mag, low, high)[rows]
+        varied = inside - inside.mean()
+    counts = np.bincount(problem.groups.index, minlength=len(problem.groups)).astype(float)
+    deviations = deviation_columns(
+        model, solution.theta, problem.groups, counts, most=MOST_EXPOSURES
+    )
+    pointed = pointing_terms(problem, solution.theta)
+    columns = AddedColumns(problem, solution.theta, {}, deviations, varied, pointed)
+    sums = _summed(solution, columns, rows, solution.stars[some])
+    found = [_tested(sums, name, which, model.order) for name, which in columns.families()]
+    if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
+        found.append(_motions(solution, epoch))
+    found += noise_tests(_noise_sample(solution, some, rows, mag))
+    return corrected([one for one in found if one is not None])
+
+
+def _summed(
+    solution: Solution, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
+) -> _Sums:
+    """Sums over some of the detections of a solution."""
+    p, scores = columns.problem, scores_of_detections(solution).at(rows)
+    n, D = columns.sparse.stop, columns.n_params
+    known, taken, square = (np.zeros((n, n)) for _ in range(3))
+    prior, score, psi = p.priors, np.zeros(n), []
+    pull = np.einsum("skq,sq->sk", prior.precision, prior.centre - stars)
+    unit = np.broadcast_to(np.eye(2), (len(p), 2, 2))
+    for piece in pieces(columns):
+        here, s = scores.at(piece.rows), piece.stars
+        sums = star_sums(columns, piece, here, pull[s], prior.precision[s])
+        taken += sums.rows.T @ sums.rows
+        score -= sums.rows.T @ sums.right
+        add_products(known, columns, columns, piece, here.curvature)
+        add_products(square, columns, columns, piece, unit[piece.rows])
+        psi.append(star_scores(columns, piece, here.gradient))
+    inside = np.ix_(columns.order, columns.order)
+    own = np.concatenate(psi)
+    N = (known - taken)[inside]
+    left = without_parameters(solution, N, score[columns.order] + own.sum(axis=0))
+    own = own[:, D:] - own[:, :D] @ left.gain
+    # given back what the parameters have taken: a little, and much the same everywhere
+    numbers = 2 * float((scores.curvature[:, 0, 0] > 0).sum()) - p.n_star * p.n_stars
+    free = max(1 - len(solution.free) / max(numbers, 1.0), 0.1)
+    covariance = own.T @ own / free + left.gain.T @ solution.information.precision @ left.gain
+    further = np.ix_(columns.order[D:], columns.order[D:])
+    return _Sums(
+        known[further],
+        left.information,
+        left.score,
+        covariance,
+        square[further] / len(p),
+        p.n_stars,
+        p.model.unit,
+    )
+
+
+def _tested(sums: _Sums, name: str, which: Int, order: int) -> Outcome | None:
+    """Outcome of one test; None where the data cannot be asked."""
+    at = np.ix_(which, which)
+    N = independent_directions(sums.known[at], sums.information[at], TOLD)
+    q, n = N.shape[1], sums.n_stars
+    if q == 0 or n < STARS_PER_DIRECTION * q + 2:
+        return None
+    U, S, V = N.T @ sums.score[which], N.T @ sums.information[at] @ N, N.T @ sums.covariance[at] @ N
+    T = float(U @ np.linalg.solve(V, U))
+    inverse, Q = np.linalg.inv(S), N.T @ sums.square[at] @ N
+    step, noise = inverse @ U, float(np.trace(Q @ inverse @ V @ inverse))
+    remedy, present, absent = _words(name, order)
+    return Outcome(
+        name=name,
+        statistic=T,
+        dof=q,
+        dof_residual=float(n - q),
+        p_value=float(stats.beta.sf(min(T / n, 1.0), q / 2, (n - q) / 2)),
+        size=float(np.sqrt(max(float(step @ Q @ step) - noise, 0.0))),
+        smallest=partial(_smallest, float(np.sqrt(max(noise, 0.0))), q, float(n - q)),
+        unit=sums.unit,
+        remedy=remedy,
+        present=present,
+        absent=absent,
+    )
+
+
+def _smallest(noise: float, dof: float, dof_residual: float, level: float) -> float:
+    return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))
+
+
+def _words(name: str, order: int) -> tuple[str, str, str]:
+    """Remedy, and the finding where there is something and where there is not."""
+    if name.startswith("order "):
+        total = int(name.removeprefix("order "))
+        raised = f"raise model.order to {total}" if total <= MAX_ORDER else "fit a look-up table"
+        return (
+            raised,
+            f"the residuals hold terms of {name}, and the model ends at order {order}",
+            f"no terms of {name} are left in the residuals",
+        )
+    if name == "magnitude":
+        return (
+            "cut the faint stars, or correct the charge-transfer efficiency",
+            "the residuals go with the magnitude of the stars",
+            "the residuals do not go with the magnitude of the stars",
+        )
+    if name == "pointing":
+        return (
+            "give the true detector.scale_mas, by which tangent planes are taken to one",
+            "the distortion goes with where exposures point, as if a curved sky were taken as flat",
+            "the distortion does not go with where exposures point",
+        )
+    return (
+        "give selfcal.frames a scale where it has none, or leave out exposures",
+        "exposures deviate from each other in linear terms that their frames do not fit",
+        "no deviations of single exposures are left in the residuals",
+    )
+
+
+def _motions(solution: Solution, epoch: Float) -> Outcome | None:
+    """Test for stars that move."""
+    p, scores = solution.problem, scores_of_detections(solution)
+    return motion_outcome(
+        StarResiduals(p.star, epoch, scores.gradient, scores.curvature, p.priors.precision),
+        p.model.unit,
+        remedy="set selfcal.motion to 'proper_motion'",
+        present="stars move between the dates of the exposures, and are taken to stand still",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """As of `Scored`."""
+
+    sample: ScoredSample
+    whole_score: Float
+    leverage: Float
+
+
+def _noise_sample(
+    solution: Solution, some: Int, rows: NDArray[np.bool_], mag: Float | None
+) -> _Scored:
+    """Some detections along the axes of the detector, in the unit of u and v.
+
+    Rolls turn the axes of the sky from exposure to exposure, and errors are those of pixels.
+    """
+    whole, theta, model = solution.problem, solution.theta, solution.problem.model
+    p, pixel = whole.of_stars(some), model.pixel_size(theta)
+    order = np.argsort(p.groups.index, kind="stable")
+    group = p.groups.index[order]
+    scores = scores_of_detections(solution).at(rows)
+    J = p.jacobians(theta, slice(0, len(p)))
+    g = np.einsum("nab,na->nb", J, scores.gradient)[order] / pixel
+    H = (np.swapaxes(J, 1, 2) @ scores.curvature @ J)[order] / pixel**2
+    r = (p.places(theta) - p.star_places(solution.stars[some]))[..., None]
+    residual = np.linalg.solve(J, r)[order, :, 0] * pixel
+    variance = (p.var[order] + solution.mixture.jitter**2) * pixel**2
+    member = memberships(whole, theta, solution.mixture, solution.stars)[rows][order]
+    starts = np.searchsorted(group, np.arange(len(p.groups) + 1))
+    jacobian, effective = p.effective_jacobian(theta), p.effective(theta)
+    blocks = tuple(
+        Block(
+            slice(int(a), int(b)),
+            int(p.groups.chip[k]),
+            int(p.groups.exposure[k]),
+            int(p.groups.exposure[k]),
+            model.frame(theta, int(p.groups.exposure[k]))[0],
+            effective[k],
+            *jacobian[k],
+        )
+        for k, (a, b) in enumerate(pairwise(starts))
+        if b > a
+    )
+    sample = ScoredSample(
+        model=model,
+        X=p.X[order],
+        Y=p.Y[order],
+        score=g.T,
+        curvature=np.stack([H[:, 0, 0], H[:, 0, 1], H[:, 1, 1]]),
+        residual=np.asarray(residual.T, float),
+        variance=np.stack([variance, variance]),
+        inlier=member,
+        mag=None if mag is None else mag[rows][order],
+        colour=None,
+        epoch=None,
+        star=p.star[order],
+        blocks=blocks,
+    )
+    taken = taken_by_stars(solution)[rows][order]
+    return _Scored(sample, sample.score / np.sqrt(1.0 - taken), np.stack([taken, taken]))

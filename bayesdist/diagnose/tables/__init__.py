@@ -1,0 +1,1 @@
+"""What look-up tables leave between their nodes."""

@@ -1,0 +1,240 @@
+"""What a look-up table leaves between its nodes: measured, not derived from how smooth it looks.
+
+A table is bilinear between nodes, and the distortion is not.  Two stars at the same place, of two
+exposures, see the same of it and nothing else in common: the mean product of their residuals is the
+mean square of what the table has left there.  The table and its polynomial were fitted to the
+same residuals and have taken some of them up: as much as their own posterior variance V, for a
+fit leaves residuals of covariance N - V.
+
+    S = <r_i r_j> + V          i, j: different stars, different exposures, same cell
+
+Cells divide the squares between nodes evenly, into 4 x 4 and 8 x 8.  What a smooth error of a
+square loses as its mean over a cell goes with the cell's area, so that both together tell the mean
+square at a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.diagnose.tables.mean_square import MeanSquare
+from bayesdist.diagnose.tables.node_cells import NodeCells
+from bayesdist.errors import DegenerateError
+from bayesdist.model import Chip
+
+__all__ = ["BetweenNodes", "between_nodes"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+FINE, COARSE = 8, 4  # cells along a side of the squares between nodes
+SHARE = (FINE / COARSE) ** 2  # areas of the cells
+FEWEST = 30  # pairs of stars
+ROUNDS = 3  # of weights that depend on the result
+SOME = 1500  # cells in which the variance of the fit is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class BetweenNodes:
+    """Mean square of what a table leaves on one chip.
+
+    Parameters
+    ----------
+    chip : int
+        Chip number.
+    square, error : ndarray, shape (2,)
+        Along x and y, square pixels, and standard deviations; a square may come out below zero.
+    n_pairs : int
+        Of stars.
+    """
+
+    chip: int
+    square: Float
+    error: Float
+    n_pairs: int
+
+    @property
+    def left(self) -> MeanSquare:
+        """What the mean squares may be, given that they are not negative."""
+        return MeanSquare(self.square, self.error)
+
+
+def between_nodes(
+    x: Float,
+    y: Float,
+    residual: Float,
+    precision: Float,
+    *,
+    star: Int,
+    exposure: Int,
+    chip: Chip,
+    step: tuple[float, float],
+    taken: Callable[[Float, Float], Float],
+) -> BetweenNodes:
+    """Mean square of what a table leaves of the distortion of one chip.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (N,)
+        Raw pixels.
+    residual : ndarray, shape (N, 2)
+        After table and polynomial, pixels.
+    precision : ndarray, shape (N, 2)
+        Inverse variances that these were fitted with; zero for a star that did not count.
+    star, exposure : ndarray of int, shape (N,)
+        Codes.
+    chip : Chip
+    step : tuple of float
+        Pixels between nodes.
+    taken : callable
+        Variance (n, 2) of table and polynomial at pixels (n,), square pixels: what the fit has
+        taken of the residuals.  Below zero for a table that was not fitted to them and errs by
+        itself: its error is in the products as it is.
+
+    Returns
+    -------
+    BetweenNodes
+
+    Raises
+    ------
+    DegenerateError
+        When too few stars lie that near to each other, or in too few places.
+    """
+    used = (precision > 0).all(axis=1)
+    stars = x[used], y[used], residual[used], precision[used], star[used], exposure[used]
+    fine, coarse = (_pairs(NodeCells.of(chip, step, parts), *stars) for parts in (FINE, COARSE))
+    n_pairs = round(float(fine.number.sum()) / 2)
+    part = fine.cells.areas(chip)
+    told = ((fine.weight > 0) & (coarse.weight > 0)).all(axis=1) & (part > 0)
+    if n_pairs < FEWEST or not told.any():
+        raise DegenerateError(
+            f"{n_pairs} pairs of stars at the same place do not tell what lies between nodes",
+            where=f"look-up table of chip {chip.number}",
+            do="give more stars or more exposures",
+        )
+    common = _of_stars(*stars[2:5])
+    square, error = np.empty(2), np.empty(2)
+    for a in (0, 1):
+        of_fine, of_coarse = (s.axis(a, told) for s in (fine, coarse))
+        each = (SHARE * of_fine.mean - of_coarse.mean) / (SHARE - 1)
+        # pairs in a fine cell are among those of the coarse one around it
+        noise = SHARE**2 * of_fine.noise - 2 * SHARE * of_fine.noise_among(of_coarse)
+        noise = (noise + of_coarse.noise) / (SHARE - 1) ** 2
+        size = max(float(np.average(each, weights=1 / noise)), 0.0)
+        for _ in range(ROUNDS):
+            # squares differ by about what they hold: where that is well known, area counts
+            weight = 1 / (noise + size**2 / part[told])
+            weight /= weight.sum()
+            square[a] = weight @ each + fine.average(taken, a, told, weight)
+            size = max(square[a], 0.0)
+        off = -part / part.sum()
+        off[told] += weight
+        uneven = size**2 * np.sum(off[part > 0] ** 2 / part[part > 0])
+        error[a] = np.sqrt(weight**2 @ noise + uneven + 4 * size * common[a])
+    return BetweenNodes(chip.number, square, error, n_pairs)
+
+
+def _of_stars(residual: Float, precision: Float, star: Int) -> Float:
+    """Variance (2,) of the mean of all residuals, as far as stars err by themselves."""
+    _, code = np.unique(star, return_inverse=True)
+    sums = [np.bincount(code, v) for v in (precision * residual).T]
+    return np.asarray(np.sum(np.square(sums), axis=1) / precision.sum(axis=0) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Axis:
+    """Sums over pairs along one axis, by square (S,): products, weights, noise of the products."""
+
+    product: Float
+    weight: Float
+    scatter: float
+
+    @property
+    def mean(self) -> Float:
+        """Mean products (S,)."""
+        return self.product / self.weight
+
+    @property
+    def noise(self) -> Float:
+        """Variances (S,) of these by what single stars have for themselves."""
+        return self.scatter / self.weight
+
+    def noise_among(self, others: _Axis) -> Float:
+        """Covariances (S,) with mean products of which these pairs are a part."""
+        return self.scatter / others.weight
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Sums over ordered pairs of different stars in different exposures of the same cell.
+
+    Parameters
+    ----------
+    cells : NodeCells
+    by_cell : ndarray, shape (cells, 2)
+        Weights.
+    product, weight, spread : ndarray, shape (squares, 2)
+        Products and weights by square; variance of the former as far as stars err by themselves.
+    number : ndarray, shape (squares,)
+    """
+
+    cells: NodeCells
+    by_cell: Float
+    product: Float
+    weight: Float
+    spread: Float
+    number: Float
+
+    def axis(self, a: int, told: NDArray[np.bool_]) -> _Axis:
+        """Of one axis, in some of the squares; noise goes with one over the weight."""
+        scatter = self.spread[:, a].sum() / self.weight[:, a].sum()
+        return _Axis(self.product[told, a], self.weight[told, a], float(scatter))
+
+    def average(
+        self,
+        function: Callable[[Float, Float], Float],
+        a: int,
+        told: NDArray[np.bool_],
+        weight: Float,
+    ) -> float:
+        """Mean of a function of the place (n, 2) along one axis, squares having weights."""
+        each = np.zeros(len(told))
+        each[told] = weight / self.weight[told, a]
+        of_cell = self.by_cell[:, a] * each[self.cells.squares()]
+        there = np.flatnonzero(of_cell > 0)
+        some = there[:: max(1, len(there) // SOME)]
+        values = function(*self.cells.centres(some))[:, a]
+        return float(np.average(values, weights=of_cell[some]))
+
+
+def _pairs(
+    cells: NodeCells,
+    x: Float,
+    y: Float,
+    residual: Float,
+    precision: Float,
+    star: Int,
+    exposure: Int,
+) -> _Pairs:
+    cell, n = cells.of_pixels(x, y), cells.number
+    p = precision * residual
+    each = np.column_stack([p, precision, p**2, np.ones(len(p))])
+
+    def squared(of: Int) -> Float:
+        """By cell, the squares of the sums over what has the same code."""
+        codes = int(of.max(initial=0)) + 1
+        key, into = np.unique(cell * codes + of, return_inverse=True)
+        sums = [np.bincount(key // codes, np.bincount(into, v) ** 2, n) for v in each.T]
+        return np.stack(sums, axis=1).astype(np.float64)
+
+    # of all pairs, those of one star and those of one exposure are taken off; the stars with
+    # themselves, taken off twice, are put back
+    sums = squared(np.zeros_like(cell)) - squared(star) - squared(exposure)
+    sums += squared(np.arange(len(cell)))
+    squares = cells.squares()
+    whole = np.stack([np.bincount(squares, v) for v in sums.T], axis=1).astype(np.float64)
+    return _Pairs(cells, sums[:, 2:4], whole[:, :2], whole[:, 2:4], 2 * whole[:, 4:6], whole[:, 6])

@@ -1,0 +1,372 @@
+"""Errors beyond the quoted ones, one for both axes or one for each group of stars: which do the
+data ask for, and how large are they?
+
+A star of group g has, along an axis, the variance s^2 + a_g.  The a_g are those of the restricted
+likelihood (REML: Patterson and Thompson 1971), in which what the fit takes up of the residuals is
+given back star by star,
+
+    E[e_i^2] = r_i^2 + x_i^T C x_i
+
+with the covariance C of the fit and the derivatives x_i of the star's position; without it errors
+would be too small by the parameters per star.  Good stars and false matches are told apart by the
+same mixture as in `by_magnitude`, so that few false ones do not count, and parameters, memberships
+and errors climb one bound in turn.
+
+Groupings are compared by their evidence after Laplace with unit-information priors,
+
+    ln E = ln L_R / c - sum_g ln(n_g) / 2
+
+where n_g are the good stars of a group and c, one for normal errors, is by how much more the sums
+of squares scatter than those of independent normal errors (from the squares themselves, all
+detections of a star together): long tails and stars that are matched often make no groups.  With
+few stars in a group the penalty keeps it from being split off; where there are many groups, their
+errors are drawn to the common one by what chance makes them differ (empirical Bayes), as the
+errors that come out are used as if they were known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.added_errors import AddedErrors, group_codes
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer.catalogue.by_magnitude import (
+    LEAST_WEIGHT,
+    memberships_of,
+    residuals_of,
+    variances_of,
+)
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.model import DistortionModel
+
+__all__ = ["ONE", "GroupedErrors", "grouped_errors"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+ONE, AXIS = "one", "axis"
+STARS = 50_000  # of which the errors are learnt: they are then known to half a percent
+PER_EXPOSURE = 100  # stars of each exposure among these, on average, at the least
+DECISIVE = 3.0  # ln evidence: odds of 20 to 1 for what is not the same for all stars
+MATERIAL = 0.01  # of the errors of typical stars: groups that differ by less are not worth it
+SETTLED, TURNS = 1e-3, 50  # change of ln variance at which the climb ends, and most turns
+HALVINGS = 45  # of the range in which an added variance lies
+FALSE = 0.02, 50.0  # fraction of false matches before the data, and the stars that this is worth
+WIDER = 5.0  # false matches scatter so many times as wide as typical good ones, or wider
+SHRUNK = 3  # labels from which on they tell how much labels scatter
+
+
+@dataclass(frozen=True, eq=False)
+class GroupedErrors:
+    """Added errors by group, as the evidence has chosen the groups.
+
+    Parameters
+    ----------
+    grouping : str
+        'one' (for both axes), 'axis', or 'chip', 'exposure', 'filter' (for both axes), or these
+        'and axis'.
+    by : str
+        'chip', 'exposure', 'filter', or empty.
+    labels : tuple of str, length G
+        As of `AddedErrors`.
+    n : ndarray, shape (G, 2)
+        Good stars of each group that its error rests on.
+    variance, error : ndarray, shape (G, 2)
+        Added variance along u and v, and its standard error.
+    evidence : dict of str to float
+        Gain of ln evidence over one error for both axes, of each grouping that was compared.
+    dispersion : float
+        The factor c.
+    """
+
+    grouping: str
+    by: str
+    labels: tuple[str, ...]
+    n: Float
+    variance: Float
+    error: Float
+    evidence: dict[str, float]
+    dispersion: float
+
+    @property
+    def by_axis(self) -> bool:
+        """Whether the axes have errors of their own."""
+        return self.grouping.endswith(AXIS)
+
+    @property
+    def sigma(self) -> Float:
+        """Added errors (G, 2)."""
+        return np.sqrt(self.variance)
+
+    @property
+    def sigma_error(self) -> Float:
+        """Their standard errors (G, 2); of errors near zero what their variance leaves room for."""
+        return self.error / (2.0 * np.sqrt(np.maximum(self.variance, self.error)))
+
+    @property
+    def gain(self) -> float:
+        """The largest gain of ln evidence over one error for both axes."""
+        return max(self.evidence.values())
+
+    @property
+    def excess(self) -> Float:
+        """What is added to the quoted errors (G, 2): the least is left to the jitter."""
+        return np.sqrt(self.variance - self.variance.min())
+
+    @property
+    def added(self) -> AddedErrors | None:
+        """The excess as errors to be added; None where one jitter will do."""
+        if self.grouping == ONE:
+            return None
+        excess = self.excess
+        weight = np.maximum(self.n, 1e-300)
+        other = np.sqrt(np.average(excess**2, axis=0, weights=weight))
+        return AddedErrors(self.by, self.labels, excess, other)
+
+
+@dataclass(eq=False)
+class _Climb:
+    """The state of the climb: fit, mixture and added variances of one grouping."""
+
+    fit: LinearFit
+    square: Float
+    f: float
+    wide: float
+    variance: Float
+    good: Float
+    log_likelihood: float = -np.inf
+
+
+def grouped_errors(
+    matches: MatchTable,
+    fit: LinearFit,
+    *,
+    by: str = "",
+    outliers: bool = True,
+    priors: GaussianPriors | None = None,
+) -> GroupedErrors:
+    """Compare one added error for both axes with one for each group.
+
+    Parameters
+    ----------
+    matches : MatchTable
+        With the quoted errors; of very many a sample is used.
+    fit : LinearFit
+        Of these matches, or of those that they are a sample of: where the climb begins.
+    by : str
+        'chip', 'exposure' or 'filter': groups that are compared beside the axes.
+    outliers : bool
+        Whether some matches may be false.
+    priors : GaussianPriors, optional
+        Of the fit.
+
+    Returns
+    -------
+    GroupedErrors
+
+    Raises
+    ------
+    InputError
+        Where all matches are of one chip, exposure or filter, by which they are to be grouped.
+    DegenerateError
+        Where the sample does not determine the model.
+    """
+    model = fit.model
+    count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
+    table = matches.sample(count)
+    names, label = group_codes(table, by)
+    present, label = np.unique(label, return_inverse=True)
+    labels = tuple(names[k] for k in present)
+    if by and len(labels) < 2:
+        raise InputError(
+            f"outliers.jitter_by is {by!r}, and all matches are of one {by}",
+            where=", ".join(table.sources),
+            do=f"leave it out, or name the column of the {by}s in data.columns",
+        )
+    axis = np.array([[0], [1]])
+    codes = {ONE: np.zeros((2, len(table)), np.int64), AXIS: axis + 0 * label}
+    if by:
+        codes |= {by: np.stack([label, label]), f"{by} and {AXIS}": 2 * label + axis}
+    quoted = _quoted(table)
+    state = _begun(table, fit, quoted, outliers)
+    climbs = {}
+    for name, code in codes.items():
+        climbs[name] = state = _climbed(table, model, quoted, code, state, outliers, priors)
+    last = list(codes)[-1]
+    dispersion = _dispersion(table, climbs[last], quoted, codes[last])
+    counts = {name: _counts(climbs[name].good, code) for name, code in codes.items()}
+    value = {
+        name: one.log_likelihood / dispersion - 0.5 * np.log(np.maximum(counts[name], 1.0)).sum()
+        for name, one in climbs.items()
+    }
+    evidence = {name: float(value[name] - value[ONE]) for name in codes if name != ONE}
+    best = max(evidence, key=lambda name: evidence[name])
+    typical = np.median(quoted + climbs[best].variance.min())
+    spread = np.ptp(climbs[best].variance) / typical
+    if evidence[best] < DECISIVE or np.sqrt(1.0 + spread) < 1.0 + MATERIAL:
+        best = ONE
+    return _result(best, by, labels, climbs[best], quoted, codes[best], evidence, dispersion)
+
+
+def _quoted(table: MatchTable) -> Float:
+    """Quoted variances (2, N)."""
+    assert table.sigma_u is not None and table.sigma_v is not None
+    return np.stack([table.sigma_u, table.sigma_v]) ** 2
+
+
+def _begun(table: MatchTable, fit: LinearFit, quoted: Float, outliers: bool) -> _Climb:
+    """One added variance for all, from the median residual."""
+    square = residuals_of(fit, table) ** 2
+    core = float(np.median(square)) / 0.4549  # of a squared normal variable
+    variance = max(0.0, core - float(np.median(quoted)))
+    wide = max(WIDER**2 * max(core, float(np.median(quoted))), float(square.sum(axis=0).max()) / 8)
+    f = FALSE[0] if outliers else 0.0
+    return _Climb(fit, square, f, wide, np.full(1, variance), np.ones(len(table)))
+
+
+def _climbed(
+    table: MatchTable,
+    model: DistortionModel,
+    quoted: Float,
+    code: Int,
+    start: _Climb,
+    outliers: bool,
+    priors: GaussianPriors | None,
+) -> _Climb:
+    """The restricted likelihood at its maximum, with groups of these codes (2, N)."""
+    n_groups = int(code.max()) + 1
+    variance = np.full(n_groups, float(np.average(start.variance)))
+    f, wide, square, typical = start.f, start.wide, start.square, float(np.median(quoted))
+    fit = start.fit
+    for _ in range(TURNS):
+        var = quoted + variance[code]
+        good = memberships_of(square, var, f, wide) if outliers else np.ones(len(table))
+        if outliers:
+            bad = 1.0 - good
+            f = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
+            least = WIDER**2 * float(np.median(var))
+            wide = max(least, float((bad * square).sum() / max(2.0 * bad.sum(), 1e-300)))
+        before, variance = variance, _maxima(quoted, square, good, code, n_groups)
+        var = quoted + variance[code]
+        weighted = table.with_sigma(*(np.sqrt(var / np.maximum(good, LEAST_WEIGHT))))
+        fit = fit_linear(weighted, model, clip_chi2=np.inf, clip_abs=None, priors=priors)
+        residual = residuals_of(fit, table) ** 2
+        square = residual + variances_of(fit, table)
+        if (np.abs(variance - before) < SETTLED * (typical + variance)).all():
+            break
+    if outliers:
+        log_bad = np.log(f) - 0.5 * (residual / wide).sum(axis=0) - np.log(wide)
+        log_good = np.log1p(-f) - 0.5 * (residual / var + np.log(var)).sum(axis=0)
+        each = np.logaddexp(log_good, log_bad)
+    else:
+        each = -0.5 * (residual / var + np.log(var)).sum(axis=0)
+    # the determinant is that of the fit's normal matrix: what makes the likelihood restricted
+    value = float(each.sum() + 0.5 * np.linalg.slogdet(fit.cov)[1])
+    return _Climb(fit, square, f, wide, variance, good, value)
+
+
+def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int) -> Float:
+    """Variance (G,) of each group at which its likelihood is largest, 0 or more.
+
+    The derivative, sum w (e^2 - s^2 - a) / (s^2 + a)^2, changes its sign there: found by halving.
+    """
+    flat, weight = code.ravel(), np.concatenate([good, good])
+    s2, e2 = quoted.ravel(), square.ravel()
+
+    def rising(a: Float) -> NDArray[np.bool_]:
+        var = s2 + a[flat]
+        return np.bincount(flat, weight * (e2 - var) / var**2, n_groups) > 0
+
+    low = np.zeros(n_groups)
+    high = np.bincount(flat, weight * e2, n_groups) / np.maximum(
+        np.bincount(flat, weight, n_groups), 1e-300
+    )
+    for _ in range(HALVINGS):  # where small quoted errors go with large residuals
+        if not (up := rising(high)).any():
+            break
+        high = np.where(up, 2.0 * high, high)
+    inside = rising(low)
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        up = rising(middle)
+        low, high = np.where(up, middle, low), np.where(up, high, middle)
+    return np.where(inside, 0.5 * (low + high), 0.0)
+
+
+def _counts(good: Float, code: Int) -> Float:
+    """Good stars (G,) of each group, each axis of a star counted."""
+    return np.asarray(np.bincount(code.ravel(), np.concatenate([good, good])), float)
+
+
+def _dispersion(table: MatchTable, climb: _Climb, quoted: Float, code: Int) -> float:
+    """By how much more the sums of squares scatter than those of independent normal errors."""
+    var = quoted + climb.variance[code]
+    score = climb.good * (climb.square / var - 1.0)
+    star = np.arange(len(table)) if table.star is None else table.star
+    n_groups = int(code.max()) + 1
+    _, of = np.unique((star * n_groups + code).ravel(), return_inverse=True)
+    sums = np.bincount(of, score.ravel())
+    return max(1.0, float((sums**2).sum() / (4.0 * climb.good.sum())))
+
+
+def _result(
+    grouping: str,
+    by: str,
+    labels: tuple[str, ...],
+    climb: _Climb,
+    quoted: Float,
+    code: Int,
+    evidence: dict[str, float],
+    dispersion: float,
+) -> GroupedErrors:
+    """The chosen groups as a table of labels and axes."""
+    columns = 2 if grouping.endswith(AXIS) else 1
+    flat, weight = code.ravel(), np.concatenate([climb.good, climb.good])
+    weight = weight / (quoted + climb.variance[code]).ravel() ** 2
+    total = np.maximum(np.bincount(flat, weight), 1e-300)
+    error = np.sqrt(2.0 * dispersion / total)
+    n = _counts(climb.good, code) / (3 - columns)  # stars, not axes of stars
+    variance = climb.variance
+    if len(variance) >= SHRUNK * columns:
+        whole = np.bincount(flat, weight * climb.square.ravel()) / total
+        own = np.bincount(flat, weight * quoted.ravel()) / total
+        variance = variance.copy()
+        for k in range(columns):
+            rows = slice(k, None, columns)
+            drawn = _drawn_together(whole[rows], (error[rows] / whole[rows]) ** 2)
+            variance[rows] = np.maximum(drawn - own[rows], 0.0)
+    several = grouping.startswith(by) if by else False
+    n, variance, error = (
+        np.broadcast_to(values.reshape(-1, columns), (len(values) // columns, 2))
+        for values in (n, variance, error)
+    )
+    return GroupedErrors(
+        grouping,
+        by if several else "",
+        labels if several else ("",),
+        n,
+        variance,
+        error,
+        evidence,
+        dispersion,
+    )
+
+
+def _drawn_together(variance: Float, noise: Float) -> Float:
+    """Variances (G,) whose logarithms are drawn to their mean by how much chance explains.
+
+    After DerSimonian and Laird 1986; `noise` (G,) is the variance of each logarithm by chance, half
+    of which its mean falls short of that of the variance.
+    """
+    log = np.log(variance) + 0.5 * noise
+    weight = 1.0 / noise
+    q = float((weight * (log - np.average(log, weights=weight)) ** 2).sum())
+    spare = float(weight.sum() - (weight**2).sum() / weight.sum())
+    between = max(0.0, (q - (len(log) - 1)) / spare)
+    mean = np.average(log, weights=1.0 / (between + noise))
+    return np.asarray(np.exp(mean + between / (between + noise) * (log - mean)))

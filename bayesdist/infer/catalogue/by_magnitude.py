@@ -1,0 +1,152 @@
+"""Fit and errors by magnitude together: one function climbed, which nothing makes turn back.
+
+Stars are good with probability 1 - f and have the errors of a smooth law of magnitude
+(`magnitude_law`), or are false matches of a wide normal distribution.  Parameters of the
+distortion, memberships and law climb the same bound on the restricted likelihood in turn
+(variational EM: the law is that of the errors after what the fit takes up, star by star, is given
+back).  Rejection by a limit has no part in it: stars that go in and out of a fit made errors swing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.stars.shards import Matches
+from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
+from bayesdist.model import DistortionModel
+
+__all__ = ["LEAST_WEIGHT", "fit_by_magnitude", "memberships_of", "residuals_of", "variances_of"]
+
+Float = NDArray[np.float64]
+
+STARS = 200_000  # of which the law is learnt: it is then known to a part in a thousand
+PER_EXPOSURE = 100  # stars of each exposure among these, on average, at the least
+SETTLED = 1e-3  # change of ln sigma at which the climb ends
+TURNS = 200  # far more than it takes; where it ends no earlier, what it has reached is the best
+FALSE = 0.02, 50.0  # fraction of false matches before the data, and the stars that this is worth
+WIDER = 10.0  # false matches scatter so many times as wide as the worst good ones, or wider
+LEAST_WEIGHT = 1e-9  # of a star: a fit wants finite errors
+
+
+def fit_by_magnitude(
+    matches: Matches,
+    model: DistortionModel,
+    *,
+    priors: GaussianPriors | None = None,
+    **options: Any,
+) -> tuple[LinearFit, Matches, MagnitudeErrors]:
+    """Fit, and errors by magnitude from its residuals, estimated together.
+
+    Parameters
+    ----------
+    matches : MatchTable or PartitionedMatches
+        With magnitudes; errors, if there are any, are replaced.
+    model : DistortionModel
+    priors : GaussianPriors, optional
+    **options
+        As of `fit_linear`.
+
+    Returns
+    -------
+    fit : LinearFit
+        Of all matches with these errors.
+    matches : MatchTable or PartitionedMatches
+        With these errors.
+    errors : MagnitudeErrors
+        The law at its nodes, and the scatter about each.
+
+    Raises
+    ------
+    InputError
+        When the table has no magnitudes, too few stars, or stars without scatter.
+    """
+    if not matches.has_mag:
+        raise InputError(
+            "errors by magnitude need magnitudes",
+            where="data.columns",
+            do="map column 'mag' or give data.sigma another value",
+        )
+    count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
+    errors = _law(matches.sample(count), model, priors, options)
+    table = matches.with_errors_by_magnitude(errors)
+    return fit_linear(table, model, priors=priors, **options), table, errors
+
+
+def _law(
+    stars: MatchTable,
+    model: DistortionModel,
+    priors: GaussianPriors | None,
+    options: dict[str, Any],
+) -> MagnitudeErrors:
+    """Errors by magnitude of some stars."""
+    assert stars.mag is not None
+    options = {name: value for name, value in options.items() if name != "compute"}
+    fit = fit_linear(stars.with_sigma(1.0, 1.0), model, priors=priors, **options)
+    residual = residuals_of(fit, stars)
+    bins = estimate(stars.mag, *residual, n_params=model.n_params)
+    law = MagnitudeLaw.of(stars.mag, bins)
+    nodes, square = law.start, residual**2
+    narrowest = (WIDER * np.exp(nodes.max())) ** 2
+    f, wide = FALSE[0], max(narrowest, float((square.sum(axis=0)).max()) / 8.0)
+    for _ in range(TURNS):
+        var = law.at_stars(nodes)
+        good = memberships_of(square, var, f, wide)
+        weight = np.sqrt(np.maximum(good, LEAST_WEIGHT))
+        weighted = stars.with_sigma(*(np.sqrt(var) / weight))
+        fit = fit_linear(weighted, model, clip_chi2=np.inf, clip_abs=None, priors=priors)
+        square = residuals_of(fit, stars) ** 2 + variances_of(fit, stars)
+        bad = 1.0 - good
+        f = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
+        wide = max(narrowest, float((bad * square).sum() / max(2.0 * bad.sum(), 1e-300)))
+        before, nodes = nodes, law.climbed(nodes, good, square)
+        if np.abs(nodes - before).max() < SETTLED:
+            break
+    sigma_u, sigma_v = np.exp(nodes)
+    scatter_u, scatter_v = _scatter(bins, stars.mag, good, square)
+    return MagnitudeErrors(bins.mag, sigma_u, sigma_v, bins.n, scatter_u, scatter_v)
+
+
+def memberships_of(square: Float, var: Float, f: float, wide: float) -> Float:
+    """Probability (N,) of each star to be a good match."""
+    log_good = np.log1p(-f) - 0.5 * (square / var + np.log(var)).sum(axis=0)
+    log_bad = np.log(f) - 0.5 * (square / wide).sum(axis=0) - np.log(wide)
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * (log_good - log_bad))))
+
+
+def _scatter(bins: MagnitudeErrors, mag: Float, good: Float, square: Float) -> Float:
+    """Scatter (2, B) of the good stars that are nearest to each node."""
+    nearest = np.searchsorted((bins.mag[1:] + bins.mag[:-1]) / 2.0, mag)
+    count = len(bins.mag)
+    n = np.bincount(nearest, weights=good, minlength=count)
+    sums = [np.bincount(nearest, weights=good * axis, minlength=count) for axis in square]
+    return np.sqrt(np.array(sums) / np.maximum(n, 1e-300))
+
+
+def residuals_of(fit: LinearFit, stars: MatchTable) -> Float:
+    """Data minus model (2, N)."""
+    some, order = prepare(fit.model, stars.with_sigma(1.0, 1.0))
+    return in_table_order(some.residuals(fit.mean), order).T
+
+
+def variances_of(fit: LinearFit, stars: MatchTable) -> Float:
+    """Variances (2, N) of the fitted positions of stars."""
+    model = fit.model
+    groups = groups_of(model, stars)
+    out = np.empty((2, len(stars)))
+    jacobians = model.effective_jacobian(fit.mean, groups)
+    for g, rows in enumerate(groups.members()):
+        columns, d = jacobians[g]
+        phi = model.basis(model.chips[groups.chip[g]].number).evaluate(stars.x[rows], stars.y[rows])
+        cov = fit.cov[np.ix_(columns, columns)]
+        for axis in (0, 1):
+            out[axis, rows] = np.einsum("nk,nk->n", phi @ (d[axis] @ cov @ d[axis].T), phi)
+    return out

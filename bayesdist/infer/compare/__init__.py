@@ -1,0 +1,1 @@
+"""Solutions compared: polynomial orders, periods, dates of change, and exposures to come."""

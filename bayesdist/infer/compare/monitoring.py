@@ -1,0 +1,336 @@
+"""Does a released solution still describe new matches?
+
+The new matches are fitted by themselves, with the polynomial order of the release, frames of their
+own for every exposure, the drift held at its released rates, and the outlier mixture with its
+jitter anew.  Their polynomials at their mean date, laid on the released ones by the one frame that
+no data can tell, differ by a change whose covariance is that of the fit plus that of the release at
+this date, extrapolated rates included.  Exposures of a campaign deviate from their polynomials as
+those of the release scatter, and what no data can tell are then their shifts and rotations alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.equations.field_test import FieldTest, field_test
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.exposures.hierarchy import held_in_reference
+from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.infer.stars.shards import Compute, Matches, load
+from bayesdist.infer.transforms import Solution, View, without_frames
+from bayesdist.model import DistortionModel
+
+__all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model"]
+
+Float = NDArray[np.float64]
+
+SAMPLE = 1_000_000  # matches that tell the mean date
+HELD = 1e-4  # of its own sigma: how exactly a released rate is held
+
+
+@dataclass(frozen=True, eq=False)
+class NewFit:
+    """The new matches fitted by themselves.
+
+    Parameters
+    ----------
+    released : View
+        The released polynomials and their drift, without frames.
+    fit : LinearFit
+        Least squares of the new matches, which seeds the mixture.
+    theta : ndarray, shape (D,)
+        Mode of the mixture, in the model of `fit`.
+    cov : ndarray, shape (D, D)
+    hyper : dict of str to float
+        'j', 'f', 's_out' at the mode, those of them that the mixture has.
+    target : Target
+        Density of the new matches.
+    psi : ndarray
+        The mode in sampled coordinates.
+    epoch : float or None
+        Mean date of the matches, where the model depends on time.
+    scatter : ndarray, shape (q,)
+        Inverse variances of the parameters of an exposure; zero for those that are free.
+    extra : ndarray, shape (n, n) or None
+        What errors that all the matches of a star share add to the covariance of the polynomials.
+    common : ndarray, shape (n_distortion, n) or None
+        Covariance of the release with these polynomials, by stars that both have.
+    """
+
+    released: View
+    fit: LinearFit
+    theta: Float
+    cov: Float
+    hyper: dict[str, float]
+    target: Target
+    psi: Float
+    epoch: float | None
+    scatter: Float = field(default_factory=lambda: np.zeros(0))
+    extra: Float | None = None
+    common: Float | None = None
+
+    @property
+    def model(self) -> DistortionModel:
+        """Of the new matches: the released structure with their exposures."""
+        return self.fit.model
+
+    @property
+    def open(self) -> DistortionModel:
+        """A model whose frames are those that no data can tell."""
+        if self.model.gauge == "first":
+            return self.model
+        return replace(
+            self.model,
+            frames="shift_rotation",
+            gauge="first",
+            held=(0.0, 0.0, 0.0),
+            chip_deviations=False,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What the new matches say has changed.
+
+    Parameters
+    ----------
+    model : DistortionModel
+        Released structure without frames.
+    epoch : float or None
+        Date at which the solutions are compared.
+    released : ndarray, shape (chips, 2, K)
+        Released polynomials at that date.
+    difference : ndarray, shape (chips, 2, K)
+        New minus released, in the frame of the release; what frames could take up is taken out.
+    cov : ndarray, shape (n, n)
+        Of the difference, n = 2 K chips.
+    released_cov : ndarray, shape (n, n)
+        Of the released polynomials at that date, and of whatever else is common to all the new
+        matches.
+    taken : ndarray, shape (n, q)
+        Fields that frames take up.
+    test : FieldTest
+        Of the whole difference.
+    frame : tuple of ndarray
+        Matrix (2, 2) and shift (2,) from the release to the first new exposure.
+    """
+
+    model: DistortionModel
+    epoch: float | None
+    released: Float
+    difference: Float
+    cov: Float
+    released_cov: Float
+    taken: Float
+    test: FieldTest
+    frame: tuple[Float, Float]
+
+
+def fit_new(
+    released: Solution,
+    matches: Matches,
+    *,
+    mixture: OutlierMixture | None = None,
+    clip_chi2: float = 25.0,
+    clip_abs: float | None = 2.0,
+    compute: Compute | None = None,
+    scatter: Mapping[str, float] | None = None,
+) -> NewFit:
+    """Fit new matches by themselves.
+
+    Parameters
+    ----------
+    released : Solution
+        A fit or a posterior; its frames, those of the exposures it was made from, play no part but
+        for their kind.
+    matches : MatchTable or PartitionedMatches
+        With errors.
+    mixture : OutlierMixture, optional
+        That of a released posterior by default, else Gaussian outliers.
+    clip_chi2, clip_abs
+        As of `fit_linear`.
+    compute : Compute, optional
+    scatter : mapping of str to float, optional
+        Standard deviations by which exposures of a campaign deviate, as their parameters are named:
+        'scale', ...  Of such a release they have to be given.
+
+    Returns
+    -------
+    NewFit
+
+    Raises
+    ------
+    InputError
+        For matches in another unit, or without the epochs that the release needs.
+    DegenerateError
+        When the matches do not determine polynomials of the released order.
+    """
+    bare = without_frames(released)
+    model = new_model(released.model, matches)
+    scattering = np.zeros(model.n_frame)
+    if scatter is not None:
+        model = held_in_reference(matches, model, model.chips[0].number)
+        model = replace(model, chip_deviations=released.model.chip_deviations)
+        names = model.free_frame_names(1)
+        scattering = np.array([scatter[k] ** -2.0 if k in scatter else 0.0 for k in names])
+    shards = load(model, matches, compute)
+    mixture = mixture or getattr(released, "mixture", None) or OutlierMixture()
+    priors = _with_scatter(_held_drift(bare, model), model, scatter or {})
+    fit = fit_linear(shards, model, clip_chi2=clip_chi2, clip_abs=clip_abs, priors=priors)
+    target = Target(shards, mixture, priors)
+    proposal = build_proposal(target, fit)
+    best, n = proposal.best, model.n_params
+    psi = proposal.split.to_psi(best.mode, best.at)
+    epoch = matches.sample(SAMPLE).epoch if model.time is not None else None
+    return NewFit(
+        released=bare,
+        fit=fit,
+        theta=psi[:n],
+        cov=best.factor.covariance()[:n, :n],
+        hyper={k: float(v) for k, v in target.hyper.values(psi[n:]).items()},
+        target=target,
+        psi=psi,
+        epoch=None if epoch is None else float(np.mean(epoch)),
+        scatter=scattering,
+    )
+
+
+def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
+    """The released structure with the exposures of new matches.
+
+    Raises
+    ------
+    InputError
+        For matches in another unit, of an unknown chip, or without epochs that are needed.
+    """
+    where = ", ".join(matches.sources)
+    if matches.unit != released.unit:
+        raise InputError(
+            f"the new matches are in {matches.unit} and the release is in {released.unit}",
+            where=where,
+            do="bring them to one unit",
+        )
+    if released.time is not None and not matches.has_epoch:
+        raise InputError(
+            "the release depends on time and the new matches have no epochs",
+            where=where,
+            do="map column 'epoch'",
+        )
+    some = matches.sample(SAMPLE)
+    return replace(
+        released,
+        exposures=matches.exposure_names,
+        gauge="first",
+        held=(0.0, 0.0, 0.0),
+        chip_deviations=False,
+        origin=(float(np.median(some.u)), float(np.median(some.v))),
+    )
+
+
+def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
+    """How the new matches differ from the release.
+
+    Parameters
+    ----------
+    new : NewFit
+    draws : float
+        Effective draws from which the released covariance was estimated: worth the more, the
+        smaller its share of the whole is (Welch and Satterthwaite).
+
+    Returns
+    -------
+    Change
+    """
+    released, model = new.released, new.released.model
+    n, K, C = model.n_polynomial, model.n_terms, len(model.chips)
+    at = _at_epoch(model, new.epoch)  # (n, n_distortion)
+    old = (at @ released.mean).reshape(C, 2, K)
+    now = (at @ new.theta[: model.n_distortion]).reshape(C, 2, K)
+    # the rates are the same on both sides, and their error counts once: with the release
+    own = new.cov[:n, :n]
+    origin = np.asarray(new.model.origin)
+    M, d = frame_between(old, now, new.open)
+    back = np.linalg.inv(M)
+    constant = np.zeros((C, 2, K))
+    constant[:, :, 0] = origin
+    shift = constant.copy()
+    shift[:, :, 0] += d
+    moved = np.einsum("ab,cbk->cak", back, now - shift) + constant
+    turn = np.kron(np.eye(C), np.kron(back, np.eye(K)))
+    released_cov = at @ released.cov @ at.T
+    if new.extra is not None:
+        released_cov = released_cov + turn @ new.extra @ turn.T
+    if new.common is not None:
+        common = at @ new.common @ turn.T
+        released_cov = released_cov - common - common.T
+    cov = turn @ own @ turn.T + released_cov
+    taken = frame_fields(model, new.open.frames, old, origin)
+    norm = mean_squares(model)
+    difference = (moved - old).ravel()
+    projector = without(taken, norm)
+    rest = projector @ difference
+    variance = np.einsum("ij,jk,ik->i", projector, cov, projector)
+    of_release = np.einsum("ij,jk,ik->i", projector, released_cov, projector)
+    known = variance > 1e-16 * np.diag(cov)
+    share = float(np.mean(of_release[known] / variance[known]))
+    return Change(
+        model=model,
+        epoch=new.epoch,
+        released=old,
+        difference=rest.reshape(C, 2, K),
+        cov=projector @ cov @ projector.T,
+        released_cov=released_cov,
+        taken=taken,
+        test=field_test(rest, cov, taken, norm, draws=draws / max(share, 1e-3) ** 2),
+        frame=(M, d),
+    )
+
+
+def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
+    """Priors that hold the drift at its released values."""
+    priors = GaussianPriors.none(model)
+    rows = slice(released.model.n_polynomial, released.model.n_distortion)
+    centre, precision = priors.centre.copy(), priors.precision.copy()
+    centre[rows] = released.mean[rows]
+    sigma = np.sqrt(np.maximum(np.diag(released.cov)[rows], 0.0))
+    least = 1e-12 * np.abs(released.mean).max(initial=1.0)
+    precision[rows] = np.maximum(HELD * sigma, least) ** -2.0
+    return GaussianPriors(centre, precision)
+
+
+def _with_scatter(
+    priors: GaussianPriors, model: DistortionModel, scatter: Mapping[str, float]
+) -> GaussianPriors:
+    """The priors with those of the deviations of all exposures."""
+    precision = priors.precision.copy()
+    for code in range(len(model.exposures)):
+        first = model.frame_slice(code).start
+        for k, name in enumerate(model.free_frame_names(code)):
+            if name in scatter:
+                precision[first + k] = scatter[name] ** -2.0
+    return GaussianPriors(priors.centre, precision)
+
+
+def _at_epoch(model: DistortionModel, epoch: float | None) -> Float:
+    """Matrix from polynomials and drift to the polynomials (n, n_distortion) at a date."""
+    out = np.eye(model.n_polynomial, model.n_distortion)
+    if model.time is None:
+        return out
+    groups = model.groups(len(model.chips), epoch=epoch, chip=[chip.number for chip in model.chips])
+    size = 2 * model.n_terms
+    for g, (columns, d) in enumerate(
+        model.effective_jacobian(np.zeros(model.n_distortion), groups)
+    ):
+        c = int(groups.chip[g])
+        out[c * size : (c + 1) * size] = 0.0
+        out[c * size : (c + 1) * size, columns] = d.reshape(size, -1)
+    return out

@@ -1,0 +1,183 @@
+"""Which polynomial order do the data ask for?  By binned surfaces, and by stars held out.
+
+WSDC D-T033, section 3, fits surfaces of order 3 to 9 to mean offsets in bins, and finds order 3
+just short and order 4 as good as those above.  Beside it stands how well each order predicts what
+it has not seen.  All of it comes from two passes over the data, beyond those of one fit of the
+highest order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.compare.order_result import HeldOutOrders, OrderSelection, OrderSurfaces
+from bayesdist.infer.compare.order_sums import (
+    LotSums,
+    bin_sums,
+    departures,
+    held_out_gain,
+    share_sums,
+    truncated,
+)
+from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.model import DistortionModel
+from bayesdist.model.basis import MAX_ORDER
+
+__all__ = ["select_order"]
+
+Float = NDArray[np.float64]
+
+DEFAULT_ORDERS = tuple(range(3, 10))
+
+
+def select_order(
+    matches: Matches | Shards,
+    model: DistortionModel,
+    *,
+    orders: Sequence[int] = DEFAULT_ORDERS,
+    bins: int = 31,
+    regions: int = 10,
+    shares: int = 100,
+    clip_chi2: float = 25.0,
+    clip_abs: float | None = 2.0,
+    compute: Compute | None = None,
+) -> OrderSelection:
+    """Compare polynomial orders.
+
+    Stars are clipped once, by the two-pass fit of the highest order, and alike for all orders.
+
+    Parameters
+    ----------
+    matches : MatchTable, PartitionedMatches or Shards
+        With errors; shards are those of the model of the highest order.
+    model : DistortionModel
+        One chip, without frames and time dependence; its own order does not matter.
+    orders : sequence of int
+        At least two.
+    bins : int
+        Bins of the surfaces on each axis.
+    regions : int
+        Regions that are held out, on each axis; each is made of whole bins.
+    shares : int
+        Shares of the stars that are held out, one at a time.
+    clip_chi2, clip_abs
+        As `fit_linear`.
+    compute : Compute, optional
+
+    Returns
+    -------
+    OrderSelection
+
+    Raises
+    ------
+    InputError
+        For fewer than two orders, orders that are none, a model of several chips, or numbers of
+        bins, regions and shares that do not go together.
+    DegenerateError
+        As `fit_linear`, for the highest order; when too few bins have stars, or a lot holds all
+        that determines a coefficient.
+    """
+    chosen = _checked(orders, model, bins, regions, shares)
+    top = replace(model, order=chosen[-1])
+    with opened(top, matches, compute) as shards:
+        fit = fit_linear(shards, top, clip_chi2=clip_chi2, clip_abs=clip_abs)
+        binned = shards.sum(bin_sums, fit.mean, fit.clip, bins)
+        shared = shards.sum(share_sums, fit.mean, fit.clip, shares)
+    n_terms = [(n + 1) * (n + 2) // 2 for n in chosen]
+    about = fit.mean.reshape(2, -1)
+    scale2 = fit.chi2 / fit.dof
+    iy, ix = np.divmod(np.arange(bins * bins), bins)
+    region = binned.joined(iy * regions // bins * regions + ix * regions // bins, regions**2)
+    try:
+        by_stars, by_regions = (
+            held_out_gain(lots.filled(), about, n_terms) / scale2 for lots in (shared, region)
+        )
+    except np.linalg.LinAlgError:
+        raise DegenerateError(
+            f"without one region the stars do not determine order {chosen[-1]}",
+            where="orders",
+            do="lower the highest order, or give more regions",
+        ) from None
+    return OrderSelection(
+        orders=chosen,
+        surfaces=_surfaces(binned.filled(), about, chosen, n_terms, scale2),
+        stars=HeldOutOrders(chosen, "stars", by_stars),
+        regions=HeldOutOrders(chosen, "regions", by_regions),
+        lost=_lost(shared, about, n_terms, scale2, fit),
+        pair_rms=float(np.hypot(fit.rms_u, fit.rms_v)),
+        error_scale=float(np.sqrt(scale2)),
+        n_used=fit.n_used,
+        unit=model.unit,
+    )
+
+
+def _checked(
+    orders: Sequence[int], model: DistortionModel, bins: int, regions: int, shares: int
+) -> tuple[int, ...]:
+    """The orders, rising."""
+    chosen = tuple(sorted({int(n) for n in orders}))
+    if len(chosen) < 2 or chosen[0] < 1 or chosen[-1] > MAX_ORDER:
+        raise InputError(
+            f"the orders to compare are {list(orders)}",
+            where="orders",
+            do=f"give at least two between 1 and {MAX_ORDER}",
+        )
+    if len(model.chips) > 1 or model.n_frame or model.time is not None:
+        raise InputError(
+            "orders are compared on one chip, without frames and time dependence",
+            where="model",
+            do="select one chip, and bring the exposures to one frame before",
+        )
+    if not 2 <= regions <= bins or shares < 2:
+        raise InputError(
+            f"{bins} bins, {regions} regions and {shares} shares do not go together",
+            where="orders",
+            do="give at least 2 regions and shares, and no more regions than bins",
+        )
+    return chosen
+
+
+def _surfaces(
+    sums: LotSums, about: Float, orders: tuple[int, ...], n_terms: list[int], scale2: float
+) -> OrderSurfaces:
+    n = len(sums.count)
+    if n <= n_terms[-1]:
+        raise DegenerateError(
+            f"{n} bins have stars, and order {orders[-1]} has {n_terms[-1]} terms",
+            where="orders",
+            do="give more bins or lower the highest order",
+        )
+    chi2, rms = np.empty((len(orders), 2)), np.empty((len(orders), 2))
+    noise = np.empty(2)
+    for axis in (0, 1):
+        w = sums.weight[:, axis, 0, 0]
+        basis = sums.weight[:, axis, 0] / w[:, None]  # mean over the stars of a bin
+        mean = sums.right[:, axis, 0] / w
+        weight, right = (basis * w[:, None]).T @ basis, (basis * w[:, None]).T @ mean
+        noise[axis] = np.sqrt(scale2 * n / w.sum())
+        for m, k in enumerate(n_terms):
+            left = mean - basis @ truncated(weight, right, about[axis], k)
+            chi2[m, axis] = w @ left**2 / scale2
+            rms[m, axis] = np.sqrt(w @ left**2 / w.sum())
+    return OrderSurfaces(orders, n, chi2, n - np.array(n_terms), rms, noise)
+
+
+def _lost(sums: LotSums, about: Float, n_terms: list[int], scale2: float, fit: LinearFit) -> Float:
+    """Rms over the detector of what each order lacks of the highest."""
+    i, j = np.array(fit.model.basis().terms).T
+    area = 1.0 / ((2 * i + 1) * (2 * j + 1))  # mean square of a product of Legendre polynomials
+    square = (departures(sums, about, n_terms) ** 2 @ area).sum(axis=1)
+    weight = sums.weight.sum(axis=0)
+    variance = np.empty(len(n_terms))
+    for m, k in enumerate(n_terms):
+        low = np.linalg.inv(weight[:, :k, :k])
+        variance[m] = np.einsum("akk,k->", low, area[:k])
+    # errors of nested fits: that of the difference is the difference of theirs
+    noise = scale2 * (variance[-1] - variance)
+    return np.sqrt(np.maximum(square - noise, 0.0))

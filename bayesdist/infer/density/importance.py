@@ -1,0 +1,119 @@
+"""What log importance weights say of a proposal, and of the chain that it drives.
+
+The weight of a proposal is w = target / proposal density.  An independence chain at a point of
+weight w rejects a proposal of weight w' with probability 1 - min(1, w'/w); hence all that is asked
+here -- quality, warm-up, price of an effective draw -- follows from the weights alone.
+
+Log weights are NaN for proposals outside the support, which were not evaluated: weight zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.sampler.convergence import importance_efficiency, pareto_k
+
+__all__ = ["Quality", "draws_per_effective", "quality_of", "rejection", "warmup_steps"]
+
+Float = NDArray[np.float64]
+
+CLOSE = 0.02  # distance from the posterior (total variation) at which warm-up ends
+MOST_WARMUP = 10_000
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How good a proposal is.
+
+    Parameters
+    ----------
+    efficiency : float
+        Effective share of its draws.
+    k : float
+        Pareto shape of the tail of the weights.
+    log_weights : ndarray, shape (n,)
+        Those inside the support.
+    n_outside : int
+        Number outside the support.
+    """
+
+    efficiency: float
+    k: float
+    log_weights: Float
+    n_outside: int
+
+
+def quality_of(log_weights: Float) -> Quality:
+    """Importance efficiency and Pareto k of log weights (any shape)."""
+    inside = log_weights[~np.isnan(log_weights)]
+    n_outside = log_weights.size - inside.size
+    if not np.isfinite(inside).any():
+        return Quality(0.0, float("inf"), inside, n_outside)
+    efficiency = importance_efficiency(inside, n_outside)
+    return Quality(efficiency, pareto_k(inside), inside, n_outside)
+
+
+def rejection(log_weights: Float) -> tuple[Float, Float]:
+    """Weights of the proposals with any, rising, and the rejection rate of a chain that is there.
+
+    Parameters
+    ----------
+    log_weights : ndarray
+        Of proposals, any shape.
+
+    Returns
+    -------
+    weight : ndarray, shape (m,)
+        Normalised to a sum of one: the posterior mass of each of these points.
+    rate : ndarray, shape (m,)
+        Mean of 1 - min(1, w'/w) over the other proposals.
+    """
+    flat = log_weights.ravel()
+    log_w = np.sort(flat[np.isfinite(flat)])
+    others, n_zero = flat.size - 1, flat.size - log_w.size
+    w = np.exp(log_w - log_w[-1])
+    below = np.cumsum(w) - w
+    smaller = np.arange(log_w.size)
+    # each smaller weight rejects in part, a zero always, a larger one never
+    rate = (n_zero + smaller - below / np.maximum(w, 1e-300)) / max(others, 1)
+    return w / w.sum(), np.clip(rate, 0.0, 1.0)
+
+
+def warmup_steps(log_weights: Float) -> int:
+    """Steps after which an independence chain that starts from the proposal has forgotten it.
+
+    Run a second chain from an exact posterior draw with the same proposals and the same uniform
+    numbers.  Once the one of larger weight accepts, so does the other, and they are one from then
+    on; until then the larger weight stays.  Hence the distance in total variation after t steps is
+    at most the mean of r(max(w, w*))^t with w drawn from the proposal, w* from the posterior and r
+    the rejection rate.
+
+    Parameters
+    ----------
+    log_weights : ndarray
+
+    Returns
+    -------
+    int
+        The first t for which this bound is at most 0.02.
+    """
+    mass, rate = rejection(log_weights)
+    by_proposal = np.arange(1, len(mass) + 1) / len(mass)
+    larger = np.diff(by_proposal * np.cumsum(mass), prepend=0.0)
+    for t in range(1, MOST_WARMUP):
+        if larger @ rate**t <= CLOSE:
+            return t
+    return MOST_WARMUP
+
+
+def draws_per_effective(log_weights: Float) -> float:
+    """Integrated autocorrelation time of an independence chain.
+
+    For functions that do not depend on the weight, the autocorrelation at lag t is the posterior
+    mean of r^t, with r the rejection rate: 1 + 2 sum_t E r^t = 1 + 2 E r / (1 - r).
+    """
+    mass, rate = rejection(log_weights)
+    return float(1 + 2 * mass @ (rate / np.maximum(1 - rate, 1e-6)))

@@ -1,0 +1,115 @@
+"""Density of the grid's coordinates, interpolated between the nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
+
+from bayesdist.infer.density.piecewise import PiecewiseExponential
+from bayesdist.infer.stars.mixture import TAILS
+
+__all__ = ["Marginal", "cardinal"]
+
+Float = NDArray[np.float64]
+
+MESH = {1: 4001, 2: 401}  # points of each axis, by their number
+
+
+def cardinal(axis: Float, *, local: bool) -> CubicSpline | CubicHermiteSpline:
+    """Splines (len(axis),) that are one at their own node and zero at the others.
+
+    Parameters
+    ----------
+    axis : ndarray, shape (n,)
+    local : bool
+        Slopes of the parabolas through three nodes each, so that a node is not felt beyond its
+        neighbours' neighbours; else natural splines, which are smoother.
+    """
+    unit = np.eye(len(axis))
+    if not local:
+        return CubicSpline(axis, unit)
+    return CubicHermiteSpline(axis, unit, np.gradient(unit, axis, axis=0, edge_order=2))
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """A normalised density in no, one or two dimensions, to be drawn from and evaluated.
+
+    Parameters
+    ----------
+    first : PiecewiseExponential or None
+        Of the first coordinate.
+    second : tuple of PiecewiseExponential
+        Of the second one, in the neighbourhood of each mesh point of the first.
+    """
+
+    first: PiecewiseExponential | None
+    second: tuple[PiecewiseExponential, ...] = ()
+
+    @classmethod
+    def of(cls, names: Sequence[str], axes: Sequence[Float], values: Float) -> Marginal:
+        """Interpolate log densities at the nodes of a product grid.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Hyperparameters of the axes: what is known of their tails.
+        axes : sequence of ndarray
+        values : ndarray, one dimension for each axis
+        """
+        # along one axis the nodes are where they are needed; a product has some far below the top
+        kind = CubicSpline if len(axes) == 1 else PchipInterpolator
+        meshes = [np.linspace(axis[0], axis[-1], MESH[len(axes)]) for axis in axes]
+        for k, (axis, mesh) in enumerate(zip(axes, meshes, strict=True)):
+            values = kind(axis, values, axis=k)(mesh)
+        if not meshes:
+            return cls(None)
+        if len(meshes) == 1:
+            return cls(_with_tails(names[0], meshes[0], values))
+        second = tuple(_with_tails(names[1], meshes[1], row) for row in values)
+        masses = np.array([density.log_mass for density in second])
+        return cls(_with_tails(names[0], meshes[0], masses), second)
+
+    def draw(self, p: Float) -> Float:
+        """Points (n, g) from uniform random numbers (n, g)."""
+        out = np.empty_like(p)
+        if self.first is not None:
+            out[:, 0] = self.first.quantile(p[:, 0])
+        for rows, density in self._conditionals(out):
+            out[rows, 1] = density.quantile(p[rows, 1])
+        return out
+
+    def log_density(self, at: Float) -> Float:
+        """Log density (n,) of points (n, g)."""
+        out = np.zeros(len(at))
+        if self.first is not None:
+            out += self.first.log_density(at[:, 0])
+        for rows, density in self._conditionals(at):
+            out[rows] += density.log_density(at[rows, 1])
+        return out
+
+    def _conditionals(self, at: Float) -> Iterator[tuple[NDArray[np.bool_], PiecewiseExponential]]:
+        """Which points have which density of their second coordinate."""
+        if self.first is None or not self.second:
+            return
+        mesh = self.first.mesh
+        nearest = np.searchsorted((mesh[1:] + mesh[:-1]) / 2, at[:, 0])
+        for k in np.unique(nearest):
+            yield nearest == k, self.second[k]
+
+
+def _with_tails(name: str, mesh: Float, values: Float) -> PiecewiseExponential:
+    step = mesh[1] - mesh[0]
+    left = max(values[1] - values[0], 1e-3) / step
+    right = min(values[-1] - values[-2], -1e-3) / step
+    end, slope = TAILS[name]
+    return PiecewiseExponential(
+        mesh,
+        values,
+        left_slope=slope if end == "left" else left,
+        right_slope=slope if end == "right" else right,
+    )

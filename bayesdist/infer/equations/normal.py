@@ -1,0 +1,226 @@
+"""Normal equations as sums over groups of stars: streaming, mergeable, movable without the data.
+
+Within a group the model is one polynomial, so the data speak only through the moments of the basis
+functions.  Partial sums over any pieces of the data add.  Because positions are linear in the
+effective coefficients, the equations can be moved to other coefficients exactly, which is how
+Gauss-Newton over the exposure frames runs without another pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer import kernel
+from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.infer.kernel import Constants
+from bayesdist.infer.stars.stars import Stars
+from bayesdist.model import DistortionModel, Groups, merge_groups
+
+__all__ = ["NormalEquations", "least_squares", "mixture"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Moments of weighted residuals about given effective coefficients.
+
+    Parameters
+    ----------
+    weight : ndarray, shape (G, 3, K, K)
+        sum of w phi phi^T for the axis pairs uu, uv, vv.
+    right : ndarray, shape (G, 2, K)
+        sum of phi (W r), r the residual at `about`.
+    about : ndarray, shape (G, 2, K)
+        Effective coefficients at which r is taken.
+    chi2 : float
+        sum of r^T W r.
+    cross : ndarray, shape (G, h, 2, K)
+        Mixed second derivatives with h further parameters.
+    scalars : ndarray
+        Further sums over the stars, which the pass that made the equations names.
+    groups : Groups
+    """
+
+    weight: Float
+    right: Float
+    about: Float
+    chi2: float
+    cross: Float
+    scalars: Float
+    groups: Groups
+
+    def __add__(self, other: NormalEquations) -> NormalEquations:
+        """Sum over both pieces of data, which may hold other groups.
+
+        Raises
+        ------
+        ValueError
+            When residuals of one group were taken at different coefficients.
+        """
+        if self.groups.same(other.groups):
+            here = np.arange(len(self.groups))
+            groups, of_self, of_other = self.groups, here, here
+        else:
+            groups, of_self, of_other = merge_groups(self.groups, other.groups)
+        pair = ((self, of_self), (other, of_other))
+
+        def total(name: str) -> Float:
+            out = np.zeros((len(groups), *getattr(self, name).shape[1:]))
+            for part, index in pair:
+                out[index] += getattr(part, name)
+            return out
+
+        about = np.empty((len(groups), *self.about.shape[1:]))
+        for part, index in pair:
+            about[index] = part.about
+        if not all(np.array_equal(about[index], part.about) for part, index in pair):
+            raise ValueError("normal equations about different coefficients do not add")
+        return NormalEquations(
+            total("weight"),
+            total("right"),
+            about,
+            self.chi2 + other.chi2,
+            total("cross"),
+            self.scalars + other.scalars,
+            groups,
+        )
+
+    def moved(self, about: Float) -> NormalEquations:
+        """The same equations about other effective coefficients: exact, without the data."""
+        step = about - self.about
+        pull = self._apply(step)
+        chi2 = self.chi2 - 2 * float((self.right * step).sum()) + float((pull * step).sum())
+        return replace(self, right=self.right - pull, about=about, chi2=chi2)
+
+    def with_cross(self, which: list[int]) -> NormalEquations:
+        """With some of the further parameters only."""
+        return replace(self, cross=self.cross[:, which])
+
+    def _apply(self, E: Float) -> Float:
+        uu, uv, vv = self.weight[:, 0], self.weight[:, 1], self.weight[:, 2]
+        u = np.einsum("gkl,gl->gk", uu, E[:, 0]) + np.einsum("gkl,gl->gk", uv, E[:, 1])
+        v = np.einsum("gkl,gl->gk", uv, E[:, 0]) + np.einsum("gkl,gl->gk", vv, E[:, 1])
+        return np.stack([u, v], axis=1)
+
+    def assemble(self, model: DistortionModel, theta: Float) -> tuple[Arrow, Float]:
+        """Normal matrix and right-hand side in the model's parameters.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        theta : ndarray, shape (n_params,)
+            Where the frames are linearised; `about` are its effective coefficients.
+
+        Returns
+        -------
+        matrix : Arrow
+            With the h further parameters as zero rows of its tail, but for `cross`.
+        right : ndarray, shape (n_params,)
+        """
+        G, q, h = model.n_global, model.n_frame, self.cross.shape[1]
+        n_blocks = len(model.local_blocks)
+        border = np.zeros((G + h, G + h))
+        edge = np.zeros((n_blocks, G + h, q))
+        blocks = np.zeros((n_blocks, q, q))
+        right = np.zeros(model.n_params)
+        tail = slice(G, G + h)
+        for g, (columns, d) in enumerate(model.effective_jacobian(theta, self.groups)):
+            uu, uv, vv = self.weight[g]
+            wd_u = uu @ d[0] + uv @ d[1]
+            wd_v = uv @ d[0] + vv @ d[1]
+            H = d[0].T @ wd_u + d[1].T @ wd_v
+            right[columns] += d[0].T @ self.right[g, 0] + d[1].T @ self.right[g, 1]
+            X = np.einsum("hak,akm->hm", self.cross[g], d)
+            n = int((columns < G).sum())
+            glob = columns[:n]
+            border[np.ix_(glob, glob)] += H[:n, :n]
+            border[tail, glob] += X[:, :n]
+            border[glob, tail] += X[:, :n].T
+            if n < len(columns):
+                e, first = divmod(columns[n] - G, q)
+                local = columns[n:] - columns[n] + first
+                edge[np.ix_([e], glob, local)] += H[None, :n, n:]
+                edge[np.ix_([e], np.r_[tail], local)] += X[None, :, n:]
+                blocks[np.ix_([e], local, local)] += H[None, n:, n:]
+        return Arrow(border, edge, blocks, n_tail=h), right
+
+
+def least_squares(
+    stars: Stars,
+    about: Float | None,
+    test: Float | None = None,
+    chi2_limit: float = np.inf,
+    abs_limit: float = np.inf,
+    corner: float = 1.0,
+    power: int = 1,
+) -> NormalEquations:
+    """Normal equations of weighted least squares with rejection: one pass over the stars.
+
+    Parameters
+    ----------
+    stars : Stars
+    about : ndarray, shape (n_params,), or None
+        Where residuals are taken; None takes the data themselves.
+    test : ndarray, shape (n_params,), or None
+        Where the residuals are taken that decide on rejection.
+    chi2_limit, abs_limit, corner, power
+        See `kernel.least_squares_moments`, which also names the `scalars`.
+
+    Returns
+    -------
+    NormalEquations
+    """
+    moments = kernel.least_squares_moments(
+        stars.pieces,
+        stars.columns,
+        stars.powers(about),
+        stars.powers(test),
+        stars.model.order,
+        chi2_limit=chi2_limit,
+        abs_limit=abs_limit,
+        corner=corner,
+        power=power,
+    )
+    if about is None:
+        E = np.zeros((len(stars.groups), 2, stars.model.n_terms))
+    else:
+        E = stars.model.effective(about, stars.groups)
+    chi2, no_cross = float(moments.scalars[6]), moments.cross[:, :0]
+    return NormalEquations(
+        moments.weight, moments.right, E, chi2, no_cross, moments.scalars, stars.groups
+    )
+
+
+def mixture(stars: Stars, theta: Float, constants: Constants, em: bool = False) -> NormalEquations:
+    """Gradient and Hessian of the mixture's log-likelihood: one pass over the stars.
+
+    Parameters
+    ----------
+    stars : Stars
+    theta : ndarray, shape (n_params,)
+    constants : Constants
+    em : bool
+        See `kernel.mixture_moments`, which also names the `scalars`.
+
+    Returns
+    -------
+    NormalEquations
+        `right` is the gradient by the effective coefficients.
+    """
+    powers, order = stars.powers(theta), stars.model.order
+    if circle := stars.circle(constants):
+        moments = kernel.truncated_moments(
+            stars.pieces, stars.columns, circle, powers, order, constants, em=em
+        )
+    else:
+        moments = kernel.mixture_moments(
+            stars.pieces, stars.columns, powers, order, constants, em=em
+        )
+    E = stars.model.effective(theta, stars.groups)
+    return NormalEquations(
+        moments.weight, moments.right, E, 0.0, moments.cross, moments.scalars, stars.groups
+    )

@@ -1,0 +1,83 @@
+"""Gaussian priors on named parameters; everything without one has a flat prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.model import DistortionModel
+
+__all__ = ["GaussianPriors"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianPriors:
+    """Independent Gaussian priors on entries of theta.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (D,)
+    precision : ndarray, shape (D,)
+        Inverse variances; 0 is a flat prior.
+    """
+
+    centre: Float
+    precision: Float
+
+    @classmethod
+    def none(cls, model: DistortionModel) -> GaussianPriors:
+        """Flat priors on everything."""
+        return cls(np.zeros(model.n_params), np.zeros(model.n_params))
+
+    @classmethod
+    def of(cls, model: DistortionModel, named: Mapping[str, tuple[float, float]]) -> GaussianPriors:
+        """Priors from a mapping of parameter names to (mean, sigma).
+
+        Raises
+        ------
+        InputError
+            For an unknown name or a sigma that is not positive.
+        """
+        centre, precision = np.zeros(model.n_params), np.zeros(model.n_params)
+        for name, (mean, sigma) in named.items():
+            if name not in model.names:
+                near = get_close_matches(name, model.names, 1)
+                raise InputError(
+                    f"there is no parameter {name!r}",
+                    where="prior",
+                    do=f"did you mean {near[0]!r}" if near else "see coefficients.ecsv for names",
+                )
+            if not (np.isfinite(mean) and 0 < sigma < np.inf):
+                raise InputError(f"prior of {name} is {mean} +- {sigma}", where="prior")
+            k = model.names.index(name)
+            centre[k], precision[k] = mean, sigma**-2
+        return cls(centre, precision)
+
+    @property
+    def n_informative(self) -> int:
+        """How many parameters have a prior."""
+        return int((self.precision > 0).sum())
+
+    def pull(self, theta: Float) -> Float:
+        """Gradient of the log prior."""
+        return self.precision * (self.centre - theta)
+
+    def log_density(self, theta: Float) -> Float:
+        """Log prior of parameter vectors (..., D), up to a constant."""
+        return -0.5 * ((theta - self.centre) ** 2 * self.precision).sum(axis=-1)
+
+    def matrix(self, model: DistortionModel, n_tail: int = 0) -> Arrow:
+        """The priors' precision as a diagonal arrow."""
+        n, q, g = len(model.local_blocks), model.n_frame, model.n_global
+        local = self.precision[g:].reshape(n, q) if n else np.zeros((0, q))
+        blocks = np.einsum("nq,qr->nqr", local, np.eye(q))
+        border = np.diag(np.concatenate([self.precision[:g], np.zeros(n_tail)]))
+        return Arrow(border, np.zeros((n, g + n_tail, q)), blocks, n_tail)

@@ -1,0 +1,224 @@
+"""Do the data determine the parameters?  If not: which ones, by name, and why.
+
+Checked before anything is solved, because a degenerate least-squares problem still returns numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.infer.stars.survey import Survey
+from bayesdist.model import DistortionModel, Groups
+from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS, frame_names
+
+__all__ = ["NullSpace", "check_coverage", "null_space"]
+
+Float = NDArray[np.float64]
+
+# Eigenvalues of the unit-diagonal normal matrix below this are zero: rounding alone leaves ~1e-15
+# and a fit that loses 11 of 16 digits is no longer a measurement.
+RANK_TOLERANCE = 1e-11
+
+# A polynomial over the detector is an extrapolation when its stars fill less than this of the area.
+LEAST_COVERAGE = 0.25
+
+
+@dataclass(frozen=True)
+class NullSpace:
+    """Directions in parameter space that the data leave free.
+
+    Parameters
+    ----------
+    rank : int
+    n_params : int
+    condition : float
+        Ratio of the extreme eigenvalues of the normal matrix scaled to unit diagonal; infinite
+        where the rank is not full.
+    directions : tuple of tuple of str
+        Names of the parameters that make up each free direction, the largest part first.
+    """
+
+    rank: int
+    n_params: int
+    condition: float
+    directions: tuple[tuple[str, ...], ...]
+
+
+def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
+    """Rank, condition and named null directions of a normal matrix.
+
+    Parameters
+    ----------
+    matrix : Arrow
+    names : tuple of str
+        Names of its rows.
+
+    Returns
+    -------
+    NullSpace
+    """
+    scale = np.sqrt(matrix.diagonal())
+    dead = scale == 0
+    scale[dead] = 1.0
+    values, vectors = np.linalg.eigh(matrix.dense() / np.outer(scale, scale))
+    free = values < RANK_TOLERANCE * max(values[-1], 1.0)
+    directions = []
+    for vector in vectors[:, free].T:
+        size = np.abs(vector)
+        parts = np.argsort(-size)[:6]
+        directions.append(tuple(names[k] for k in parts if size[k] > 0.1 * size.max()))
+    return NullSpace(
+        rank=int((~free).sum()),
+        n_params=len(names),
+        condition=float("inf") if free.any() else float(values[-1] / values[0]),
+        directions=tuple(directions),
+    )
+
+
+def require_full_rank(matrix: Arrow, model: DistortionModel, groups: Groups) -> NullSpace:
+    """The null space, which must be empty.
+
+    Raises
+    ------
+    DegenerateError
+        Naming the parameters of the first free direction and, where it can be told, the reason.
+    """
+    space = null_space(matrix, model.names)
+    if space.rank == space.n_params:
+        return space
+    first = space.directions[0]
+    listed = ", ".join(first[:-1]) + f" and {first[-1]}" if len(first) > 1 else first[0]
+    verb = "are degenerate" if len(first) > 1 else "is not determined by the data"
+    reason, do = _reason(first, model, groups, _simpler_frames(matrix, model))
+    raise DegenerateError(
+        f"{listed} {verb} (rank {space.rank} of {space.n_params}){reason}", where="model", do=do
+    )
+
+
+def _simpler_frames(matrix: Arrow, model: DistortionModel) -> str:
+    """The setting of the richest frames with which nothing is degenerate; empty where none are."""
+    dense = matrix.dense()
+    for kind in reversed(FRAME_KINDS[: FRAME_KINDS.index(model.frames)]):
+        names = frame_names(kind)
+        kept = [
+            k
+            for k, p in enumerate(model.parameters)
+            if p.kind != "frame" or p.name.rpartition(".")[2] in names
+        ]
+        part = dense[np.ix_(kept, kept)]
+        scale = np.sqrt(part.diagonal())
+        if (scale == 0).any():
+            continue
+        values = np.linalg.eigvalsh(part / np.outer(scale, scale))
+        if values[0] >= RANK_TOLERANCE * max(values[-1], 1.0):
+            return f", or set model.frames = '{kind}'"
+    return ""
+
+
+def _reason(
+    direction: tuple[str, ...], model: DistortionModel, groups: Groups, simpler: str
+) -> tuple[str, str]:
+    kinds = {p.name: p for p in model.parameters}
+    parts = [kinds[name] for name in direction]
+    deviations = any(p.kind == "frame" and p.name.endswith(DEVIATIONS) for p in parts)
+    if model.gauge == "held" and deviations:
+        return (
+            ": the scale or shear that all exposures have in common is also in the polynomials",
+            "give scale and shear of every exposure Gaussian priors, or choose gauge 'first'",
+        )
+    if any(p.kind == "tdd" for p in parts):
+        if len(np.unique(groups.epoch)) == 1:
+            return (
+                ": all exposures share one epoch",
+                "drop model.tdd or add exposures at other epochs",
+            )
+        if any(p.kind == "frame" for p in parts):
+            return (
+                f": the frame '{model.frames}' of each exposure absorbs the drift",
+                f"drop the time-dependent term (model.tdd){simpler}",
+            )
+        return (
+            ": the epochs of a segment do not fix its terms",
+            "drop the term or the break, or add exposures in that segment",
+        )
+    if any(p.kind == "frame" for p in parts):
+        return (
+            ": too little joins the exposures",
+            f"give more stars that exposures have on the same chips{simpler}",
+        )
+    return (
+        f": the stars do not fill the detector well enough for order {model.order}",
+        "lower model.order or add stars",
+    )
+
+
+def check_coverage(model: DistortionModel, survey: Survey, n_priors: int = 0) -> None:
+    """Refuse data that cannot carry the model, with the plain reason.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    survey : Survey
+    n_priors : int
+        Parameters with a prior: each is a number more.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer numbers than parameters, too few stars in an exposure, stars on a line, or stars in
+        one corner of a chip.
+    """
+    n = survey.n
+    if 2 * n + n_priors < model.n_params:
+        raise DegenerateError(
+            f"{n} stars give {2 * n} numbers, fewer than the {model.n_params} parameters",
+            where=survey.where,
+            do="lower model.order or give more stars",
+        )
+    q = len(frame_names(model.frames))
+    if q:
+        for name, count in zip(model.exposures, survey.exposures, strict=True):
+            if 2 * count < q:
+                kinds = [kind for kind in FRAME_KINDS if 2 * count >= len(frame_names(kind))]
+                stars = "1 star" if count == 1 else f"{count} stars"
+                raise DegenerateError(
+                    f"exposure {name!r} has {stars}, too few for frame '{model.frames}'",
+                    where=survey.where,
+                    do=f"leave the exposure out, or set model.frames = '{kinds[-1]}'",
+                )
+    for chip, found in zip(model.chips, survey.chips, strict=True):
+        where = f"chip {chip.name}" if len(model.chips) > 1 else survey.where
+        if not found.n:
+            raise DegenerateError("no star lies on this chip", where=where, do="drop the chip")
+        if found.outside:
+            raise DegenerateError(
+                found.outside,
+                where=where,
+                do="correct detector.size, the columns or data.pixel_origin",
+            )
+        a, b, aa, ab, bb = found.sums / found.n
+        spread = np.linalg.eigvalsh([[aa - a * a, ab - a * b], [ab - a * b, bb - b * b]])
+        # variances: they lose half of the digits
+        if found.n < 3 or spread[0] < 1e-12 * spread[1]:
+            raise DegenerateError(
+                "all stars lie on a line", where=where, do="check columns x and y"
+            )
+        try:
+            covered = ConvexHull(found.corners / chip.size).volume
+        except QhullError:  # nearly collinear: no area to speak of
+            covered = 0.0
+        if covered < LEAST_COVERAGE:
+            x, y = found.corners.T
+            raise DegenerateError(
+                f"the stars lie within x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to "
+                f"{y.max():.0f} and span {100 * covered:.0f} % of the detector, so that the rest "
+                "would be extrapolated",
+                where=where,
+                do="add stars, or describe only the part that is measured as the detector",
+            )

@@ -1,0 +1,1 @@
+"""What varies from exposure to exposure: frames, chip offsets, trends."""

@@ -1,0 +1,406 @@
+"""All exposures jointly, with scale and shear of each scattered about the common polynomials.
+
+    deviation k of exposure e ~ N(0, tau_k^2)     k: scale, shear_plus, shear_cross, and with
+                                                  `chip_deviations` shift, rotation, scale and shear
+                                                  of every chip but the first
+
+A telescope breathes: the linear terms of its exposures scatter by more than their formal errors,
+and a joint fit that does not know this believes in each star as if it were a new measurement of the
+detector.  The scatter tau is estimated with everything else.
+
+How the distance between chips goes with scale and shear is left open: it is no ruler, as it may
+drift by itself, and no measurement of its own (see `CAUTION`); where the chips lie is settled
+afterwards (see `Settling`).
+
+One linear fit with a wide prior on the deviations is enough.  Its normal equations tell what the
+data alone say of them; tau, and what follows from any tau for all parameters, is then algebra (see
+`Scatter`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.equations.normal import least_squares
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.exposures.scatter import Scatter
+from bayesdist.infer.linear import Clip, LinearFit, fit_linear
+from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.transforms import reference_gauge
+from bayesdist.model import DistortionModel
+
+__all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference"]
+
+Float = NDArray[np.float64]
+
+SCALE = 1e-4  # of the prior on tau: what velocity aberration does to the scale in a year
+# A focal plane that breathes moves its chips too: then the gap's deviations are those of scale and
+# shear over again, and taken as independent they would halve the error of a drift.  At four times
+# their scatter they take 3 % off it.
+CAUTION = 4.0
+MOST_OUTLYING = 0.2  # of the exposures: beyond, they are the rule
+LEAST_DETERMINED = 0.5  # deviations of a kind that the data must determine, out of E
+
+
+@dataclass(frozen=True, eq=False)
+class HierarchicalFit:
+    """A joint solution of all exposures in which scale and shear of each may deviate.
+
+    Draws and mean are over the posterior of tau.  So is the covariance, but for one simplification:
+    for its part within one tau stands that of the root mean square of tau.  Variances are linear in
+    tau^2 where the scatter rules, and more concave elsewhere, so that this errs to the safe side.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        The linear fit with tau held at its root mean square.
+    scatter : Scatter
+        What the data say of tau.
+    tau_draws : ndarray, shape (n, k)
+        Draws of tau from its posterior.
+    others : GaussianPriors
+        The priors that were given.
+    settling : Settling
+        What was done, in `fit` too, to the shifts of single chips.
+    outlying : tuple of str
+        Exposures whose deviations are far beyond the scatter of the others.  They are fitted with a
+        wide prior, and tau is not theirs.
+    """
+
+    fit: LinearFit
+    scatter: Scatter
+    tau_draws: Float
+    others: GaussianPriors
+    settling: Settling
+    outlying: tuple[str, ...] = ()
+
+    @property
+    def index(self) -> NDArray[np.int64]:
+        """Where theta holds the deviations."""
+        return self.scatter.index
+
+    @property
+    def model(self) -> DistortionModel:
+        """The distortion model."""
+        return self.fit.model
+
+    @property
+    def unit(self) -> str:
+        """Unit of u and v."""
+        return self.model.unit
+
+    @property
+    def clip(self) -> Clip:
+        """What was left out of the second pass."""
+        return self.fit.clip
+
+    def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
+        """Which stars (N,) of a table were used."""
+        return self.fit.uses(matches)
+
+    @property
+    def tau(self) -> dict[str, float]:
+        """Posterior median of the scatter of each kind of deviation."""
+        median = np.median(self.tau_draws, axis=0)
+        return dict(zip(self.scatter.kinds, map(float, median), strict=True))
+
+    def tau_interval(self, probability: float = 0.68) -> dict[str, tuple[float, float]]:
+        """Central posterior interval of each tau."""
+        tail = (1 - probability) / 2
+        ends = np.quantile(self.tau_draws, [tail, 1 - tail], axis=0).T
+        return {k: (float(a), float(b)) for k, (a, b) in zip(self.scatter.kinds, ends, strict=True)}
+
+    @property
+    def priors(self) -> GaussianPriors:
+        """The given priors and those of the deviations, as `sample` wants them."""
+        return _with_deviations(
+            self.others, self.index, self.scatter.prior(_root_mean_square(self.tau_draws))
+        )
+
+    @cached_property
+    def _means(self) -> Float:
+        """Mean of theta for each draw of tau, shape (n, D)."""
+        return self.settling.mean(
+            np.stack([self.scatter.posterior(tau)[0] for tau in self.tau_draws])
+        )
+
+    @cached_property
+    def mean(self) -> Float:
+        """Posterior mean of theta, shape (D,)."""
+        return np.asarray(self._means.mean(axis=0))
+
+    @cached_property
+    def cov(self) -> Float:
+        """Posterior covariance of theta, shape (D, D)."""
+        spread = self._means - self.mean
+        return np.asarray(self.fit.cov + spread.T @ spread / len(spread))
+
+    @property
+    def sigma(self) -> Float:
+        """Posterior standard deviation of theta, shape (D,)."""
+        return np.asarray(np.sqrt(np.diag(self.cov)))
+
+    @threadpool_limits.wrap(limits=1, user_api="blas")
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Parameter vectors (n, D): each with a tau of its own, and theta drawn with it."""
+        which = np.sort(rng.integers(len(self.tau_draws), size=n))
+        theta = rng.standard_normal((n, len(self.fit.mean)))
+        for t in np.unique(which):
+            rows = which == t
+            mean, factor = self.scatter.posterior(self.tau_draws[t])
+            theta[rows] = mean + factor.colour(theta[rows])
+        return np.asarray(rng.permutation(self.settling.draws(theta, self.tau_draws[which], rng)))
+
+    def deviations(self, exposure: str) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of the deviations of one exposure.
+
+        Raises
+        ------
+        InputError
+            For an unknown exposure.
+        """
+        if exposure not in self.model.exposures:
+            raise InputError(f"there is no exposure {exposure!r}")
+        names = [f"{exposure}.{kind}" for kind in self.scatter.kinds]
+        at = [self.model.names.index(name) for name in names]
+        pairs = zip(self.mean[at], self.sigma[at], strict=True)
+        return {
+            k: (float(m), float(s)) for k, (m, s) in zip(self.scatter.kinds, pairs, strict=True)
+        }
+
+
+def _root_mean_square(tau: Float) -> Float:
+    return np.asarray(np.sqrt((tau**2).mean(axis=0)))
+
+
+def _with_deviations(
+    others: GaussianPriors, index: NDArray[np.int64], inverse_variance: Float
+) -> GaussianPriors:
+    centre, precision = others.centre.copy(), others.precision.copy()
+    centre[index], precision[index] = 0.0, inverse_variance
+    return GaussianPriors(centre, precision)
+
+
+def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -> DistortionModel:
+    """The model in gauge 'held', with polynomials that lie along the reference chip's axes.
+
+    The first exposure's stars on that chip are fitted alone; where its reference pixel lies and how
+    it is turned is where the first exposure is held.  Frames then rotate about the reference pixel,
+    and scale, shear and drift are those of the detector, whatever the roll angles are.
+
+    Parameters
+    ----------
+    matches : MatchTable or PartitionedMatches
+    model : DistortionModel
+        Of all exposures; its gauge is replaced.
+    chip : int
+        Number of the reference chip.
+
+    Returns
+    -------
+    DistortionModel
+
+    Raises
+    ------
+    DegenerateError
+        When the first exposure has too few stars on that chip.
+    """
+    first = model.exposures[0]
+    number = model.chips[model.chip_code(chip)].number
+    parts = []
+    for piece in matches.pieces():
+        table = piece.read()
+        rows = np.asarray(table.exposure_names)[table.exposure] == first
+        rows &= table.chip_number == number
+        if rows.any():
+            parts.append(table.select(rows))
+    if not parts:
+        raise DegenerateError(
+            f"exposure {first!r}, which defines the gauge, has no stars on the reference chip",
+            where=f"chip {model.chips[model.chip_code(chip)].name}",
+            do="put another exposure first",
+        )
+    alone = replace(
+        model,
+        chips=(model.chips[model.chip_code(chip)],),
+        time=None,
+        frames="none",
+        exposures=("1",),
+        gauge="first",
+        held=(0.0, 0.0, 0.0),
+    )
+    table = MatchTable.concatenate(parts)
+    gauge = reference_gauge(fit_linear(table, alone), chip).gauge
+    assert gauge is not None
+    return replace(model, gauge="held", held=(*gauge.shift, -gauge.rotation), origin=(0.0, 0.0))
+
+
+# matrices here are small: more BLAS threads only get in each other's way
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def fit_hierarchical(
+    matches: Matches | Shards,
+    model: DistortionModel,
+    *,
+    deviations: Sequence[str] | None = None,
+    priors: GaussianPriors | None = None,
+    scale: float = SCALE,
+    pixel: float = 1.0,
+    n_tau: int = 256,
+    seed: int = 1,
+    clip_chi2: float = 25.0,
+    clip_abs: float | None = 2.0,
+    compute: Compute | None = None,
+) -> HierarchicalFit:
+    """Fit all exposures jointly, with the scatter of their scale and shear.
+
+    Parameters
+    ----------
+    matches : MatchTable, PartitionedMatches or Shards
+        With errors.
+    model : DistortionModel
+        Frames 'shift_rotation_scale' or 'affine', or deviations of single chips, in gauge 'held':
+        see `held_in_reference`.
+    deviations : sequence of str, optional
+        Kinds of deviation that scatter; all that the frames have by default.  The others need a
+        prior.
+    priors : GaussianPriors, optional
+        On other parameters.
+    scale : float
+        Of the half-Student-t prior on each tau, with 4 degrees of freedom.  It is flat for scatter
+        much below, and makes the posterior proper with few exposures.  For shifts of single chips
+        it counts at half the longest side of a chip.
+    pixel : float
+        Size of a pixel in the unit of u, v.
+    n_tau : int
+        Draws of tau over which results are averaged.
+    seed : int
+        Of these draws.
+    clip_chi2, clip_abs, compute
+        As of `fit_linear`.
+
+    Returns
+    -------
+    HierarchicalFit
+
+    Raises
+    ------
+    InputError
+        For a model without such frames, another gauge, or an unknown deviation.
+    DegenerateError
+        When the data do not determine the scatter, by name; else as `fit_linear`.
+    """
+    has = list(model.free_frame_names(0)) if model.gauge == "held" else []
+    kinds = tuple(has if deviations is None else deviations)
+    _check(model, has, kinds)
+    others = priors or GaussianPriors.none(model)
+    names = {name: k for k, name in enumerate(model.names)}
+    index = np.array([names[f"{e}.{kind}"] for kind in kinds for e in model.exposures])
+    n = len(model.exposures)
+    kind, member = np.divmod(np.arange(len(index)), n)
+    half = max(max(chip.size) for chip in model.chips) / 2
+    of_gap = np.array(["shift" in name for name in kinds])
+    scales = scale * np.where(of_gap, half * pixel, 1.0)
+    options: dict[str, Any] = {"clip_chi2": clip_chi2, "clip_abs": clip_abs}
+    with opened(model, matches, compute) as shards:
+        wide = _with_deviations(others, index, scales[kind] ** -2)
+        first = fit_linear(shards, model, priors=wide, **options)
+        limits = (first.clip.theta, first.clip.chi2_limit, first.clip.abs_limit)
+        equations = shards.sum(least_squares, first.mean, *limits)
+        matrix, right = equations.assemble(model, first.mean)
+        scatter = Scatter(
+            kinds,
+            kind,
+            index,
+            matrix + others.matrix(model),
+            right + others.pull(first.mean),
+            first.mean,
+            scales,
+            np.zeros(len(index), bool),
+            np.where(of_gap, CAUTION, 1.0),
+        )
+        _require_determined(scatter, model)
+        outlying = _outlying(scatter, member)
+        scatter = scatter.loosened(outlying[member])
+        tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
+        precision = scatter.prior(_root_mean_square(tau_draws))
+        fit = fit_linear(
+            shards, model, priors=_with_deviations(others, index, precision), **options
+        )
+        settling = Settling.of(model, kinds, equations.groups, others.precision > 0, outlying)
+    fit = replace(
+        fit,
+        mean=settling.mean(fit.mean),
+        cov=settling.covariance(fit.cov, _root_mean_square(tau_draws)),
+    )
+    names_of = tuple(model.exposures[e] for e in np.flatnonzero(outlying))
+    return HierarchicalFit(fit, scatter, tau_draws, others, settling, names_of)
+
+
+def _outlying(scatter: Scatter, member: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which exposures (E,) went wrong: one after the other, the worst first, tau from the rest.
+
+    None are named where they are more than a fifth: then they are the rule.
+    """
+    n = int(member.max()) + 1
+    found = np.zeros(n, bool)
+    while found.sum() <= MOST_OUTLYING * n:
+        some = scatter.loosened(found[member])
+        odds = some.odds(np.exp(some.mode()), member)
+        odds[found] = -np.inf
+        worst = int(np.argmax(odds))
+        if odds[worst] <= 0:
+            return found
+        found[worst] = True
+    return np.zeros(n, bool)
+
+
+def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> None:
+    if model.gauge != "held" or not has:
+        raise InputError(
+            f"frames '{model.frames}' in gauge '{model.gauge}' leave nothing that scatters",
+            where="model.frames",
+            do="choose 'shift_rotation_scale' or 'affine' in gauge 'held' (held_in_reference)",
+        )
+    unknown = [kind for kind in kinds if kind not in has]
+    if unknown or not kinds:
+        raise InputError(
+            f"{unknown[0]!r} is no deviation of frames '{model.frames}'"
+            if unknown
+            else "no deviation is named",
+            where="deviations",
+            do=f"choose among {', '.join(has)}",
+        )
+
+
+def _require_determined(scatter: Scatter, model: DistortionModel) -> None:
+    """Refuse data that hardly say more of a kind of deviation than its prior does."""
+    _, factor = scatter.posterior(scatter.scale / scatter.caution)
+    # of E deviations of a kind, so many are known from the data rather than from the prior
+    known = 1 - factor.variances()[scatter.index] / scatter.scale[scatter.kind] ** 2
+    determined = np.bincount(scatter.kind, known)
+    if (determined < LEAST_DETERMINED).any():
+        worst = scatter.kinds[int(np.argmin(determined))]
+        n = len(scatter.kind) // len(scatter.kinds)
+        drifts = model.time is not None
+        raise DegenerateError(
+            f"the scatter of {worst!r} is not determined: {n} exposures are no more than the "
+            f"linear terms{' and their drift' if drifts else ''} absorb",
+            where="exposures",
+            do="give more exposures, or "
+            + (
+                "drop the drift (model.tdd)"
+                if drifts
+                else "calibrate matched stars ([data] in place of [campaign], model.frames = "
+                "'shift_rotation_scale')"
+            ),
+        )

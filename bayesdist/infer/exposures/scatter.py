@@ -1,0 +1,280 @@
+"""The scatter of deviations, from what the data say of each of them.
+
+Deviations b ~ N(0, T), T = diag(tau^2) with one tau for each kind, among parameters theta of which
+the data say the quadratic form -1/2 d^T H d + r^T d, d = theta - theta_0.  Then, with P the
+precision T^-1 where theta holds deviations and 0 elsewhere,
+
+    log p(data | tau) = 1/2 [-log |H + P| - log |T| + q^T (H + P)^-1 q - b_0^T T^-1 b_0]
+    q = r - P theta_0
+
+the restricted likelihood (REML: all that is not a deviation is integrated out, not maximised).  Its
+maximum is the fixed point tau_k^2 = mean over e of (b_ek^2 + var b_ek) of the EM algorithm.
+H has arrow shape, so that cost grows linearly with the number of exposures.
+
+An exposure that went wrong would make all others look worse than they are.  Its deviations may be
+called *loose*: they get a wide prior and say nothing of tau.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import logsumexp
+
+from bayesdist.infer.density.piecewise import PiecewiseExponential
+from bayesdist.infer.equations.arrow import Arrow, ArrowFactor
+
+__all__ = ["Scatter"]
+
+Float = NDArray[np.float64]
+
+DEGREES = 4.0  # of freedom of the prior on tau, a half-Student-t
+MESH = np.concatenate([np.arange(-10.0, -3.0), np.arange(-3.0, 4.25, 0.5), [5.0, 7.0]])  # sigmas
+WIDENED = 0.9  # factor on the logarithm of the proposals' density
+LEAST_CURVATURE = 0.3
+LEAST_EFFICIENCY = 0.05  # effective fraction of the proposals; below, a chain is run
+PROPOSALS = 4  # for each draw of tau that is asked for
+BURN_IN, BETWEEN = 40, 3  # sweeps of a chain over all kinds, before the first draw and from then on
+SMALLEST, LARGEST = 1e-6, 1e3  # of the prior's scale: where the search for tau ends
+OUTLYING = 10.0  # times tau: scatter of the deviations of exposures that went wrong
+OUTLYING_FRACTION = 0.02  # of the exposures, expected to have gone wrong
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """What the data say of the deviations, and hence of their scatter.
+
+    Parameters
+    ----------
+    kinds : tuple of str, length k
+        Kinds of deviation.
+    kind : ndarray of int, shape (m,)
+        Kind of each deviation.
+    index : ndarray of int, shape (m,)
+        Where theta holds the deviations.
+    matrix : Arrow
+        H, without the prior on the deviations.
+    right : ndarray, shape (D,)
+        r.
+    about : ndarray, shape (D,)
+        theta_0.
+    scale : ndarray, shape (k,)
+        Of the half-Student-t prior on each tau, with 4 degrees of freedom.
+    loose : ndarray of bool, shape (m,)
+        Which deviations have the prior N(0, scale^2).
+    caution : ndarray, shape (k,)
+        Factor, 1 or more, on tau in what follows from it for theta.  A kind that may be correlated
+        with others is kept from telling of them what it takes from its independence.
+    """
+
+    kinds: tuple[str, ...]
+    kind: NDArray[np.int64]
+    index: NDArray[np.int64]
+    matrix: Arrow
+    right: Float
+    about: Float
+    scale: Float
+    loose: NDArray[np.bool_]
+    caution: Float
+
+    def precision(self, tau: Float) -> Float:
+        """Inverse variances (m,) of the deviations where tau is known."""
+        return np.asarray(np.where(self.loose, self.scale[self.kind], tau[self.kind]) ** -2)
+
+    def prior(self, tau: Float) -> Float:
+        """Inverse variances (m,) of the deviations' prior, with caution."""
+        return self.precision(self.caution * tau)
+
+    def _solved(self, precision: Float) -> tuple[ArrowFactor, Float, Float]:
+        """H + P factored, q, and (H + P)^-1 q."""
+        diagonal = np.zeros(len(self.about))
+        diagonal[self.index] = precision
+        border, local = self.matrix.split(diagonal)
+        factor = Arrow(
+            self.matrix.border + np.diag(border),
+            self.matrix.edge,
+            self.matrix.blocks + np.einsum("nq,qr->nqr", local, np.eye(local.shape[1])),
+        ).factor()
+        q = self.right - diagonal * self.about
+        return factor, q, factor.solve(q)
+
+    def posterior(self, tau: Float) -> tuple[Float, ArrowFactor]:
+        """Mean of theta (D,), and its precision factored, given tau (k,) and with caution."""
+        return self._moments(self.prior(tau))
+
+    def _moments(self, precision: Float) -> tuple[Float, ArrowFactor]:
+        factor, _, step = self._solved(precision)
+        return self.about + step, factor
+
+    def log_density(self, tau: Float) -> float:
+        """Log posterior density of log tau, up to a constant."""
+        if (tau > LARGEST * self.scale).any():
+            return -np.inf
+        precision, b = self.precision(tau), self.about[self.index]
+        factor, q, step = self._solved(precision)
+        value = q @ step - factor.logdet + np.log(precision).sum() - precision @ b**2
+        prior = -0.5 * (DEGREES + 1) * np.log1p((tau / self.scale) ** 2 / DEGREES)
+        return float(0.5 * value + (prior + np.log(tau)).sum())
+
+    def gradient(self, tau: Float) -> Float:
+        """Derivative of `log_density` by log tau, shape (k,)."""
+        mean, factor = self._moments(self.precision(tau))
+        squares = (mean**2 + factor.variances())[self.index]
+        tight, k = ~self.loose, len(self.kinds)
+        second = np.bincount(self.kind[tight], squares[tight], k)
+        ratio = (tau / self.scale) ** 2
+        prior = 1.0 - (DEGREES + 1) * ratio / (DEGREES + ratio)
+        return np.asarray(second / tau**2 - np.bincount(self.kind[tight], minlength=k) + prior)
+
+    @cached_property
+    def robust(self) -> Float:
+        """A first tau (k,) that a few exposures which went wrong do not raise much."""
+        mean, factor = self._moments(self.precision(self.scale))
+        b, sigma = mean[self.index], np.sqrt(factor.variances()[self.index])
+        out = np.empty(len(self.kinds))
+        for k in range(len(out)):
+            some = b[self.kind == k]
+            spread = 1.4826 * np.median(np.abs(some - np.median(some)))
+            # the deviations are known against each other better than by themselves
+            out[k] = max(spread, 0.1 * float(np.median(sigma[self.kind == k])))
+        return np.minimum(out, self.scale)
+
+    def odds(self, tau: Float, member: NDArray[np.int64]) -> Float:
+        """How much better "it went wrong" explains the deviations of each group.
+
+        Parameters
+        ----------
+        tau : ndarray, shape (k,)
+            Of all that are not loose.
+        member : ndarray of int, shape (m,)
+            Group (exposure) of each deviation, from 0.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Log odds of ten times the scatter against the scatter, 1 to 49 beforehand, by what all
+            others leave of the group.  The scatter is that of the others: a group that went wrong
+            raises tau, and would excuse itself.
+        """
+        precision = self.precision(tau)
+        mean, factor = self._moments(precision)
+        squares = (mean**2 + factor.variances())[self.index]
+        tight, k = ~self.loose, len(self.kinds)
+        total = np.bincount(self.kind[tight], squares[tight], k)
+        count = np.bincount(self.kind[tight], minlength=k)
+        out = np.empty(int(member.max()) + 1)
+        for group in range(len(out)):
+            own = np.flatnonzero(member == group)
+            at, kind = self.index[own], self.kind[own]
+            columns = np.zeros((len(at), len(self.about)))
+            columns[np.arange(len(at)), at] = 1.0
+            cov = factor.solve(columns)[:, at]
+            inverse = np.linalg.inv((cov + cov.T) / 2)
+            # what the data, and through them the other groups, say of this one
+            information = inverse - np.diag(precision[own])
+            pull = inverse @ mean[at]
+            mine = np.where(tight[own], squares[own], 0.0)
+            others = np.maximum(count[kind] - tight[own], 1)
+            scatter = np.sqrt(np.maximum(total[kind] - mine, 0.0) / others)
+            evidence = []
+            for times in (1.0, OUTLYING):
+                T = np.maximum(times * scatter, SMALLEST * self.scale[kind]) ** -2.0
+                L = np.linalg.cholesky(information + np.diag(T))
+                half = np.linalg.solve(L, pull)
+                evidence.append(
+                    0.5 * half @ half - np.log(np.diag(L)).sum() + 0.5 * np.log(T).sum()
+                )
+            prior = np.log(OUTLYING_FRACTION / (1 - OUTLYING_FRACTION))
+            out[group] = evidence[1] - evidence[0] + prior
+        return out
+
+    def loosened(self, loose: NDArray[np.bool_]) -> Scatter:
+        """The same with other loose deviations (m,)."""
+        return replace(self, loose=loose)
+
+    def mode(self) -> Float:
+        """The most probable log tau, shape (k,)."""
+        low, high = np.log(SMALLEST * self.scale), np.log(LARGEST * self.scale)
+        bounds = list(zip(low, high - 1e-6, strict=True))
+        found = minimize(
+            lambda x: -self.log_density(np.exp(x)),
+            np.log(self.robust),
+            jac=lambda x: -self.gradient(np.exp(x)),
+            method="L-BFGS-B",
+            bounds=bounds,
+            options={"gtol": 1e-4, "ftol": 1e-12},
+        )
+        return np.asarray(found.x)
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Draws of tau from its posterior, shape (n, k), of equal weight.
+
+        Importance sampling of log tau, resampled.  The kinds are proposed independently, each from
+        its density with the others at the mode, made a little wider: what one kind scatters mostly
+        says little of the others.  Where it says much, a Markov chain begins at the best of the
+        proposals.
+        """
+        proposals = self._proposals(self.mode())
+        u = rng.uniform(size=(PROPOSALS * n, len(proposals)))
+        x = np.stack([one.quantile(p) for one, p in zip(proposals, u.T, strict=True)], axis=1)
+        log_q = sum(one.log_density(t) for one, t in zip(proposals, x.T, strict=True))
+        log_w = np.array([self.log_density(t) for t in np.exp(x)]) - log_q
+        w = np.exp(log_w - logsumexp(log_w))
+        if 1 / (w**2).sum() < LEAST_EFFICIENCY * len(w):
+            return np.exp(self._chain(x[int(np.argmax(w))], proposals, n, rng))
+        # systematic resampling
+        at = (np.arange(n) + rng.uniform()) / n
+        return np.exp(x[np.minimum(np.searchsorted(np.cumsum(w), at), len(w) - 1)])
+
+    def _chain(
+        self,
+        start: Float,
+        proposals: list[PiecewiseExponential],
+        n: int,
+        rng: np.random.Generator,
+    ) -> Float:
+        """Draws (n, k) of log tau by a Metropolis chain, one kind after another.
+
+        A step is one from the kind's proposal, or a normal one of about its width: the first
+        crosses a density that is wide, the second follows one that moves with the other kinds.
+        """
+        x = start.copy()
+        value, out = self.log_density(np.exp(x)), np.empty((n, len(x)))
+        ends = np.array([one.quantile(np.array([0.16, 0.84])) for one in proposals])
+        width = np.diff(ends, axis=1)[:, 0] / 2
+        for sweep in range(BURN_IN + BETWEEN * n):
+            for k, one in enumerate(proposals):
+                new = x.copy()
+                gain = 0.0
+                if rng.uniform() < 0.5:
+                    new[k] = one.quantile(rng.uniform(size=1))[0]
+                    gain = float(np.subtract(*one.log_density(np.array([x[k], new[k]]))))
+                else:
+                    new[k] += width[k] * rng.standard_normal()
+                there = self.log_density(np.exp(new))
+                if np.log(rng.uniform()) < there - value + gain:
+                    x, value = new, there
+            if sweep >= BURN_IN:
+                out[(sweep - BURN_IN) // BETWEEN] = x
+        return out
+
+    def _proposals(self, mode: Float) -> list[PiecewiseExponential]:
+        """A density of log tau for each kind, given the others at the mode."""
+        out, step = [], 1e-3
+        for k, e in enumerate(np.eye(len(mode))):
+            up, down = (self.gradient(np.exp(mode + s * step * e))[k] for s in (1, -1))
+            # towards zero the density falls as tau: no wider than a few units of log tau
+            sigma = 1 / np.sqrt(max((down - up) / (2 * step), LEAST_CURVATURE))
+            mesh = mode[k] + sigma * MESH
+            mesh = mesh[mesh < np.log(LARGEST * self.scale[k])]
+            points = mode + (mesh - mode[k])[:, None] * e
+            values = WIDENED * np.array([self.log_density(np.exp(t)) for t in points])
+            slopes = np.diff(values) / np.diff(mesh)
+            out.append(
+                PiecewiseExponential(mesh, values, max(slopes[0], 0.5), min(slopes[-1], -0.5))
+            )
+        return out

@@ -1,0 +1,1 @@
+"""Solutions as netCDF files: fit.nc and posterior.nc."""

@@ -1,0 +1,199 @@
+"""posterior.nc: the posterior as a netCDF tree that ArviZ and xarray open.
+
+Groups: posterior, sample_stats, diagnostics; of tables in memory also observed_data, constant_data
+and, where that is not too large, log_likelihood.  What the posterior says of each star of larger
+data stands beside it, in the parts of `stars/`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer.density.memberships import outlier_probability, star_log_likelihood
+from bayesdist.infer.files import netcdf
+from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.sampler.convergence import Convergence, Limits
+from bayesdist.infer.sampler.surrogate import Certificate
+from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.model import DistortionModel
+
+__all__ = ["load_posterior", "save_posterior"]
+
+SCHEMA = 2
+NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
+MOST_STARS = 1_000_000  # whose data are repeated here
+LARGEST = 16_000_000  # bytes of log-likelihood that are kept star by star and draw by draw
+
+
+def save_posterior(
+    posterior: Posterior,
+    matches: MatchTable | None,
+    path: str | Path,
+    *,
+    provenance: Mapping[str, object] | None = None,
+) -> None:
+    """Write a posterior.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    matches : MatchTable or None
+        The data it was made from; None, or more than a million stars, leaves them out.
+    path : path
+        Replaced atomically.
+    provenance : mapping, optional
+        JSON-able facts about the run, kept as an attribute.
+    """
+    import xarray as xr
+
+    c = posterior.convergence
+    n_theta = len(posterior.model.names)
+    parameter = ("parameter", list(posterior.model.names))
+    sampled = ("sampled", list(c.names))
+    groups = {
+        "posterior": xr.Dataset(
+            {
+                "theta": (("chain", "draw", "parameter"), posterior.theta),
+                **{k: (("chain", "draw"), v) for k, v in posterior.hyper.items()},
+            },
+            coords={"parameter": parameter, "unit": ("parameter", list(posterior.model.units))},
+        ),
+        "sample_stats": xr.Dataset(
+            {"lp": (("chain", "draw"), posterior.log_prob)},
+            attrs=asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
+        ),
+        "diagnostics": xr.Dataset(
+            {
+                name: ("sampled", getattr(c, name))
+                for name in ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
+            },
+            coords={"sampled": sampled},
+            attrs={
+                "pareto_k": c.pareto_k,
+                "importance_efficiency": c.importance_efficiency,
+                "converged": int(c.converged),
+                "reasons": json.dumps(c.reasons),
+                "limit_ess": c.limits.ess,
+                "limit_rhat": c.limits.rhat,
+            },
+        ),
+    }
+    if matches is not None and len(matches) <= MOST_STARS:
+        groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
+        groups["constant_data"] = _constants(posterior, matches, xr)
+        # of one draw alone where the places of stars go with it
+        few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
+        if few and not posterior.own_places:
+            values = star_log_likelihood(posterior, matches)
+            groups["log_likelihood"] = xr.Dataset({"uv": (("chain", "draw", "star"), values)})
+    tree = xr.DataTree.from_dict({f"/{name}": data for name, data in groups.items()})
+    tree.attrs = {
+        "schema": SCHEMA,
+        "creator": "bayesdist",
+        "model": json.dumps(posterior.model.to_dict()),
+        "mixture": json.dumps(asdict(posterior.mixture)),
+        "provenance": json.dumps(dict(provenance or {}), default=str),
+        "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
+        "n_parameters": n_theta,
+        "own_places": int(posterior.own_places),
+        **{name: getattr(posterior, name) for name in NUMBERS},
+    }
+    netcdf.write(tree, path)
+
+
+def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[no-untyped-def]
+    columns = {
+        "x": matches.x,
+        "y": matches.y,
+        "sigma_u": matches.sigma_u,
+        "sigma_v": matches.sigma_v,
+        "exposure": np.asarray(matches.exposure),
+        "chip": matches.chip_number,
+        "outlier_probability": outlier_probability(posterior, matches),
+        "row": matches.row,
+    }
+    for name in ("epoch", "mag", "colour"):
+        if getattr(matches, name) is not None:
+            columns[name] = getattr(matches, name)
+    return xr.Dataset(
+        {name: ("star", values) for name, values in columns.items()},
+        attrs={"unit": matches.unit, "exposure_names": json.dumps(matches.exposure_names)},
+    )
+
+
+def load_posterior(path: str | Path) -> Posterior:
+    """Read a posterior back.
+
+    Parameters
+    ----------
+    path : path
+        A posterior.nc, or a run directory that holds one.
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    FormatError
+        When the file is missing or is not such a file.
+    """
+    import xarray as xr
+
+    path = Path(path)
+    if path.is_dir():
+        path = path / "posterior.nc"
+    with netcdf.reading(path, "a posterior", "sample"):
+        with xr.open_datatree(path, engine=netcdf.ENGINE) as tree:
+            tree.load()
+        attrs = tree.attrs
+        draws, checks = tree["posterior"].to_dataset(), tree["diagnostics"].to_dataset()
+        stats = tree["sample_stats"].to_dataset()
+        if attrs.get("creator") != "bayesdist":
+            raise KeyError("creator")
+        mixture = json.loads(attrs["mixture"])
+        mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
+        info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
+        info["exact"] = bool(info["exact"])
+        return Posterior(
+            model=DistortionModel.from_dict(json.loads(attrs["model"])),
+            mixture=OutlierMixture(**mixture),
+            theta=draws["theta"].values,
+            hyper={k: draws[k].values for k in ("j", "f", "s_out") if k in draws},
+            log_prob=stats["lp"].values,
+            n_stars=int(attrs["n_stars"]),
+            n_flagged=int(attrs["n_flagged"]),
+            n_false=float(attrs["n_false"]),
+            reference_sigma=float(attrs["reference_sigma"]),
+            convergence=Convergence(
+                names=tuple(str(n) for n in checks["sampled"].values),
+                rhat=checks["rhat"].values,
+                ess_bulk=checks["ess_bulk"].values,
+                ess_tail=checks["ess_tail"].values,
+                mcse_mean=checks["mcse_mean"].values,
+                mcse_sd=checks["mcse_sd"].values,
+                pareto_k=float(checks.attrs["pareto_k"]),
+                importance_efficiency=float(checks.attrs["importance_efficiency"]),
+                converged=bool(checks.attrs["converged"]),
+                reasons=tuple(json.loads(checks.attrs["reasons"])),
+                limits=Limits(float(checks.attrs["limit_ess"]), float(checks.attrs["limit_rhat"])),
+            ),
+            sampler=SamplerInfo(**info),
+            certificate=_certificate(json.loads(attrs["certificate"])),
+            own_places=bool(attrs.get("own_places", False)),
+        )
+
+
+def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
+    return None if fields is None else Certificate(**fields | {"reasons": tuple(fields["reasons"])})
+
+
+def _plain(value: object) -> object:
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,1 +1,0 @@
-"""Everything that speaks xarray and ArviZ: convergence diagnostics and netCDF files."""

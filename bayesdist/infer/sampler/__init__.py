@@ -1,0 +1,1 @@
+"""Sampling the posterior: moves, ensembles, convergence, checkpoints."""

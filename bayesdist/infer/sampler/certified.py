@@ -1,0 +1,189 @@
+"""Sampling with few passes: a surrogate from pilots, its certificate, and an exact second stage.
+
+The surrogate (`certificate`) is a proposal better than the one that it was made from.  As long as
+it fits the time its draws are therefore accepted or refused by exact evaluations: delayed
+acceptance, of which rejection from the first proposal is the first stage.  Beyond that its draws
+stand for the posterior, as an approximation with a certificate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.infer.density.laplace import Node
+from bayesdist.infer.density.proposal import GridProposal, Random
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
+from bayesdist.infer.sampler.convergence import diagnose
+from bayesdist.infer.sampler.lookahead import Page, pilot_page
+from bayesdist.infer.sampler.move_schedule import Plan, expected_passes
+from bayesdist.infer.sampler.surrogate import Certificate, Surrogate, certify, draw_surrogate
+from bayesdist.infer.sampler.whitening import Whitening
+
+__all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
+
+Float = NDArray[np.float64]
+
+SECOND_STAGES = ("auto", "always", "never")
+PILOTS = 400  # passes that the certificate costs
+AFFORDABLE = (
+    1e11  # evaluations of a star, four minutes on two cores, that the second stage may cost
+)
+LEAST_DRAWS = 1000  # approximate draws of each ensemble: they cost no pass
+KEY = (1_000_000,)  # of the pilots' random numbers
+
+
+@dataclass(frozen=True, eq=False)
+class SurrogateProposal:
+    """The surrogate as a proposal: q exp(g), to be drawn from and evaluated.
+
+    Parameters
+    ----------
+    first : GridProposal
+        q.
+    whitening : Whitening
+    surrogate : Surrogate
+        g.
+    """
+
+    first: GridProposal
+    whitening: Whitening
+    surrogate: Surrogate
+
+    @property
+    def best(self) -> Node:
+        """As of the first proposal."""
+        return self.first.best
+
+    def draw(self, n: int, rng: Random) -> Float:
+        """Points (n, D) in sampled coordinates."""
+        return self.accepted(n, rng)[0]
+
+    def accepted(self, n: int, rng: Random) -> tuple[Float, float]:
+        """Points (n, D), and the share of the first proposal's that was accepted."""
+        return draw_surrogate(self.first.draw, self.whitening.to_white, self.surrogate, n, rng)
+
+    def log_density(self, psi: Float) -> Float:
+        """Log density (n,) of points (n, D), up to a constant."""
+        return self.first.log_density(psi) + self.surrogate.log_weight(self.whitening.to_white(psi))
+
+
+def has_second_stage(choice: str, passes: int, n_stars: int) -> bool:
+    """Whether exact evaluations follow the surrogate.
+
+    Parameters
+    ----------
+    choice : str
+        Of `SECOND_STAGES`.
+    passes : int
+        That they are expected to take.
+    n_stars : int
+    """
+    affordable = float(passes) * n_stars <= AFFORDABLE
+    return choice == "always" or (choice == "auto" and affordable)
+
+
+def run_certified(
+    target: Target, proposal: GridProposal, settings: Settings, second_stage: str = "auto"
+) -> tuple[Chains, Certificate, bool]:
+    """Draws by way of a surrogate.
+
+    Parameters
+    ----------
+    target : Target
+    proposal : GridProposal
+    settings : Settings
+    second_stage : str
+        'always', 'never', or 'auto': where the passes that it is expected to take are affordable.
+
+    Returns
+    -------
+    chains : Chains
+    certificate : Certificate
+    exact : bool
+        Whether the second stage made the draws exact; otherwise they have converged only when the
+        certificate is granted.
+
+    Raises
+    ------
+    InputError
+        For an unknown second stage, and as `certify`.
+    DegenerateError, NotConvergedError
+        As `run_chains` and `draw_surrogate`.
+    """
+    if second_stage not in SECOND_STAGES:
+        raise InputError(
+            f"there is no second stage {second_stage!r}",
+            where="sampler.second_stage",
+            do=f"choose {', '.join(SECOND_STAGES)}",
+        )
+    s, E = settings, len(settings.seeds)
+    page = pilot_page(
+        target, proposal, s.seeds, -(-PILOTS // E), s.folder, s.fingerprint, "certificate", KEY
+    )
+    psi, log_weights = page.psi.reshape(-1, page.psi.shape[-1]), page.log_weights.ravel()
+    inside = np.isfinite(psi).all(axis=1)
+    psi, log_weights = psi[inside], log_weights[inside]
+    whitening = Whitening.of(target, proposal, psi)
+    rng = np.random.default_rng(np.random.SeedSequence(s.seeds[0], spawn_key=KEY))
+    n_hyper = len(target.names) - target.n_theta
+    surrogate, certificate = certify(whitening.to_white(psi), log_weights, n_hyper, rng=rng)
+    better = SurrogateProposal(proposal, whitening, surrogate)
+
+    passes = expected_passes(len(target.names), s.n_stars, s.limits, E)
+    if has_second_stage(second_stage, passes, s.n_stars):
+        # a surrogate that is no good is no better proposal either
+        chains = run_chains(target, better if certificate.granted else proposal, s)
+        method = f"delayed acceptance ({chains.plan.method} second stage)"
+        plan = replace(chains.plan, method=method)
+        return (
+            replace(chains, plan=plan, passes=chains.passes + page.n_evaluated),
+            certificate,
+            True,
+        )
+    return _approximate(target, better, certificate, page, s), certificate, False
+
+
+def _approximate(
+    target: Target,
+    proposal: SurrogateProposal,
+    certificate: Certificate,
+    page: Page,
+    s: Settings,
+) -> Chains:
+    """Independent draws of the surrogate, as chains of one walker each."""
+    n = max(LEAST_DRAWS, int(2 * s.limits.ess))
+    psi, shares = [], []
+    for seed in s.seeds:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(*KEY, 1)))
+        draws, share = proposal.accepted(n, rng)
+        psi.append(draws[:, None])
+        shares.append(share)
+    kept = np.array(psi)
+    log_prob = np.array([proposal.log_density(p[:, 0])[:, None] for p in psi])
+    flat = page.psi.reshape(-1, page.psi.shape[-1])
+    inside = np.isfinite(page.log_prob.ravel())
+    weights = page.log_prob.ravel()[inside] - proposal.log_density(flat[inside])
+    verdict = diagnose(kept, target.names, weights, s.limits, coupled=False)
+    verdict = replace(
+        verdict,
+        pareto_k=certificate.pareto_k,
+        importance_efficiency=certificate.raw_efficiency,
+    )
+    if not certificate.granted:
+        reasons = (*verdict.reasons, certificate.statement)
+        verdict = replace(verdict, converged=False, reasons=reasons)
+    return Chains(
+        psi=kept,
+        log_prob=log_prob,
+        verdict=verdict,
+        plan=Plan("certified surrogate (approximate)", (1.0, 0.0, 0.0), 1, 0.0),
+        steps=n,
+        warmup=0,
+        passes=page.n_evaluated,
+        acceptance=float(np.mean(shares)),
+    )

@@ -1,0 +1,322 @@
+"""Chains until they have converged: pilot, plan, blocks, verdicts, and the way back.
+
+The proposal is judged by the importance weights of everything that was proposed, again after every
+block.  When it turns out worse than the pilot said, the chains start again with moves that do not
+depend on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.density.importance import (
+    Quality,
+    draws_per_effective,
+    quality_of,
+    warmup_steps,
+)
+from bayesdist.infer.density.proposal import Proposal
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.sampler.blocks import Block
+from bayesdist.infer.sampler.convergence import (
+    LEAST_PER_WALKER,
+    Convergence,
+    Limits,
+    diagnose,
+)
+from bayesdist.infer.sampler.ensembles import Ensembles
+from bayesdist.infer.sampler.lookahead import pilot_page
+from bayesdist.infer.sampler.move_schedule import (
+    EFFICIENT,
+    LONGEST_TAIL,
+    Plan,
+    Stretch,
+    boundaries,
+    first_check,
+    ladder,
+    next_check,
+    pilot_steps,
+    plan_moves,
+    walkers_for,
+)
+from bayesdist.infer.sampler.whitening import Whitening
+
+__all__ = ["Chains", "Settings", "run_chains"]
+
+Float = NDArray[np.float64]
+
+LEAST_ROWS = 10  # rows of a chain that diagnostics make sense of
+MIX_STEPS = 500  # by which Crank-Nicolson moves must have brought every walker around
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the user decides.
+
+    Parameters
+    ----------
+    seeds : tuple of int
+        One for each ensemble.
+    n_stars : int
+        What a pass costs.
+    walkers : int or None
+        Of one ensemble; None leaves it to the plan.
+    limits : Limits
+    max_steps, checkpoint_every : int
+    folder : path or None
+    fingerprint : str
+    progress : callable or None
+    """
+
+    seeds: tuple[int, ...]
+    n_stars: int
+    walkers: int | None = None
+    limits: Limits = field(default_factory=Limits)
+    max_steps: int = 20_000
+    checkpoint_every: int = 200
+    folder: Path | None = None
+    fingerprint: str = ""
+    progress: Callable[[int, int], None] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """Draws after warm-up, and how they came about.
+
+    Parameters
+    ----------
+    psi : ndarray, shape (ensembles, steps kept, walkers, D)
+    log_prob : ndarray, shape (ensembles, steps kept, walkers)
+    verdict : Convergence
+    plan : Plan
+    steps : int
+        Of each ensemble, everything counted.
+    warmup : int
+        Steps that were dropped.
+    passes : int
+        Evaluations of the posterior density.
+    acceptance : float
+    """
+
+    psi: Float
+    log_prob: Float
+    verdict: Convergence
+    plan: Plan
+    steps: int
+    warmup: int
+    passes: int
+    acceptance: float
+
+
+@dataclass(eq=False)
+class _History:
+    """Blocks of one plan since its first step."""
+
+    runs: Ensembles
+    begin: int
+    psi: list[Float] = field(default_factory=list)
+    log_prob: list[Float] = field(default_factory=list)
+    accepted: float = 0.0
+    rows: int = 0
+    end: int = 0
+
+    def add(self, blocks: list[Block], end: int) -> None:
+        self.psi.append(np.array([self.runs.psi(b) for b in blocks]))
+        self.log_prob.append(np.array([b.log_prob for b in blocks]))
+        self.accepted += float(sum(b.accepted.sum() for b in blocks))
+        self.rows += self.psi[-1].shape[1]
+        self.end = end
+
+    def kept(self, warmup: int) -> tuple[Float, Float]:
+        """Draws and log densities after some rows."""
+        psi = np.concatenate(self.psi, axis=1)[:, warmup:]
+        return psi, np.concatenate(self.log_prob, axis=1)[:, warmup:]
+
+    def chains(self, warmup: int, verdict: Convergence, passes: int) -> Chains:
+        plan, (psi, log_prob) = self.runs.plan, self.kept(warmup)
+        made = len(self.runs.seeds) * plan.walkers * self.rows
+        return Chains(
+            psi=psi,
+            log_prob=log_prob,
+            verdict=verdict,
+            plan=plan,
+            steps=self.end,
+            warmup=self.begin + warmup * plan.thin,
+            passes=passes,
+            acceptance=self.accepted / made,
+        )
+
+
+def run_chains(target: Target, proposal: Proposal, settings: Settings) -> Chains:
+    """Sample until the targets are met or the steps are used up.
+
+    Parameters
+    ----------
+    target : Target
+        Or anything else with `log_density`, `names` and `n_theta`.
+    proposal : Proposal
+        Or anything else with `draw`, `log_density` and `best`.
+    settings : Settings
+
+    Returns
+    -------
+    Chains
+
+    Raises
+    ------
+    DegenerateError
+        When hardly a proposal falls inside the support.
+    InputError
+        For checkpoints that cannot be read or written.
+    """
+    s, E = settings, len(settings.seeds)
+    W = s.walkers or walkers_for(s.n_stars)
+    n = W * (pilot_steps(E, W) + 1)
+    pilot = pilot_page(target, proposal, s.seeds, n, s.folder, s.fingerprint)
+    inside = np.isfinite(pilot.log_prob)
+    if inside.sum() < 2:
+        raise DegenerateError(
+            "the Laplace approximation has no mass inside the support",
+            where="posterior",
+            do="check the match, the errors and the outlier model",
+        )
+    whitening = Whitening.of(target, proposal, pilot.psi[inside])
+
+    def start(plan: Plan) -> Ensembles:
+        return Ensembles(target, proposal, pilot, whitening, plan, s.seeds, s.folder, s.fingerprint)
+
+    quality, passes, steps = quality_of(pilot.log_weights), pilot.n_evaluated, 0
+    plan = _plan(target, quality, s)
+    if plan.independent:
+        chains, quality, passes, steps = _drawn_ahead(target, start(plan), s, passes)
+        if chains is not None:
+            return chains
+        plan = _plan(target, quality, s)
+    if not plan.coupled:
+        chains, passes, steps = _state_dependent(target, start(plan), s, quality, passes, steps)
+        if chains is not None:
+            return chains
+        plan = plan_moves(0.0, np.inf, len(target.names), s.n_stars, s.walkers)
+    chains, *_ = _state_dependent(target, start(plan), s, quality, passes, steps)
+    assert chains is not None
+    return chains
+
+
+def _plan(target: Target, quality: Quality, s: Settings) -> Plan:
+    q, n_proposals = quality, len(quality.log_weights) + quality.n_outside
+    return plan_moves(q.efficiency, q.k, len(target.names), s.n_stars, s.walkers, n_proposals)
+
+
+def _drawn_ahead(
+    target: Target, runs: Ensembles, s: Settings, passes: int
+) -> tuple[Chains | None, Quality, int, int]:
+    """Pure independence: the chains, or None when the proposal turned out worse than the pilot.
+
+    Also the quality of the proposal as it is known then, and the passes and steps made.
+    """
+    pilot, W, total = runs.pilot, runs.plan.walkers, len(s.seeds) * runs.plan.walkers
+    first = pilot.psi.shape[1] // W - 1
+    states, taken, further = runs.starts()
+    rest = pilot.without(taken, first * W)
+    history, weights = _History(runs, 0), [pilot.log_weights]
+    passes += further
+    warmup = warmup_steps(pilot.log_weights)
+    cost = draws_per_effective(pilot.log_weights)
+    wanted = first_check(s.limits, cost, len(target.names), len(s.seeds), W)
+    wanted = max(wanted, total * LEAST_ROWS)
+    for stretch in ladder(first, s.checkpoint_every, s.max_steps, s.n_stars):
+        blocks = runs.advance(states, stretch, rest)
+        states = [block.end for block in blocks]
+        history.add(blocks, stretch.end)
+        if stretch.begin >= first:
+            weights.append(np.array([block.log_weights for block in blocks]))
+            passes += int((~np.isnan(weights[-1])).sum())
+        if s.progress is not None:
+            s.progress(stretch.end, s.max_steps)
+        # judged at each block, whatever the targets are: a resumed run may have others
+        quality = quality_of(np.concatenate(weights, axis=1))
+        last = stretch.end == s.max_steps
+        if not _plan(target, quality, s).independent and not last:
+            return None, quality, passes, stretch.end
+        dropped = min(warmup, history.rows // 2)
+        made = total * (history.rows - dropped)
+        trusted = quality.efficiency > EFFICIENT and quality.k < LONGEST_TAIL
+        if (made < wanted or not trusted) and not last:
+            continue
+        verdict = _verdict(target, history, dropped, quality, s.limits)
+        if not trusted:
+            verdict = _distrusted(verdict, quality)
+        if verdict.converged or last:
+            break
+        wanted = next_check(made, verdict, s.n_stars, total)
+    return history.chains(dropped, verdict, passes), quality, passes, history.end
+
+
+def _distrusted(verdict: Convergence, quality: Quality) -> Convergence:
+    reason = (
+        "the proposal misses part of the posterior (importance efficiency "
+        f"{quality.efficiency:.2g}, Pareto k {quality.k:.2g}) and no steps are left for other moves"
+    )
+    return replace(verdict, converged=False, reasons=(*verdict.reasons, reason))
+
+
+def _state_dependent(
+    target: Target, runs: Ensembles, s: Settings, quality: Quality, passes: int, begin: int
+) -> tuple[Chains | None, int, int]:
+    """Moves that are evaluated as they come; the first half of them is warm-up.
+
+    The chains, or None when Crank-Nicolson moves get nowhere; the passes and steps made.
+    """
+    if s.max_steps - begin < 10 * runs.plan.thin:  # too few steps to leave any out
+        runs = replace(runs, plan=replace(runs.plan, thin=1))
+    plan, total = runs.plan, len(s.seeds) * runs.plan.walkers
+    states, _, further = runs.starts()
+    passes += further
+    history, wanted, nothing = _History(runs, begin), 0.0, runs.pilot[slice(0, 0)]
+    for stretch in _from(begin, boundaries(s.checkpoint_every, s.max_steps - begin, plan.thin)):
+        blocks = runs.advance(states, stretch, nothing)
+        states = [block.end for block in blocks]
+        history.add(blocks, stretch.end)
+        passes += total * (stretch.end - stretch.begin)
+        if s.progress is not None:
+            s.progress(stretch.end, s.max_steps)
+        warmup, last = history.rows // 2, stretch.end + plan.thin > s.max_steps
+        made = total * (history.rows - warmup)
+        # at the same step whatever the targets are, as a resumed run may have others
+        trial = not plan.coupled and stretch.begin < begin + MIX_STEPS <= stretch.end
+        if made < max(wanted, total * LEAST_ROWS) and not last and not trial:
+            continue
+        verdict = _verdict(target, history, warmup, quality, s.limits)
+        if verdict.converged or last:
+            break
+        ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
+        if trial and ess < LEAST_PER_WALKER * total:
+            return None, passes, stretch.end
+        wanted = next_check(made, verdict, s.n_stars, total)
+    return history.chains(warmup, verdict, passes), passes, history.end
+
+
+def _from(begin: int, ends: Iterator[int]) -> Iterator[Stretch]:
+    here = begin
+    for end in ends:
+        yield Stretch(here, begin + end, begin + end)
+        here = begin + end
+
+
+def _verdict(
+    target: Target, history: _History, warmup: int, quality: Quality, limits: Limits
+) -> Convergence:
+    return diagnose(
+        history.kept(warmup)[0],
+        target.names,
+        quality.log_weights,
+        limits,
+        coupled=history.runs.plan.coupled,
+        n_outside=quality.n_outside,
+    )

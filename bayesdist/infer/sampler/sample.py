@@ -1,0 +1,221 @@
+"""From a linear fit to a posterior: mode, proposal, ensembles, and the decision when to stop."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from bayesdist.errors import InputError
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.memberships import count_outliers
+from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.sampler.certified import run_certified
+from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
+from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.sampler.convergence import Limits
+from bayesdist.infer.sampler.surrogate import Certificate
+from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
+from bayesdist.infer.stars.stars import Stars
+
+__all__ = ["sample"]
+
+Float = NDArray[np.float64]
+
+METHODS = ("exact", "certified")
+FORMAT = 2  # of the checkpoints
+ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may give other bits
+
+
+# matrices here are small: more BLAS threads only get in each other's way
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def sample(
+    fit: LinearFit,
+    matches: Matches | Shards,
+    *,
+    outliers: OutlierMixture | None = None,
+    priors: GaussianPriors | None = None,
+    seed: int = 1,
+    ensembles: int = 4,
+    walkers: int | None = None,
+    target_ess: float = 400.0,
+    target_rhat: float = 1.01,
+    max_steps: int = 20_000,
+    checkpoint_every: int = 200,
+    method: str = "exact",
+    second_stage: str = "auto",
+    folder: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    compute: Compute | None = None,
+) -> Posterior:
+    """Sample the posterior of the distortion and of the outlier mixture.
+
+    Parameters
+    ----------
+    fit : LinearFit
+        Of the same matches; it seeds the search for the mode.
+    matches : MatchTable, PartitionedMatches or Shards
+        All stars: none is clipped.
+    outliers : OutlierMixture, optional
+        Gaussian outliers by default.
+    priors : GaussianPriors, optional
+    seed : int
+        All random numbers follow from it.
+    ensembles : int
+        Independent ensembles, over which convergence is judged; 2 or more.
+    walkers : int, optional
+        Walkers of one ensemble; chosen with the moves by default.
+    target_ess, target_rhat : float
+        The run stops when every parameter has reached them.
+    max_steps : int
+        Largest total of steps of each ensemble, also over resumed runs.
+    checkpoint_every : int
+        Most steps between two checkpoints.
+    method : str
+        'exact', or 'certified': by way of a surrogate that costs few passes.
+    second_stage : str
+        With 'certified': whether exact evaluations accept or refuse the surrogate's draws
+        ('always', 'never'), or do so where that is affordable ('auto'); see `certified`.
+    folder : path, optional
+        Where checkpoints are kept.  Blocks found there are read instead of run, so that a killed
+        run goes on bit for bit.
+    progress : callable, optional
+        Called with (steps made, `max_steps`).
+    compute : Compute, optional
+        Where the work is done; one process with threads by default.
+
+    Returns
+    -------
+    Posterior
+        `convergence.converged` says whether the targets were reached.
+
+    Raises
+    ------
+    DegenerateError
+        When no posterior mode is found.
+    InputError
+        For checkpoints of other data or settings, or a disk that is full.
+    """
+    if ensembles < 2:
+        raise InputError(
+            f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
+        )
+    if method not in METHODS:
+        raise InputError(
+            f"there is no method {method!r}",
+            where="sampler.method",
+            do=f"choose {' or '.join(METHODS)}",
+        )
+    if max_steps < 1 or checkpoint_every < 1:
+        raise InputError("steps must be positive", where="sampler")
+    started = time.monotonic()
+    with opened(fit.model, matches, compute) as shards:
+        mixture, priors = outliers or OutlierMixture(), priors or GaussianPriors.none(fit.model)
+        target = Target(shards, mixture, priors)
+        folder = None if folder is None else Path(folder)
+        known = _fingerprint(target, seed, ensembles, walkers, checkpoint_every, method)
+        proposal = _proposal(target, fit, folder, known)
+        seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
+        settings = Settings(
+            seeds=tuple(int(s) for s in seeds[:-1]),
+            n_stars=len(shards),
+            walkers=walkers,
+            limits=Limits(target_ess, target_rhat),
+            max_steps=max_steps,
+            checkpoint_every=checkpoint_every,
+            folder=folder,
+            fingerprint=known,
+            progress=progress,
+        )
+        certificate, exact = None, True
+        if method == "exact":
+            chains = run_chains(target, proposal, settings)
+        else:
+            chains, certificate, exact = run_certified(target, proposal, settings, second_stage)
+        info = SamplerInfo(
+            method=f"emcee {chains.plan.method}" if exact else chains.plan.method,
+            ensembles=ensembles,
+            walkers=chains.plan.walkers,
+            steps=chains.steps,
+            warmup=chains.warmup,
+            passes=chains.passes,
+            acceptance=chains.acceptance,
+            wall_s=time.monotonic() - started,
+            seed=seed,
+            exact=exact,
+        )
+        return _posterior(target, chains, info, certificate)
+
+
+def _posterior(
+    target: Target, chains: Chains, info: SamplerInfo, certificate: Certificate | None
+) -> Posterior:
+    E, T, W, D = chains.psi.shape
+    draws = np.swapaxes(chains.psi, 1, 2).reshape(E, W * T, D)
+    flat = draws.reshape(-1, D)
+    n = target.n_theta
+    flagged, expected = count_outliers(target.shards, target.hyper, flat[:, :n], flat[:, n:])
+    return Posterior(
+        model=target.model,
+        mixture=target.mixture,
+        theta=draws[..., :n].copy(),
+        hyper=target.hyper.values(draws[..., n:]),
+        log_prob=np.swapaxes(chains.log_prob, 1, 2).reshape(E, W * T),
+        n_stars=len(target.shards),
+        n_flagged=flagged,
+        n_false=expected,
+        reference_sigma=target.hyper.scale,
+        convergence=chains.verdict,
+        sampler=info,
+        certificate=certificate,
+    )
+
+
+def _fingerprint(target: Target, *settings: object) -> str:
+    """What must not change between a run and its resumption."""
+    digest = hashlib.sha256()
+    digest.update("".join(target.shards.sum(_digest)).encode())
+    digest.update(repr([(name, metadata.version(name)) for name in ENGINES]).encode())
+    digest.update(target.priors.centre.tobytes() + target.priors.precision.tobytes())
+    digest.update(repr((target.model.to_dict(), target.mixture, settings, FORMAT)).encode())
+    return digest.hexdigest()
+
+
+def _digest(stars: Stars) -> tuple[str]:
+    digest = hashlib.sha256()
+    groups = stars.groups
+    for column in (
+        *stars.columns,
+        *stars.offsets,
+        stars.starts,
+        groups.chip,
+        groups.exposure,
+        groups.epoch,
+    ):
+        digest.update(np.ascontiguousarray(column).data)
+    return (digest.hexdigest(),)
+
+
+def _proposal(
+    target: Target, fit: LinearFit, folder: Path | None, fingerprint: str
+) -> GridProposal:
+    """The proposal, kept in a file so that a resumed run has the very same one."""
+    path = None if folder is None else folder / "chain-0-proposal.h5"
+    if path is not None and path.exists():
+        arrays = read_arrays(path, fingerprint, do="start again with --force")
+        return GridProposal.from_arrays(target.n_theta, target.mixture.hyper, arrays)
+    proposal = build_proposal(target, fit)
+    if path is not None:
+        write_arrays(path, fingerprint, proposal.to_arrays())
+    return proposal

@@ -1,0 +1,425 @@
+"""Draws that cost no pass over the data, and a certificate of how good they are.
+
+With many stars the proposal q is so close to the posterior p that the log importance weight
+log p - log q is small and smooth.  A few hundred exact weights (pilots) are regressed on features
+of low order, g, and the surrogate is s = q exp(g).  Pilots that took no part in the regression
+then say how far s is from p.
+
+**What is certified.**  With d = log p - log s, known up to a constant, and expectations over s,
+
+    chi2(p || s) = E[e^2d] / E[e^d]^2 - 1,
+
+and for any function f of the parameters, because E_p f - E_s f = E_s[(p/s - 1) (f - E_s f)],
+Cauchy and Schwarz give
+
+    |E_p f - E_s f| <= sd_s(f) sqrt(chi2),        total variation <= sqrt(chi2) / 2.
+
+So every mean, also that of a square or of the indicator of an interval, is off by at most
+sqrt(chi2) of its own standard deviation.  The pilots are draws of q, hence E[.] is a mean weighted
+by e^g.
+
+**What is not.**  The inequality is exact, chi2 is an estimate.  Its upper limit allows for what
+the pilots could have missed: three more of them (the rule of three: a region of more than 3/n of
+q's probability is hit with 95 %), each with twice the worst remainder seen.  Normal theory or the
+bootstrap are too low here, since remainders have the tails of a cubic.  All figures are those of
+the region that the pilots reach.  Of the outermost tails of q and of what lies beyond, such as a
+second mode far away, nothing is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from math import factorial
+
+import numpy as np
+from numpy.polynomial import hermite_e
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError, NotConvergedError
+from bayesdist.infer.density.proposal import Random
+from bayesdist.infer.sampler.convergence import importance_efficiency
+from bayesdist.infer.sampler.convergence import pareto_k as tail_shape
+from bayesdist.infer.sampler.move_schedule import EFFICIENT, LONGEST_TAIL
+
+__all__ = ["Certificate", "Surrogate", "certify", "draw_surrogate"]
+
+Float = NDArray[np.float64]
+
+DEGREE = 3  # of the polynomial in the hyperparameters
+LEAST_TRAINING = 20
+LEAST_HELD_OUT = 100  # fewer leave more than 3 % of the probability unseen
+MOST_REMAINDER = 0.1
+MOST_SHIFT = 0.1  # posterior standard deviations: the Monte-Carlo error of 100 draws
+MISSED = 3  # pilots, by the rule of three
+MISSED_FACTOR = 2.0  # by how much an unseen remainder may exceed the worst that was seen
+ROUNDING = 1e-6  # of log densities of 1e7 and more
+LARGEST = 300.0  # of a log weight: its square must not overflow
+BATCH = 4096  # proposals drawn at a time; draws depend on it
+LEAST_ACCEPTED = 1e-3
+
+SHARES = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 9)])  # prior sd: linear terms over core
+STRENGTHS = np.geomspace(1e-9, 1e5, 43)  # of the ridge, for each pilot
+
+
+@dataclass(frozen=True, eq=False)
+class Surrogate:
+    """Approximate log importance weight, as a bounded function of whitened coordinates.
+
+    Its features are orthonormal (Hermite) polynomials under the proposal: up to third degree in
+    the hyperparameters u; S = sum_k (t_k^2 - 1) over the coefficients t, with S u and S^2, since
+    the hyperparameters scale the errors of all coefficients together; and each t_k by itself.
+
+    Parameters
+    ----------
+    n_hyper : int
+        h: the last h coordinates are hyperparameters.
+    centre : ndarray, shape (h,)
+    root : ndarray, shape (h, h)
+        Hyperparameters u = root @ (w - centre) have mean zero and unit covariance.
+    constant : float
+    coefficients : ndarray, shape (p,)
+    lower, upper : float
+        Bounds of the log weight.  A cubic has none, and q exp(cubic) would be no density; `upper`
+        also is the exact envelope of rejection sampling.
+    """
+
+    n_hyper: int
+    centre: Float
+    root: Float
+    constant: float
+    coefficients: Float
+    lower: float
+    upper: float
+
+    def log_weight(self, white: Float) -> Float:
+        """Log s - log q (n,), up to the constant of the exact ones, at points (n, D)."""
+        core, linear = _features(white, self.centre, self.root)
+        c = core.shape[1]
+        value = self.constant + core @ self.coefficients[:c] + linear @ self.coefficients[c:]
+        return np.clip(value, self.lower, self.upper)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """How far the surrogate s is from the posterior p, by pilots it was not made from.
+
+    Parameters
+    ----------
+    n_train, n_held_out : int
+        Pilots, each of them one pass over the data.
+    n_outside : int
+        Pilots where the posterior density is zero.
+    raw_sd : float
+        Standard deviation of log p - log q: without a surrogate.
+    remainder_sd : float
+        The same of log p - log s, over the pilots held out.
+    remainder_max : float
+        The largest of them, with p and s normalised.
+    raw_efficiency : float
+        Effective share of draws of q, weighted by p / q; over all pilots.
+    efficiency : float
+        The same of draws of s, weighted by p / s; over the pilots held out: 1 / (1 + chi2).
+    pareto_k : float
+        Tail of p / q: where it is heavy, q misses a part of p that no pilot shows.
+    chi2, chi2_upper : float
+        chi2(p || s): estimate and upper limit (module docstring).
+    mean_shift_bound : float
+        No posterior mean is off by more than this many standard deviations; from `chi2_upper`.
+    tv_bound : float
+        Bound of the total variation: no probability is off by more; from `chi2_upper`.
+    unseen : float
+        Largest probability under q of a region that all held-out pilots missed (95 %).
+    reasons : tuple of str
+        Why it is refused; empty when it is granted.
+    """
+
+    n_train: int
+    n_held_out: int
+    n_outside: int
+    raw_sd: float
+    remainder_sd: float
+    remainder_max: float
+    raw_efficiency: float
+    efficiency: float
+    pareto_k: float
+    chi2: float
+    chi2_upper: float
+    mean_shift_bound: float
+    tv_bound: float
+    unseen: float
+    reasons: tuple[str, ...]
+
+    @property
+    def granted(self) -> bool:
+        """Whether draws of the surrogate may stand for the posterior."""
+        return not self.reasons
+
+    @property
+    def statement(self) -> str:
+        """What it says and what it does not, in words."""
+        if not self.granted:
+            return f"certificate refused: {'; '.join(self.reasons)}"
+        return (
+            f"approximate, with certificate: by {self.n_held_out} exact evaluations that took no "
+            f"part in the approximation, no posterior mean is off by more than "
+            f"{self.mean_shift_bound:.2g} of its standard deviation; regions that hold less than "
+            f"{self.unseen:.2g} of the proposal's probability, such as a separate mode, "
+            f"may have been missed"
+        )
+
+
+def certify(
+    white: Float,
+    log_weights: Float,
+    n_hyper: int,
+    *,
+    rng: np.random.Generator,
+    held_out: float = 0.5,
+    pareto_k: float | None = None,
+) -> tuple[Surrogate, Certificate]:
+    """Fit the surrogate to some of the pilots and judge it by the others.
+
+    Parameters
+    ----------
+    white : ndarray, shape (n, D)
+        Draws of the proposal q, independent and inside its support, in coordinates that are about
+        standard normal under q.
+    log_weights : ndarray, shape (n,)
+        Exact log p - log q, up to a constant; minus infinity where p is zero.
+    n_hyper : int
+        The last `n_hyper` coordinates are hyperparameters.
+    rng : numpy.random.Generator
+        Splits the pilots.
+    held_out : float
+        Share of the pilots that are kept for the certificate.
+    pareto_k : float, optional
+        Of the raw weights, where it is known; found from all pilots by default.
+
+    Returns
+    -------
+    surrogate : Surrogate
+    certificate : Certificate
+
+    Raises
+    ------
+    InputError
+        For arrays that do not fit together, pilots that are not finite, or too few of them.
+    """
+    white, log_weights = np.asarray(white, float), np.asarray(log_weights, float)
+    n = len(log_weights)
+    if white.shape[:1] != (n,) or white.ndim != 2 or not 0 <= n_hyper <= white.shape[1]:
+        raise InputError(
+            f"{n} log weights and {n_hyper} hyperparameters do not go with points of shape "
+            f"{white.shape}",
+            where="certificate",
+        )
+    if not np.isfinite(white).all() or np.isnan(log_weights).any() or (log_weights == np.inf).any():
+        raise InputError(
+            "pilots must be finite, and their log weights finite or minus infinity",
+            where="certificate",
+            do="leave out draws outside the support of the proposal",
+        )
+    order = rng.permutation(n)
+    n_test = round(held_out * n)
+    test, train = order[:n_test], order[n_test:]
+    train = train[np.isfinite(log_weights[train])]
+    if len(train) < LEAST_TRAINING or not np.isfinite(log_weights[test]).any():
+        raise InputError(
+            f"{len(train)} pilots to learn from and {n_test} to judge by are too few",
+            where="certificate",
+            do="draw a few hundred pilots",
+        )
+    surrogate = _fit(white[train], log_weights[train], n_hyper)
+    if pareto_k is None:
+        # the tail of rounding errors tells nothing
+        flat = np.ptp(log_weights[np.isfinite(log_weights)]) < ROUNDING
+        pareto_k = float("-inf") if flat else tail_shape(log_weights)
+    guess = surrogate.log_weight(white[test])
+    return surrogate, _judge(log_weights, log_weights[test], guess, len(train), pareto_k)
+
+
+def draw_surrogate(
+    propose: Callable[[int, Random], Float],
+    whiten: Callable[[Float], Float],
+    surrogate: Surrogate,
+    n: int,
+    rng: Random,
+) -> tuple[Float, float]:
+    """Independent draws of the surrogate, all of weight one, by rejection from the proposal.
+
+    The surrogate is bounded, so its bound is an envelope and the draws follow it exactly; resampled
+    draws would repeat themselves.  Draws of one generator begin alike, however many there are.
+
+    Parameters
+    ----------
+    propose : callable
+        (m, rng) -> draws of q (m, D); rows that are not finite are outside the support.
+    whiten : callable
+        Draws (m, D) -> whitened coordinates (m, D), as those of the pilots.
+    surrogate : Surrogate
+    n : int
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    draws : ndarray, shape (n, D)
+    acceptance : float
+        Share of the proposals that was accepted.
+
+    Raises
+    ------
+    NotConvergedError
+        When next to no proposal is accepted.
+    """
+    kept: list[Float] = []
+    n_kept = tried = 0
+    while n_kept < n:
+        psi = propose(BATCH, rng)
+        chance = np.log(rng.uniform(size=BATCH))
+        inside = np.isfinite(psi).all(axis=1)
+        psi, chance = psi[inside], chance[inside]
+        take = psi[chance < surrogate.log_weight(whiten(psi)) - surrogate.upper]
+        kept.append(take)
+        n_kept, tried = n_kept + len(take), tried + BATCH
+        if tried >= 10 / LEAST_ACCEPTED and n_kept < LEAST_ACCEPTED * tried:
+            raise NotConvergedError(
+                f"the surrogate accepts {n_kept} of {tried} proposals",
+                where="certificate",
+                do="sample the exact posterior",
+            )
+    draws = np.concatenate(kept)[:n] if kept else propose(0, rng)
+    return draws, n_kept / tried if tried else 1.0
+
+
+# -- the surrogate --------------------------------------------------------------------------------
+
+
+def _features(white: Float, centre: Float, root: Float) -> tuple[Float, Float]:
+    """Core features (n, c), and the coefficients themselves (n, D - h)."""
+    h = len(centre)
+    t, u = white[:, : white.shape[1] - h], (white[:, white.shape[1] - h :] - centre) @ root.T
+    hermite = [
+        hermite_e.hermeval(u, [0.0] * d + [1.0 / np.sqrt(factorial(d))]) for d in range(DEGREE + 1)
+    ]
+    columns = []
+    for degree in range(1, DEGREE + 1):
+        for chosen in combinations_with_replacement(range(h), degree):
+            power = np.bincount(chosen, minlength=h)
+            columns.append(np.prod([hermite[power[k]][:, k] for k in range(h)], axis=0))
+    if t.shape[1]:
+        S = (t**2 - 1).sum(axis=1) / np.sqrt(2 * t.shape[1])
+        columns += [S, (S**2 - 1) / np.sqrt(2), *(S * u[:, k] for k in range(h))]
+    return np.stack(columns, axis=1), t
+
+
+def _fit(white: Float, log_weights: Float, n_hyper: int) -> Surrogate:
+    hyper = white[:, white.shape[1] - n_hyper :]
+    centre = hyper.mean(axis=0)
+    cov = (hyper - centre).T @ (hyper - centre) / len(hyper) + 1e-12 * np.eye(n_hyper)
+    root = np.linalg.inv(np.linalg.cholesky(cov))
+    core, linear = _features(white, centre, root)
+    coefficients = _ridge(core, linear, log_weights)
+    fitted = np.concatenate([core, linear], axis=1) @ coefficients
+    constant = float(log_weights.mean() - fitted.mean())
+    fitted += constant
+    # half the range more on either side: about five standard deviations
+    margin = np.ptp(fitted) / 2
+    return Surrogate(
+        n_hyper,
+        centre,
+        root,
+        constant,
+        coefficients,
+        float(fitted.min() - margin),
+        float(fitted.max() + margin),
+    )
+
+
+def _ridge(core: Float, linear: Float, y: Float) -> Float:
+    """Ridge coefficients, the strength and that of the linear terms chosen by leave-one-out."""
+    n = len(y)
+    y = y - y.mean()
+    core, linear = core - core.mean(axis=0), linear - linear.mean(axis=0)
+    least, best = np.inf, np.zeros(core.shape[1] + linear.shape[1])
+    for share in SHARES:
+        # in the space of the pilots: there may be more features than pilots
+        values, U = np.linalg.eigh(core @ core.T + share**2 * (linear @ linear.T))
+        values, along = np.maximum(values, 0.0), U.T @ y
+        for strength in n * STRENGTHS:
+            left = strength / (values + strength)
+            free = U**2 @ left - 1 / n  # of each residual; the constant is fitted too
+            if free.min() < 1e-6:
+                continue  # a pilot that decides its own value says nothing about others
+            error = float((((U @ (left * along)) / free) ** 2).sum())
+            if error < least:
+                dual = U @ (along / (values + strength))
+                best = np.concatenate([core.T @ dual, share**2 * (linear.T @ dual)])
+                least = error
+    return best
+
+
+# -- the certificate ------------------------------------------------------------------------------
+
+
+def _judge(
+    log_weights: Float, exact: Float, guess: Float, n_train: int, pareto_k: float
+) -> Certificate:
+    """Certificate from all log weights and, over pilots held out, exact and approximate ones."""
+    finite = np.isfinite(exact)
+    n_outside = int((~np.isfinite(log_weights)).sum())
+    weight = np.exp(guess - guess.max())
+    weight /= weight.sum()  # means over s from draws of q
+    remainder = exact - guess
+    top = remainder.max()
+    d = remainder - top - np.log(weight @ np.exp(remainder - top))  # E_s[e^d] = 1
+    worst = float(np.abs(d[finite]).max())
+    chi2 = _chi2(weight, d)
+    # what was not seen, at the weight of an average pilot
+    n = len(exact)
+    share = MISSED / (n + MISSED)
+    missed = min(MISSED_FACTOR * worst, LARGEST)
+    upper = _chi2(np.append((1 - share) * weight, share), np.append(d, missed))
+    bound = float(np.sqrt(upper))
+    sd = float(np.std(remainder[finite]))
+    efficiency = importance_efficiency(log_weights[np.isfinite(log_weights)], n_outside)
+
+    reasons = []
+    if n < LEAST_HELD_OUT:
+        reasons.append(f"{n} pilots held out are fewer than {LEAST_HELD_OUT}")
+    if n_outside:
+        reasons.append(f"{n_outside} pilots lie where the posterior is zero")
+    if not pareto_k < LONGEST_TAIL:
+        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {LONGEST_TAIL}")
+    if not efficiency > EFFICIENT:
+        reasons.append(f"efficiency {efficiency:.3f} of the proposal is not above {EFFICIENT}")
+    if not sd <= MOST_REMAINDER:
+        reasons.append(f"standard deviation {sd:.2g} of the remainder exceeds {MOST_REMAINDER}")
+    if not bound <= MOST_SHIFT:
+        reasons.append(f"means may be off by {bound:.2g} standard deviations, above {MOST_SHIFT}")
+    return Certificate(
+        n_train=n_train,
+        n_held_out=n,
+        n_outside=n_outside,
+        raw_sd=float(np.std(log_weights[np.isfinite(log_weights)])),
+        remainder_sd=sd,
+        remainder_max=worst,
+        raw_efficiency=efficiency,
+        efficiency=1 / (1 + chi2),
+        pareto_k=pareto_k,
+        chi2=chi2,
+        chi2_upper=upper,
+        mean_shift_bound=bound,
+        tv_bound=min(bound / 2, 1.0),
+        unseen=float(1 - 0.05 ** (1 / n)),
+        reasons=tuple(reasons),
+    )
+
+
+def _chi2(weight: Float, d: Float) -> float:
+    """Variance of e^d over its squared mean, for weights that add up to one."""
+    b = np.exp(d)
+    mean = weight @ b
+    # centred: E[b^2] - 1 would lose all figures where the remainder is 1e-8
+    return float(weight @ (b - mean) ** 2 / mean**2)

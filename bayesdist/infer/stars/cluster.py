@@ -1,0 +1,375 @@
+"""The Dask engine: shards stay on the workers that read them, and only sums travel.
+
+Each piece of the data becomes one task whose result, a shard, is kept by the worker that made it.
+A pass is one map-reduce: a task for each shard, run where the shard is, whose results come back and
+are added in the order of the shards, as threads add them, however many workers there are and
+whatever happens to them: a worker that is lost takes its shards along, and Dask makes them again
+elsewhere from the pieces.  What a kernel gives for one shard is the same up to rounding: code that
+was compiled for another processor may differ in the last bits.
+
+The only module that knows dask and distributed; it is imported when the engine is asked for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import pickle
+import threading
+import weakref
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass, replace
+from time import monotonic
+from typing import Any
+
+from bayesdist import __version__
+from bayesdist.data.partitioned import PartPiece
+from bayesdist.data.pieces import Piece
+from bayesdist.errors import InputError
+from bayesdist.infer import kernel
+from bayesdist.infer.stars.shards import Compute, Matches, Shards, Task, shard_of, total
+from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.survey import Survey
+from bayesdist.model import DistortionModel
+
+try:
+    import dask
+    from dask.sizeof import sizeof
+    from dask.system import CPU_COUNT
+    from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
+    from distributed.comm import resolve_address
+except ModuleNotFoundError as error:
+    raise InputError(
+        "the Dask engine needs the package distributed",
+        where="compute.engine",
+        do="pip install 'bayesdist[dask]'",
+    ) from error
+
+__all__ = ["ClusterShards"]
+
+CONNECT = 10.0  # seconds to find the scheduler
+PATIENCE = 60.0  # seconds without any worker after which none is expected any more
+POLL = 1.0  # seconds between two looks at whether there are workers
+ALLOWED_FAILURES = 10  # workers that a shard may lose before it counts as their killer
+LARGE = 50_000  # bytes of arguments from which one worker passes them on to the others
+TOGETHER = 256  # results that are fetched at a time
+
+_one_pass = threading.Lock()  # a pass uses all threads of its process
+
+
+class ClusterShards(Shards):
+    """Shards on the workers of a Dask cluster.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    matches : MatchTable or PartitionedMatches
+        Pieces of a table in memory are sent; those of a partitioned one are read by the workers,
+        which have to see the files under the same absolute paths.
+    compute : Compute
+        With a `scheduler`, the cluster is that one; the version of bayesdist must be the same on
+        its workers.  Otherwise `workers` processes are started here and ended by `close`, or when
+        this object or the program goes; a script that does so needs the usual
+        ``if __name__ == "__main__":``.
+
+    Raises
+    ------
+    InputError
+        When the cluster cannot be reached or started, has no workers, or has workers with another
+        version of bayesdist; and as `prepare` and `Piece.read`.
+    """
+
+    def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
+        super().__init__(model)
+        self._shards: list[Future] = []
+        self._loading: set[str] = set()  # workers that pieces are tied to
+        self._client, cluster, self._threads = _connected(compute)
+        self._where = self._client.scheduler.address
+        self._end = weakref.finalize(self, _end, self._client, cluster)
+        try:
+            places = _places(self._client)
+            self._loading = set(places)
+            _require_version(self._client)
+            # the scheduler keeps the pieces, so that a lost shard can be made again
+            with _large_graphs():
+                for k, piece in enumerate(matches.pieces()):
+                    self._shards.append(
+                        self._client.submit(
+                            _shard,
+                            model,
+                            _anywhere(piece),
+                            len(matches),
+                            workers=[places[k % len(places)]],
+                            allow_other_workers=True,
+                            pure=False,
+                        )
+                    )
+            self.survey = total(self._results(self._on_each(_survey)))
+            self._settle()
+        except BaseException:
+            self.close()
+            raise
+
+    def sum(self, task: Task, *args: Any) -> Any:
+        """Sum over the shards of ``task(stars, *args)``, in their order.
+
+        Raises
+        ------
+        InputError
+            When there are no workers any more, or when they die of the task.
+        Exception
+            Whatever the task raises on the first shard, in their order, that it fails on.
+        """
+        work: _Work | Future = _Work(task, args, self._threads)
+        with _large_graphs():
+            if len(pickle.dumps(args, protocol=5)) > LARGE:
+                # sent once; a task's result, unlike scattered data, outlives its worker
+                work = self._client.submit(_same, work, pure=False)
+            return total(self._results(self._on_each(_pass, work=work)))
+
+    def close(self) -> None:
+        """Let go of the data, and of the cluster where it was started for them."""
+        self._shards = []
+        self._end()
+
+    def _on_each(self, function: Task, **options: Any) -> list[Future]:
+        # Tied to some workers, loosely.  Tasks that are not, and few, count as roots of a graph:
+        # Dask then spreads them without regard to where the shards are, which would travel.
+        workers = sorted(self._workers()) or None
+        return self._client.map(
+            function,
+            self._shards,
+            workers=workers,
+            allow_other_workers=workers is not None,
+            pure=False,
+            **options,
+        )
+
+    def _results(self, futures: Sequence[Future]) -> Iterator[Any]:
+        """Results in the order of the shards, or the first error in that order."""
+        try:
+            for k in range(0, len(futures), TOGETHER):
+                yield from self._awaited(futures[k : k + TOGETHER])
+        except KilledWorker as error:
+            raise InputError(
+                "workers die again and again while they work on the same stars",
+                where=f"cluster {self._where}",
+                do="look into their logs, and give them more memory",
+            ) from error
+        except CancelledError as error:
+            raise InputError(
+                "the connection to the scheduler is lost",
+                where=f"cluster {self._where}",
+                do="start it and the run again",
+            ) from error
+        finally:
+            # after an error the rest of the pass would go on as long as its traceback is kept
+            unfinished = [future for future in futures if not future.done()]
+            if unfinished and self._client.status == "running":
+                self._client.cancel(unfinished, force=True)
+
+    def _awaited(self, futures: Sequence[Future]) -> list[Any]:
+        """Results of tasks, waited for as long as there are workers."""
+        loop = self._client.loop.asyncio_loop
+        results = asyncio.run_coroutine_threadsafe(_in_order(self._client, futures), loop)
+        seen = monotonic()
+        try:
+            while True:
+                try:
+                    return results.result(timeout=POLL)
+                except TimeoutError:
+                    if results.done():  # the task's own
+                        raise
+                workers = self._workers()
+                if workers:
+                    seen = monotonic()
+                    if self._loading and not self._loading & workers:
+                        raise InputError(
+                            "all workers were lost while they read the stars",
+                            where=f"cluster {self._where}",
+                            do="look into their logs, give them more memory, and start again",
+                        )
+                elif monotonic() - seen > PATIENCE:
+                    raise InputError(
+                        f"has had no workers for {PATIENCE:g} seconds",
+                        where=f"cluster {self._where}",
+                        do="start workers, then the run again",
+                    )
+        finally:
+            results.cancel()
+
+    def _workers(self) -> set[str]:
+        try:
+            return set(self._client.nthreads())
+        except OSError:  # the scheduler is gone: tasks will be cancelled
+            return set()
+
+    def _settle(self) -> None:
+        """Untie the shards from the workers that they were spread over.
+
+        Dask takes no other worker for a tied task when, for a moment, there was none at all: it
+        would wait for the lost one for ever.
+        """
+        free: dict[Any, list[str]] = {shard.key: [] for shard in self._shards}
+        self._client.sync(self._client.scheduler.set_restrictions, worker=free)
+        self._loading = set()
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """A task and its arguments, which Dask is not to look into."""
+
+    task: Task
+    args: tuple[Any, ...]
+    threads: int | None
+
+
+def _shard(model: DistortionModel, piece: Piece, n_total: int) -> tuple[Stars, Survey]:
+    """On a worker: read one piece; from here, so that Dask knows how large a shard is."""
+    return shard_of(model, piece, n_total)
+
+
+def _survey(shard: tuple[Stars, Survey]) -> Survey:
+    """On a worker: what is to be known of a shard."""
+    return shard[1]
+
+
+def _same(work: _Work) -> _Work:
+    """On a worker: arguments, to be fetched by the others."""
+    return work
+
+
+def _pass(shard: tuple[Stars, Survey], work: _Work) -> Any:
+    """On a worker: a task on one shard."""
+    with _one_pass:
+        # of this thread, which may be another one each time
+        kernel.set_threads(work.threads or get_worker().state.nthreads)
+        return work.task(shard[0], *work.args)
+
+
+@sizeof.register(Stars)
+def _bytes_of(stars: Stars) -> int:
+    """What a shard occupies, without which the scheduler would move it as if it were nothing."""
+    return stars.nbytes
+
+
+async def _in_order(client: Any, futures: Sequence[Future]) -> list[Any]:
+    for future in futures:
+        if await future.exception() is not None:
+            await future  # raises it
+    return await client.gather(futures, asynchronous=True)
+
+
+def _anywhere(piece: Piece) -> Piece:
+    """A piece that can be read in any folder."""
+    if not isinstance(piece, PartPiece):
+        return piece
+    parts = tuple(
+        replace(one, part=replace(one.part, path=one.part.path.absolute())) for one in piece.parts
+    )
+    return replace(piece, parts=parts)
+
+
+def _connected(compute: Compute) -> tuple[Any, LocalCluster | None, int | None]:
+    """Client, the cluster where it is our own, and threads of a pass (None: the worker's)."""
+    if compute.scheduler is not None:
+        try:
+            # a client that fails on a bad address would never be closed
+            resolve_address(compute.scheduler)
+            return Client(compute.scheduler, timeout=CONNECT, set_as_default=False), None, None
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at {compute.scheduler!r}",
+                where="compute.scheduler",
+                do="start one, correct the address, or leave it out for a cluster of this machine",
+            ) from error
+    workers = CPU_COUNT if compute.workers is None else compute.workers
+    if workers < 1:
+        raise InputError(
+            f"{workers} workers do no work", where="compute.workers", do="give 1 or more"
+        )
+    with dask.config.set({"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}):
+        try:
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                memory_limit=0,
+                dashboard_address="127.0.0.1:0",  # None is port 8787, which may be taken
+                scheduler_kwargs={"dashboard": False},
+                silence_logs=logging.CRITICAL,
+            )
+        except (RuntimeError, OSError) as error:
+            raise InputError(
+                f"{workers} worker processes do not start",
+                where="compute.workers",
+                do="ask for fewer, and begin a script of your own with if __name__ == '__main__'",
+            ) from error
+    try:
+        client = Client(cluster, set_as_default=False)
+    except BaseException:
+        cluster.close()
+        raise
+    return client, cluster, max(1, CPU_COUNT // workers)
+
+
+def _places(client: Any) -> list[str]:
+    """Addresses of the workers, each as often as it has threads, in turn."""
+    try:
+        client.wait_for_workers(1, timeout=PATIENCE)
+    except TimeoutError as error:
+        raise InputError(
+            f"has no workers after {PATIENCE:g} seconds",
+            where=f"cluster {client.scheduler.address}",
+            do="start workers",
+        ) from error
+    threads = sorted(client.nthreads().items())
+    most = max(n for _, n in threads)
+    return [address for k in range(most) for address, n in threads if k < n]
+
+
+def _require_version(client: Any) -> None:
+    """Refuse workers whose bayesdist is another one than ours."""
+
+    def version() -> str:  # a local function travels whole, and needs no bayesdist over there
+        try:
+            from bayesdist import __version__
+        except ImportError:
+            return "none"
+        return __version__
+
+    for address, found in sorted(client.run(version).items()):
+        if found != __version__:
+            raise InputError(
+                f"has bayesdist {found}, and here it is {__version__}",
+                where=f"worker {address}",
+                do="install one version everywhere",
+            )
+
+
+def _large_graphs() -> Any:
+    """No warning of data inside graphs, where they have to be so that they can be made again."""
+    return dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 PB"})
+
+
+def _end(client: Any, cluster: LocalCluster | None) -> None:
+    """Close the client and its own cluster."""
+
+    def close() -> None:
+        client.close()
+        if cluster is not None:
+            cluster.close()
+
+    # garbage may be collected in the thread that closing has to wait for
+    if client.loop.asyncio_loop is _running_loop():
+        threading.Thread(target=close).start()
+    else:
+        close()
+
+
+def _running_loop() -> asyncio.AbstractEventLoop | None:
+    try:
+        return asyncio.get_running_loop()
+    except RuntimeError:
+        return None

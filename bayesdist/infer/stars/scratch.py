@@ -1,0 +1,111 @@
+"""Where shards are kept: in memory as far as the budget reaches, in a scratch file beyond it."""
+
+from __future__ import annotations
+
+import tempfile
+import weakref
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import IO, Any
+
+import numpy as np
+
+from bayesdist.errors import InputError
+from bayesdist.infer.stars.stars import Stars
+
+__all__ = ["Store"]
+
+EMPTY = np.zeros(0)
+COLUMNS, OFFSETS = ("X", "Y", "u", "v", "var_u", "var_v"), ("off_u", "off_v")
+
+
+class Store:
+    """Shards in the order in which they were added.
+
+    Parameters
+    ----------
+    budget : float
+        Bytes of columns that may stay in memory.
+    """
+
+    def __init__(self, budget: float) -> None:
+        self._left = budget
+        self._kept: list[tuple[Stars, int | None]] = []
+        self._file: IO[bytes] | None = None
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def add(self, stars: Stars) -> None:
+        """Keep a shard.
+
+        Raises
+        ------
+        InputError
+            When the disk is full.
+        """
+        if stars.nbytes <= self._left:
+            self._left -= stars.nbytes
+            self._kept.append((stars, None))
+            return
+        stars.blocks, stars.pieces  # noqa: B018  worked out once, kept with the frame of the shard
+        try:
+            if self._file is None:
+                # without a name: it is gone when the process is, however that ends
+                self._file = tempfile.TemporaryFile(prefix="bayesdist-", buffering=0)
+                self._closed = weakref.finalize(self, self._file.close)
+            place = self._file.seek(0, 2)
+            for column in (*stars.columns, *stars.offsets):
+                _write(self._file, np.ascontiguousarray(column).view(np.uint8).data)
+        except OSError as error:
+            raise InputError(
+                f"the stars do not fit into the scratch folder ({error.strerror})",
+                where=_folder(),
+                do="set TMPDIR to a folder with more room, or raise compute.memory_mb",
+            ) from error
+        none: dict[str, Any] = {name: EMPTY for name in COLUMNS + OFFSETS[: len(stars.offsets)]}
+        frame = replace(stars, **none)
+        frame.__dict__.update(blocks=stars.blocks, pieces=stars.pieces)
+        self._kept.append((frame, place))
+
+    def close(self) -> None:
+        """Forget the shards and give the disk back."""
+        self._kept = []
+        if self._file is not None:
+            self._closed()
+            self._file = None
+
+    def __iter__(self) -> Iterator[Stars]:
+        for stars, place in self._kept:
+            yield stars if place is None else self._restored(stars, place)
+
+    def _restored(self, frame: Stars, place: int) -> Stars:
+        assert self._file is not None
+        n = int(frame.starts[-1])
+        names = COLUMNS + OFFSETS[: len(frame.offsets)]
+        columns = np.empty((len(names), n))
+        self._file.seek(place)
+        view, done = columns.ravel().view(np.uint8).data, 0
+        while done < len(view):
+            got = self._file.readinto(view[done:])  # type: ignore[attr-defined]
+            if not got:
+                raise InputError("the scratch file has become shorter", do="start again")
+            done += got
+        read: dict[str, Any] = dict(zip(names, columns, strict=True))
+        stars = replace(frame, **read)
+        stars.__dict__.update(blocks=frame.blocks, pieces=frame.pieces)
+        return stars
+
+
+def _write(file: IO[bytes], view: memoryview) -> None:
+    """Write all of it: a disk that is nearly full takes a part, and refuses only the next one."""
+    while len(view):
+        view = view[file.write(view) :]
+
+
+def _folder() -> str:
+    """The scratch folder, as far as there is one."""
+    try:
+        return tempfile.gettempdir()
+    except OSError:
+        return "TMPDIR"

@@ -1,0 +1,197 @@
+"""The data as shards, and the one thing that is done with them: a task on each, and the sum.
+
+Everything that is inferred passes through `Shards.sum`.  Results add up in the order of the shards,
+which is that of the data, so that they depend neither on the threads nor on the engine.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from bayesdist.data import MatchTable, PartitionedMatches
+from bayesdist.data.pieces import Piece
+from bayesdist.errors import InputError
+from bayesdist.infer.stars.scratch import Store
+from bayesdist.infer.stars.stars import Stars, prepare
+from bayesdist.infer.stars.survey import Survey, survey
+from bayesdist.model import DistortionModel, Groups
+
+__all__ = ["Compute", "LocalShards", "Matches", "Shards", "load", "opened", "shard_of"]
+
+Matches = MatchTable | PartitionedMatches
+Task = Callable[..., Any]
+
+SAMPLE = 1_000_000  # stars whose errors tell the median error
+
+
+@dataclass(frozen=True)
+class Compute:
+    """Where the work is done.
+
+    Parameters
+    ----------
+    engine : str
+        'threads', or 'dask'.
+    memory_mb : float
+        Columns of stars that are kept in memory; what goes beyond is kept in a scratch file.
+    scheduler : str, optional
+        Address of a Dask scheduler; without one a cluster of this machine's processes is started.
+    workers : int, optional
+        Processes of that cluster; as many as there are cores by default.
+    """
+
+    engine: str = "threads"
+    memory_mb: float = 1000.0
+    scheduler: str | None = None
+    workers: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.memory_mb < float("inf"):
+            raise InputError(
+                f"memory_mb is {self.memory_mb}",
+                where="compute.memory_mb",
+                do="give 0 or a positive number",
+            )
+        if self.engine not in ("threads", "dask"):
+            raise InputError(
+                f"there is no engine {self.engine!r}",
+                where="compute.engine",
+                do="choose threads or dask",
+            )
+
+
+class Shards(ABC):
+    """The stars of a model, wherever they are.
+
+    Parameters
+    ----------
+    model : DistortionModel
+
+    Attributes
+    ----------
+    survey : Survey
+        Of all stars.
+    """
+
+    survey: Survey
+
+    def __init__(self, model: DistortionModel) -> None:
+        self.model = model
+
+    def __len__(self) -> int:
+        """Number of stars."""
+        return self.survey.n
+
+    @property
+    def groups(self) -> Groups:
+        """Groups of the whole, without members."""
+        return self.survey.groups
+
+    @abstractmethod
+    def sum(self, task: Task, *args: Any) -> Any:
+        """Sum over the shards of ``task(stars, *args)``, in their order."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of the data."""
+
+
+class LocalShards(Shards):
+    """Shards in this process.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    matches : MatchTable or PartitionedMatches
+    memory_mb : float
+    """
+
+    def __init__(self, model: DistortionModel, matches: Matches, memory_mb: float) -> None:
+        super().__init__(model)
+        self._store = Store(1e6 * memory_mb)
+        surveys = []
+        for piece in matches.pieces():
+            stars, found = shard_of(model, piece, len(matches))
+            self._store.add(stars)
+            surveys.append(found)
+        self.survey = total(surveys)
+
+    def sum(self, task: Task, *args: Any) -> Any:
+        """Sum over the shards of ``task(stars, *args)``, in their order."""
+        return total(task(stars, *args) for stars in self._store)
+
+    def close(self) -> None:
+        """Let go of the data."""
+        self._store.close()
+
+
+def shard_of(model: DistortionModel, piece: Piece, n_total: int) -> tuple[Stars, Survey]:
+    """One shard, and what is to be known of it."""
+    table = piece.read()
+    stars, _ = prepare(model, table)
+    return stars, survey(stars, table, max(1, n_total // SAMPLE))
+
+
+def total(parts: Any) -> Any:
+    """Sum of one or more parts, from the first to the last."""
+    out = None
+    for part in parts:
+        out = part if out is None else out + part
+    return out
+
+
+@contextmanager
+def opened(
+    model: DistortionModel, matches: Matches | Shards, compute: Compute | None = None
+) -> Iterator[Shards]:
+    """The data as shards, as `load`; those that were not given are closed at the end."""
+    shards = load(model, matches, compute)
+    try:
+        yield shards
+    finally:
+        if shards is not matches:
+            shards.close()
+
+
+def load(
+    model: DistortionModel, matches: Matches | Shards, compute: Compute | None = None
+) -> Shards:
+    """The data as shards of a model.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    matches : MatchTable, PartitionedMatches or Shards
+        Shards are given back as they are.
+    compute : Compute, optional
+
+    Returns
+    -------
+    Shards
+
+    Raises
+    ------
+    InputError
+        As `prepare`; for a full scratch folder; when no cluster is there.
+    """
+    if isinstance(matches, Shards):
+        if matches.model != model:
+            raise InputError(
+                "the shards were made for another model", do="load the matches for this one"
+            )
+        return matches
+    if not isinstance(matches, MatchTable | PartitionedMatches):
+        raise InputError(
+            f"{type(matches).__name__} holds no matches",
+            do="give what read_matches, open_matches or load returned",
+        )
+    compute = compute or Compute()
+    if compute.engine == "threads":
+        return LocalShards(model, matches, compute.memory_mb)
+    from bayesdist.infer.stars.cluster import ClusterShards  # only where it is asked for
+
+    return ClusterShards(model, matches, compute)

@@ -1,0 +1,196 @@
+"""What must be known of all stars before anything is fitted, as sums over pieces of the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer.stars.stars import Stars
+from bayesdist.model import Groups, merge_groups
+
+__all__ = ["ChipSurvey", "Survey", "survey"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+ROUNDING = 1e-6  # by how much, relative, a star at the edge of its circle may seem to lie outside
+
+
+@dataclass(frozen=True, eq=False)
+class ChipSurvey:
+    """Where the stars of one chip lie.
+
+    Parameters
+    ----------
+    n : int
+    corners : ndarray, shape (m, 2)
+        Vertices of the convex hull, FITS 1-based pixels; all points where they span no area.
+    sums : ndarray, shape (5,)
+        Of x, y, x^2, xy, y^2 in units of the chip's size.
+    outside : str
+        The first star that lies on no pixel, as a sentence; empty where there is none.
+    """
+
+    n: int
+    corners: Float
+    sums: Float
+    outside: str
+
+    def __add__(self, other: ChipSurvey) -> ChipSurvey:
+        return ChipSurvey(
+            self.n + other.n,
+            _hull(np.concatenate([self.corners, other.corners])),
+            self.sums + other.sums,
+            self.outside or other.outside,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Counts and extents of some of the data; surveys of pieces add.
+
+    Parameters
+    ----------
+    n : int
+    groups : Groups
+        Without members.
+    exposures : ndarray of int, shape (E,)
+        Stars of each exposure of the model.
+    chips : tuple of ChipSurvey
+        In the order of the model's.
+    variance : tuple of ndarray
+        Evenly spread samples of the squared errors of both axes.
+    sources : tuple of str
+    farthest : tuple of float and str
+        Largest distance of a star from its nominal position, and which star that is; less than 0
+        where there are no nominal positions.
+    """
+
+    n: int
+    groups: Groups
+    exposures: Int
+    chips: tuple[ChipSurvey, ...]
+    variance: tuple[Float, ...]
+    sources: tuple[str, ...]
+    farthest: tuple[float, str] = (-1.0, "")
+
+    def __add__(self, other: Survey) -> Survey:
+        return Survey(
+            self.n + other.n,
+            merge_groups(self.groups, other.groups)[0],
+            self.exposures + other.exposures,
+            tuple(a + b for a, b in zip(self.chips, other.chips, strict=True)),
+            self.variance + other.variance,
+            self.sources,
+            max(self.farthest, other.farthest, key=lambda one: one[0]),
+        )
+
+    @property
+    def reference_sigma(self) -> float:
+        """Median quoted error of one axis: the scale of the priors."""
+        return float(np.sqrt(np.median(np.concatenate(self.variance))))
+
+    def check_circle(self, radius: float | None) -> None:
+        """Refuse stars outside the circle in which they are said to have been matched.
+
+        Parameters
+        ----------
+        radius : float or None
+            In the unit of u, v; None where stars are not said to be matched in a circle.
+
+        Raises
+        ------
+        InputError
+            Naming the star that is farthest from its nominal position.
+        """
+        distance, where = self.farthest
+        if radius is not None and distance > radius * (1 + ROUNDING):
+            raise InputError(
+                f"lies {distance:.6g} from its nominal position, outside the match circle of "
+                f"radius {radius:g}",
+                where=where,
+                do="set outliers.match_radius to the radius with which the stars were matched, or "
+                "correct the row",
+            )
+
+    @property
+    def where(self) -> str:
+        """Names of the files, for errors."""
+        return ", ".join(self.sources)
+
+
+def survey(stars: Stars, matches: MatchTable, every: int) -> Survey:
+    """Survey one piece.
+
+    Parameters
+    ----------
+    stars : Stars
+        Of these matches.
+    matches : MatchTable
+    every : int
+        Every so manieth star gives its errors to the sample.
+    """
+    model = stars.model
+    numbers = matches.chip_number
+    chips = []
+    for chip in model.chips:
+        rows = np.flatnonzero(numbers == chip.number) if len(model.chips) > 1 else slice(None)
+        x, y = matches.x[rows], matches.y[rows]
+        out = (x < 0.5) | (x > chip.size[0] + 0.5) | (y < 0.5) | (y > chip.size[1] + 0.5)
+        sentence = ""
+        if out.any():
+            k = int(np.arange(len(matches))[rows][np.argmax(out)])
+            file = f" of {matches.sources[matches.source[k]]}" if len(matches.sources) > 1 else ""
+            sentence = (
+                f"row {matches.row[k] + 1}{file} lies at pixel ({matches.x[k]:.2f}, "
+                f"{matches.y[k]:.2f}), outside the {chip.size[0]:g} x {chip.size[1]:g} detector"
+            )
+        a, b = x / chip.size[0], y / chip.size[1]
+        sums = np.array([a.sum(), b.sum(), a @ a, a @ b, b @ b])
+        chips.append(ChipSurvey(len(x), _hull(np.column_stack([x, y])), sums, sentence))
+    return Survey(
+        n=len(stars),
+        groups=stars.groups,
+        # without frames a model need not know the exposures; the length is that of the model
+        exposures=np.bincount(matches.exposure, minlength=len(model.exposures))[
+            : len(model.exposures)
+        ],
+        chips=tuple(chips),
+        variance=(stars.var_u[::every].copy(), stars.var_v[::every].copy()),
+        sources=matches.sources,
+        farthest=_farthest(matches),
+    )
+
+
+def _farthest(matches: MatchTable) -> tuple[float, str]:
+    """Largest distance of a star from its nominal position, and the star's file and row."""
+    if matches.u_nominal is None or matches.v_nominal is None:
+        return -1.0, ""
+    distance = np.hypot(matches.u - matches.u_nominal, matches.v - matches.v_nominal)
+    k = int(np.argmax(distance))
+    return float(distance[k]), f"{matches.sources[matches.source[k]]}, row {matches.row[k] + 1}"
+
+
+def _hull(points: Float) -> Float:
+    """Vertices of the convex hull, or all points where it has no area."""
+    if len(points) < 4:
+        return points
+    try:
+        if len(points) > 1000:  # what lies inside the octagon of the extremes is no vertex
+            x, y = points.T
+            seen = (x, y, x + y, x - y)
+            extreme = points[sorted(set(chain(*((p.argmin(), p.argmax()) for p in seen))))]
+            inner = ConvexHull(extreme).equations
+            beyond = np.zeros(len(points), bool)
+            for a, b, c in inner:
+                beyond |= a * x + b * y + c > -1e-9
+            points = points[beyond]
+        return points[ConvexHull(points).vertices]
+    except QhullError:  # nearly collinear: no area to speak of
+        return points

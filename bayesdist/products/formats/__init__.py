@@ -1,0 +1,1 @@
+"""The formats of calibration files, one module or folder each."""

@@ -1,0 +1,182 @@
+"""Polynomials in two variables by their coefficients {(i, j): c} of x^i y^j, and which is which.
+
+The only place that knows which coefficient of a format multiplies which powers of x and y:
+
+=========  =======================  =====================================
+format     coefficient              multiplies
+=========  =======================  =====================================
+bayesdist  term (i, j)              x^i y^j
+SIP        A_p_q, B_p_q, AP_, BP_   x^p y^q
+IDCTAB     CXnj, CYnj               x^j y^(n-j): CX11 goes with x, CX10 with y
+SIAF       Sci2IdlXnj, Sci2IdlYnj   x^(n-j) y^j: the mirror image of IDCTAB
+=========  =======================  =====================================
+
+x and y are pixel offsets from the reference pixel.  IDCTAB is as stwcs reads it, SIP as in Shupe et
+al. 2005 (ASP Conf. 347, 491).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.polynomial import polynomial
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+
+__all__ = [
+    "Coefficients",
+    "coefficient_matrix",
+    "evaluate",
+    "idctab_column",
+    "idctab_powers",
+    "largest_magnitude",
+    "sip_keyword",
+    "sip_powers",
+]
+
+Float = NDArray[np.float64]
+Coefficients = Mapping[tuple[int, int], float]
+
+_IDCTAB = re.compile(r"(CX|CY|A|B)(\d)(\d)")
+_SIP = re.compile(r"(A|B|AP|BP|AE|BE)_(\d)_(\d)")
+# Starting points of the search for an extremum: the interior grid, and the best of all to refine.
+_GRID, _BEST = 65, 8
+_BORDER = 2**16  # steps along an edge at most: a size may be a slip of the pen
+
+
+def idctab_column(prefix: str, i: int, j: int) -> str:
+    """Column of an IDCTAB that multiplies x^i y^j: ``idctab_column("CX", 1, 0) == "CX11"``."""
+    return f"{prefix}{i + j}{i}"
+
+
+def idctab_powers(column: str) -> tuple[str, int, int] | None:
+    """Prefix and powers (i, j) of x and y of an IDCTAB column; None for any other column."""
+    match = _IDCTAB.fullmatch(column)
+    if match is None or match[3] > match[2]:
+        return None
+    order, i = int(match[2]), int(match[3])
+    return match[1], i, order - i
+
+
+def sip_keyword(prefix: str, i: int, j: int) -> str:
+    """Keyword that multiplies x^i y^j, as ``sip_keyword("A", 2, 0) == "A_2_0"``."""
+    return f"{prefix}_{i}_{j}"
+
+
+def sip_powers(keyword: str) -> tuple[str, int, int] | None:
+    """Prefix and powers (i, j) of a SIP keyword or of its sigma; None for any other keyword."""
+    match = _SIP.fullmatch(keyword)
+    return None if match is None else (match[1], int(match[2]), int(match[3]))
+
+
+def coefficient_matrix(coefficients: Coefficients, order: int | None = None) -> Float:
+    """Matrix whose entry [i, j] multiplies x^i y^j.
+
+    Parameters
+    ----------
+    coefficients : mapping of (int, int) to float
+    order : int, optional
+        Terms above this total order are left out, as astropy.wcs does.
+
+    Returns
+    -------
+    ndarray, shape (n + 1, n + 1)
+    """
+    kept = {k: c for k, c in coefficients.items() if order is None or sum(k) <= order}
+    n = max((max(k) for k in kept), default=0)
+    out = np.zeros((n + 1, n + 1))
+    for (i, j), c in kept.items():
+        out[i, j] = c
+    return out
+
+
+def evaluate(
+    coefficients: Coefficients, x: ArrayLike, y: ArrayLike, order: int | None = None
+) -> Float:
+    """Values of a polynomial.
+
+    Parameters
+    ----------
+    coefficients : mapping of (int, int) to float
+    x, y : array_like
+        Same shapes.
+    order : int, optional
+        Terms above this total order are left out.
+
+    Returns
+    -------
+    ndarray, same shape
+    """
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    return polynomial.polyval2d(x, y, coefficient_matrix(coefficients, order))
+
+
+def largest_magnitude(
+    coefficients: Coefficients,
+    x_range: tuple[float, float],
+    y_range: tuple[float, float],
+    order: int | None = None,
+) -> float:
+    """Largest |p(x, y)| over a rectangle, its border included.
+
+    The border is looked at every unit step and the interior on a grid; the best points of both are
+    refined by bounded minimisation, so that the result is a maximum and not a sample.
+
+    Parameters
+    ----------
+    coefficients : mapping of (int, int) to float
+    x_range, y_range : tuple of float
+        Lowest and highest values.
+    order : int, optional
+        Terms above this total order are left out.
+
+    Returns
+    -------
+    float
+    """
+    c = coefficient_matrix(coefficients, order)
+    low = np.array([x_range[0], y_range[0]], float)
+    high = np.array([x_range[1], y_range[1]], float)
+    x, y = _candidates(low, high)
+    values = np.abs(polynomial.polyval2d(x, y, c))
+    sampled = float(values.max())
+    if sampled == 0.0:
+        return 0.0
+    centre, half = (low + high) / 2, (high - low) / 2
+    half[half == 0] = 1.0
+    dx, dy = polynomial.polyder(c, axis=0), polynomial.polyder(c, axis=1)
+
+    def falling(z: Float, sign: float) -> tuple[float, Float]:
+        px, py = centre + half * z
+        slope = np.array([polynomial.polyval2d(px, py, d) for d in (dx, dy)]) * half
+        return -sign * float(polynomial.polyval2d(px, py, c)) / sampled, -sign * slope / sampled
+
+    bounds = list(zip((low - centre) / half, (high - centre) / half, strict=True))
+    best = sampled
+    for start in np.argsort(values)[-_BEST:]:
+        point = np.array([x[start], y[start]])
+        sign = float(np.sign(polynomial.polyval2d(x[start], y[start], c)))
+        found = minimize(
+            falling,
+            (point - centre) / half,
+            args=(sign,),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+        )
+        best = max(best, -float(found.fun) * sampled)
+    return best
+
+
+def _candidates(low: Float, high: Float) -> tuple[Float, Float]:
+    """A grid over the rectangle and every unit step along its border."""
+    gx, gy = np.meshgrid(*np.linspace(low, high, _GRID).T)
+    ex, ey = (
+        np.linspace(a, b, min(int(np.ceil(b - a)), _BORDER) + 1)
+        for a, b in zip(low, high, strict=True)
+    )
+    x = [gx.ravel(), ex, ex, np.full(ey.size, low[0]), np.full(ey.size, high[0])]
+    y = [gy.ravel(), np.full(ex.size, low[1]), np.full(ex.size, high[1]), ey, ey]
+    return np.concatenate(x), np.concatenate(y)

@@ -1,0 +1,314 @@
+"""The content of a file: its bytes, the HDUs of a FITS file with their cards, its text.
+
+Every reader comes through here, so that a file is opened once whatever it turns out to be.  Headers
+are often kept without their data, one after the other or alone: HDUs are found by what their
+headers say of them, and whether data are whole is stated.  The bytes are kept beside what they
+mean, which is what makes reading and writing lossless.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import re
+import warnings
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.data.files import atomic_path
+from bayesdist.errors import BayesdistError, FormatError, InputError
+from bayesdist.products.formats.common.cards import card_images, header_of
+
+__all__ = ["Content", "Hdu", "hdus_of", "read_content", "read_hdus", "readable", "write_hdus"]
+
+RECORD = 2880  # bytes
+LARGEST = 2**32  # bytes: what a compressed file may grow to
+_STARTS = (b"SIMPLE  =", b"XTENSION=")
+_CARD = re.compile(r"[A-Z0-9_-]{1,8} *=|(COMMENT|HISTORY| {8})")
+
+
+@dataclass(frozen=True, eq=False)
+class Hdu:
+    """One HDU, or the cards of one.
+
+    Parameters
+    ----------
+    cards : tuple of str
+        Header cards without END, 80 characters each.
+    data : bytes
+        As in the file, whether padded to whole records or not.
+    number : int
+        Place in the file, the first one 0.
+    state : str
+        'whole', 'none' where there are no data though the header says some, or 'cut'.
+    """
+
+    cards: tuple[str, ...]
+    data: bytes = b""
+    number: int = 0
+    state: str = "whole"
+
+    @property
+    def header(self) -> fits.Header:
+        """The header; a new one at each call."""
+        return header_of(self.cards)
+
+    @cached_property
+    def name(self) -> str:
+        """EXTNAME, in capitals."""
+        return str(self.header.get("EXTNAME", "")).strip().upper()
+
+    @property
+    def label(self) -> str:
+        """EXTNAME with EXTVER, as 'SCI,1'; empty where there is none."""
+        header = self.header
+        name = str(header.get("EXTNAME", "")).strip()
+        return f"{name},{header.get('EXTVER', 1)}" if name else ""
+
+    def to_bytes(self) -> bytes:
+        """Header and data, each padded to whole records."""
+        head = "".join([*self.cards, "END".ljust(80)]).encode("latin-1")
+        return head.ljust(_padded(len(head)), b" ") + self.data.ljust(
+            _padded(len(self.data)), b"\0"
+        )
+
+    @cached_property
+    def rows(self) -> NDArray[np.void]:
+        """Rows of a binary table: native numbers, and text without trailing blanks.
+
+        Raises
+        ------
+        FormatError
+            When this is no binary table.
+        """
+        if self.header.get("XTENSION", "").strip() != "BINTABLE":
+            raise FormatError(f"HDU {self.name!r} is no binary table")
+        table = fits.BinTableHDU.fromstring(self.to_bytes()).data
+        columns = {name: np.asarray(table[name]) for name in table.names}
+        columns = {
+            n: np.strings.rstrip(c) if c.dtype.kind == "U" else c for n, c in columns.items()
+        }
+        layout = [(n, c.dtype.newbyteorder("="), c.shape[1:]) for n, c in columns.items()]
+        out = np.empty(len(table), dtype=layout)
+        for name, column in columns.items():
+            out[name] = column
+        out.flags.writeable = False
+        return out
+
+    @cached_property
+    def image(self) -> NDArray[np.float64]:
+        """Pixels of an image extension."""
+        return np.asarray(fits.ImageHDU.fromstring(self.to_bytes()).data, float)
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What a file holds, decompressed.
+
+    Parameters
+    ----------
+    name : str
+        Of the file, for messages.
+    raw : bytes
+    """
+
+    name: str
+    raw: bytes
+
+    @property
+    def is_fits(self) -> bool:
+        """Whether it begins as a FITS file, or as an HDU of one."""
+        return self.raw[:9] in _STARTS and b"\n" not in self.raw[:81]
+
+    @cached_property
+    def text(self) -> str:
+        """All as text, one line below the other; empty for a FITS file."""
+        if self.is_fits or b"\0" in self.raw[:RECORD]:
+            return ""
+        return self.raw.decode("latin-1").replace("\r\n", "\n")
+
+    @cached_property
+    def hdus(self) -> tuple[Hdu, ...]:
+        """HDUs as far as they can be found, or the one that the cards of a text file are."""
+        if self.is_fits:
+            return tuple(_walked(self.raw))
+        if not _CARD.match(self.text):
+            return ()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of cards that are not ours to judge
+            sep = "\n" if "\n" in self.text.strip() else ""
+            header = fits.Header.fromstring(self.text, sep=sep)
+            state = "whole" if "NAXIS" not in header else "none"
+            return (Hdu(card_images(header), state=state),)
+
+    def whole(self) -> tuple[Hdu, ...]:
+        """All HDUs of a FITS file that is whole.
+
+        Raises
+        ------
+        FormatError
+            When it is no FITS file, or is truncated or damaged.
+        """
+        hdus = self.hdus if self.is_fits else ()
+        if not hdus or self.raw[:9] != _STARTS[0]:
+            raise FormatError("is no FITS file", where=self.name, do="check the file")
+        end = sum(len(hdu.to_bytes()) for hdu in hdus)
+        broken = any(hdu.state != "whole" for hdu in hdus)
+        if broken or end > len(self.raw) or self.raw[end:].strip(b"\0 "):
+            raise FormatError(
+                f"is truncated or damaged: {len(self.raw)} bytes, and {len(hdus)} HDUs end at "
+                f"{end if not broken else 'more'}",
+                where=self.name,
+                do="fetch the file again",
+            )
+        return hdus
+
+    @cached_property
+    def tables(self) -> tuple[Hdu, ...]:
+        """HDUs of a whole FITS file; none for any other."""
+        return () if self.damage is not None or not self.is_fits else self.whole()
+
+    @cached_property
+    def damage(self) -> FormatError | None:
+        """Why a file that begins as a FITS file is none that is whole."""
+        try:
+            self.whole()
+        except FormatError as error:
+            return error if self.is_fits else None
+        return None
+
+    @cached_property
+    def opened(self) -> fits.HDUList | None:
+        """The file by astropy, whose extensions hold tables of a distortion; None if not whole."""
+        if not self.is_fits or any(hdu.state != "whole" for hdu in self.hdus):
+            return None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                return fits.open(io.BytesIO(self.raw), memmap=False, lazy_load_hdus=False)
+            except (OSError, ValueError, fits.VerifyError):
+                return None
+
+
+@contextmanager
+def readable(where: str) -> Iterator[None]:
+    """What a library raises of a damaged file inside becomes a FormatError that names it."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of cards that are not ours to judge
+            yield
+    except BayesdistError:
+        raise
+    except (fits.VerifyError, ValueError, KeyError, IndexError, TypeError, OSError) as error:
+        raise FormatError(
+            f"is not a header that can be read ({error})", where=where, do="check the file"
+        ) from error
+
+
+def read_content(path: str | os.PathLike[str]) -> Content:
+    """Content of a file, decompressed where gzip has compressed it.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    Content
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is a broken gzip file, or one that grows beyond 4 GiB.
+    """
+    where = str(path)
+    try:
+        raw = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror or error})", where=where, do="check the path"
+        ) from error
+    if raw[:2] == b"\x1f\x8b":
+        try:
+            with gzip.GzipFile(fileobj=io.BytesIO(raw)) as stream:
+                raw = stream.read(LARGEST + 1)
+        except (EOFError, OSError, zlib.error) as error:
+            raise FormatError(
+                f"is a broken gzip file ({error})", where=where, do="fetch the file again"
+            ) from error
+        if len(raw) > LARGEST:
+            raise FormatError(
+                f"holds more than {LARGEST} bytes", where=where, do="decompress it first"
+            )
+    return Content(where, raw)
+
+
+def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:
+    """All HDUs of a FITS file that is whole; raises as `read_content` and `Content.whole`."""
+    return read_content(path).whole()
+
+
+def hdus_of(made: Iterable[fits.hdu.base.ExtensionHDU | fits.PrimaryHDU]) -> tuple[Hdu, ...]:
+    """HDUs that astropy made, with the bytes that it writes."""
+    stream = io.BytesIO()
+    fits.HDUList(list(made)).writeto(stream)
+    return Content("new file", stream.getvalue()).whole()
+
+
+def write_hdus(hdus: Iterable[Hdu], path: str | os.PathLike[str]) -> None:
+    """Write a FITS file, whole or not at all; compressed when its name ends in .gz."""
+    raw = b"".join(hdu.to_bytes() for hdu in hdus)
+    if str(path).endswith(".gz"):
+        raw = gzip.compress(raw, mtime=0)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(raw)
+
+
+def _walked(raw: bytes) -> Iterable[Hdu]:
+    """HDUs one after the other, with their data between them or not."""
+    number, at = 0, 0
+    while raw[at : at + 9] in _STARTS:
+        cards, after = list[str](), at
+        while after < len(raw):
+            card = raw[after : after + 80].decode("latin-1")
+            after += 80
+            if card[:8].rstrip() == "END":
+                break
+            cards.append(card.ljust(80))
+        begin = at + _padded(after - at)
+        size = _data_size(header_of(cards))
+        state, at = "whole", begin + _padded(size)
+        if begin + size > len(raw):
+            follows = raw[begin : begin + 9] == _STARTS[1]
+            state, at = ("none", begin) if follows or len(raw) <= begin else ("cut", len(raw))
+        yield Hdu(tuple(cards), raw[begin:at], number, state)
+        number += 1
+
+
+def _data_size(header: fits.Header) -> int:
+    """Bytes of data that a header announces (FITS 4.0, section 4.4.1)."""
+    try:
+        sides = [int(header[f"NAXIS{k + 1}"]) for k in range(int(header.get("NAXIS", 0)))]
+        bits, groups = abs(int(header["BITPIX"])), int(header.get("GCOUNT", 1))
+        more = int(header.get("PCOUNT", 0))
+    except (KeyError, TypeError, ValueError, fits.VerifyError):
+        return 0
+    n = 1 if sides else 0
+    for side in sides:
+        n *= side
+    return bits // 8 * groups * (more + n)
+
+
+def _padded(n: int) -> int:
+    return -(-n // RECORD) * RECORD

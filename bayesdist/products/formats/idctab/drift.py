@@ -1,0 +1,282 @@
+"""The time-dependent terms of ACS/WFC in an IDCTAB, and what of a drift it can hold.
+
+    CX11 += CXB dt,  CY11 += CTB dt,  CY10 += CYB dt
+
+with dt in years from TDD_DATE (scheme of 2015), in the primary header, as stwcs reads them.
+
+A calibration that was turned into V2 and V3 drifts in terms that a file has no keyword for: a
+change of the y scale turns into one of CX10, by the sine of 2.2 degrees for ACS/WFC.  Such terms
+are left out only where what they do over the years of the file is bounded, and the bound is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.errors import InputError
+from bayesdist.infer.transforms import Solution, View
+from bayesdist.infer.transforms import segment as segment_of
+from bayesdist.model import TimeDependence
+
+__all__ = ["RATES", "Loss", "drift", "scheme_of", "storable"]
+
+Float = NDArray[np.float64]
+Term = tuple[str, int, int]
+
+NEGLIGIBLE = 1e-3  # mas: what is held at zero by a prior, or by the gauge, is not worth a word
+
+# (axis, power of x, power of y) of a coefficient: the keyword of its rate, less the chip number.
+RATES = {("u", 1, 0): "TDD_CXB", ("v", 1, 0): "TDD_CTB", ("v", 0, 1): "TDD_CYB"}
+
+
+def scheme_of(keywords: Mapping[str, float]) -> str:
+    """What stwcs makes of the keywords of an ACS/WFC table, in its order of trial.
+
+    Parameters
+    ----------
+    keywords : mapping
+        All keywords that begin with TDD.
+
+    Returns
+    -------
+    str
+        '2015' (TDD_CTB1 ...), '2014' (TDD_CYB1 ...), 'order' (TDDORDER with TDD_A, TDD_B), or
+        'default': terms of 2004.5 that are written in its code.
+    """
+    for keyword, scheme in (("TDD_CTB1", "2015"), ("TDD_CYB1", "2014"), ("TDDORDER", "order")):
+        if keyword in keywords:
+            return scheme
+    return "default"
+
+
+def drift(
+    keywords: Mapping[str, float],
+    terms: tuple[tuple[int, int], ...],
+    chip: int,
+    epoch: float,
+    where: str,
+) -> NDArray[np.float64]:
+    """What the terms add to the coefficients of a chip.
+
+    Parameters
+    ----------
+    keywords : mapping
+        All keywords that begin with TDD.
+    terms : tuple of (int, int)
+        Powers of the coefficients.
+    chip : int
+    epoch : float
+        Decimal years.
+    where : str
+        Name of the file, for the error.
+
+    Returns
+    -------
+    ndarray, shape (2, n_terms)
+
+    Raises
+    ------
+    InputError
+        For keywords of another scheme than that of 2015.
+    """
+    scheme = scheme_of(keywords)
+    if scheme != "2015" or "TDD_DATE" not in keywords:
+        raise InputError(
+            f"time-dependent terms of the scheme {scheme!r} are not evaluated here",
+            where=where,
+            do="leave out the epoch, or use a table with TDD_DATE and TDD_CTB1",
+        )
+    out = np.zeros((2, len(terms)))
+    for (axis, i, j), name in RATES.items():
+        rate = keywords.get(f"{name}{chip}", 0.0)
+        out["uv".index(axis), terms.index((i, j))] = rate * (epoch - keywords["TDD_DATE"])
+    return out
+
+
+# -- what a file can hold --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A drift that a file does not hold.
+
+    Parameters
+    ----------
+    chip : str
+        Name of the chip.
+    term : tuple of (str, int, int)
+        Axis, power of x, power of y.
+    mas, sigma : float
+        Largest displacement that is left out, over the chip and the years of the file, and its
+        standard deviation; mas.
+    years : tuple of float
+        First and last date.
+    """
+
+    chip: str
+    term: Term
+    mas: float
+    sigma: float
+    years: tuple[float, float]
+
+    def __str__(self) -> str:
+        axis, i, j = self.term
+        return (
+            f"Not stored: drift of the {axis} term x^{i} y^{j} of {self.chip}, at most "
+            f"{self.mas:.2g} +- {self.sigma:.1g} mas over the chip from {self.years[0]:g} to "
+            f"{self.years[1]:g}"
+        )
+
+
+def storable(
+    calibration: Calibration,
+    *,
+    years: tuple[float, float],
+    segment: int = 0,
+    limit_mas: float = 0.1,
+    like: Calibration | None = None,
+) -> tuple[Calibration, tuple[Loss, ...]]:
+    """One segment of a calibration, with the drift that an IDCTAB can store.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        In an angular unit, along the axes of the IDCTAB (see `calibration.orientation`).
+    years : tuple of float
+        First and last date for which the file is meant, decimal years.
+    segment : int
+        Number of the segment, from 0.
+    limit_mas : float
+        Largest displacement that may be left out: the sum of all terms of a chip, mas.
+    like : Calibration, optional
+        The one whose drift the file will hold.  This one then gives its coefficients at the
+        reference date, and the difference of the drifts counts as left out.
+
+    Returns
+    -------
+    calibration : Calibration
+        Without breaks, with drifting terms that have keywords.
+    lost : tuple of Loss
+        What was left out.
+
+    Raises
+    ------
+    InputError
+        When more than `limit_mas` would be left out, for a unit of pixels, years that do not rise,
+        no such segment, or a solution that does not depend on time, or from another date, where
+        `like` does.
+    """
+    solution = calibration.solution
+    if solution.model.unit not in ARCSEC:
+        raise InputError(
+            f"u and v are in {solution.model.unit}, and the axes of an IDCTAB are angles",
+            where="model.unit",
+            do="orient the solution first",
+        )
+    first, last = years
+    if not first < last:
+        raise InputError(
+            f"the years {first} to {last} do not rise", where="years", do="give first and last date"
+        )
+    _check_like(solution, like, segment)
+    view: Solution = solution
+    of_view: Callable[[Float], Float] = np.asarray
+    if solution.model.time is not None:
+        own = segment_of(solution, segment)
+        view, of_view = own, own.transform
+    model, time = view.model, view.model.time
+    kept: list[Term] = []
+    if time is not None and like is None:
+        kept = [term for term in time.terms if term in RATES]
+    new = replace(model, time=TimeDependence(tuple(kept), time.epoch0) if time and kept else None)
+    columns = list(range(model.n_polynomial))
+    for chip in model.chips:
+        start = model.tdd_slice(chip.number).start
+        columns += [start + k for k, t in enumerate(time.terms if time else ()) if t in kept]
+    lost = _lost(view, None if like is None else like.solution, kept, (first, last))
+    _check_lost(lost, limit_mas)
+
+    def transform(theta: Float) -> Float:
+        return of_view(theta)[..., columns]
+
+    cov = np.asarray(view.cov, float)[np.ix_(columns, columns)]
+    held = View(new, np.asarray(view.mean, float)[columns], cov, solution, transform)
+    shared = calibration.with_plane
+    with_plane = None if shared is None else transform(shared.T).T  # the transformation is linear
+    return replace(calibration, solution=held, with_plane=with_plane), lost
+
+
+def _check_like(solution: Solution, like: Calibration | None, segment: int) -> None:
+    if like is None or like.model.time is None:
+        return
+    time = solution.model.time
+    wanted = like.model.time.epoch0[0]
+    if time is None or not 0 <= segment < time.n_segments or time.epoch0[segment] != wanted:
+        stated = "does not depend on time" if time is None else f"counts from {time.epoch0}"
+        raise InputError(
+            f"the solution {stated}, and the file's drift from {wanted:g}",
+            where="model.tdd",
+            do="fit it with the same segments and reference dates, its rates held if need be",
+        )
+
+
+def _lost(
+    view: Solution, like: Solution | None, kept: list[Term], years: tuple[float, float]
+) -> tuple[Loss, ...]:
+    """What each drifting term does beyond the drift that is stored."""
+    model = view.model
+    if model.time is None:
+        return ()
+    factor = 1e3 * ARCSEC[model.unit]
+    span = max(abs(t - model.time.epoch0[0]) for t in years)
+    out = []
+    for chip in model.chips:
+        rates, sigmas = _rates(view, chip.number)
+        stored = {} if like is None else _rates(like, chip.number)[0]
+        for term in dict.fromkeys([*rates, *stored]):
+            if term in kept:
+                continue
+            _, i, j = term
+            reach = 1.0
+            for n, ref, power in zip(chip.size, chip.reference_pixel, (i, j), strict=True):
+                # in units of half the chip's size, as the model has its rates
+                reach *= (max(n + 0.5 - ref, ref - 0.5) / (n / 2)) ** power
+            lever = factor * span * reach
+            rate = rates.get(term, 0.0) - stored.get(term, 0.0)
+            # a drift that was taken over is the stored one, in every draw
+            sigma = lever * sigmas.get(term, 0.0) if rate or term not in stored else 0.0
+            if max(lever * abs(rate), sigma) > NEGLIGIBLE and (rate or term not in stored):
+                out.append(Loss(chip.name, term, lever * abs(rate), sigma, years))
+    return tuple(out)
+
+
+def _rates(solution: Solution, chip: int) -> tuple[dict[Term, float], dict[Term, float]]:
+    """Rates and their sigmas, for a model of one segment."""
+    model = solution.model
+    if model.time is None:
+        return {}, {}
+    place = model.tdd_slice(chip)
+    values = np.asarray(solution.mean, float)[place].tolist()
+    sigmas = np.sqrt(np.diag(np.asarray(solution.cov, float))[place]).tolist()
+    terms = model.time.terms
+    return dict(zip(terms, values, strict=True)), dict(zip(terms, sigmas, strict=True))
+
+
+def _check_lost(lost: tuple[Loss, ...], limit_mas: float) -> None:
+    for chip in dict.fromkeys(entry.chip for entry in lost):
+        mine = [entry for entry in lost if entry.chip == chip]
+        total = sum(entry.mas for entry in mine)
+        if total > limit_mas:
+            worst = max(mine, key=lambda entry: entry.mas)
+            raise InputError(
+                f"an IDCTAB cannot store drifts of {chip} that reach {total:.3g} mas, most of all "
+                f"the term ({', '.join(map(str, worst.term))}) with {worst.mas:.3g} mas",
+                where="model.tdd.terms",
+                do=f"choose a file for fewer years, or a limit above {limit_mas:g} mas",
+            )

@@ -1,0 +1,83 @@
+"""What HST's pipeline knows of its detectors beside their IDCTABs: parities and filter wheels.
+
+V2 = V2REF + p0 Xc,  V3 = V3REF + p1 Yc, with the parities p0, p1 of stwcs (wcsutil/instruments.py).
+An IDCTAB of ACS names the filters of both wheels in each row.
+"""
+
+from __future__ import annotations
+
+from bayesdist.errors import InputError
+
+__all__ = ["combination_of", "parity_of"]
+
+_PARITY = {
+    ("ACS", "WFC"): (1, -1),
+    ("ACS", "HRC"): (-1, 1),
+    ("ACS", "SBC"): (-1, 1),
+    ("WFC3", "UVIS"): (-1, 1),
+    ("WFC3", "IR"): (-1, 1),
+}
+
+# FILTER1 and FILTER2 of real IDCTABs; ramp filters (FR...) are all in the second wheel.
+_FIRST = (
+    "F475W", "F502N", "F550M", "F555W", "F606W", "F625W", "F658N", "F775W", "F850LP", "F892N",
+    "G800L", "POL0UV", "POL60UV", "POL120UV",
+)  # fmt: skip
+_SECOND = ("F435W", "F660N", "F814W", "POL0V", "POL60V", "POL120V")
+
+
+def parity_of(instrument: str, detector: str) -> tuple[int, int]:
+    """Parities (p0, p1) of a detector.
+
+    Raises
+    ------
+    InputError
+        For a detector that is not known.
+    """
+    try:
+        return _PARITY[instrument.strip().upper(), detector.strip().upper()]
+    except KeyError:
+        known = ", ".join(f"{i}/{d}" for i, d in _PARITY)
+        raise InputError(
+            f"the parity of {instrument}/{detector} is not known",
+            where="products.idctab",
+            do=f"choose one of {known}",
+        ) from None
+
+
+def combination_of(filter: str | tuple[str, ...], instrument: str) -> tuple[str, ...]:
+    """Names of all wheels for a filter, the others being clear.
+
+    Parameters
+    ----------
+    filter : str or tuple of str
+        One name, as "F606W" or "CLEAR"; a tuple is given back as it is.
+    instrument : str
+        INSTRUME.
+
+    Returns
+    -------
+    tuple of str
+        As ("F606W", "CLEAR2L") for ACS; one name for others.
+
+    Raises
+    ------
+    InputError
+        When the wheel of an ACS filter is not known.
+    """
+    if not isinstance(filter, str):
+        return tuple(map(str, filter))
+    name = filter.strip().upper()
+    if instrument != "ACS":
+        return (name,)
+    if name.startswith("CLEAR"):
+        return ("CLEAR1L", "CLEAR2L")
+    if name in _FIRST:
+        return (name, "CLEAR2L")
+    if name in _SECOND or name.startswith("FR"):
+        return ("CLEAR1L", name)
+    raise InputError(
+        f"the filter wheel of {filter!r} is not known",
+        where="filters",
+        do='name both wheels, as ("F606W", "CLEAR2L")',
+    )

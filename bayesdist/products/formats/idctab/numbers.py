@@ -1,0 +1,291 @@
+"""The numbers that an IDCTAB takes from a calibration, with their derivatives and covariance.
+
+Calibrations of different filters come from different stars, but may lie in one plane by one
+orientation.  Given the orientation p they are independent, so that
+
+    Cov(a, b) = Cov(a, p) Cov(p)^-1 Cov(p, b)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.inverse import fitted_inverse
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.products.formats.common.coefficients import idctab_column
+from bayesdist.products.formats.idctab.drift import RATES
+
+__all__ = [
+    "ChipInverse",
+    "ChipNumbers",
+    "check_time",
+    "chip_inverse",
+    "chip_numbers",
+    "joint_covariance",
+]
+
+Float = NDArray[np.float64]
+
+SINGULAR = 1e-12  # of the largest coefficient squared
+INVERSE_NODES = 33  # points of each axis of the fit
+
+
+@dataclass(frozen=True, eq=False)
+class ChipNumbers:
+    """The fitted numbers of one chip, as an IDCTAB names them.
+
+    Parameters
+    ----------
+    chip : Chip
+    names : tuple of str
+        V2REF, V3REF, CX10, CX11, ..., CY10, ...; then keywords of the rates that were fitted.
+    values : ndarray, shape (P,)
+        Arcseconds, arcsec/pix^n, arcsec/pix/yr.
+    jacobian : ndarray, shape (P, D)
+        Derivatives by the parameters of the solution.
+    constant : ndarray, shape (2,)
+        (Xc, Yc) of the reference pixel, which V2REF and V3REF contain; arcseconds.
+    """
+
+    chip: Chip
+    names: tuple[str, ...]
+    values: Float
+    jacobian: Float
+    constant: Float
+
+    def column(self, name: str) -> float:
+        """Value of a name."""
+        return float(self.values[self.names.index(name)])
+
+    def without_rates(self) -> ChipNumbers:
+        """The numbers without those of the drift."""
+        keep = [k for k, name in enumerate(self.names) if not name.startswith("TDD")]
+        names = tuple(self.names[k] for k in keep)
+        return ChipNumbers(self.chip, names, self.values[keep], self.jacobian[keep], self.constant)
+
+
+@dataclass(frozen=True, eq=False)
+class ChipInverse:
+    """The INVERSE row of one chip, at the reference date of its drift.
+
+    Parameters
+    ----------
+    values, sigmas : dict of str to float
+        By column: pixels per arcsec^n.
+    closure : float
+        Largest distance between a pixel and the inverse of its forward position, pixels.
+    """
+
+    values: dict[str, float]
+    sigmas: dict[str, float]
+    closure: float
+
+
+def check_time(model: DistortionModel, *, acs_wfc: bool) -> None:
+    """Refuse time dependence that stwcs would not apply; to leave it out would be a silent error.
+
+    Raises
+    ------
+    InputError
+        For time-dependent terms other than (u, 1, 0), (v, 1, 0) and (v, 0, 1), of several segments,
+        or of a detector other than ACS/WFC.
+    """
+    if model.time is None:
+        return
+    single = "write SIP headers for single epochs instead"
+    if not acs_wfc:
+        raise InputError(
+            "an IDCTAB stores time-dependent terms for ACS/WFC only", where="model.tdd", do=single
+        )
+    for axis, i, j in model.time.terms:
+        if (axis, i, j) not in RATES:
+            raise InputError(
+                f"an IDCTAB cannot store the time-dependent term ({axis}, {i}, {j})",
+                where="model.tdd.terms",
+                do=f"keep to (u, 1, 0), (v, 1, 0) and (v, 0, 1), or {single}",
+            )
+    if model.time.n_segments > 1:
+        raise InputError(
+            f"an IDCTAB holds one reference date, and there are {model.time.n_segments} segments",
+            where="model.tdd.breaks",
+            do="fit each segment by itself and write a file for each",
+        )
+
+
+def chip_numbers(
+    calibration: Calibration,
+    chip: int,
+    *,
+    factor: float,
+    parity: tuple[int, int],
+    zero: tuple[float, float],
+) -> ChipNumbers:
+    """Numbers of one chip, at the reference date of its drift.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    chip : int
+        Chip number.
+    factor : float
+        Arcseconds of the IDCTAB in one unit of u, v.
+    parity : tuple of int
+        Sense of V2 and V3 against Xc and Yc.
+    zero : tuple of float
+        V2 and V3 of (u, v) = (0, 0), arcseconds.
+
+    Returns
+    -------
+    ChipNumbers
+
+    Raises
+    ------
+    InputError
+        For an unknown chip.
+    DegenerateError
+        When the linear part is singular.
+    """
+    model = calibration.model
+    coefficients, jacobian = calibration.coefficients(chip, reference_date(calibration))
+    basis = model.basis(chip)
+    values = basis.to_monomials(coefficients)
+    by = np.einsum("kl,ald->akd", basis.monomial_matrix, jacobian.reshape(2, basis.n_terms, -1))
+    linear = values[:, 1:3]
+    if abs(np.linalg.det(linear)) <= SINGULAR * np.abs(linear).max() ** 2:
+        raise DegenerateError(
+            f"the linear part of chip {chip} is singular",
+            do="check that the stars cover the detector in x and in y",
+        )
+    constant = values[:, 0] * factor
+    listed: list[tuple[str, float, Float]] = [
+        (name, zero[a] + parity[a] * constant[a], parity[a] * by[a, 0] * factor)
+        for a, name in enumerate(("V2REF", "V3REF"))
+    ]
+    for axis, prefix in enumerate(("CX", "CY")):
+        # tables list CX10 before CX11: rising powers of x within an order
+        for k, (i, j) in sorted(enumerate(basis.terms), key=lambda t: (sum(t[1]), t[1])):
+            if i + j:
+                name = idctab_column(prefix, i, j)
+                listed.append((name, values[axis, k] * factor, by[axis, k] * factor))
+    listed += _rates(calibration, chip, factor)
+    names, numbers, derivatives = zip(*listed, strict=True)
+    return ChipNumbers(
+        model.chips[model.chip_code(chip)],
+        names,
+        np.array(numbers, float),
+        np.array(derivatives),
+        constant,
+    )
+
+
+def reference_date(calibration: Calibration) -> float | None:
+    """The date from which the drift of a single segment counts; None without drift."""
+    time = calibration.model.time
+    return None if time is None else time.epoch0[0]
+
+
+def _rates(calibration: Calibration, chip: int, factor: float) -> list[tuple[str, float, Float]]:
+    """Rates per pixel; the model has them per half size of the detector."""
+    model = calibration.model
+    if model.time is None:
+        return []
+    first = model.tdd_slice(chip).start
+    half_x, half_y = model.basis(chip).half_size
+    out = []
+    for k, (axis, i, j) in enumerate(model.time.terms):
+        scale = factor * half_x**-i * half_y**-j
+        derivative = np.zeros(model.n_params)
+        derivative[first + k] = scale
+        value = float(np.asarray(calibration.solution.mean)[first + k]) * scale
+        out.append((f"{RATES[axis, i, j]}{chip}", value, derivative))
+    return out
+
+
+def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInverse:
+    """Least-squares inverse of a chip's polynomials, of their order, over the whole chip.
+
+    There is no constant term: (0, 0) is XREF, YREF in both directions.  stwcs has no use for
+    INVERSE rows (ACS handbook 4.1.5); other programs start their iterations there, so that the
+    closure matters and is stated.
+
+    Raises
+    ------
+    InputError
+        When the map folds the chip onto itself.
+    """
+    stated = calibration.at(reference_date(calibration), origin="chip")[chip]
+    one: ChipMap = stated.transformed(factor * np.eye(2))
+    try:
+        inverse = fitted_inverse(
+            one, one.basis.order, nodes=INVERSE_NODES, constant=False, linear=np.eye(2)
+        )
+    except InputError as error:
+        raise InputError(
+            f"the distortion of chip {chip} maps several pixels to one position",
+            where="INVERSE rows",
+            do="lower the order, fit stars over the whole chip, or leave the inverse out",
+        ) from error
+    sigma = np.zeros(2 * len(inverse.x_terms))
+    if one.cov is not None and inverse.jacobian is not None:
+        by = inverse.jacobian
+        sigma = np.sqrt(np.maximum(np.einsum("kl,lm,km->k", by, one.cov, by, optimize=True), 0.0))
+    columns, values = [], []
+    for axis, (prefix, terms) in enumerate((("CX", inverse.x_terms), ("CY", inverse.y_terms))):
+        for (i, j), value in terms.items():
+            columns.append(idctab_column(prefix, i, j))
+            values.append(value + ((i, j) == (1 - axis, axis)))  # the whole offset, not less (X, Y)
+    closure, _ = inverse.misses(one)
+    return ChipInverse(
+        dict(zip(columns, values, strict=True)),
+        dict(zip(columns, sigma.tolist(), strict=True)),
+        closure,
+    )
+
+
+def joint_covariance(
+    calibrations: Sequence[Calibration], numbers: Sequence[Sequence[ChipNumbers]]
+) -> Float:
+    """Covariance of all numbers of all calibrations, with what those of one orientation share.
+
+    Parameters
+    ----------
+    calibrations : sequence of Calibration
+    numbers : sequence of sequence of ChipNumbers
+        Of each calibration, those of all chips.
+    """
+    jacobians = [np.concatenate([chip.jacobian for chip in chips]) for chips in numbers]
+    ends = np.cumsum([len(j) for j in jacobians])
+    places = [slice(int(e) - len(j), int(e)) for e, j in zip(ends, jacobians, strict=True)]
+    out = np.zeros((int(ends[-1]), int(ends[-1])))
+    for one, jacobian, place in zip(calibrations, jacobians, places, strict=True):
+        out[place, place] = jacobian @ np.asarray(one.solution.cov, float) @ jacobian.T
+    laid = [
+        (k, one.plane.orientation, jacobians[k] @ one.with_plane)
+        for k, one in enumerate(calibrations)
+        if one.plane.orientation is not None and one.with_plane is not None
+    ]
+    for a, orientation, by_a in laid:
+        for b, other, by_b in laid:
+            if b > a and orientation is other:
+                shared = by_a @ _inverse(orientation.cov) @ by_b.T
+                out[places[a], places[b]] = shared
+                out[places[b], places[a]] = shared.T
+    return out
+
+
+def _inverse(cov: Float) -> Float:
+    """Inverse of the orientation's covariance, whose scale may be held and so have variance 0."""
+    sigma = np.sqrt(np.diag(cov))
+    known = sigma > 0
+    out = np.zeros_like(cov)
+    pick = np.ix_(known, known)
+    norm = np.outer(sigma[known], sigma[known])
+    out[pick] = np.linalg.pinv(cov[pick] / norm, hermitian=True) / norm
+    return out

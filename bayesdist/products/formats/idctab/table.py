@@ -1,0 +1,435 @@
+"""The IDCTAB: the distortion table of HST instruments, as stwcs reads it (its distortion/mutil.py).
+
+    Xc ["] = sum CXnj x^j y^(n-j),  Yc ["] = sum CYnj x^j y^(n-j),   x, y from XREF, YREF;  n >= 1
+
+Rows with DIRECTION 'INVERSE' lead back: x and y in pixels from powers of Xc and Yc in arcseconds.
+
+Uncertainties stand in HDUs behind the first table, where stwcs does not look:
+
+SIGMA
+    A table with the rows of the coefficient table: its key columns (DETCHIP, DIRECTION, filters),
+    and the standard deviations of V2REF, V3REF and every coefficient, under the same names.  Those
+    of the time-dependent terms are keywords of its header, named as in the primary header.
+COVAR
+    A table with one row for each fitted number of the file: DETCHIP, the filters where these have
+    numbers of their own (of the first row that holds the number), PARAM (column or keyword name),
+    VALUE, and COV, its covariances with all rows in order.  INVERSE rows follow from FORWARD ones
+    and are not in it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.errors import FormatError, InputError
+from bayesdist.model import polynomial_terms
+from bayesdist.products.formats.common.coefficients import evaluate, idctab_column
+from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
+from bayesdist.products.formats.idctab.drift import drift, scheme_of
+
+__all__ = ["FILTER_COLUMNS", "IdcTab", "read_idctab", "write_idctab"]
+
+Float = NDArray[np.float64]
+
+FILTER_COLUMNS = ("FILTER1", "FILTER2", "FILTER", "OPT_ELEM")
+# The chip to whose zero point stwcs refers both chips of ACS/WFC and of WFC3/UVIS.
+_REFERENCE = 2
+_ANY_CHIP = -999  # stwcs lets such a row serve every chip
+
+
+@dataclass(frozen=True, eq=False)
+class IdcTab:
+    """An IDCTAB file: all its HDUs, and what they mean.
+
+    Parameters
+    ----------
+    hdus : tuple of Hdu
+        All HDUs; the first table is HDU 1.
+    name : str
+        What to call the file in errors.
+
+    Raises
+    ------
+    FormatError
+        When a keyword or column is missing that stwcs cannot do without.
+    """
+
+    hdus: tuple[Hdu, ...]
+    name: str = "IDCTAB"
+
+    def __post_init__(self) -> None:
+        header = self.header
+        for keyword in ("INSTRUME", "NORDER"):
+            if keyword not in header:
+                raise FormatError(
+                    "is missing", where=f"{self.name}, keyword {keyword}", do="add the keyword"
+                )
+        order = header["NORDER"]
+        if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= 9:
+            raise FormatError(
+                f"is {order!r}", where=f"{self.name}, keyword NORDER", do="give an order of 1 to 9"
+            )
+        if len(self.hdus) < 2:
+            raise FormatError("has no table in HDU 1", where=self.name, do="check the file")
+        x, y = self.prefixes
+        needed = [
+            *("XSIZE", "YSIZE", "XREF", "YREF", "SCALE"),
+            *(idctab_column(p, i, j) for p in (x, y) for i, j in self.terms if i + j),
+        ]
+        for column in needed:
+            if column not in self.columns:
+                raise FormatError(
+                    "is missing",
+                    where=f"{self.name}, column {column}",
+                    do="add it, or lower NORDER",
+                )
+
+    # -- what the file holds ---------------------------------------------------------------------
+
+    @property
+    def header(self) -> fits.Header:
+        """The primary header; a new one at each call."""
+        return self.hdus[0].header
+
+    @property
+    def rows(self) -> NDArray[np.void]:
+        """The coefficient table as a structured array."""
+        return self.hdus[1].rows
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns."""
+        return self.rows.dtype.names or ()
+
+    @property
+    def prefixes(self) -> tuple[str, str]:
+        """What coefficient columns begin with: CX, CY, or A, B in very old files."""
+        return ("CX", "CY") if "CX10" in self.columns else ("A", "B")
+
+    @cached_property
+    def norder(self) -> int:
+        """Polynomial order."""
+        return int(self.header["NORDER"])
+
+    @property
+    def terms(self) -> tuple[tuple[int, int], ...]:
+        """Powers (i, j) of x and y, in the order of `coefficients`."""
+        return polynomial_terms(self.norder)
+
+    @property
+    def instrument(self) -> str:
+        """INSTRUME."""
+        return str(self.header["INSTRUME"]).strip()
+
+    @property
+    def detector(self) -> str:
+        """DETECTOR, empty where the file has none."""
+        return str(self.header.get("DETECTOR", "")).strip()
+
+    @property
+    def is_acs_wfc(self) -> bool:
+        """Whether stwcs looks for time-dependent terms."""
+        return self.instrument == "ACS" and self.detector == "WFC"
+
+    @cached_property
+    def tdd(self) -> dict[str, float]:
+        """All keywords of time-dependent terms: TDD..."""
+        return {
+            k: float(v)
+            for k, v in self.header.items()
+            if k.startswith("TDD") and isinstance(v, int | float)
+        }
+
+    @property
+    def tdd_scheme(self) -> str:
+        """As `drift.scheme_of`; 'none' for detectors other than ACS/WFC."""
+        return scheme_of(self.tdd) if self.is_acs_wfc else "none"
+
+    @property
+    def sigma(self) -> NDArray[np.void] | None:
+        """Rows of the HDU SIGMA; None where there is none."""
+        return self._rows_of("SIGMA")
+
+    @property
+    def covariance(self) -> NDArray[np.void] | None:
+        """Rows of the HDU COVAR; None where there is none."""
+        return self._rows_of("COVAR")
+
+    def _rows_of(self, name: str) -> NDArray[np.void] | None:
+        return next((hdu.rows for hdu in self.hdus[2:] if hdu.name == name), None)
+
+    @property
+    def chips(self) -> tuple[int, ...]:
+        """Chip numbers, that one first to whose zero point stwcs refers the others."""
+        numbers = {1}
+        if "DETCHIP" in self.columns:
+            numbers = {max(int(n), 1) for n in self.rows["DETCHIP"]}
+        return tuple(sorted(numbers, key=lambda n: (n != _REFERENCE, n)))
+
+    # -- one row ---------------------------------------------------------------------------------
+
+    def row(
+        self,
+        chip: int,
+        filter: str | Sequence[str] | None = None,
+        direction: str = "FORWARD",
+    ) -> int:
+        """Index of the row that stwcs would use.
+
+        Parameters
+        ----------
+        chip : int
+        filter : str or sequence of str, optional
+            One name, or those of both wheels; CLEAR1L and its like are one and the same.  None will
+            do where all rows of the chip hold the same coefficients.
+        direction : str
+
+        Returns
+        -------
+        int
+            0-based.
+
+        Raises
+        ------
+        InputError
+            When no row fits, or rows differ and no filter is given.
+        """
+        found = self.matching_rows(chip, filter, direction)
+        where = f"{self.name}, chip {chip}, direction {direction}"
+        if not found.size:
+            raise InputError(
+                f"there is no row for filter {filter!r}" if filter else "there is no row",
+                where=where,
+                do="see the table's DETCHIP, DIRECTION and filter columns",
+            )
+        if filter is None and not self._all_equal(found):
+            raise InputError(
+                "the coefficients differ from filter to filter", where=where, do="name the filter"
+            )
+        return int(found[0])
+
+    def matching_rows(
+        self,
+        chip: int,
+        filter: str | Sequence[str] | None = None,
+        direction: str = "FORWARD",
+    ) -> NDArray[np.int64]:
+        """Indices of all rows of a chip, filter and direction.
+
+        Parameters
+        ----------
+        chip, filter, direction
+            As in `row`.
+
+        Returns
+        -------
+        ndarray of int
+            0-based; empty where no row fits.
+        """
+        rows, columns = self.rows, self.columns
+        keep = np.ones(len(rows), bool)
+        if "DETCHIP" in columns:
+            keep &= np.isin(rows["DETCHIP"].astype(int), (chip, _ANY_CHIP))
+        if "DIRECTION" in columns:
+            keep &= np.char.upper(np.char.strip(rows["DIRECTION"])) == direction.upper()
+        if filter is not None:
+            asked = _filters([filter] if isinstance(filter, str) else filter)
+            keep &= np.array([_fits(asked, _filters(names)) for names in self.filters()], bool)
+        return np.flatnonzero(keep)
+
+    def filters(self) -> list[tuple[str, ...]]:
+        """Filter names of every row; empty tuples where the table has no such columns."""
+        columns = [c for c in FILTER_COLUMNS if c in self.columns]
+        return [tuple(str(row[c]).strip() for c in columns) for row in self.rows]
+
+    def _all_equal(self, found: NDArray[np.int64]) -> bool:
+        names = [c for c in self.columns if c not in (*FILTER_COLUMNS, "DETCHIP", "DIRECTION")]
+        return all((self.rows[name][found] == self.rows[name][found[0]]).all() for name in names)
+
+    def coefficients_of_row(self, row: int) -> tuple[Float, Float]:
+        """Coefficients of a row, as `coefficients`."""
+        record = self.rows[row]
+        x, y = (
+            np.array(
+                [
+                    float(record[column])
+                    if (column := idctab_column(p, i, j)) in self.columns
+                    else 0.0
+                    for i, j in self.terms
+                ]
+            )
+            for p in self.prefixes
+        )
+        return x, y
+
+    def coefficients(
+        self,
+        chip: int,
+        filter: str | Sequence[str] | None = None,
+        direction: str = "FORWARD",
+    ) -> tuple[Float, Float]:
+        """Coefficients of x^i y^j, for (i, j) in `terms`.
+
+        Parameters
+        ----------
+        chip, filter, direction
+            As in `row`.
+
+        Returns
+        -------
+        cx, cy : ndarray, shape (n_terms,)
+            Arcseconds per pixel^(i + j), or pixels per arcsecond^(i + j) in INVERSE rows, as they
+            stand in the table; the first is CX00, 0 where there is no such column.
+
+        Raises
+        ------
+        InputError
+            As `row`.
+        """
+        return self.coefficients_of_row(self.row(chip, filter, direction))
+
+    def evaluate(
+        self,
+        chip: int,
+        x: ArrayLike,
+        y: ArrayLike,
+        *,
+        filter: str | Sequence[str] | None = None,
+        direction: str = "FORWARD",
+        epoch: float | None = None,
+    ) -> tuple[Float, Float]:
+        """Positions in the aperture's frame, as stwcs computes them.
+
+        CX00 and CY00 are not used, and coefficients are multiplied by SCALE where CX11 is exactly 1
+        and SCALE is not.
+
+        Parameters
+        ----------
+        chip, filter, direction
+            As in `row`.
+        x, y : array_like
+            FITS 1-based pixels.
+        epoch : float, optional
+            Decimal years, for the time-dependent terms of the 2015 scheme; without it they are left
+            out.
+
+        Returns
+        -------
+        Xc, Yc : ndarray
+            Arcseconds from the reference pixel.
+
+        Raises
+        ------
+        InputError
+            As `row`; for an epoch where a table of ACS/WFC has time-dependent terms of another
+            scheme than that of 2015.
+        """
+        row = self.row(chip, filter, direction)
+        record = self.rows[row]
+        both = np.stack(self.coefficients_of_row(row))
+        both[:, 0] = 0.0
+        scale = round(float(record["SCALE"]), 8)
+        if both[0, self.terms.index((1, 0))] == 1.0 and scale != 1.0:
+            both *= scale
+        if epoch is not None and self.is_acs_wfc:
+            both += drift(self.tdd, self.terms, chip, epoch, self.name)
+        dx = np.asarray(x, float) - float(record["XREF"])
+        dy = np.asarray(y, float) - float(record["YREF"])
+        u, v = (evaluate(dict(zip(self.terms, c, strict=True)), dx, dy) for c in both)
+        return u, v
+
+    def invert(
+        self,
+        chip: int,
+        Xc: ArrayLike,
+        Yc: ArrayLike,
+        *,
+        filter: str | Sequence[str] | None = None,
+    ) -> tuple[Float, Float]:
+        """Pixels of positions in the aperture's frame, by the INVERSE row.
+
+        Parameters
+        ----------
+        chip, filter
+            As in `row`.
+        Xc, Yc : array_like
+            Arcseconds from the reference pixel, at the reference date of the drift.
+
+        Returns
+        -------
+        x, y : ndarray
+            FITS 1-based pixels.
+
+        Raises
+        ------
+        InputError
+            As `row`.
+        """
+        row = self.row(chip, filter, "INVERSE")
+        record = self.rows[row]
+        Xc, Yc = np.asarray(Xc, float), np.asarray(Yc, float)
+        x, y = (
+            evaluate(dict(zip(self.terms[1:], c[1:], strict=True)), Xc, Yc)
+            for c in self.coefficients_of_row(row)
+        )
+        return x + float(record["XREF"]), y + float(record["YREF"])
+
+
+def _filters(names: Sequence[str]) -> tuple[str, ...]:
+    """Names as stwcs compares them: every CLEAR is the same."""
+    return tuple("CLEAR" if "CLEAR" in n.upper() else n.strip() for n in names)
+
+
+def _fits(asked: tuple[str, ...], row: tuple[str, ...]) -> bool:
+    """Whether a row's filters are those asked for; a table without filter columns serves all."""
+    if not row:
+        return True
+    if len(asked) == len(row):
+        return asked == row
+    clear = [name for name in row if name not in asked]
+    return set(asked) - {"CLEAR"} <= set(row) and all(name in ("CLEAR", "N/A") for name in clear)
+
+
+def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
+    """Read an IDCTAB.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    IdcTab
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is no FITS file, is truncated, or lacks what an IDCTAB must have.
+    """
+    return IdcTab(read_hdus(path), str(path))
+
+
+def write_idctab(tab: IdcTab, path: str | os.PathLike[str]) -> None:
+    """Write an IDCTAB, whole or not at all; one that was read is written back bit by bit.
+
+    Parameters
+    ----------
+    tab : IdcTab
+    path : path-like
+        stwcs wants a name that ends in ``_idc.fits``.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    write_hdus(tab.hdus, path)

@@ -1,0 +1,1 @@
+"""D2IMFILE and NPOLFILE: look-up tables of HST instruments."""

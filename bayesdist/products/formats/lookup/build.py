@@ -1,0 +1,174 @@
+"""The extensions of a D2IMFILE or NPOLFILE, so that no consumer drops or misplaces a table.
+
+**Registration.**  CRPIX, CRVAL and CDELT are always written (see `lookup_file`).
+
+**Padding.**  stwcs notes as the size of a correction the maximum of its table, not of the absolute
+value, and astropy.wcs leaves out a table whose maximum is below zero.  Where no node is clearly
+above zero, columns are added at the right end: copies of the last one until the detector has ended,
+so that nothing changes there, then one that is positive and that no pixel reaches.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from textwrap import wrap
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.model.lookup import LookupTable
+from bayesdist.products.formats.common.cards import number_card, text_card
+from bayesdist.products.formats.common.content import hdus_of
+from bayesdist.products.formats.lookup.file import AXES, LookupFile
+
+__all__ = ["Part", "identity_cards", "lookup_file", "one_per_chip", "optional_cards"]
+
+Float = NDArray[np.float64]
+
+# A maximum below this fraction of the largest absolute value may turn negative on the way.
+_CLEARLY = 0.01
+
+
+def one_per_chip(tables: Sequence[LookupTable], where: str) -> list[LookupTable]:
+    """Tables in the order of the file: the highest chip first, so that EXTVER 1 is chip 2 of ACS.
+
+    Raises
+    ------
+    InputError
+        When there is none, or two of one chip.
+    """
+    if not tables:
+        raise InputError("no look-up table is given", where=where, do="give one for each chip")
+    chip, count = Counter(t.chip for t in tables).most_common(1)[0]
+    if count > 1:
+        raise InputError(
+            f"{count} look-up tables of chip {chip}", where=where, do="give one for each chip"
+        )
+    return sorted(tables, key=lambda table: -table.chip)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What the file holds of one chip.
+
+    Parameters
+    ----------
+    table : LookupTable
+        For its chip and grid.
+    values : ndarray, shape (2, ny, nx)
+        To be stored.
+    sigma : ndarray, shape (2, ny, nx), or None
+        To be stored.
+    turn : ndarray, shape (2, 2)
+        What the consumer multiplies the values by before it takes their maxima.
+    """
+
+    table: LookupTable
+    values: Float
+    sigma: Float | None
+    turn: Float = field(default_factory=lambda: np.eye(2))
+
+    def padding(self, columns: int) -> Float:
+        """Columns to be added for a chip of so many columns, shape (2, ny, n); n is often 0."""
+        seen = np.einsum("ab,byx->ayx", self.turn, self.values)
+        largest = np.abs(seen).max(axis=(1, 2))
+        if not (seen.max(axis=(1, 2)) < _CLEARLY * largest).any():
+            return self.values[..., :0]
+        last = self.table.nodes()[0][-1]
+        # half a step more than the detector, since the pixel may have been shifted already
+        copies = int(np.ceil((columns + 0.5 - last) / self.table.step[0] + 0.5))
+        beyond = np.linalg.solve(self.turn, np.full(2, largest.max()))
+        column = np.broadcast_to(beyond[:, None, None], (*self.values.shape[:2], 1))
+        same = np.repeat(self.values[..., -1:], max(copies, 1), axis=-1)
+        return np.concatenate([same, column], axis=-1)
+
+
+def lookup_file(
+    parts: Sequence[Part], *, size: tuple[int, int], cards: Sequence[str], name: str
+) -> LookupFile:
+    """A file of all its parts.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        In the order of EXTVER.
+    size : tuple of int
+        Columns and rows of a chip.
+    cards : sequence of str
+        Of the primary header.
+    name : str
+        What to call the file.
+    """
+    primary = fits.PrimaryHDU()
+    _append(primary, cards)
+    hdus, sigmas = [primary], []
+    for version, part in enumerate(parts, start=1):
+        extra = part.padding(size[0])
+        for axis, name_of_axis in enumerate(AXES):
+            place = _place_cards(part.table, version, size)
+            if n := extra.shape[-1]:
+                place.append(number_card("BDPAD", n, "columns at the end that are no nodes"))
+            plane = np.concatenate([part.values[axis], extra[axis]], axis=-1)
+            hdus.append(_image(name_of_axis, plane, place))
+            if part.sigma is not None:
+                place = _place_cards(part.table, version, size)
+                sigmas.append(_image(f"SIGMA_{name_of_axis}", part.sigma[axis], place))
+    # stwcs goes through the extensions in turn until it has found its own
+    return LookupFile(hdus_of([*hdus, *sigmas]), name)
+
+
+def _image(name: str, plane: Float, cards: Sequence[str]) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.asarray(plane, np.float32))
+    _append(hdu, [text_card("EXTNAME", name), *cards])
+    return hdu
+
+
+def _place_cards(table: LookupTable, version: int, size: tuple[int, int]) -> list[str]:
+    """Where the table lies."""
+    return [
+        number_card("EXTVER", version),
+        number_card("CCDCHIP", table.chip, "chip of the table"),
+        number_card("ONAXIS1", int(size[0]), "columns of the chip"),
+        number_card("ONAXIS2", int(size[1]), "rows of the chip"),
+        *(
+            number_card(f"{keyword}{axis + 1}", value, comment)
+            for axis in (0, 1)
+            for keyword, value, comment in (
+                ("CRPIX", 1.0, "node, from 1"),
+                ("CRVAL", table.first[axis], "[pixel] of that node, from 1"),
+                ("CDELT", table.step[axis], "[pixel] between nodes"),
+            )
+        ),
+        text_card("BUNIT", "pixel"),
+    ]
+
+
+def identity_cards(instrument: str, detector: str, filetype: str, description: str) -> list[str]:
+    """Cards that every reference file has."""
+    return [
+        text_card("TELESCOP", "HST"),
+        text_card("INSTRUME", instrument),
+        text_card("DETECTOR", detector),
+        text_card("FILETYPE", filetype),
+        text_card("OBSTYPE", "IMAGING"),
+        text_card("DESCRIP", description),
+        text_card("CREATOR", "bayesdist"),
+    ]
+
+
+def optional_cards(useafter: str | None, pedigree: str | None, history: Sequence[str]) -> list[str]:
+    """Cards that only the user can fill."""
+    return [
+        *([text_card("USEAFTER", useafter)] if useafter else []),
+        *([text_card("PEDIGREE", pedigree)] if pedigree else []),
+        *(text_card("HISTORY", piece) for line in history for piece in wrap(line, 70) or [""]),
+    ]
+
+
+def _append(hdu: fits.PrimaryHDU | fits.ImageHDU, cards: Sequence[str]) -> None:
+    for card in cards:
+        hdu.header.append(fits.Card.fromstring(card), end=True)

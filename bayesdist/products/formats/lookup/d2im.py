@@ -1,0 +1,118 @@
+"""D2IMFILE: the detector's own look-up tables, in pixels before the polynomial."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from bayesdist.errors import InputError
+from bayesdist.model.lookup import LookupTable
+from bayesdist.products.formats.lookup.build import (
+    Part,
+    identity_cards,
+    lookup_file,
+    one_per_chip,
+    optional_cards,
+)
+from bayesdist.products.formats.lookup.file import (
+    LookupFile,
+    check_kind,
+    read_lookup_file,
+    write_lookup_file,
+)
+
+__all__ = ["read_d2im", "write_d2im"]
+
+
+def write_d2im(
+    tables: Sequence[LookupTable],
+    path: str | os.PathLike[str],
+    *,
+    instrument: str = "ACS",
+    detector: str = "WFC",
+    size: tuple[int, int] = (4096, 2048),
+    description: str = "Pixel-grid distortion with its uncertainty, by bayesdist",
+    useafter: str | None = None,
+    pedigree: str | None = None,
+    history: Sequence[str] = (),
+) -> LookupFile:
+    """Write the detector's tables as a D2IMFILE, whole or not at all.
+
+    Parameters
+    ----------
+    tables : sequence of LookupTable
+        At most one for each chip, none of a filter.  Their sigmas, where they have some, become
+        extensions SIGMA_DX, SIGMA_DY.
+    path : path-like
+        Pipelines want a name that ends in ``_d2i.fits``.
+    instrument, detector : str
+        INSTRUME and DETECTOR.
+    size : tuple of int
+        Columns and rows of a chip.
+    description : str
+        DESCRIP.
+    useafter, pedigree : str, optional
+        USEAFTER ("Mar 01 2002 00:00:00") and PEDIGREE ("INFLIGHT 01/05/2006"), which only the user
+        knows.
+    history : sequence of str
+        Lines of HISTORY.
+
+    Returns
+    -------
+    LookupFile
+        What was written: single precision, as these files are.
+
+    Raises
+    ------
+    InputError
+        For no table, two tables of a chip, a table of a filter, or a file that cannot be written.
+    """
+    where = "D2IMFILE"
+    for table in tables:
+        if table.filter:
+            raise InputError(
+                f"the look-up table {table.label} is not the detector's",
+                where=where,
+                do="give the tables of filters to write_npol",
+            )
+    chips = one_per_chip(tables, where)
+    file = lookup_file(
+        [Part(t, t.values, t.sigma) for t in chips],
+        size=size,
+        cards=[
+            *identity_cards(instrument, detector, f"{detector} D2I FILE", description),
+            *optional_cards(useafter, pedigree, history),
+        ],
+        name=str(path),
+    )
+    write_lookup_file(file, path)
+    return file
+
+
+def read_d2im(
+    path: str | os.PathLike[str], *, first: Sequence[float] | None = None
+) -> tuple[LookupTable, ...]:
+    """The detector's tables of a D2IMFILE.
+
+    Parameters
+    ----------
+    path : path-like
+    first : sequence of float, optional
+        Pixel (x, y) of the first node, against what the file says: for files without CRPIX and
+        CRVAL, which older programs registered at pixel 1 and astropy.wcs since 6.1 at pixel 64.
+
+    Returns
+    -------
+    tuple of LookupTable
+        One for each chip, registered as astropy.wcs does it.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is no D2IMFILE, or its tables are incomplete or not finite.
+    """
+    file = read_lookup_file(path)
+    check_kind(file, "d2im")
+    return tuple(file.table(c, file.values(c), file.sigma(c), first=first) for c in file.chips)

@@ -1,0 +1,247 @@
+"""D2IMFILE and NPOLFILE: look-up tables of the distortion, as stwcs and astropy.wcs read them.
+
+Image extensions DX and DY for each chip, told apart by CCDCHIP.  Node k (from 1) of axis a lies at
+pixel CRVALa + (k - CRPIXa) CDELTa; a file without CRPIX and CRVAL has both 0, which puts the first
+node at pixel CDELT (astropy 6.1 and later; before, at pixel 1).
+
+A file of ours has in addition, where no consumer looks:
+
+SIGMA_DX, SIGMA_DY
+    Image extensions of the same shape: the standard error of each node.
+BDPAD
+    Columns at the right end that are no nodes (see `bayesdist.products.formats.lookup.build`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.errors import FormatError, InputError
+from bayesdist.model.lookup import LookupTable
+from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
+from bayesdist.products.formats.lookup.plane import Plane
+
+__all__ = ["AXES", "LookupFile", "check_kind", "read_lookup_file", "write_lookup_file"]
+
+Float = NDArray[np.float64]
+
+AXES = ("DX", "DY")
+_SIGMA = "SIGMA_"
+_FILTERS = ("FILTER1", "FILTER2", "FILTER")
+
+
+@dataclass(frozen=True, eq=False)
+class LookupFile:
+    """A D2IMFILE or NPOLFILE: all its HDUs, and what they mean.
+
+    Parameters
+    ----------
+    hdus : tuple of Hdu
+        All HDUs.
+    name : str
+        What to call the file in errors.
+
+    Raises
+    ------
+    FormatError
+        When there is no image extension DX or DY.
+    """
+
+    hdus: tuple[Hdu, ...]
+    name: str = "look-up tables"
+
+    def __post_init__(self) -> None:
+        if not self.planes:
+            raise FormatError(
+                "has no image extension DX or DY",
+                where=self.name,
+                do="give a D2IMFILE or an NPOLFILE with two-dimensional tables",
+            )
+
+    @cached_property
+    def header(self) -> fits.Header:
+        """The primary header."""
+        return self.hdus[0].header
+
+    @property
+    def kind(self) -> str:
+        """'npol' for a file that says so or names a filter, else 'd2im'."""
+        filetype = str(self.header.get("FILETYPE", "")).upper()
+        if "D2I" in filetype:
+            return "d2im"
+        return "npol" if "DXY" in filetype or self.filters else "d2im"
+
+    @property
+    def instrument(self) -> str:
+        """INSTRUME, empty where the file has none."""
+        return str(self.header.get("INSTRUME", "")).strip()
+
+    @property
+    def detector(self) -> str:
+        """DETECTOR, empty where the file has none."""
+        return str(self.header.get("DETECTOR", "")).strip()
+
+    @property
+    def filters(self) -> tuple[str, ...]:
+        """Filter names of the primary header, in the order of the wheels."""
+        return tuple(str(self.header[k]).strip() for k in _FILTERS if k in self.header)
+
+    @cached_property
+    def planes(self) -> tuple[Plane, ...]:
+        """The extensions DX and DY, in the order of the file."""
+        return self._planes(AXES)
+
+    @cached_property
+    def sigma_planes(self) -> tuple[Plane, ...]:
+        """The extensions SIGMA_DX and SIGMA_DY."""
+        return self._planes(tuple(_SIGMA + a for a in AXES))
+
+    def _planes(self, names: tuple[str, ...]) -> tuple[Plane, ...]:
+        out = []
+        for number, hdu in enumerate(self.hdus[1:], start=1):
+            header, name = hdu.header, hdu.name
+            image = str(header.get("XTENSION", "")).strip() == "IMAGE" and header["NAXIS"] == 2
+            if name in names and image and hdu.data:
+                out.append(Plane(hdu, name, f"{self.name}, HDU {number} ({name})"))
+        return tuple(out)
+
+    @property
+    def chips(self) -> tuple[int, ...]:
+        """Chip numbers, in the order of the file."""
+        return tuple(dict.fromkeys(p.chip for p in self.planes))
+
+    def pair(self, chip: int) -> tuple[Plane, Plane]:
+        """The extensions DX and DY of a chip.
+
+        Raises
+        ------
+        FormatError
+            When one is missing or stands twice, or when the two are no common grid.
+        """
+        x, y = (self._one(chip, axis) for axis in AXES)
+        if x.nodes.shape != y.nodes.shape or x.first != y.first or x.step != y.step:
+            raise FormatError(
+                "DX and DY differ in shape or registration",
+                where=f"{self.name}, chip {chip}",
+                do="give both on the same grid",
+            )
+        return x, y
+
+    def _one(self, chip: int, axis: str) -> Plane:
+        found = [p for p in self.planes if p.chip == chip and p.name == axis]
+        if len(found) != 1:
+            raise FormatError(
+                f"there are {len(found)} extensions {axis}",
+                where=f"{self.name}, chip {chip}",
+                do="give exactly one for each chip",
+            )
+        return found[0]
+
+    def values(self, chip: int) -> Float:
+        """Node values of a chip as they stand in the file, shape (2, ny, nx); errors as `pair`."""
+        return np.stack([p.nodes for p in self.pair(chip)])
+
+    def sigma(self, chip: int) -> Float | None:
+        """Standard errors of the node values, shape (2, ny, nx); None where there are none."""
+        found = {p.name: p.nodes for p in self.sigma_planes if p.chip == chip}
+        names = [_SIGMA + a for a in AXES]
+        return np.stack([found[n] for n in names]) if set(names) <= set(found) else None
+
+    def table(
+        self,
+        chip: int,
+        values: Float,
+        sigma: Float | None,
+        *,
+        filter: str = "",
+        first: Sequence[float] | None = None,
+    ) -> LookupTable:
+        """Values on the grid of a chip.
+
+        Parameters
+        ----------
+        chip : int
+        values, sigma : ndarray, shape (2, ny, nx)
+            Pixels, as in `LookupTable`; `sigma` may be None.
+        filter : str
+            As in `LookupTable`.
+        first : sequence of float, optional
+            Pixel (x, y) of the first node, against what the file says.
+
+        Returns
+        -------
+        LookupTable
+
+        Raises
+        ------
+        FormatError
+            As `pair`, and for what `LookupTable` refuses.
+        """
+        x, _ = self.pair(chip)
+        place = x.first if first is None else (float(first[0]), float(first[1]))
+        try:
+            return LookupTable(chip, values, filter, place, x.step, sigma)
+        except InputError as error:
+            raise FormatError(
+                error.cause, where=f"{self.name}, {error.where}", do=error.do
+            ) from error
+
+
+def read_lookup_file(path: str | os.PathLike[str]) -> LookupFile:
+    """Read a D2IMFILE or NPOLFILE as it stands.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    LookupFile
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    FormatError
+        When it is no FITS file, is truncated, or has no tables.
+    """
+    return LookupFile(read_hdus(path), str(path))
+
+
+def write_lookup_file(file: LookupFile, path: str | os.PathLike[str]) -> None:
+    """Write a D2IMFILE or NPOLFILE, whole or not at all; one that was read stays the same bits.
+
+    Parameters
+    ----------
+    file : LookupFile
+    path : path-like
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    write_hdus(file.hdus, path)
+
+
+def check_kind(file: LookupFile, kind: str) -> None:
+    """Refuse a file of the other kind.
+
+    Raises
+    ------
+    FormatError
+    """
+    if file.kind != kind:
+        names = {"d2im": "a D2IMFILE", "npol": "an NPOLFILE"}
+        raise FormatError(
+            f"is {names[file.kind]}, not {names[kind]}",
+            where=file.name,
+            do=f"read it with read_{file.kind}",
+        )

@@ -1,0 +1,96 @@
+"""One image extension of a D2IMFILE or NPOLFILE, and where its nodes lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.errors import FormatError
+from bayesdist.products.formats.common.content import Hdu
+
+__all__ = ["Plane"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """One image extension: the shifts along one axis of one chip, or their sigmas.
+
+    Parameters
+    ----------
+    hdu : Hdu
+    name : str
+        EXTNAME: DX, DY, SIGMA_DX or SIGMA_DY.
+    where : str
+        The extension in words, for errors.
+    """
+
+    hdu: Hdu
+    name: str
+    where: str
+
+    @cached_property
+    def header(self) -> fits.Header:
+        """Header of the extension."""
+        return self.hdu.header
+
+    def number(self, keyword: str, default: float) -> float:
+        """Value of a keyword.
+
+        Raises
+        ------
+        FormatError
+            When it is no number.
+        """
+        value = self.header.get(keyword, default)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise FormatError(
+                f"is {value!r}", where=f"{self.where}, keyword {keyword}", do="give a number"
+            )
+        return value
+
+    @property
+    def chip(self) -> int:
+        """CCDCHIP; 1 without it, as for stwcs."""
+        return int(self.number("CCDCHIP", 1))
+
+    @property
+    def version(self) -> int:
+        """EXTVER; 1 without it, as in the FITS standard."""
+        return int(self.number("EXTVER", 1))
+
+    @property
+    def values(self) -> Float:
+        """All nodes, padding included, shape (ny, nx)."""
+        return self.hdu.image
+
+    @property
+    def nodes(self) -> Float:
+        """The nodes without padding, shape (ny, nx)."""
+        pad = int(self.number("BDPAD", 0))
+        return self.values[..., :-pad] if pad > 0 else self.values
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Keywords of the registration that the header lacks."""
+        names = ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2", "CDELT1", "CDELT2")
+        return tuple(name for name in names if name not in self.header)
+
+    @property
+    def first(self) -> tuple[float, float]:
+        """Pixel (x, y) of the first node, as astropy.wcs has it."""
+        x, y = (
+            self.number(f"CRVAL{a}", 0.0) + (1.0 - self.number(f"CRPIX{a}", 0.0)) * step
+            for a, step in zip((1, 2), self.step, strict=True)
+        )
+        return x, y
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Pixels between nodes along x and y."""
+        return float(self.number("CDELT1", 1.0)), float(self.number("CDELT2", 1.0))

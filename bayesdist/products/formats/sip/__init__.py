@@ -1,0 +1,1 @@
+"""The SIP header: a distortion as FITS keywords."""

@@ -1,0 +1,326 @@
+"""A SIP header from a solution: forward terms with their sigmas, and an inverse that is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from textwrap import wrap
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.chip_map import Monomials
+from bayesdist.calibration.inverse import fit_inverse
+from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.calibration.sky import reprojected
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.transforms import Solution
+from bayesdist.products.formats.common.cards import convergence_cards, number_card, text_card
+from bayesdist.products.formats.common.coefficients import largest_magnitude
+from bayesdist.products.formats.sip.families import offset_ranges
+from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
+
+__all__ = ["build_sip", "sip_from_solution"]
+
+Float = NDArray[np.float64]
+
+# How far from the identity the linear part may be when it is to be a correction of pixels.
+_NEAR_IDENTITY = 0.5
+
+
+def sip_from_solution(
+    solution: Solution,
+    *,
+    chip: int | None = None,
+    epoch: float | None = None,
+    inverse_order: int | None = None,
+    linear: str = "cd",
+    crval: tuple[float, float] | None = None,
+    tangent_point: tuple[float, float] | None = None,
+    scale_arcsec: float | None = None,
+    origin: tuple[float, float] | None = None,
+    notes: Sequence[str] = (),
+) -> SipHeader:
+    """SIP header of one chip at one epoch.
+
+    (u, v) are taken as the axes (xi, eta) of the tangent plane, in the frame of the first exposure.
+    Where the sky position at which that plane touches is known, the header is right on the sky by
+    itself.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    chip : int, optional
+        Chip number; the first chip by default.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    inverse_order : int, optional
+        Order of AP and BP, 2 to 9; by default one above the order of A and B, at most 9.
+    linear : {'cd', 'sip'}
+        'cd': the linear part of the model is the CD matrix, A and B begin at order 2, and CRVAL
+        stands for the reference pixel.  'sip': the CD matrix is a pure scale, and A and B hold
+        constant and linear terms too, relative to u = x and v = y in pixels, as the WISE pipeline
+        has it (WSDC D-T033, Appendix B); CRVAL stands for `origin`.
+    crval : tuple of float, optional
+        Sky position that the header states, degrees.  With `tangent_point` that of the reference
+        pixel by default, and CRPIX is the pixel of any other one that is given; where the solution
+        has no such pixel, A_0_0 and B_0_0 are what they must be.  Without `tangent_point` it is
+        written as it is, (0, 0) by default.
+    tangent_point : tuple of float, optional
+        Sky position of (u, v) = (0, 0), degrees: `MatchTable.tangent_point`.  The polynomial is
+        brought to the plane of CRVAL, to 1e-5 pixels, with a higher order where that takes one.
+    scale_arcsec : float, optional
+        Arcseconds per pixel, for u, v in pixels; without it 1 arcsec is written and called nominal.
+        With ``linear="sip"`` also for angular u, v; without it their mean scale at the reference
+        pixel.
+    origin : tuple of float, optional
+        (u, v) from which ``linear="sip"`` counts, without `tangent_point`.  By default (0, 0)
+        where u, v are offsets from the reference pixel, and the reference pixel where they are
+        positions on the detector: of the two, the one that leaves the smaller constant terms.  The
+        header states it in BDU0, BDV0.
+    notes : sequence of str
+        Sentences for COMMENT.
+
+    Returns
+    -------
+    SipHeader
+
+    Raises
+    ------
+    InputError
+        For an unknown chip or `linear`, a missing epoch, an order that cannot be written, a linear
+        part that is singular ('cd') or far from the identity ('sip'), a distortion without inverse,
+        a tangent point of u, v in pixels, or a `crval` that is no position of the field.
+    """
+    plane = None if tangent_point is None else Plane("sky", point=tangent_point)
+    return build_sip(
+        calibration_of(solution, plane=plane),
+        chip=chip,
+        epoch=epoch,
+        inverse_order=inverse_order,
+        linear=linear,
+        crval=crval,
+        scale_arcsec=scale_arcsec,
+        origin=origin,
+        notes=notes,
+    )
+
+
+def build_sip(
+    calibration: Calibration,
+    *,
+    chip: int | None = None,
+    epoch: float | None = None,
+    inverse_order: int | None = None,
+    linear: str = "cd",
+    crval: tuple[float, float] | None = None,
+    scale_arcsec: float | None = None,
+    origin: tuple[float, float] | None = None,
+    notes: Sequence[str] = (),
+) -> SipHeader:
+    """As `sip_from_solution`, of a calibration: on the sky where its plane is."""
+    if linear not in ("cd", "sip"):
+        raise InputError(
+            f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
+        )
+    if scale_arcsec is not None and not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
+        raise InputError(f"scale is {scale_arcsec} arcsec per pixel", do="give a positive number")
+    model = calibration.model
+    if model.time is not None and epoch is None:
+        raise InputError(
+            "a SIP header holds for one epoch, and the model depends on time",
+            where="products.sip.epoch",
+            do="give an epoch in decimal years",
+        )
+    tangent_point = calibration.plane.point
+    number = calibration.numbers[0] if chip is None else chip
+    one = calibration.chip(number, epoch, origin="stated")
+    poly = one.monomials()
+    _check_linear(poly, number)
+    unit_arcsec = ARCSEC[model.unit] if model.unit != "pix" else (scale_arcsec or 1.0)
+    sky = None
+    if tangent_point is not None:
+        if model.unit == "pix" or origin is not None:
+            raise InputError(
+                "a tangent point is given beside u, v in pixels or an origin of one's own",
+                where="tangent_point",
+                do="leave one of them out",
+            )
+        sky = reprojected(one, unit_arcsec, tangent_point, crval, SIP_ORDERS[0])
+        poly, crval = sky.poly, sky.crval
+    order = max(SIP_ORDERS[0], *(i + j for i, j in poly.terms))  # readers ignore order 1
+    inverse = _inverse_order(inverse_order, order)
+    if linear == "cd":
+        cd = poly.linear * unit_arcsec / 3600.0
+        offset = (float(poly.constant[0]), float(poly.constant[1]))
+        terms, sigma = _relative_to_linear(poly)
+    else:
+        pixel = _units_per_pixel(poly, model.unit, scale_arcsec)
+        cd = np.eye(2) * pixel * unit_arcsec / 3600.0
+        offset = _origin(poly, model.unit) if origin is None else origin
+        terms, sigma = _relative_to_identity(poly, pixel, offset)
+    kept = [k for k, (i, j) in enumerate(poly.terms) if linear == "sip" or i + j >= 2]
+    if sky is not None:
+        offset = sky.offset
+        if linear == "cd" and poly.constant.any():  # no pixel has CRVAL: only A and B can say so
+            kept.insert(0, poly.index(0, 0))
+            notes = (*notes, "No pixel of the solution has CRVAL: A_0_0 and B_0_0 hold the rest.")
+    a, b = ({poly.terms[k]: float(terms[axis, k]) for k in kept} for axis in (0, 1))
+    if not kept:
+        a = b = dict.fromkeys(((2, 0), (1, 1), (0, 2)), 0.0)
+    cards = _cards(
+        number, linear, epoch if model.time is not None else None, model.unit, scale_arcsec
+    )
+    cards += _sky_cards(tangent_point, crval)
+    cards += tuple(text_card("COMMENT", part) for note in notes for part in wrap(note, 70))
+    cards += tuple(convergence_cards(calibration.solution))
+    size = (int(poly.basis.size[0]), int(poly.basis.size[1]))
+    sip = SipHeader(
+        crpix=poly.basis.reference_pixel,
+        crval=(0.0, 0.0) if crval is None else (float(crval[0]), float(crval[1])),
+        cd=cd,
+        ctype=("RA---TAN-SIP", "DEC--TAN-SIP"),
+        order=(order, order),
+        a=a,
+        b=b,
+        sigma_a={poly.terms[k]: float(sigma[0, k]) for k in kept},
+        sigma_b={poly.terms[k]: float(sigma[1, k]) for k in kept},
+        offset=offset,
+        unit=model.unit,
+        size=size,
+        cards=cards,
+    )
+    ranges = offset_ranges(sip, size)
+    ap, bp = fit_inverse(sip.forward, sip.crpix, size, inverse)
+    sip = replace(
+        sip,
+        dmax=(largest_magnitude(a, *ranges), largest_magnitude(b, *ranges)),
+        inverse_order=(inverse, inverse),
+        ap=ap,
+        bp=bp,
+    )
+    return replace(sip, closure=worst_closure(sip, size))
+
+
+def _check_linear(poly: Monomials, chip: int) -> None:
+    linear = poly.linear
+    if abs(np.linalg.det(linear)) <= 1e-12 * np.abs(linear).max() ** 2:
+        raise DegenerateError(
+            f"the linear part of chip {chip} is singular",
+            do="check that the stars cover the detector in x and in y",
+        )
+
+
+def _inverse_order(asked: int | None, order: int) -> int:
+    if asked is None:
+        return min(order + 1, SIP_ORDERS[1])
+    if not SIP_ORDERS[0] <= asked <= SIP_ORDERS[1]:
+        raise InputError(
+            f"inverse order is {asked}",
+            where="products.sip.inverse_order",
+            do=f"choose an order from {SIP_ORDERS[0]} to {SIP_ORDERS[1]}",
+        )
+    return asked
+
+
+def _units_per_pixel(poly: Monomials, unit: str, scale_arcsec: float | None) -> float:
+    """Units of u, v in one pixel, after a check that (u, v) runs along (x, y)."""
+    if unit == "pix":
+        pixel = 1.0
+    elif scale_arcsec is not None:
+        pixel = scale_arcsec / ARCSEC[unit]
+    else:
+        pixel = float(np.sqrt(abs(np.linalg.det(poly.linear))))
+    if np.abs(poly.linear / pixel - np.eye(2)).max() > _NEAR_IDENTITY:
+        raise InputError(
+            "u and v do not run along x and y, so the linear part is no small correction of pixels",
+            where="products.sip.linear",
+            do="choose 'cd'",
+        )
+    return pixel
+
+
+def _relative_to_linear(poly: Monomials) -> tuple[Float, Float]:
+    """A, B = L^-1 C of every term, and their sigmas: dA = L^-1 (dC - dL A)."""
+    terms = np.linalg.solve(poly.linear, poly.values)
+    K = len(poly.terms)
+    inner = np.eye(K)
+    inner[:, 1:3] -= terms.T  # dL is the change of the two linear terms
+    return np.asarray(terms), _sigma(np.kron(np.linalg.inv(poly.linear), inner), poly)
+
+
+def _sigma(by: Float, poly: Monomials) -> Float:
+    """Standard deviations (2, K) behind a linear map of the coefficients."""
+    if poly.cov is None:
+        return np.zeros(poly.values.shape)
+    variance = np.einsum("kl,lm,km->k", by, poly.cov, by, optimize=True)
+    # a variance of -1e-40 is a rounded zero
+    return np.sqrt(np.maximum(variance, 0.0)).reshape(2, -1)
+
+
+def _origin(poly: Monomials, unit: str) -> tuple[float, float]:
+    """(0, 0), or the reference pixel where that is nearer to the model's constant."""
+    reference = poly.basis.reference_pixel
+    from_reference = np.hypot(*(poly.constant - reference))
+    positions = unit == "pix" and from_reference < np.hypot(*poly.constant)
+    return reference if positions else (0.0, 0.0)
+
+
+def _relative_to_identity(
+    poly: Monomials, pixel: float, origin: tuple[float, float]
+) -> tuple[Float, Float]:
+    """The whole model in pixels from the origin, less u = x and v = y, and its sigmas."""
+    terms = poly.values / pixel
+    for axis, power in enumerate(((1, 0), (0, 1))):
+        terms[axis, poly.index(0, 0)] -= origin[axis] / pixel
+        terms[axis, poly.index(*power)] -= 1.0
+    return terms, _sigma(np.eye(2 * len(poly.terms)) / pixel, poly)
+
+
+def _cards(
+    chip: int,
+    linear: str,
+    epoch: float | None,
+    unit: str,
+    scale_arcsec: float | None,
+) -> tuple[str, ...]:
+    """What the fields of a SipHeader do not say."""
+    what = {
+        "cd": "CD holds the linear terms; A and B begin at order 2.",
+        "sip": "CD is a pure scale; A and B hold constant and linear terms.",
+    }[linear]
+    cards = [
+        text_card("COMMENT", f"Distortion of chip {chip}, by bayesdist."),
+        text_card("COMMENT", what),
+        text_card("COMMENT", "A_p_q multiplies u^p v^q; AE_p_q and BE_p_q are 1-sigma errors."),
+    ]
+    if unit == "pix" and scale_arcsec is None:
+        cards.append(text_card("COMMENT", "The scale of CD is nominal: 1 arcsec per pixel."))
+    cards += [
+        number_card("WCSAXES", 2, "number of axes"),
+        text_card("CUNIT1", "deg"),
+        text_card("CUNIT2", "deg"),
+        number_card("BDCHIP", chip, "chip number"),
+    ]
+    if epoch is not None:
+        cards.append(number_card("BDEPOCH", float(epoch), "[yr] epoch of the coefficients"))
+    return tuple(cards)
+
+
+def _sky_cards(
+    tangent_point: tuple[float, float] | None, crval: tuple[float, float] | None
+) -> tuple[str, ...]:
+    """What CRVAL rests on."""
+    if tangent_point is None:
+        if crval is not None:
+            return ()
+        return (
+            text_card("COMMENT", "Where u, v lie on the sky is not known: CRVAL is a placeholder."),
+        )
+    return (
+        text_card("COMMENT", "CRVAL and CRPIX are those of the solution, on the sky of its stars."),
+        number_card("LONPOLE", 180.0, "[deg] north is up also at a pole"),
+        number_card("BDTAN1", float(tangent_point[0]), "[deg] sky position of u, v = 0: RA"),
+        number_card("BDTAN2", float(tangent_point[1]), "[deg] sky position of u, v = 0: Dec"),
+    )

@@ -1,0 +1,99 @@
+"""A SIP header as a calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.calibration.calibration import Calibration, calibration_of_maps
+from bayesdist.calibration.chip_map import fitted_map
+from bayesdist.calibration.plane import Plane
+from bayesdist.errors import InputError
+from bayesdist.model import polynomial_terms
+from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
+
+__all__ = ["MissingSize", "sip_calibration"]
+
+Float = NDArray[np.float64]
+
+
+class MissingSize(InputError):
+    """A header that does not say how large its image is."""
+
+
+def sip_calibration(
+    sip: SipHeader,
+    name: str,
+    *,
+    size: tuple[float, float] | None = None,
+    pixels: bool = False,
+    notes: tuple[str, ...] = (),
+) -> Calibration:
+    """The calibration that a SIP header holds.
+
+    Parameters
+    ----------
+    sip : SipHeader
+    name : str
+        Of the file, for messages.
+    size : tuple of float, optional
+        Columns and rows, for a header that does not say.
+    pixels : bool
+        Whether (u, v) are corrected pixels, for a file that states no CD; else arcseconds.
+    notes : tuple of str
+        What else a reader has to know.
+
+    Returns
+    -------
+    Calibration
+        Of one chip without number; with the sigmas that the header may hold.
+
+    Raises
+    ------
+    MissingSize
+        Without a size.
+    """
+    found = size if sip.size is None else (float(sip.size[0]), float(sip.size[1]))
+    if found is None:
+        raise MissingSize(
+            "does not say how large the image is",
+            where=name,
+            do="add NAXIS1 and NAXIS2 (or IMAGEW and IMAGEH), or compare it with a file that says",
+        )
+    linear = np.eye(2) if pixels else 3600.0 * sip.cd
+
+    def positions(x: Float, y: Float) -> tuple[Float, Float]:
+        if pixels:
+            return sip.forward(x, y)
+        xi, eta = sip.plane(x, y)
+        return 3600.0 * xi, 3600.0 * eta
+
+    one = fitted_map(
+        positions,
+        name,
+        order=max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1,
+        size=found,
+        reference_pixel=sip.crpix,
+        unit="pix" if pixels else "arcsec",
+        monomial_cov=_variances(sip, linear),
+    )
+    return calibration_of_maps(
+        {1: one},
+        name,
+        cov=one.cov,
+        errors="sigma",
+        plane=Plane("detector") if pixels else Plane("sky", point=sip.crval),
+        numbered=False,
+        notes=notes,
+    )
+
+
+def _variances(sip: SipHeader, linear: Float) -> Float | None:
+    """Variances of the header's sigmas, behind a linear map; None where there are none."""
+    if not sip.sigma_a and not sip.sigma_b:
+        return None
+    order = max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1
+    terms = polynomial_terms(order)
+    sigma = [float(s.get(t, 0.0)) for s in (sip.sigma_a, sip.sigma_b) for t in terms]
+    turn = np.kron(linear, np.eye(len(terms)))
+    return (turn * np.array(sigma) ** 2) @ turn.T

@@ -1,0 +1,72 @@
+"""The SIP header as a format."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import (
+    BuildOptions,
+    Built,
+    Choice,
+    Finding,
+    Format,
+    FormatSettings,
+)
+from bayesdist.products.formats.sip.build import build_sip
+from bayesdist.products.formats.sip.calibration import sip_calibration
+from bayesdist.products.formats.sip.lint import lint_sip
+from bayesdist.products.formats.sip.read import holds_sip, sip_of
+from bayesdist.products.formats.sip.write import sip_text
+from bayesdist.products.formats.wcs import describe_wcs
+
+__all__ = ["FORMAT", "Settings"]
+
+
+class Settings(FormatSettings):
+    """A SIP header."""
+
+    inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
+    linear: Literal["cd", "sip"] = "cd"
+    crval: tuple[float, float] | None = None
+
+
+def _parse(content: Content) -> Content | None:
+    return content if holds_sip(content) else None
+
+
+def _lint(content: Content) -> tuple[Finding, ...]:
+    return lint_sip(sip_of(content))
+
+
+def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
+    return sip_calibration(sip_of(content), name, size=choice.size)
+
+
+def _build(
+    calibration: Calibration, settings: Settings, options: BuildOptions
+) -> tuple[Built, ...]:
+    """A header for each chip."""
+    notes = [*calibration.notes, *([calibration.plane.note] if calibration.plane.note else [])]
+    out = []
+    for number in calibration.numbers:
+        sip = build_sip(
+            calibration,
+            chip=number,
+            epoch=options.epoch,
+            scale_arcsec=options.scale_arcsec,
+            notes=notes,
+            **settings.model_dump(),
+        )
+        name = f"sip_{number}.hdr" if len(calibration.numbers) > 1 else "sip.hdr"
+        summary = {"closure_pix": sip.closure, "a_dmax": sip.a_dmax, "b_dmax": sip.b_dmax}
+        out.append(Built(name, "SIP", sip_text(sip).encode("ascii"), sip, number, summary))
+    return tuple(out)
+
+
+FORMAT = Format(
+    "sip", "a SIP header", 1, _parse, describe_wcs, _lint, _calibration, Settings, _build
+)

@@ -1,0 +1,185 @@
+"""The SIP header: a distortion as FITS keywords (Shupe et al. 2005, ASP Conf. 347, 491).
+
+With FITS pixels (x, y):
+
+    u = x - CRPIX1,    v = y - CRPIX2
+    U = u + A(u, v),   V = v + B(u, v),   (xi, eta) = CD (U, V)
+    u = U + AP(U, V),  v = V + BP(U, V)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.errors import InputError
+from bayesdist.products.formats.common.coefficients import evaluate
+
+__all__ = ["SIP_ORDERS", "SipHeader", "worst_closure"]
+
+Float = NDArray[np.float64]
+Terms = Mapping[tuple[int, int], float]
+
+# Programs ignore lower orders, and a keyword has room for one digit.
+SIP_ORDERS = (2, 9)
+
+
+@dataclass(frozen=True, eq=False)
+class SipHeader:
+    """What a header says of the distortion of one image, and every other card of it.
+
+    Mappings go from the powers (p, q) of u and v to the coefficient.
+
+    Parameters
+    ----------
+    crpix : tuple of float
+        Reference pixel, FITS 1-based.
+    crval : tuple of float
+        Its position on the sky, degrees.
+    cd : ndarray, shape (2, 2)
+        CD matrix, degrees per pixel.
+    ctype : tuple of str
+    order : tuple of int
+        A_ORDER and B_ORDER.
+    a, b : mapping
+        Forward coefficients, pixels.
+    inverse_order : tuple of int, optional
+        AP_ORDER and BP_ORDER.
+    ap, bp : mapping
+        Inverse coefficients; empty where the header has none.
+    sigma_a, sigma_b : mapping
+        Standard deviations of `a` and `b`: keywords AE_p_q and BE_p_q.
+    dmax : tuple of float, optional
+        A_DMAX and B_DMAX: largest ``|A|`` and ``|B|`` over the detector, pixels.
+    closure : float, optional
+        Worst distance between a pixel and the inverse of its forward position: keyword BDCLOS,
+        pixels.
+    offset : tuple of float, optional
+        (u, v) of the model that CRVAL stands for: keywords BDU0 and BDV0.
+    unit : str
+        Unit of `offset`: keyword BDUNIT.
+    size : tuple of int, optional
+        Columns and rows of the image (NAXIS1/2, or IMAGEW/H in a header without data).
+    cards : tuple of str
+        All cards as they were read, or those that the fields above do not stand for.
+    """
+
+    crpix: tuple[float, float]
+    crval: tuple[float, float]
+    cd: Float
+    ctype: tuple[str, str]
+    order: tuple[int, int]
+    a: Terms
+    b: Terms
+    inverse_order: tuple[int, int] | None = None
+    ap: Terms = field(default_factory=dict)
+    bp: Terms = field(default_factory=dict)
+    sigma_a: Terms = field(default_factory=dict)
+    sigma_b: Terms = field(default_factory=dict)
+    dmax: tuple[float | None, float | None] = (None, None)
+    closure: float | None = None
+    offset: tuple[float, float] | None = None
+    unit: str = ""
+    size: tuple[int, int] | None = None
+    cards: tuple[str, ...] = ()
+
+    @property
+    def a_dmax(self) -> float | None:
+        """A_DMAX, pixels."""
+        return self.dmax[0]
+
+    @property
+    def b_dmax(self) -> float | None:
+        """B_DMAX, pixels."""
+        return self.dmax[1]
+
+    @property
+    def has_inverse(self) -> bool:
+        """Whether the header holds AP and BP."""
+        return self.inverse_order is not None
+
+    def forward(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
+        """Corrected offsets from CRPIX, as astropy.wcs computes them.
+
+        Terms above the order are left out; constant and linear ones are applied.
+
+        Parameters
+        ----------
+        x, y : array_like
+            FITS 1-based pixels.
+
+        Returns
+        -------
+        U, V : ndarray
+            Pixels.
+        """
+        u = np.asarray(x, float) - self.crpix[0]
+        v = np.asarray(y, float) - self.crpix[1]
+        if min(self.order) < SIP_ORDERS[0]:  # astropy.wcs drops both axes then
+            return u, v
+        return (
+            u + evaluate(self.a, u, v, self.order[0]),
+            v + evaluate(self.b, u, v, self.order[1]),
+        )
+
+    def inverse(self, U: ArrayLike, V: ArrayLike) -> tuple[Float, Float]:
+        """Pixels of corrected offsets, by AP and BP.
+
+        Parameters
+        ----------
+        U, V : array_like
+            Corrected offsets from CRPIX, pixels.
+
+        Returns
+        -------
+        x, y : ndarray
+            FITS 1-based pixels.
+
+        Raises
+        ------
+        InputError
+            When the header has no inverse.
+        """
+        if self.inverse_order is None:
+            raise InputError(
+                "the header has no AP_ORDER and BP_ORDER", do="invert the forward terms instead"
+            )
+        U, V = np.asarray(U, float), np.asarray(V, float)
+        return (
+            U + evaluate(self.ap, U, V, self.inverse_order[0]) + self.crpix[0],
+            V + evaluate(self.bp, U, V, self.inverse_order[1]) + self.crpix[1],
+        )
+
+    def plane(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
+        """Tangent-plane coordinates (xi, eta) of pixels about CRVAL, degrees."""
+        U, V = self.forward(x, y)
+        return self.cd[0, 0] * U + self.cd[0, 1] * V, self.cd[1, 0] * U + self.cd[1, 1] * V
+
+
+def worst_closure(sip: SipHeader, size: tuple[float, float]) -> float:
+    """Largest distance between a pixel and the inverse of its forward position.
+
+    Parameters
+    ----------
+    sip : SipHeader
+        With an inverse.
+    size : tuple of float
+        Columns and rows.
+
+    Returns
+    -------
+    float
+        Pixels, over a grid of 257 x 257 pixels from corner to corner.
+
+    Raises
+    ------
+    InputError
+        When the header has no inverse.
+    """
+    x, y = detector_grid(size)
+    back_x, back_y = sip.inverse(*sip.forward(x, y))
+    return float(np.hypot(back_x - x, back_y - y).max())

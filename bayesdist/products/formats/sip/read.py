@@ -1,0 +1,203 @@
+"""Reading of SIP headers: FITS files, and text files of header cards."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.errors import FormatError, InputError
+from bayesdist.products.formats.common.cards import card_images
+from bayesdist.products.formats.common.coefficients import sip_powers
+from bayesdist.products.formats.common.content import Content, read_content, readable
+from bayesdist.products.formats.sip.header import SipHeader
+
+__all__ = [
+    "CD_KEYWORDS",
+    "LINEAR_KEYWORDS",
+    "cd_matrix",
+    "holds_sip",
+    "image_size",
+    "parsed",
+    "read_sip",
+    "sip_of",
+]
+
+CD_KEYWORDS = ("CD1_1", "CD1_2", "CD2_1", "CD2_2")
+# What stands for a CD matrix in other headers.
+LINEAR_KEYWORDS = (
+    *("PC1_1", "PC1_2", "PC2_1", "PC2_2"),
+    *("CDELT1", "CDELT2", "CROTA1", "CROTA2"),
+)
+
+
+def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> SipHeader:
+    """Read a SIP header.
+
+    Parameters
+    ----------
+    path : path-like
+        A FITS file, or a text file of header cards (one a line, or 80 characters each).
+    ext : int or str, optional
+        HDU of a FITS file; by default the first one with A_ORDER.
+
+    Returns
+    -------
+    SipHeader
+
+    Raises
+    ------
+    FormatError
+        When the file is neither, has no A_ORDER, or a keyword is missing or no number.
+    InputError
+        When the file cannot be read.
+    """
+    return sip_of(read_content(path), ext=ext)
+
+
+def sip_of(content: Content, *, ext: int | str | None = None) -> SipHeader:
+    """As `read_sip`, of what a file holds."""
+    with readable(content.name):
+        header = _chosen(content, ext)
+    return parsed(header, content.name)
+
+
+def holds_sip(content: Content) -> bool:
+    """Whether there is a header with A_ORDER, right or wrong."""
+    return any("A_ORDER" in hdu.header for hdu in content.hdus)
+
+
+# -- from content to a header --------------------------------------------------------------------
+
+
+def _chosen(content: Content, ext: int | str | None) -> fits.Header:
+    """The header of an HDU; by default the first one with A_ORDER."""
+    if not content.hdus:
+        raise FormatError(
+            "is not a header that can be read: there is no A_ORDER",
+            where=content.name,
+            do="give a FITS file or cards of a header",
+        )
+    if ext is None:
+        found = [hdu for hdu in content.hdus if "A_ORDER" in hdu.header]
+        return (found or content.hdus)[0].header
+    if not content.is_fits:
+        raise InputError("is a text file and has no HDUs", where=content.name, do="leave out ext")
+    key = ext.upper() if isinstance(ext, str) else ext
+    for hdu in content.hdus:
+        if key in (hdu.number, hdu.name):
+            return hdu.header
+    raise InputError(
+        f"there is no HDU {ext!r}",
+        where=content.name,
+        do=f"choose one of 0 to {len(content.hdus) - 1}",
+    )
+
+
+# -- from a header to the noun -------------------------------------------------------------------
+
+
+def parsed(header: fits.Header, where: str) -> SipHeader:
+    """The SIP header that cards hold; `where` names them in errors."""
+    with readable(where):
+        return _parsed(header, where)
+
+
+def _parsed(header: fits.Header, where: str) -> SipHeader:
+    if "A_ORDER" not in header:
+        raise FormatError(
+            "there is no A_ORDER", where=where, do="give a header with SIP keywords, or its HDU"
+        )
+    terms: dict[str, dict[tuple[int, int], float]] = {
+        prefix: {} for prefix in ("A", "B", "AP", "BP", "AE", "BE")
+    }
+    for keyword in header:
+        powers = sip_powers(keyword)
+        if powers is not None:
+            terms[powers[0]][powers[1:]] = _number(header, keyword, where)
+    inverse = "AP_ORDER" in header or "BP_ORDER" in header
+    offset = "BDU0" in header
+    return SipHeader(
+        crpix=(_number(header, "CRPIX1", where), _number(header, "CRPIX2", where)),
+        crval=(_number(header, "CRVAL1", where, 0.0), _number(header, "CRVAL2", where, 0.0)),
+        cd=cd_matrix(header, where),
+        ctype=(str(header.get("CTYPE1", "")), str(header.get("CTYPE2", ""))),
+        order=(_order(header, "A_ORDER", where), _order(header, "B_ORDER", where)),
+        a=terms["A"],
+        b=terms["B"],
+        inverse_order=(_order(header, "AP_ORDER", where), _order(header, "BP_ORDER", where))
+        if inverse
+        else None,
+        ap=terms["AP"],
+        bp=terms["BP"],
+        sigma_a=terms["AE"],
+        sigma_b=terms["BE"],
+        dmax=(_optional(header, "A_DMAX", where), _optional(header, "B_DMAX", where)),
+        closure=_optional(header, "BDCLOS", where),
+        offset=(_number(header, "BDU0", where), _number(header, "BDV0", where)) if offset else None,
+        unit=str(header.get("BDUNIT", "")),
+        size=image_size(header),
+        cards=card_images(header),
+    )
+
+
+def _number(header: fits.Header, keyword: str, where: str, default: float | None = None) -> float:
+    value = header.get(keyword, default)
+    if value is None:
+        raise FormatError("is missing", where=f"{where}, keyword {keyword}", do="add the keyword")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise FormatError(
+            f"value {value!r} is no finite number",
+            where=f"{where}, keyword {keyword}",
+            do="correct the value",
+        )
+    return float(value)
+
+
+def _optional(header: fits.Header, keyword: str, where: str) -> float | None:
+    return _number(header, keyword, where) if keyword in header else None
+
+
+def _order(header: fits.Header, keyword: str, where: str) -> int:
+    value = _number(header, keyword, where)
+    if value != int(value) or value < 0:
+        raise FormatError(
+            f"polynomial order is {value:g}",
+            where=f"{where}, keyword {keyword}",
+            do="give a whole number",
+        )
+    return int(value)
+
+
+def cd_matrix(header: fits.Header, where: str) -> NDArray[np.float64]:
+    """CD matrix (2, 2), also of a header with PC and CDELT or CROTA2 (FITS 4.0, section 8.1)."""
+    if any(keyword in header for keyword in CD_KEYWORDS):
+        return np.array([_number(header, k, where, 0.0) for k in CD_KEYWORDS]).reshape(2, 2)
+    scale = np.array([_number(header, k, where, 1.0) for k in ("CDELT1", "CDELT2")])
+    if "CROTA2" in header:
+        angle = np.deg2rad(_number(header, "CROTA2", where))
+        c, s = np.cos(angle), np.sin(angle)
+        return np.array([[scale[0] * c, -scale[1] * s], [scale[0] * s, scale[1] * c]])
+    pc = [
+        _number(header, k, where, d)
+        for k, d in zip(LINEAR_KEYWORDS[:4], (1.0, 0.0, 0.0, 1.0), strict=True)
+    ]
+    return scale[:, None] * np.array(pc).reshape(2, 2)
+
+
+def image_size(header: fits.Header) -> tuple[int, int] | None:
+    """Columns and rows that a header states; a side of one pixel is a placeholder.
+
+    A compressed image is a table, and its size stands in ZNAXIS; HST writes NPIX where all pixels
+    have one value and no data follow.
+    """
+    pairs = [("ZNAXIS1", "ZNAXIS2"), ("IMAGEW", "IMAGEH"), ("NPIX1", "NPIX2")]
+    if "TABLE" not in str(header.get("XTENSION", "")):
+        pairs.insert(0, ("NAXIS1", "NAXIS2"))
+    for names in pairs:
+        n = [header.get(name, 0) for name in names]
+        if all(isinstance(k, int | float) and k > 1 for k in n):
+            return int(n[0]), int(n[1])
+    return None

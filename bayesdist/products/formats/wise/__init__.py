@@ -1,0 +1,1 @@
+"""The distortion entries of WISE meta-data."""

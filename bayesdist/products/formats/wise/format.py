@@ -1,0 +1,111 @@
+"""WISE meta-data as a format."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import Plane
+from bayesdist.errors import InputError
+from bayesdist.products.formats.common.content import Content
+from bayesdist.products.formats.common.document import (
+    BuildOptions,
+    Built,
+    Choice,
+    Finding,
+    Format,
+    FormatSettings,
+)
+from bayesdist.products.formats.sip.build import build_sip
+from bayesdist.products.formats.sip.header import SIP_ORDERS
+from bayesdist.products.formats.wise.build import wise_text
+from bayesdist.products.formats.wise.lint import lint_wise_band
+from bayesdist.products.formats.wise.meta import (
+    ARRAYS,
+    WiseBand,
+    bands_of,
+    holds_wise_meta,
+    wise_calibration,
+)
+from bayesdist.products.formats.wise.text import describe_wise_meta
+
+__all__ = ["FORMAT", "Settings"]
+
+Bands = tuple[WiseBand, ...]
+
+
+class Settings(FormatSettings):
+    """The entries of the band that the detector is named after."""
+
+    def check(
+        self,
+        detector: str,
+        size: tuple[float, float] | None,
+        reference_pixel: tuple[float, float] | None,
+    ) -> None:
+        """Refuse what is not the whole array of a band, its middle the reference pixel."""
+        band = _band(detector)
+        if band is None:
+            raise ValueError(
+                "products.wise_meta is of a run of WISE W1, W2, W3 or W4, and detector.name is "
+                f"{detector!r}; name the band there, or leave wise_meta out"
+            )
+        side, _ = ARRAYS[band]
+        if size != (side, side) or reference_pixel not in (None, ((side + 1) / 2,) * 2):
+            raise ValueError(
+                f"products.wise_meta is of the whole array of W{band}, {side} x {side} pixels "
+                f"about {(side + 1) / 2:g}, {(side + 1) / 2:g}; correct detector.size and "
+                "model.reference_pixel, or leave wise_meta out"
+            )
+
+
+def _band(detector: str) -> int | None:
+    """Number of the band that a detector is named after."""
+    return next((band for band in ARRAYS if detector == f"W{band}"), None)
+
+
+def _parse(content: Content) -> tuple[str, Bands] | None:
+    return (content.name, bands_of(content)) if holds_wise_meta(content) else None
+
+
+def _describe(named: tuple[str, Bands]) -> list[str]:
+    return describe_wise_meta(named[1], named[0])
+
+
+def _lint(named: tuple[str, Bands]) -> list[Finding]:
+    return [finding for band in named[1] for finding in lint_wise_band(band)]
+
+
+def _calibration(named: tuple[str, Bands], name: str, choice: Choice) -> Calibration:
+    return wise_calibration(named[1], name, choice.filter)
+
+
+def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """As WISE has it: all linear terms in A and B, and an inverse of the same order."""
+    band = _band(calibration.detector)
+    if band is None:
+        raise InputError(
+            f"the detector is {calibration.detector!r}, no band of WISE",
+            where="products.wise_meta",
+            do="name the band as detector.name, or leave wise_meta out",
+        )
+    sip = build_sip(
+        replace(calibration, plane=Plane("free")),  # the entries have no place for the sky
+        epoch=options.epoch,
+        inverse_order=max(calibration.model.order, SIP_ORDERS[0]),
+        linear="sip",
+        scale_arcsec=options.scale_arcsec,
+    )
+    name, content = f"w{band}.meta", wise_text({band: sip}).encode("ascii")
+    [written] = bands_of(Content(name, content))  # numbers are those of the digits as written
+    summary = {
+        "closure_pix": written.sip.closure,
+        "a_dmax": written.sip.a_dmax,
+        "b_dmax": written.sip.b_dmax,
+    }
+    return (Built(name, "WISE meta-data", content, sip, None, summary),)
+
+
+FORMAT = Format(
+    "wise_meta", "WISE meta-data", 5, _parse, _describe, _lint, _calibration, Settings, _build
+)

@@ -1,0 +1,212 @@
+"""Reading of the distortion entries of WISE meta-data: WSDC D-T033, Appendix B."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from astropy.io import fits
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.errors import FormatError, InputError
+from bayesdist.products.formats.common.content import Content, read_content
+from bayesdist.products.formats.sip.calibration import sip_calibration
+from bayesdist.products.formats.sip.header import SipHeader
+from bayesdist.products.formats.sip.read import parsed
+
+__all__ = [
+    "ARRAYS",
+    "WiseBand",
+    "bands_of",
+    "holds_wise_meta",
+    "monomial",
+    "read_wise_meta",
+    "wise_calibration",
+]
+
+_ENTRY = re.compile(r"\S*distort_(?:skew|(?:a|b|ap|bp)_)\S*")
+_ENTRY_LINE = re.compile(r"\S*distort_(\S+)\s+(\d+)\s+(\S+)\s+([ir])\s+(\S+)\s*(.*)")
+_KEYWORD = re.compile(r"SKEW|[AB]P?_(?:ORDER|\d_\d)|[AB]_DMAX")
+# What `write_wise_meta` says in comment lines, which other readers pass over.
+_ASIDE = re.compile(r"\\\s+(\d+)\s+([AB]E_\d_\d|BDCLOS)\s+r\s+(\S+).*")
+# Columns and rows of the arrays, and arcseconds in a pixel: those of W4 are twice as wide.
+ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
+
+
+@dataclass(frozen=True, eq=False)
+class WiseBand:
+    """The distortion entries of one band in a WISE meta-data file.
+
+    Parameters
+    ----------
+    band : int
+    sip : SipHeader
+        The reference pixel is the middle of the array.  The file says nothing of the sky: CRVAL is
+        zero, and CD has the nominal scale.
+    skew : float
+        Of the CD matrix, radians.
+    printed : mapping of str to str
+        Numbers as they stand in the file, by keyword.
+    comments : mapping of str to str
+    """
+
+    band: int
+    sip: SipHeader
+    skew: float
+    printed: Mapping[str, str]
+    comments: Mapping[str, str]
+
+
+def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
+    """Read the distortion entries of a WISE meta-data file.
+
+    The layout is that of WSDC D-T033 ("WISE IOC Distortion Calibration"), Appendix B: name, band,
+    keyword, type, value, comment.  Entries of other kinds are passed over, and comment lines but
+    for the standard deviations and the closure that `write_wise_meta` puts there.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    tuple of WiseBand
+        In the order of the bands.
+
+    Raises
+    ------
+    FormatError
+        When there is no such entry, or one is broken, contradicts itself, comes twice or is
+        missing.
+    InputError
+        When the file cannot be read.
+    """
+    return bands_of(read_content(path))
+
+
+def bands_of(content: Content) -> tuple[WiseBand, ...]:
+    """As `read_wise_meta`, of what a file holds."""
+    where, lines = content.name, content.text.splitlines()
+    entries: dict[int, dict[str, tuple[str, str]]] = {}
+    asides: dict[int, dict[str, str]] = {}
+    for number, line in enumerate(lines, start=1):
+        if _ENTRY.match(line):
+            band, keyword, value, comment = _entry(line, f"{where}, line {number}")
+            if keyword in entries.setdefault(band, {}):
+                raise FormatError(
+                    f"{keyword} of band {band} comes a second time",
+                    where=f"{where}, line {number}",
+                    do="remove one",
+                )
+            entries[band][keyword] = value, comment
+        elif aside := _ASIDE.fullmatch(line.rstrip()):
+            asides.setdefault(int(aside[1]), {})[aside[2]] = aside[3]
+    if not entries:
+        raise FormatError(
+            "there are no distortion entries", where=where, do="give a WISE meta-data file"
+        )
+    return tuple(
+        _wise_band(band, entries[band], asides.get(band, {}), where) for band in sorted(entries)
+    )
+
+
+def holds_wise_meta(content: Content) -> bool:
+    """Whether there are distortion entries of WISE meta-data, right or wrong."""
+    return any(_ENTRY.match(line) for line in content.text.splitlines())
+
+
+def _entry(line: str, where: str) -> tuple[int, str, str, str]:
+    """Band, keyword, value as printed and comment of one line."""
+    match = _ENTRY_LINE.fullmatch(line.rstrip())
+    if match is None:
+        raise FormatError(
+            "is not name, band, keyword, type, value, comment", where=where, do="correct the line"
+        )
+    name, band, keyword, _, value, comment = match.groups()
+    if name.upper() != keyword:
+        raise FormatError(
+            f"the name says {name.upper()} and the keyword {keyword}", where=where, do="correct one"
+        )
+    if not _KEYWORD.fullmatch(keyword):
+        raise FormatError(f"{keyword} is no keyword of SIP", where=where, do="correct the keyword")
+    if int(band) not in ARRAYS:
+        raise FormatError(f"band {band} is none of 1 to 4", where=where, do="correct the band")
+    return int(band), keyword, value, " ".join(comment.split())
+
+
+def monomial(p: int, q: int) -> str:
+    """Of u^p v^q, as the comments have it: u2.v, u.v, v3, and v0 for the constant."""
+    if p == 0:
+        return f"v{q}"
+    if q == 0:
+        return f"u{p}"
+    return ".".join(n if k == 1 else f"{n}{k}" for n, k in (("u", p), ("v", q)))
+
+
+def _wise_band(
+    band: int, entries: dict[str, tuple[str, str]], asides: dict[str, str], where: str
+) -> WiseBand:
+    where = f"{where}, band {band}"
+    header = fits.Header()
+    values = {keyword: value for keyword, (value, _) in entries.items()}
+    for keyword, value in (values | asides).items():
+        try:
+            header[keyword] = int(value) if keyword.endswith("_ORDER") else float(value)
+        except ValueError:
+            raise FormatError(
+                f"value {value!r} is no finite number",
+                where=f"{where}, keyword {keyword}",
+                do="correct the value",
+            ) from None
+    side, scale = ARRAYS[band]
+    for axis, ctype in enumerate(("RA---TAN-SIP", "DEC--TAN-SIP"), start=1):
+        header[f"CTYPE{axis}"] = ctype
+        header[f"CRPIX{axis}"] = (side + 1) / 2
+        header[f"CD{axis}_{axis}"] = (-1) ** axis * scale / 3600
+        header[("IMAGEW", "IMAGEH")[axis - 1]] = side
+    return WiseBand(
+        band,
+        parsed(header, where),
+        float(header.get("SKEW", 0.0)),
+        values,
+        {keyword: comment for keyword, (_, comment) in entries.items()},
+    )
+
+
+def wise_calibration(bands: Sequence[WiseBand], name: str, band: str | None = None) -> Calibration:
+    """The calibration of one band: (u, v) in corrected pixels about the middle of the array.
+
+    Parameters
+    ----------
+    bands : sequence of WiseBand
+    name : str
+        Of the file, for messages.
+    band : str, optional
+        As "W2"; needed where the file has several.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        For a band that the file does not have, or that has to be named.
+    """
+    known = {f"W{one.band}": one for one in bands}
+    chosen = (band or "").upper()
+    if band is not None and chosen not in known:
+        raise InputError(
+            f"there is no band {band}", where=name, do=f"choose one of {', '.join(known)}"
+        )
+    if band is None and len(known) > 1:
+        raise InputError(
+            f"holds the bands {', '.join(known)}",
+            where=name,
+            do="name one by --filter, or one for each file as in --filter W1:W2",
+        )
+    one = known[chosen] if band is not None else next(iter(known.values()))
+    notes = ("without the SKEW of its CD matrix",) if one.skew else ()
+    return sip_calibration(one.sip, f"{name}, W{one.band}", pixels=True, notes=notes)

@@ -1,0 +1,166 @@
+"""All formats, and what is done with a file whatever its format.
+
+A format is a module of `bayesdist.products.formats`, or the module `format` of a folder there, that
+has a FORMAT: a new one is found by that alone.
+"""
+
+from __future__ import annotations
+
+import os
+import pkgutil
+from functools import cache
+from importlib import import_module
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.errors import InputError
+from bayesdist.products import formats
+from bayesdist.products.formats.common.content import Content, read_content, readable
+from bayesdist.products.formats.common.document import (
+    BuildOptions,
+    Built,
+    Choice,
+    Document,
+    Finding,
+    Format,
+    FormatSettings,
+)
+
+__all__ = [
+    "all_formats",
+    "build",
+    "describe",
+    "lint",
+    "open_document",
+    "product_settings",
+    "read_calibration",
+    "recognized",
+]
+
+
+@cache
+def all_formats() -> tuple[Format, ...]:
+    """Every format, in the order in which a file is tried against them."""
+    found = []
+    for entry in pkgutil.iter_modules(formats.__path__):
+        if entry.name == "common":
+            continue
+        name = f"{formats.__name__}.{entry.name}" + (".format" if entry.ispkg else "")
+        one = getattr(import_module(name), "FORMAT", None)
+        if one is not None:
+            found.append(one)
+    return tuple(sorted(found, key=lambda one: one.rank))
+
+
+def open_document(path: str | os.PathLike[str]) -> Document:
+    """What a file holds; its format is known by its content.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    Document
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read or is of no format.
+    FormatError
+        When it is of a format and broken.
+    """
+    return recognized(read_content(path))
+
+
+def recognized(content: Content) -> Document:
+    """As `open_document`, of content in memory."""
+    for one in all_formats():
+        with readable(content.name):
+            holds = one.parse(content)
+        if holds is not None:
+            return Document(content.name, one, holds)
+    if content.damage is not None:
+        raise content.damage
+    *others, last = (one.title for one in all_formats())
+    raise InputError(
+        "is of no kind that is understood here",
+        where=content.name,
+        do=f"give {', '.join(others)}, or {last}",
+    )
+
+
+def read_calibration(
+    path: str | os.PathLike[str],
+    *,
+    filter: str | None = None,
+    size: tuple[float, float] | None = None,
+) -> Calibration:
+    """The calibration of a file of any format.
+
+    Parameters
+    ----------
+    path : path-like
+    filter, size
+        As in `Choice`.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        For a file that holds none, a filter or band that it does not have or that has to be named,
+        or a SIP header without a size.
+    """
+    return open_document(path).calibration(Choice(filter, size))
+
+
+def describe(path: str | os.PathLike[str]) -> str:
+    """Readable text of what a file holds, with what is wrong in it; raises as `open_document`."""
+    return open_document(path).describe()
+
+
+def lint(path: str | os.PathLike[str]) -> tuple[Finding, ...]:
+    """What is wrong, or looks wrong, in a file; raises as `open_document`."""
+    return open_document(path).lint()
+
+
+def product_settings() -> dict[str, type[FormatSettings]]:
+    """Settings of the formats that can be built, by key: what [products] may hold."""
+    return {one.key: one.settings for one in all_formats() if one.settings is not None}
+
+
+def build(
+    key: str,
+    calibration: Calibration,
+    settings: FormatSettings,
+    options: BuildOptions = BuildOptions(),  # noqa: B008
+) -> tuple[Built, ...]:
+    """Files of a format, built and not written.
+
+    Parameters
+    ----------
+    key : str
+        Of the format.
+    calibration : Calibration
+    settings : FormatSettings
+        Of that format.
+    options : BuildOptions
+
+    Returns
+    -------
+    tuple of Built
+
+    Raises
+    ------
+    InputError
+        For what the format cannot hold.
+    """
+    for one in all_formats():
+        if one.key == key and one.build is not None:
+            return one.build(calibration, settings, options)
+    raise InputError(
+        f"there is no format {key!r} that can be built",
+        do=f"choose one of {', '.join(product_settings())}",
+    )

@@ -1,0 +1,353 @@
+"""Vectors over panels, and errors as crosses, each drawn to one scale that a key states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from numpy.typing import NDArray
+from scipy.stats import f as f_distribution
+
+from bayesdist.report.numbers import size_of
+from bayesdist.report.panels import Panels
+from bayesdist.report.style import CYCLE, INK, PALE, PALETTE, figure_style, nice_below
+
+if TYPE_CHECKING:
+    from bayesdist.assess import BinnedResiduals, UncertaintyMap, VectorMap
+
+__all__ = [
+    "CHANCE",
+    "Arrows",
+    "cross_map",
+    "magnification_of",
+    "significant_cells",
+    "spacing",
+    "square_cells",
+    "vector_map",
+]
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+CHANCE = 0.0455  # how often noise alone puts one axis beyond 2 sigma
+
+# -- grids ----------------------------------------------------------------------------------------
+
+
+def spacing(x: Float, y: Float) -> float:
+    """Smaller distance between neighbouring points of a grid, in pixels."""
+    steps = [np.diff(np.unique(a)) for a in (x, y)]
+    return float(min((s.min() for s in steps if s.size), default=1.0))
+
+
+def square_cells(x: Float, y: Float, every: int = 1) -> tuple[slice, slice]:
+    """Rows and columns of a grid whose points stand about as far apart on both axes.
+
+    Only steps that keep both ends are taken: the corners are where distortions are largest.
+
+    Parameters
+    ----------
+    x : ndarray, shape (nx,)
+    y : ndarray, shape (ny,)
+    every : int
+        Only every so manieth of these, for small panels.
+
+    Returns
+    -------
+    rows, columns : slice
+    """
+    steps = [(a[-1] - a[0]) / (len(a) - 1) for a in (y, x)]
+    out = []
+    for a, step in zip((y, x), steps, strict=True):
+        stride = round(max(steps) / step)
+        fitting = [s for s in (stride * every, stride, 1) if (len(a) - 1) % s == 0]
+        out.append(slice(None, None, fitting[0]))
+    return out[0], out[1]
+
+
+def significant_cells(binned: BinnedResiduals) -> Bool:
+    """Cells whose mean lies so far from zero as noise puts it with probability `CHANCE`.
+
+    Parameters
+    ----------
+    binned : BinnedResiduals
+
+    Returns
+    -------
+    ndarray of bool
+        False where a standard error is unknown or zero.
+    """
+    # the errors are those of as few stars as the cell has: the tails are nearly Fisher's
+    beyond = 2.0 * f_distribution.isf(CHANCE, 2, np.maximum(binned.count - 1, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z2 = (binned.mean_u / binned.sem_u) ** 2 + (binned.mean_v / binned.sem_v) ** 2
+    return np.isfinite(z2) & (z2 > beyond)
+
+
+# -- vectors --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Arrows:
+    """Vectors of one chip as they are drawn.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (N,)
+        Tails, in pixels.
+    du, dv : ndarray, shape (N,)
+        Vectors, in the unit of the map.
+    step : float
+        Between neighbouring vectors, in pixels.
+    clear : ndarray of bool, shape (N,), or None
+        Vectors that noise alone hardly makes; the others are pale, and all have a dot at their
+        tail.  None where noise is no question.
+    ring : tuple of float, or None
+        Position that is ringed: that of the largest vector.
+    """
+
+    x: Float
+    y: Float
+    du: Float
+    dv: Float
+    step: float
+    clear: Bool | None = None
+    ring: tuple[float, float] | None = None
+
+    @classmethod
+    def of_grid(
+        cls, x: Float, y: Float, du: Float, dv: Float, *, every: int = 1, clear: Bool | None = None
+    ) -> Arrows:
+        """Vectors (ny, nx) of a grid that stand far enough apart, the largest of all ringed."""
+        rows, columns = square_cells(x, y, every)
+        gx, gy = np.meshgrid(x[columns], y[rows])
+        iy, ix = np.unravel_index(int(np.hypot(du, dv).argmax()), du.shape)
+        return cls(
+            gx.ravel(),
+            gy.ravel(),
+            du[rows, columns].ravel(),
+            dv[rows, columns].ravel(),
+            spacing(x[columns], y[rows]),
+            None if clear is None else clear[rows, columns].ravel(),
+            (float(x[ix]), float(y[iy])),
+        )
+
+    @classmethod
+    def of_map(cls, vectors: VectorMap, every: int = 1) -> Arrows:
+        """A map of the distortion, along the axes of the detector in its pixels."""
+        return cls.of_grid(vectors.x, vectors.y, *vectors.on_detector, every=every)
+
+    @classmethod
+    def of_cells(cls, binned: BinnedResiduals, min_count: int = 1) -> Arrows:
+        """Mean residuals of the cells with so many stars; empty cells stay empty."""
+        full = np.isfinite(binned.mean_u) & np.isfinite(binned.mean_v)
+        full &= np.asarray(binned.count) >= min_count
+        gx, gy = np.meshgrid(binned.x, binned.y)
+        vectors = binned.mean_u[full], binned.mean_v[full]
+        clear = significant_cells(binned)[full]
+        return cls(gx[full], gy[full], *vectors, spacing(binned.x, binned.y), clear)
+
+    @property
+    def length(self) -> Float:
+        """Lengths of the vectors that are drawn."""
+        return np.hypot(self.du, self.dv)
+
+    @property
+    def n_clear(self) -> int:
+        """Number of vectors that noise alone hardly makes."""
+        return self.x.size if self.clear is None else int(self.clear.sum())
+
+    def reach(self, magnification: float, size: tuple[float, float]) -> float:
+        """How far the vectors stand out beyond a chip of that size, in pixels."""
+        over = [
+            np.abs(a + magnification * d - (n + 1) / 2).max() - n / 2
+            for a, d, n in ((self.x, self.du, size[0]), (self.y, self.dv, size[1]))
+        ]
+        return float(max(*over, 0.0))
+
+
+def magnification_of(step: float, length: float) -> float:
+    """Round factor that draws a length about a step long; 1 for one that is only rounding."""
+    return nice_below(step / length) if length > 1e-10 * step else 1.0
+
+
+def vector_map(
+    panels: Panels,
+    chips: Sequence[Arrows | None],
+    titles: Sequence[str],
+    *,
+    magnification: float,
+    key: float | Sequence[float],
+    unit: str = "pix",
+    pad: float = 9.0,
+    fine: bool = False,
+) -> None:
+    """Draw vectors of each chip, all to one scale that a key states.
+
+    Parameters
+    ----------
+    panels : Panels
+        Framed: their limits are final.
+    chips : sequence of Arrows or None
+        None for a chip that has no vectors.
+    titles : sequence of str
+        Of each panel.
+    magnification : float
+        Pixels of the axes for one unit of the vectors.
+    key : float or sequence of float
+        Length that the arrow above each panel stands for, in `unit`.
+    unit : str
+        Of the vectors.
+    pad : float
+        Of the titles, in points: 17 and more put them above the key.
+    fine : bool
+        Whether arrows are finely drawn, for small panels.
+    """
+    keys: dict[Axes, float] = {}
+    with figure_style():
+        for k, (arrows, one) in enumerate(
+            zip(chips, np.broadcast_to(np.asarray(key, float), len(chips)), strict=True)
+        ):
+            if arrows is None:
+                continue
+            ax = panels.axes[k][0]
+            _draw(ax, arrows, panels.offset(k), magnification, fine=fine)
+            keys.setdefault(ax, float(one))
+        for ax, title in zip(panels.all_axes, titles, strict=True):
+            ax.set_title(title, pad=pad)
+        for ax, length in keys.items():
+            _key(ax, length, magnification=magnification, unit=unit)
+
+
+def _draw(
+    ax: Axes, arrows: Arrows, offset: tuple[float, float], magnification: float, *, fine: bool
+) -> None:
+    x, y = arrows.x + offset[0], arrows.y + offset[1]
+    if arrows.clear is None:
+        _arrows(ax, x, y, arrows.du, arrows.dv, magnification, INK, fine=fine)
+    else:
+        for some, color in ((~arrows.clear, PALE), (arrows.clear, INK)):
+            vectors = arrows.du[some], arrows.dv[some]
+            _arrows(ax, x[some], y[some], *vectors, magnification, color, fine=fine)
+        ax.plot(x, y, ".", ms=1.2, color=PALE, zorder=2)
+    if arrows.ring is not None:
+        at = np.add(arrows.ring, offset)
+        ring = {"ms": 5, "mfc": "none", "mec": PALETTE["vermilion"], "mew": 1.3, "zorder": 5}
+        ax.plot(*at, "o", **ring)
+
+
+def _arrows(
+    ax: Axes,
+    x: Float,
+    y: Float,
+    du: Float,
+    dv: Float,
+    magnification: float,
+    color: str,
+    *,
+    fine: bool,
+) -> None:
+    """Arrows from (x, y) to (x + M du, y + M dv), in the axes' own pixels."""
+    head = (3.2, 4.0, 3.6) if fine else (4.0, 5.0, 4.5)
+    ax.quiver(
+        x,
+        y,
+        du,
+        dv,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0 / magnification,
+        units="inches",
+        width=0.007 if fine else 0.011,
+        headwidth=head[0],
+        headlength=head[1],
+        headaxislength=head[2],
+        minlength=0.3,
+        color=color,
+        zorder=3,
+    )
+
+
+def _key(ax: Axes, length: float, *, magnification: float, unit: str) -> None:
+    """Arrow of a stated length above the axes' right end; their limits must be final."""
+    end = ax.get_xlim()[1]
+    drawn = length * magnification
+    start = end - drawn
+    transform = ax.get_xaxis_transform()
+    times = f"×{magnification:,.6g}".replace(",", "\u202f")
+    how = times if unit == "pix" else f"as {drawn:.3g} pix"
+    ax.annotate(
+        "",
+        xy=(end, 1.035),
+        xytext=(start, 1.035),
+        xycoords=transform,
+        textcoords=transform,
+        arrowprops={
+            "arrowstyle": "-|>,head_width=0.18,head_length=0.35",
+            "shrinkA": 0,
+            "shrinkB": 0,
+            "lw": 1.0,
+            "color": INK,
+            "mutation_scale": 9,
+        },
+        annotation_clip=False,
+    )
+    text = f"{size_of(length, unit)}, drawn {how} "
+    ax.text(start, 1.035, text, transform=transform, ha="right", va="center", fontsize=7.5)
+
+
+# -- crosses --------------------------------------------------------------------------------------
+
+
+def cross_map(
+    panels: Panels,
+    maps: Sequence[UncertaintyMap],
+    titles: Sequence[str],
+    *,
+    magnification: float | Sequence[float],
+    key: float | Sequence[float],
+    every: int = 1,
+) -> None:
+    """Draw errors as four vectors from each point, to all combinations of (±sigma_u, ±sigma_v).
+
+    Parameters
+    ----------
+    panels : Panels
+        Framed: their limits are final.
+    maps : sequence of UncertaintyMap
+        Those of the first chip, then those of the next.
+    titles : sequence of str
+        Of each panel.
+    magnification : float or sequence of float
+        Pixels of the axes for one unit of the errors.
+    key : float or sequence of float
+        Length that the arrow above each panel stands for.
+    every : int
+        As in `square_cells`.
+    """
+    places = [(column, ax) for several in panels.axes for column, ax in enumerate(several)]
+    scales, keys = (np.broadcast_to(np.asarray(a, float), len(maps)) for a in (magnification, key))
+    with figure_style():
+        for (column, ax), one, title, M, length in zip(
+            places, maps, titles, scales, keys, strict=True
+        ):
+            segments = _crosses(one, float(M), every)
+            ax.add_collection(LineCollection(segments, colors=CYCLE[column], linewidths=0.8))
+            ax.set_title(title, pad=20)
+            # one key serves all panels, but a panel that is cut out must state its scale too
+            _key(ax, float(length), magnification=float(M), unit=one.unit)
+
+
+def _crosses(m: UncertaintyMap, magnification: float, every: int) -> Float:
+    """Ends (4 N, 2, 2) of the four segments from each point."""
+    rows, columns = square_cells(m.x, m.y, every)
+    gx, gy = np.meshgrid(m.x[columns], m.y[rows])
+    start = np.stack([gx.ravel(), gy.ravel()], axis=-1)
+    sigma = [s[rows, columns].ravel() for s in (m.sigma_u, m.sigma_v)]
+    half = magnification * np.stack(sigma, axis=-1)
+    ends = [start + half * np.array(s) for s in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+    return np.concatenate([np.stack([start, end], axis=1) for end in ends])

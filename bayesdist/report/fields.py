@@ -1,0 +1,172 @@
+"""Values over panels: contours or cells, with one colour scale or one for each map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, Normalize
+from matplotlib.contour import QuadContourSet
+from matplotlib.image import AxesImage
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from bayesdist.report.panels import Panels
+from bayesdist.report.style import INK, SEQUENTIAL, figure_style
+
+__all__ = ["Grid", "contour_levels", "scalar_map"]
+
+Float = NDArray[np.float64]
+
+EMPTY = "#D9DEE3"  # of a cell without a value
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Values on a grid of one chip.
+
+    Parameters
+    ----------
+    x : ndarray, shape (nx,)
+    y : ndarray, shape (ny,)
+        Points, or centres of cells, in pixels.
+    values : ndarray, shape (ny, nx)
+        In the unit that is shown.
+    ring : tuple of float, or None
+        Position that is ringed.
+    """
+
+    x: Float
+    y: Float
+    values: Float
+    ring: tuple[float, float] | None = None
+
+
+def contour_levels(values: ArrayLike, n: int = 10) -> Float:
+    """Round levels that span some values, at least two."""
+    low, high = float(np.min(values)), float(np.max(values))
+    if not high > low:
+        pad = max(abs(low), 1e-12) * 0.05
+        low, high = low - pad, high + pad
+    locator = MaxNLocator(n, steps=[1, 2, 2.5, 5, 10])
+    return np.asarray(locator.tick_values(low, high), float)
+
+
+def scalar_map(
+    panels: Panels,
+    grids: Sequence[Grid | None],
+    titles: Sequence[str],
+    *,
+    label: str = "",
+    levels: Float | None = None,
+    norm: Normalize | Sequence[Normalize] | None = None,
+    cmap: str | Colormap = SEQUENTIAL,
+    labelled: bool = False,
+) -> None:
+    """Draw values of each map of each chip, smooth between levels or cell by cell.
+
+    Parameters
+    ----------
+    panels : Panels
+        Framed.
+    grids : sequence of Grid or None
+        Maps of the first chip, then those of the next; None where there are no values.
+    titles : sequence of str
+        Of each panel.
+    label : str
+        Of the colour bar, with the unit; without a label there is none.
+    levels : ndarray, optional
+        Contours are drawn at these; cells where it is not given.
+    norm : matplotlib.colors.Normalize, or a sequence of it, optional
+        Colours of the cells: one scale for all maps, or one and a colour bar for each.
+    cmap : str or matplotlib.colors.Colormap
+    labelled : bool
+        Whether contours carry their values.
+    """
+    drawn: dict[Axes, QuadContourSet | AxesImage] = {}
+    places = [(k, ax) for k, maps in enumerate(panels.axes) for ax in maps]
+    single = norm is None or isinstance(norm, Normalize)
+    norms: Sequence[Normalize | None] = (
+        [norm] * len(places) if norm is None or isinstance(norm, Normalize) else norm
+    )
+    with figure_style():
+        for (k, ax), grid, one in zip(places, grids, norms, strict=True):
+            if grid is None:
+                continue
+            px, py = panels.offset(k)
+            if levels is not None:
+                drawn[ax] = _contours(ax, grid, (px, py), levels, labelled=labelled)
+            else:
+                drawn[ax] = _cells(ax, grid, (px, py), one, cmap)
+            if grid.ring is not None:
+                at = np.add(grid.ring, (px, py))
+                for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
+                    ring = {"ms": 5, "mfc": "none", "clip_on": False, "zorder": order}
+                    ax.plot(*at, "o", mec=color, mew=width, **ring)
+        for ax, title in zip(panels.all_axes, titles, strict=True):
+            ax.set_title(title)
+        if not label or not drawn:
+            return
+        look = {"label": label, "fraction": 0.05, "pad": 0.02}
+        if levels is not None or single:
+            last = list(drawn.values())[-1]
+            beyond = {} if levels is not None else {"extend": _extend(grids, last.norm)}
+            panels.figure.colorbar(last, ax=panels.all_axes, **look, **beyond)
+        else:
+            for ax, image in drawn.items():
+                extend = _extend([grids[panels.all_axes.index(ax)]], image.norm)
+                panels.figure.colorbar(image, ax=ax, **look, extend=extend)
+
+
+def _contours(
+    ax: Axes, grid: Grid, offset: tuple[float, float], levels: Float, *, labelled: bool
+) -> QuadContourSet:
+    """Filled contours with lines between them, by a spline: what is drawn is a polynomial's."""
+    x, y, values = grid.x, grid.y, grid.values
+    spline = RectBivariateSpline(y, x, values, kx=min(3, len(y) - 1), ky=min(3, len(x) - 1))
+    fine_x, fine_y = (np.linspace(a[0], a[-1], 4 * len(a)) for a in (x, y))
+    # the spline may overshoot a little, and what is above the last level would stay white
+    fine = np.clip(spline(fine_y, fine_x), values.min(), values.max())
+    at = fine_x + offset[0], fine_y + offset[1]
+    filled = ax.contourf(*at, fine, levels, cmap=SEQUENTIAL)
+    crossed = [v for v in levels if fine.min() < v < fine.max()]
+    if crossed:
+        lines = ax.contour(*at, fine, crossed, colors="white", linewidths=0.6)
+        if labelled:
+            ax.clabel(lines, fontsize=7, fmt=lambda v: f"{v:.4g}".replace("-", "−"))
+    return filled
+
+
+def _cells(
+    ax: Axes, grid: Grid, offset: tuple[float, float], norm: Normalize | None, cmap: str | Colormap
+) -> AxesImage:
+    """Cells of one colour each."""
+    limits = ax.get_xlim(), ax.get_ylim()
+    if not np.isfinite(grid.values).all():
+        ax.set_facecolor(EMPTY)
+    edges = []
+    for a, shift in zip((grid.x, grid.y), offset, strict=True):
+        half = 0.5 * (a[-1] - a[0]) / max(len(a) - 1, 1)
+        edges += [a[0] - half + shift, a[-1] + half + shift]
+    image = ax.imshow(
+        grid.values,
+        origin="lower",
+        extent=tuple(edges),
+        cmap=cmap,
+        norm=norm,
+        aspect="equal",
+        interpolation="nearest",
+    )
+    ax.set(xlim=limits[0], ylim=limits[1])  # the image has set its own
+    return image
+
+
+def _extend(grids: Sequence[Grid | None], norm: Normalize) -> str:
+    """On which sides of the colour bar values lie beyond it."""
+    assert norm.vmin is not None and norm.vmax is not None
+    values = np.concatenate([g.values[np.isfinite(g.values)] for g in grids if g is not None])
+    below, above = (values < norm.vmin).any(), (values > norm.vmax).any()
+    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max"}.get((int(below), int(above)), "both")

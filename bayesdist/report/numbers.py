@@ -1,0 +1,263 @@
+"""Numbers and lengths as a reader wants them: digits they deserve, readable units, never 'NaN'."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+__all__ = [
+    "MISSING",
+    "Scale",
+    "broken_name",
+    "count",
+    "display_scale",
+    "interval",
+    "ladder",
+    "number",
+    "percent",
+    "probability",
+    "rounded",
+    "size_of",
+    "with_mas",
+]
+
+MISSING = "–"
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_MINUS = str.maketrans("-", "−")
+_LEAST_P = 1e-300  # tails of distributions underflow not far below
+_MAX_DECIMALS = 10  # beyond this a fixed-point number is harder to read than a power of ten
+
+
+def _finite(value: Any) -> float | None:
+    """The value as a float, or None for what is missing, masked, text or not finite."""
+    if value is np.ma.masked:  # converts to NaN, with a warning
+        return None
+    try:
+        x = float(value)
+    except (TypeError, ValueError):
+        return None
+    return x if math.isfinite(x) else None
+
+
+def _infinite(value: Any) -> str:
+    """What stands for a value that is no finite number: a diagnostic may well be infinite."""
+    if value is np.ma.masked:
+        return MISSING
+    try:
+        return {math.inf: "∞", -math.inf: "−∞"}.get(float(value), MISSING)
+    except (TypeError, ValueError):
+        return MISSING
+
+
+def _power_of_ten(x: float, decimals: int, exponent: int) -> str:
+    # decimal, as 10.0**exponent would underflow for the smallest doubles
+    mantissa = f"{Decimal(x).scaleb(-exponent):.{decimals}f}".translate(_MINUS)
+    return f"{mantissa}\u202f×\u202f10{str(exponent).translate(_SUPERSCRIPTS)}"
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A number to some significant digits; powers of ten where it is very small or large.
+
+    Parameters
+    ----------
+    value : float or anything
+    digits : int
+
+    Returns
+    -------
+    str
+        `MISSING` for what is no number.
+    """
+    x = _finite(value)
+    if x is None:
+        return _infinite(value)
+    if x == 0:
+        return "0"
+    exponent = int(f"{x:.{digits - 1}e}".split("e")[1])  # after rounding: 9.99 may become 10
+    if -4 <= exponent < max(digits, 6):
+        return f"{x:.{max(0, digits - 1 - exponent)}f}".translate(_MINUS)
+    return _power_of_ten(x, digits - 1, exponent)
+
+
+def rounded(value: Any, sigma: Any) -> str:
+    """A number to the second significant digit of its standard deviation.
+
+    Parameters
+    ----------
+    value, sigma : float or anything
+
+    Returns
+    -------
+    str
+        `MISSING` for what is not a finite number; five digits where sigma is none or zero.
+    """
+    x, s = _finite(value), _finite(sigma)
+    if x is None:
+        return MISSING
+    if s is None or s <= 0:
+        return number(x, 5)
+    last = int(f"{s:.1e}".split("e")[1]) - 1
+    exponent = int(f"{max(abs(x), s):.6e}".split("e")[1])
+    if -4 <= exponent < 7 and -last <= _MAX_DECIMALS:
+        text = f"{round(x, -last):.{max(0, -last)}f}"
+        return (text[1:] if float(text) == 0 and text[0] == "-" else text).translate(_MINUS)
+    return _power_of_ten(x, max(0, exponent - last), exponent)
+
+
+def interval(low: Any, high: Any, sigma: Any) -> str:
+    """An interval, each end to the second digit of a standard deviation."""
+    if _finite(low) is None or _finite(high) is None:
+        return MISSING
+    return f"{rounded(low, sigma)} to {rounded(high, sigma)}"
+
+
+def count(value: Any) -> str:
+    """A whole number with its digits in groups of three."""
+    x = _finite(value)
+    return MISSING if x is None else f"{round(x):,}".replace(",", "\u202f").translate(_MINUS)
+
+
+def percent(value: Any, digits: int = 3) -> str:
+    """A fraction in percent."""
+    x = _finite(value)
+    return MISSING if x is None else f"{number(100 * x, digits)}\u202f%"
+
+
+def probability(p: Any) -> str:
+    """A probability of chance with its sign; below what a double tells from zero, a bound."""
+    x = _finite(p)
+    if x is not None and 0 <= x < _LEAST_P:
+        return f"p < 10{str(round(math.log10(_LEAST_P))).translate(_SUPERSCRIPTS)}"
+    return f"p = {number(p, 2)}"
+
+
+def broken_name(name: str, width: int = 10) -> str:
+    """A long name of a parameter on several lines, broken after its points."""
+    lines = [""]
+    for part in name.replace(".", ".\0").split("\0"):
+        if lines[-1] and len(lines[-1]) + len(part) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)
+
+
+# -- lengths and their units ----------------------------------------------------------------------
+
+# (factor, name) from the largest unit down
+_LADDERS: dict[str, tuple[tuple[float, str], ...]] = {
+    "pix": ((1.0, "pix"), (1e3, "10⁻³ pix"), (1e6, "10⁻⁶ pix")),
+    "deg": ((1.0, "deg"), (3.6e3, "arcsec"), (3.6e6, "mas"), (3.6e9, "µas")),
+    "arcsec": ((1.0, "arcsec"), (1e3, "mas"), (1e6, "µas")),
+    "mas": ((1e-3, "arcsec"), (1.0, "mas"), (1e3, "µas")),
+}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A unit for display.
+
+    Parameters
+    ----------
+    factor : float
+        What a number in the native unit is multiplied by.
+    unit : str
+        Name of the unit after that, for a label.
+    """
+
+    factor: float
+    unit: str
+
+    def text(self, value: float, digits: int = 3) -> str:
+        """A number in the native unit as text in this one."""
+        times = "\u202f×\u202f" if self.unit.startswith("10") else "\u202f"
+        return f"{value * self.factor:.{digits}g}{times}{self.unit}".replace("-", "−")
+
+
+def display_scale(unit: str, values: ArrayLike) -> Scale:
+    """Unit in which the largest of some values needs few zeros.
+
+    Parameters
+    ----------
+    unit : str
+        Native unit, or one per year ("pix/yr"); one that is not known is kept as it is.
+    values : array_like
+        In the native unit; what is not finite does not count.
+
+    Returns
+    -------
+    Scale
+    """
+    base, _, rate = unit.partition("/")
+    steps = ladder(base)
+    if rate:
+        steps = tuple((factor, f"{name}/{rate}") for factor, name in steps)
+    size = np.abs(np.asarray(values, float))
+    size = size[np.isfinite(size)]
+    largest = float(size.max()) if size.size else 0.0
+    if largest == 0.0:
+        return Scale(*next(step for step in steps if step[0] == 1.0))
+    # pixels have no name for a thousandth, so that 0.0266 pix reads better than 26.6 × 10⁻³ pix
+    readable = 0.000999 if base == "pix" else 0.0999
+    for factor, name in steps:
+        if largest * factor >= readable:
+            return Scale(factor, name)
+    return Scale(*steps[-1])
+
+
+def ladder(unit: str) -> tuple[tuple[float, str], ...]:
+    """Units in which lengths of a native unit are shown: (factor, name), the largest first."""
+    return _LADDERS.get(unit, ((1.0, unit),))
+
+
+def with_mas(value: float, unit: str, scale_mas: float | None, digits: int = 3) -> str:
+    """A length with its unit, and in mas beside it where the size of a pixel is known.
+
+    Parameters
+    ----------
+    value : float
+        In `unit`.
+    unit : str
+    scale_mas : float or None
+        Size of a pixel in mas.
+    digits : int
+        Significant digits.
+
+    Returns
+    -------
+    str
+        As in ``"0.00930 pix (25.6 mas)"``; a dash where the value is not finite.
+    """
+    if not np.isfinite(value):
+        return MISSING
+    if unit != "pix":
+        angle = display_scale(unit, value)
+        return f"{number(value * angle.factor, digits)}\u202f{angle.unit}"
+    text = f"{number(value, digits)}\u202fpix"
+    return (
+        text
+        if scale_mas is None
+        else f"{text} ({with_mas(value * scale_mas, 'mas', None, digits)})"
+    )
+
+
+def size_of(value: float, unit: str = "pix", digits: int = 3) -> str:
+    """A length in the unit that needs few zeros.
+
+    Parameters
+    ----------
+    value : float
+        In `unit`.
+    unit : str
+    digits : int
+        Significant digits.
+
+    Returns
+    -------
+    str
+    """
+    return display_scale(unit, value).text(value, digits)

@@ -1,0 +1,232 @@
+"""Where chips stand in a figure: each in a panel of its own, or all together as one array."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from bayesdist.report.mosaic import Mosaic
+from bayesdist.report.style import OUTLINE, WIDTH, figure_style, new_figure
+
+__all__ = ["ArrayPanels", "ChipPanels", "OneArray", "Panels", "chip_axes"]
+
+Size = tuple[float, float]
+
+TALLEST_PANEL = 8.0  # inches
+WIDE = 0.7  # rows over columns below which a chip is wide: its maps stand above each other
+
+
+class Panels:
+    """Axes of a figure by chip and by map of that chip.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    axes : list of list of matplotlib.axes.Axes
+        For each chip those of its maps.
+    names : sequence of str
+        What titles begin with; empty where there is one chip.
+    """
+
+    def __init__(self, figure: Figure, axes: list[list[Axes]], names: Sequence[str]) -> None:
+        self.figure, self.axes, self.names = figure, axes, tuple(names)
+
+    @property
+    def all_axes(self) -> list[Axes]:
+        """Axes of all maps, each once."""
+        return list(dict.fromkeys(ax for maps in self.axes for ax in maps))
+
+    def offset(self, chip: int) -> tuple[float, float]:
+        """What is added to pixels of a chip, counted from 0, in its axes."""
+        return 0.0, 0.0
+
+    def title(self, chip: int, text: str, joined: str = ": ") -> str:
+        """A panel's title, which names the chip where there are several."""
+        return f"{self.names[chip]}{joined}{text}" if self.names[chip] else text
+
+
+class ChipPanels(Panels):
+    """One panel for each map of each chip, placed as the chips lie, all at one scale.
+
+    Parameters
+    ----------
+    mosaic : Mosaic
+    maps : int
+        Maps of the same chip: one or two.
+    colorbar : bool
+        Whether room for one shared colour bar is needed.
+    """
+
+    def __init__(self, mosaic: Mosaic, maps: int = 1, *, colorbar: bool = False) -> None:
+        self.mosaic = mosaic
+        columns = 1 + max(place[1] for place in mosaic.legible_places)
+        rows = 1 + max(place[0] for place in mosaic.legible_places)
+        aspect = mosaic.largest[1] / mosaic.largest[0]
+        # maps of a chip stand beside each other; of a wide detector, or chip, above each other
+        beside = columns == 1 if mosaic.several else aspect >= WIDE
+        down, across = (rows, maps) if beside else (maps * rows, columns)
+        width = WIDTH if across > 1 or aspect < WIDE else 0.66 * WIDTH
+        margin = 0.75 + 0.55 * (across - 1) + (0.8 if colorbar else 0.0)
+        height = down * (min((width - margin) / across * aspect, TALLEST_PANEL) + 0.8)
+        with figure_style():
+            figure = new_figure(width, height, layout="compressed")
+            grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+        axes = [
+            [grid[row, k] if beside else grid[k * rows + row, column] for k in range(maps)]
+            for row, column in mosaic.legible_places
+        ]
+        super().__init__(figure, axes, mosaic.names if mosaic.several else ("",))
+        for ax in set(grid.ravel()) - set(self.all_axes):
+            ax.remove()
+
+    def frame(self, margin: float = 0.0) -> None:
+        """Make all panels maps of their chips, with so many pixels beyond the outline."""
+        largest = self.mosaic.largest
+        for size, maps in zip(self.mosaic.sizes, self.axes, strict=True):
+            for ax in maps:
+                chip_axes(ax, largest, margin=margin)
+                if self.mosaic.several:
+                    _label_edges(ax)
+                if size != largest:
+                    ax.add_patch(
+                        Rectangle((0.5, 0.5), *size, fill=False, lw=0.9, ec="#5B6673", zorder=1)
+                    )
+
+
+class ArrayPanels(Panels):
+    """Panels of several arrays beside each other, equally wide, each in its own pixels.
+
+    Parameters
+    ----------
+    sizes : mapping of str to (float, float)
+        Columns and rows of each array, by its name.
+    columns : int
+        Panels beside each other, at most.
+    colorbar : bool
+        Whether room for one shared colour bar is needed.
+    """
+
+    def __init__(
+        self, sizes: Mapping[str, Size], *, columns: int = 2, colorbar: bool = False
+    ) -> None:
+        self.sizes = tuple(sizes.values())
+        columns = min(columns, len(sizes))
+        rows = -(-len(sizes) // columns)
+        width = WIDTH if columns > 1 else 0.66 * WIDTH
+        panel = (width - 0.75 - 0.5 * (columns - 1) - (0.8 if colorbar else 0.0)) / columns
+        aspect = max(ny / nx for nx, ny in self.sizes)
+        with figure_style():
+            figure = new_figure(width, rows * (panel * aspect + 0.72), layout="compressed")
+            grid = figure.subplots(rows, columns, squeeze=False).ravel()
+        for ax in grid[len(sizes) :]:
+            ax.remove()
+        super().__init__(figure, [[ax] for ax in grid[: len(sizes)]], tuple(sizes))
+        self._columns, self._rows = columns, rows
+
+    def frame(self, margin: float = 0.0) -> None:
+        """Make panels maps; the margin is a part of each array's longer side."""
+        n, differ = len(self.sizes), len(set(self.sizes)) > 1
+        for k, (size, (ax,)) in enumerate(zip(self.sizes, self.axes, strict=True)):
+            chip_axes(ax, size, margin=margin * max(size))
+            if differ:  # then a neighbour's numbers do not serve
+                ax.tick_params(labelbottom=True, labelleft=True)
+            # nothing stands below it in a last row that is not full
+            if k // self._columns == self._rows - 2 and k + self._columns >= n:
+                ax.tick_params(labelbottom=True)
+                ax.set_xlabel("x [pix]")
+
+
+class OneArray(Panels):
+    """All chips in one panel, as one array.
+
+    Parameters
+    ----------
+    sizes : mapping of int to (float, float)
+        Columns and rows, by chip number.
+    offsets : mapping of int to (float, float)
+        What is added to the pixels of each chip.
+    margin : float
+        Room beyond the array, in pixels.
+    colorbar : bool
+        Whether room for a colour bar is needed.
+    """
+
+    def __init__(
+        self,
+        sizes: Mapping[int, Size],
+        offsets: Mapping[int, Size],
+        *,
+        margin: float = 0.0,
+        colorbar: bool = False,
+    ) -> None:
+        self._offsets = [offsets[n] for n in sizes]
+        corners = np.array(self._offsets) + 0.5
+        low = corners.min(axis=0) - margin
+        high = (corners + np.array(list(sizes.values()))).max(axis=0) + margin
+        width = 0.8 * WIDTH
+        room = 0.8 + (0.7 if colorbar else 0.0)
+        aspect = float((high[1] - low[1]) / (high[0] - low[0]))
+        with figure_style():
+            figure = new_figure(width, (width - room) * min(aspect, 1.6) + 0.9, layout="compressed")
+            ax = figure.subplots()
+            ax.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+            ax.set(xlabel="x [pix]", ylabel="y [pix]")
+            self._outline(ax, sizes)
+        super().__init__(figure, [[ax]] * len(sizes), [""] * len(sizes))
+
+    def offset(self, chip: int) -> tuple[float, float]:
+        """What is added to pixels of a chip, counted from 0, in the array."""
+        return self._offsets[chip]
+
+    def _outline(self, ax: Axes, sizes: Mapping[int, Size]) -> None:
+        """Edges of all chips; those of one column are named at the right."""
+        shift = max(abs(px) for px, _ in self._offsets)
+        named = len(sizes) > 1 and shift < 0.5 * min(size[0] for size in sizes.values())
+        for (number, (nx, ny)), (px, py) in zip(sizes.items(), self._offsets, strict=True):
+            corner = px + 0.5, py + 0.5
+            ax.add_patch(Rectangle(corner, nx, ny, fill=False, lw=0.7, ec=OUTLINE, zorder=4))
+            if named:
+                beside = ax.get_yaxis_transform()
+                words = {"rotation": 270, "ha": "left", "va": "center", "fontsize": 7.5}
+                ax.text(1.012, py + ny / 2, f"chip {number}", transform=beside, **words)
+
+
+def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:
+    """Make axes a map of a chip: x to the right, y up, pixels square, outline drawn.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    size : tuple of float
+        Columns and rows, in pixels.
+    margin : float
+        Room beyond the outline, in pixels.
+    """
+    nx, ny = size
+    ax.set_aspect("equal")
+    ax.set_xlim(0.5 - margin, nx + 0.5 + margin)
+    ax.set_ylim(0.5 - margin, ny + 0.5 + margin)
+    if margin > 0:
+        ax.add_patch(Rectangle((0.5, 0.5), nx, ny, fill=False, lw=0.7, ec=OUTLINE, zorder=0))
+    ax.set_xlabel("x [pix]")
+    ax.set_ylabel("y [pix]")
+    ax.label_outer()
+
+
+def _label_edges(ax: Axes) -> None:
+    """Label axes that stand at the edge because there is no chip beyond them."""
+    spec = ax.get_subplotspec()
+    assert spec is not None
+    others = [o.get_subplotspec() for o in ax.figure.axes if o is not ax]
+    here = spec.rowspan.start, spec.colspan.start
+    places = [(o.rowspan.start, o.colspan.start) for o in others if o is not None]
+    if not any(row > here[0] and column == here[1] for row, column in places):
+        ax.tick_params(labelbottom=True)
+        ax.set_xlabel("x [pix]")
+    if not any(column < here[1] and row == here[0] for row, column in places):
+        ax.tick_params(labelleft=True)
+        ax.set_ylabel("y [pix]")

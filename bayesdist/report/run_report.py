@@ -1,0 +1,173 @@
+"""The report of a run: its page, and the same as Markdown."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from bayesdist.data.files import atomic_path
+from bayesdist.report.context import ReportInput
+from bayesdist.report.drawing import Drawing, draw_all
+from bayesdist.report.page import Part, parts_of, template
+from bayesdist.report.sections import REPORT
+from bayesdist.report.sections.run.status import verdict
+
+__all__ = ["draw_report", "render_markdown", "render_report", "write_report"]
+
+_PROVISIONAL = (
+    "The sampler did not reach its targets. Every number below is provisional; those marked † rest"
+    " on its draws and may be wrong by more than their stated errors. Sample longer, or look at the"
+    " reasons, before anything is used."
+)
+_FOOTER = (
+    "u and v are the reference axes; x runs to the right and y up, in FITS"
+    " pixels (centre of the first pixel = 1)."
+)
+_BUDGET_WORDS = (
+    "The budget of the table, computed in this page at any position, between two positions of one"
+    " image, and at any epoch and magnitude. The parts of the model are correlated: the bar stacks"
+    " variances, and the hatched piece is what their correlation adds. Where it takes off, the"
+    " stack is longer than the total, which the dark line marks; in the table it then has a minus"
+    " before the root of its size."
+)
+_PRINT_WORDS = (
+    "In print: what decides. All tables and figures, and the budget at any position and epoch, are"
+    " in report.html; the figures also lie in figures/."
+)
+
+
+def draw_report(r: ReportInput, *, processes: int = 1) -> dict[str, Drawing]:
+    """All figures of the report of a run as files, by name, in its order.
+
+    Parameters
+    ----------
+    r : ReportInput
+    processes : int
+        As of `draw_all`.
+
+    Returns
+    -------
+    dict of str to Drawing
+    """
+    return draw_all(REPORT, r, processes=processes)
+
+
+def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
+    """The report as a page.
+
+    Parameters
+    ----------
+    r : ReportInput
+    drawings : mapping of str to Drawing
+        As of `draw_report`.
+
+    Returns
+    -------
+    str
+        A whole HTML document that needs no other file.  Its script computes from numbers in the
+        page; whoever does without sees all tables and figures.
+    """
+    data = {item.name: _embedded(item.made(r)) for item in REPORT.items(r, "data")}
+    return template("report.html.jinja").render(
+        **_contents(r, drawings),
+        trace=f"{r.name} · {_maker(r)}",
+        budget_words=_BUDGET_WORDS,
+        print_words=_PRINT_WORDS,
+        data=data,
+    )
+
+
+def _embedded(data: Any) -> Markup:
+    """Data as JSON that may stand within a page: nothing in it can end the element."""
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c"))
+
+
+def render_markdown(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
+    """The same tables, figures and words as Markdown; figures are links into figures/.
+
+    Parameters
+    ----------
+    r, drawings
+        As in `render_report`.
+
+    Returns
+    -------
+    str
+    """
+    return template("report.md.jinja").render(**_contents(r, drawings))
+
+
+def write_report(
+    path: str | os.PathLike[str], r: ReportInput, drawings: Mapping[str, Drawing]
+) -> None:
+    """Write the report, and beside it the same as Markdown.
+
+    Parameters
+    ----------
+    path : path-like
+        Of the page; the other file has its name with .md for .html.
+    r : ReportInput
+    drawings : mapping of str to Drawing
+        As of `draw_report`.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    texts = {
+        Path(path): render_report(r, drawings),
+        Path(path).with_suffix(".md"): render_markdown(r, drawings),
+    }
+    for target, text in texts.items():
+        with atomic_path(target) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+
+def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]:
+    """What both forms of the report show."""
+    parts = parts_of(REPORT, r, drawings)
+    status = next(part for part in parts if part.name == "status")
+    others: list[Part] = [part for part in parts if part is not status]
+    return {
+        "run": r,
+        "status": status,
+        "parts": others,
+        "provisional": _PROVISIONAL,
+        "footer": f"Made by {_maker(r)}. {_FOOTER}",
+        "chips": _chips(r),
+        "verdict": verdict(r),
+    }
+
+
+def _maker(r: ReportInput) -> str:
+    """Version and time by which a copy on paper is traced to its run, as far as they are known."""
+    versions = r.provenance.get("versions", {})
+    began = str(r.provenance.get("created", "")).replace("T", " ").replace("+00:00", " UTC")
+    return " ".join(
+        part
+        for part in (
+            "bayesdist",
+            str(versions.get("bayesdist", "")),
+            f"in a run of {began}" if began else "",
+        )
+        if part
+    )
+
+
+def _chips(r: ReportInput) -> str:
+    """Names and sizes of the chips, those of equal size together."""
+    names: dict[str, list[str]] = {}
+    for c in r.chips:
+        size = "{:g} × {:g}".format(*c.chip.size)
+        names.setdefault(size, []).append(c.chip.name or f"chip {c.chip.number}")
+    return "; ".join(
+        f"{', '.join(several[:-1])}{' and ' if len(several) > 1 else ''}{several[-1]}, {size}"
+        for size, several in names.items()
+    )

@@ -1,0 +1,1 @@
+"""Sections of runs that began with star lists."""

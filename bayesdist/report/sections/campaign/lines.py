@@ -1,0 +1,219 @@
+"""Tables of the linear terms against time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+from bayesdist.report.campaign import CampaignResults
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput, campaign_of
+from bayesdist.report.numbers import MISSING, count, display_scale, interval, number, rounded
+from bayesdist.report.sections.campaign.published import (
+    SOURCE,
+    WHERE,
+    PublishedLine,
+    published_lines,
+)
+from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
+from bayesdist.report.texttable import TextTable, listing
+
+__all__ = [
+    "time_tables",
+]
+
+Row = tuple[str, ...]
+
+_SIGNIFICANT = 3.0  # sigmas
+FIXED = 5e-3  # 10^-6, or 10^-3 of a length: errors below it say that a term is held
+
+
+@REPORT.table("campaign-time", needs=("campaign",))
+def time_tables(r: ReportInput) -> Iterator[TextTable]:
+    """Gauge, lines of each term, changes at the breaks, scatter and claims."""
+    c = campaign_of(r)
+    found, joint = c.section("time_dependence"), c.summary.get("lines") or []
+    names = {chip.number: chip.name for chip in c.chips}
+    published = published_lines(c.config, c.filter, tuple(names.values()))
+    if c.section("gauge"):
+        yield _gauge(c)
+    terms = dict.fromkeys(row["term"] for row in joint)
+    alone = {
+        (row["term"], row["segment"]): row
+        for row in found.get("lines", ())
+        if row["alpha"] is not None
+    }
+    note = _why_errors_differ(c) if alone else ""
+    for term in [t for t in (*WHERE, "A_3") if t in terms]:
+        rows = [row for row in joint if row["term"] == term and _is_free(row, c.unit)]
+        rows.sort(key=lambda row: (row["segment"], names[row["chip"]]))
+        if rows:
+            table = _line_table(term, rows, names, alone, published.get(term, ()), c)
+            yield replace(table, note=" ".join(text for text in (table.note, note) if text))
+            note = ""  # said once, under the first of them
+    if found.get("breaks"):
+        yield _changes(found["breaks"], c.unit)
+    if c.section("scatter"):
+        yield _scatter(c)
+    if found.get("verdicts"):
+        rows_of = tuple((v["term"], v["claim"], v["text"]) for v in found["verdicts"])
+        yield TextTable(
+            "Which course each term takes, by held-out exposures",
+            ("Term", "Claim", "Why"),
+            rows_of,
+            words=(0, 1, 2),
+            detail=True,
+        )
+
+
+def _gauge(c: CampaignResults) -> TextTable:
+    g = c.section("gauge")
+    name = c.chip_name(g["chip"])
+    scale = display_scale(c.unit, g["sigma_shift"])
+    when = "" if g.get("epoch") is None else f" at {g['epoch']:g}"
+    shift = ", ".join(
+        f"{rounded(s * scale.factor, e * scale.factor)} ± {number(e * scale.factor, 2)}"
+        for s, e in zip(g["shift"], g["sigma_shift"], strict=True)
+    )
+    rotation, sigma = 1e6 * g["rotation"], 1e6 * g["sigma_rotation"]
+    fixed = ", ".join(g["fixed"])
+    return listing(
+        "Gauge of the linear terms against time",
+        {
+            "Fixed": f"{name} is the reference: {fixed} are zero at its zero point{when}. Other"
+            " chips live in its system: gap and rotation between chips are in their coefficients.",
+            "Where it holds": "in the tables and figures of this part. The tables of coefficients"
+            " further down are in the fit's own gauge, and differ by the shift and rotation below.",
+            "Shift that did it (u, v)": f"{shift} {scale.unit}",
+            "Rotation that did it": f"{rounded(rotation, sigma)} ± {number(sigma, 2)} 10⁻⁶ rad",
+        },
+    )
+
+
+def _line_table(
+    term: str,
+    joint: list[Mapping[str, Any]],
+    names: Mapping[int, str],
+    alone: Mapping[tuple[str, int], Mapping[str, Any]],
+    published: tuple[PublishedLine, ...],
+    c: CampaignResults,
+) -> TextTable:
+    """alpha and beta of a term: joint, exposure by exposure, and published."""
+    factor, unit = _scale(term, c.unit)
+    own = [row for row in (*joint, *alone.values()) if _is_of(row, term)]
+    # as many digits for all of this run's, so that they can be compared; others as printed
+    digits = {
+        key: min((row[key] for row in own if row[key] * factor > FIXED), default=0.0)
+        for key in ("sigma_alpha", "sigma_beta")
+    }
+    rows: list[Row] = []
+    for row in joint:
+        chip = names[row["chip"]]
+        head = (chip, f"{row['epoch0']:.1f}")
+        rows.append((*head, "joint fit", *_numbers(row, factor, digits)))
+        label = f"{chip}.{term}" if len(c.chips) > 1 else term
+        if (label, row["segment"]) in alone:
+            numbers = _numbers(alone[label, row["segment"]], factor, digits)
+            rows.append((*head, "exposures, then line", *numbers))
+        for one in published:
+            if one.chip == chip and abs(one.rdate - row["epoch0"]) < 1e-6:
+                rows.append((*head, SOURCE, *_numbers(vars(one), factor, vars(one))))
+    source = f"; published: {SOURCE}, {WHERE[term]}" if published else ""
+    system = ""
+    if c.section("gauge"):
+        system = f", in the system of {c.chip_name(c.section('gauge')['chip'])}"
+    return TextTable(
+        f"{name_of_term(term)}: α + β (TIME − RDATE){system}{source}",
+        ("Chip", "RDATE", "From", "α", f"σ α [{unit}]", f"β [{unit}/yr]", f"σ β [{unit}/yr]"),
+        tuple(rows),
+        words=(0, 2),
+        note=f"{MISSING}: no rate is fitted." if any(MISSING in row for row in rows) else "",
+        detail=True,
+    )
+
+
+def _why_errors_differ(c: CampaignResults) -> str:
+    """Why two fits of the same stars give two errors, for those who see them side by side."""
+    n = count(len(c.matching) if c.series is None else len(c.series.exposures))
+    return (
+        "The two σ of this run may differ, here and in the tables below. An exposure that is fitted"
+        " alone frees all of its higher-order terms, and the scatter of a term is that of its"
+        f" values in the {n} exposures. The joint fit has one set of higher-order terms for all"
+        " exposures, and lets scale and shear scatter independently: X and Y scale then scatter"
+        " alike."
+    )
+
+
+def _scale(term: str, unit: str) -> tuple[float, str]:
+    """Unit in which errors and rates of a term are read: constants are lengths."""
+    return (1e3, f"10⁻³ {unit}") if term.endswith("_1") else (1e6, "10⁻⁶")
+
+
+def _is_free(row: Mapping[str, Any], unit: str) -> bool:
+    """Whether the data have a say: the gauge fixes terms of the reference chip."""
+    return bool(row["sigma_alpha"] * _scale(row["term"], unit)[0] > FIXED)
+
+
+def _is_of(row: Mapping[str, Any], term: str) -> bool:
+    return str(row["term"]).rpartition(".")[2] == term
+
+
+def _numbers(row: Mapping[str, Any], factor: float, digits: Mapping[str, Any]) -> Row:
+    beta, sigma = factor * row["beta"], factor * row["sigma_beta"]
+    moves = sigma > FIXED
+    return (
+        rounded(row["alpha"], digits["sigma_alpha"]),
+        number(factor * row["sigma_alpha"], 3),
+        rounded(beta, factor * digits["sigma_beta"]) if moves else MISSING,
+        number(sigma, 3) if moves else MISSING,
+    )
+
+
+def _changes(breaks: list[Mapping[str, Any]], unit: str) -> TextTable:
+    rows = tuple(
+        (
+            f"{row['break']:.2f}",
+            str(row["term"]),
+            _scale(row["term"], unit)[1],
+            *_change(row["term"], row["step"], row["sigma_step"]),
+            *_change(row["term"], row["slope_change"], row["sigma_slope_change"]),
+        )
+        for row in breaks
+        if row["step"] is not None
+    )
+    return TextTable(
+        "Changes at the breaks, from the exposures alone",
+        ("Break", "Term", "Unit", "Step", "σ", "Step / σ", "Rate, per year", "σ", "Rate / σ"),
+        rows,
+        words=(1, 2),
+        note=f"Beyond {_SIGNIFICANT:g} σ a change is hardly chance.",
+        detail=True,
+    )
+
+
+def _change(term: str, value: float, sigma: float) -> Row:
+    factor, _ = _scale(term, "")
+    v, s = factor * value, factor * sigma
+    return rounded(v, s), number(s, 2), number(value / sigma, 2) if sigma > 0 else MISSING
+
+
+def _scatter(c: CampaignResults) -> TextTable:
+    rows: list[Row] = []
+    for kind, tau in c.section("scatter").items():
+        factor, unit = (1e3, f"10⁻³ {c.unit}") if ".shift_" in f".{kind}" else (1e6, "10⁻⁶")
+        low, high = (factor * end for end in tau["interval_68"])
+        span = interval(low, high, (high - low) / 2)
+        rows.append((name_of_scatter(kind), "joint fit", unit, number(factor * tau["value"]), span))
+    n_joint = len(rows)
+    for label, value in c.section("time_dependence").get("scatter", {}).items():
+        if value is not None:
+            factor, unit = _scale(label, c.unit)
+            rows.append((label, "exposures alone", unit, number(factor * value), MISSING))
+    return TextTable(
+        "Scatter of the exposures beyond their formal errors, 1 σ",
+        ("Kind", "From", "Unit", "τ", "68 % interval"),
+        tuple(rows),
+        words=(0, 1, 2),
+        leading=n_joint,
+    )

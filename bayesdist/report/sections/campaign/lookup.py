@@ -1,0 +1,350 @@
+"""Look-up tables: what they take out of the residuals, and how well their nodes are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from numpy.typing import NDArray
+
+from bayesdist.model import LookupTable
+from bayesdist.report.arrows import Arrows, magnification_of, spacing, vector_map
+from bayesdist.report.campaign import CampaignResults, ChipResiduals
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput, campaign_of
+from bayesdist.report.fields import Grid, scalar_map
+from bayesdist.report.numbers import count, display_scale, number, size_of
+from bayesdist.report.panels import ChipPanels
+from bayesdist.report.registry import Plot
+from bayesdist.report.sections.run.residuals import residual_panels
+from bayesdist.report.style import OUTLINE, PALETTE, WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.texttable import TextTable, listing
+
+if TYPE_CHECKING:
+    from bayesdist.assess import BinnedResiduals
+
+__all__ = [
+    "binned_of",
+    "largest_cell",
+    "lookup_table",
+    "residual_map",
+    "rms_of_cells",
+    "table_errors",
+    "table_nodes",
+    "table_residuals",
+]
+
+Float = NDArray[np.float64]
+
+WITHOUT, WITH = PALETTE["vermilion"], PALETTE["blue"]
+_REACH = 4.5  # times the robust width of the residuals without tables: where axes end
+
+
+@REPORT.table("campaign-tables", needs=("campaign",))
+def lookup_table(r: ReportInput) -> TextTable:
+    """The look-up tables of each chip."""
+    c = campaign_of(r)
+    t = c.section("tables")
+    if not t.get("chips"):
+        return listing("Look-up tables", {"Method": "none: no tables were fitted"})
+    words = {
+        "field": "Gaussian random field",
+        "binned": "binned and smoothed",
+        "none": "not fitted",
+    }
+    rows = tuple(
+        (
+            row.get("filter") or "detector",
+            c.chip_name(row["chip"]),
+            "{1} × {0}".format(*row["nodes"]),
+            number(row["rms"]),
+            number(row["largest"]),
+            number(row["sigma_median"]),
+        )
+        for row in t["chips"]
+    )
+    caption, note = f"Look-up tables: {words.get(t['method'], t['method'])}", ""
+    if "converged" in t:
+        caption += ", converged" if t["converged"] else ", NOT converged"
+        note = (
+            f"Rms residual of an axis: {number(t['rms_before'])} pix before the tables of this run,"
+            f" {number(t['rms_after'])} pix with them."
+        )
+    if t.get("detector"):
+        note = f"The detector's are those of {t['detector']}. {note}".strip()
+    return TextTable(
+        caption,
+        ("Of", "Chip", "Nodes", "Rms of an axis [pix]", "Largest [pix]", "σ, median [pix]"),
+        rows,
+        words=(0, 1),
+        note=note,
+    )
+
+
+@REPORT.figure("campaign-tables", needs=("campaign.residuals", "campaign.tables"))
+def table_residuals(r: ReportInput) -> Plot:
+    """Residuals of single stars on each chip, without the tables and with them.
+
+    Figures 6 and 7 of ACS ISR 2015-06.
+    """
+    found = campaign_of(r)
+    order = sorted(range(len(found.residuals)), key=lambda k: r.mosaic.places[k])
+    chips = [found.residuals[k] for k in order]  # from the top
+    every = np.concatenate([c.without for c in chips])
+    reach = _REACH * 1.4826 * float(np.median(np.abs(every)))
+    scale = display_scale("pix", reach)
+    with figure_style():
+        fig = new_figure(WIDTH, 2.35 * len(chips) + 0.35)
+        grid = fig.subplots(len(chips), 3, squeeze=False)
+        for axes, chip in zip(grid, chips, strict=True):
+            assert chip.with_tables is not None
+            name = chip.chip.name or f"chip {chip.chip.number}"
+            parts = ((chip.without, "without tables", WITHOUT), (chip.with_tables, "with", WITH))
+            for ax, (residual, what, color) in zip(axes, parts, strict=False):
+                _cloud(ax, residual * scale.factor, reach * scale.factor, color)
+                ax.set_title(f"{name}, {what}")
+                ax.set_xlabel(f"residual in x [{scale.unit}]")
+            axes[0].set_ylabel(f"residual in y [{scale.unit}]")
+            axes[1].tick_params(labelleft=False)
+            edges = np.linspace(-reach, reach, 91) * scale.factor
+            for residual, what, color in parts:
+                for k, style in enumerate(("-", ":")):
+                    counts, _ = np.histogram(residual[:, k] * scale.factor, edges)
+                    label = f"{'xy'[k]}, {what.split()[0]}"
+                    axes[2].stairs(counts, edges, color=color, ls=style, lw=1.0, label=label)
+            axes[2].set_xlim(edges[0], edges[-1])
+            axes[2].set_title(f"{name}, histograms")
+            axes[2].set_xlabel(f"residual [{scale.unit}]")
+            axes[2].set_ylabel("stars drawn per bin")
+        grid[0, 2].legend(loc="upper left", fontsize=6.5, handlelength=1.5, borderaxespad=0.2)
+    t = found.section("tables")
+    drawn = sum(len(c.without) for c in chips)
+    text = (
+        "Each point is a star in one exposure, after the best polynomial and a linear map of the"
+        " exposure, along the axes of the detector. What is elongated or has corners on the left is"
+        " structure that no polynomial follows."
+    )
+    if "rms_before" in t:
+        before, after = (size_of(float(t[f"rms_{when}"])) for when in ("before", "after"))
+        text += f" The tables bring the rms of an axis from {before} to {after}."
+    text += (
+        f" Histograms: full lines x, dotted y. {count(drawn)} stars are drawn, each with both"
+        " residuals; the farthest may lie beyond the panels."
+    )
+    return Plot(
+        fig,
+        f"Residuals {_base(found)} and with all look-up tables",
+        text,
+        "Clouds of residuals of each chip, narrower with the tables than before, and histograms.",
+    )
+
+
+def _cloud(ax: Axes, residual: Float, reach: float, color: str) -> None:
+    ax.axhline(0, color=OUTLINE, lw=0.5, zorder=0)
+    ax.axvline(0, color=OUTLINE, lw=0.5, zorder=0)
+    ax.plot(*residual.T, ".", ms=1.3, mec="none", alpha=0.55, color=color)
+    ax.set_xlim(-reach, reach)
+    ax.set_ylim(-reach, reach)
+    ax.set_box_aspect(1)
+
+
+def _base(c: CampaignResults) -> str:
+    """What the residuals of a run are compared with: what its own tables were fitted over."""
+    return "with the detector's tables alone" if any(c.table_filters) else "without"
+
+
+def _maps_of_residuals(r: ReportInput) -> Mapping[str, str]:
+    which = ("without", "with") if campaign_of(r).tables else ("without",)
+    return {f"residuals_{one}_tables": one for one in which}
+
+
+@REPORT.figure("campaign-tables", needs=("campaign.residuals",), each=_maps_of_residuals)
+def residual_map(r: ReportInput, which: str) -> Plot:
+    """Mean residual of each cell, without the tables or with them, at one scale for both.
+
+    Figure 10 of ACS ISR 2015-06.
+    """
+    c = campaign_of(r)
+    binned = binned_of(c.residuals, which)
+    M, key = _common_scale(c.residuals)
+    panels = residual_panels(binned, r.mosaic, unit="pix", magnification=M, key=key)
+    mean, noise = rms_of_cells(*binned)
+    cell = c.residuals[0].chip.size[0] / len(binned[0].x)
+    largest = largest_cell(*binned)
+    text = (
+        f"Mean residual of each cell of {cell:.0f} pixels, along the axes of the detector; light"
+        f" arrows differ from zero by less than 2 σ. The largest is {size_of(largest)}; the rms of"
+        f" an axis over the cells is {size_of(mean)}, where the scatter inside the cells alone"
+        f" would give {size_of(noise)}."
+    )
+    if which == "without":
+        text += " What stands out repeats in all exposures."
+        alone = any(c.table_filters)
+        title = f"Residuals over the detector, {_base(c)}{'' if alone else ' tables'}"
+    else:
+        if mean < noise:
+            text += " It is less, because the tables follow these very stars."
+        text += " The scale is that of the figure before."
+        title = "Residuals over the detector, with the tables"
+    return Plot(
+        panels.figure, title, text, f"Map of residual vectors; the largest is {size_of(largest)}."
+    )
+
+
+def _common_scale(chips: Sequence[ChipResiduals]) -> tuple[float, float]:
+    """Magnification at which the vectors without tables are seen well, and length of the key.
+
+    Both maps are drawn so.
+    """
+    length = np.concatenate([_lengths(c.binned_without) for c in chips])
+    typical = float(np.quantile(length, 0.95)) if length.size else 1.0
+    step = min(spacing(c.binned_without.x, c.binned_without.y) for c in chips)
+    magnification = nice_below(1.6 * step / typical) if typical > 0 else 1.0
+    return magnification, nice_below(float(length.max(initial=0.0)) / 1.5)
+
+
+def binned_of(chips: Sequence[ChipResiduals], which: str) -> list[BinnedResiduals]:
+    """Binned residuals of all chips, 'without' the tables or 'with' them."""
+    found = [c.binned_without if which == "without" else c.binned_with for c in chips]
+    return [one for one in found if one is not None]
+
+
+def _lengths(binned: BinnedResiduals) -> Float:
+    length = np.hypot(binned.mean_u, binned.mean_v)[np.asarray(binned.count) > 0]
+    return np.asarray(length[np.isfinite(length)], float)
+
+
+def largest_cell(*binned: BinnedResiduals) -> float:
+    """Length of the longest mean vector."""
+    return max((float(_lengths(b).max(initial=0.0)) for b in binned), default=0.0)
+
+
+def rms_of_cells(*binned: BinnedResiduals) -> tuple[float, float]:
+    """Rms of the cells' means on an axis, and what the scatter in the cells alone would give."""
+    mean, noise = [], []
+    for b in binned:
+        full = np.isfinite(b.mean_u) & np.isfinite(b.sem_u) & np.isfinite(b.sem_v)
+        mean += [b.mean_u[full], b.mean_v[full]]
+        noise += [b.sem_u[full], b.sem_v[full]]
+    square = (np.concatenate(a) ** 2 for a in (mean, noise))
+    first, second = (float(np.sqrt(s.mean())) if s.size else np.nan for s in square)
+    return first, second
+
+
+def _figures_by_filter(r: ReportInput, name: str, *, known: bool) -> Mapping[str, str]:
+    """Names of figures by filter, '' the detector's own; only with known errors where asked."""
+    tables = [t for t in campaign_of(r).tables if t.sigma is not None or not known]
+    return {f"{name}_{t.filter}" if t.filter else name: t.filter for t in tables}
+
+
+def _by_chip(c: CampaignResults, filter: str) -> list[LookupTable | None]:
+    """The table of each chip, None where there is none."""
+    of = {table.chip: table for table in c.tables if table.filter == filter}
+    return [of.get(chip.number) for chip in c.chips]
+
+
+@REPORT.figure(
+    "campaign-tables",
+    needs=("campaign.tables",),
+    each=lambda r: _figures_by_filter(r, "table_nodes", known=False),
+)
+def table_nodes(r: ReportInput, filter: str) -> Plot:
+    """What the tables of a filter add to the pixels, an arrow at each node."""
+    c = campaign_of(r)
+    chips = _by_chip(c, filter)
+    tables = [t for t in c.tables if t.filter == filter]
+    length = np.concatenate([np.hypot(*t.values).ravel() for t in tables])
+    panels = ChipPanels(r.mosaic)
+    panels.frame(0.03 * r.mosaic.longest_side)
+    arrows, titles = [], []
+    for k, table in enumerate(chips):
+        arrows.append(None if table is None else _arrows(table))
+        text = "no table"
+        if table is not None:
+            text = f"largest shift {np.hypot(*table.values).max():.3g} pix"
+        titles.append(panels.title(k, text))
+    vector_map(
+        panels,
+        arrows,
+        titles,
+        magnification=magnification_of(
+            1.6 * min(min(t.step) for t in tables), float(np.quantile(length, 0.95))
+        ),
+        key=nice_below(length.max() / 1.5),
+    )
+    parts = []
+    for t in tables:
+        ny, nx = t.shape
+        rms = float(np.sqrt((t.values**2).mean()))
+        parts.append(f"{c.chip_name(t.chip)}: {nx} × {ny}, rms of an axis {size_of(rms)}")
+    whose = f"filter {filter}, applied second" if filter else "the detector, applied first"
+    largest = max(float(np.hypot(*t.values).max()) for t in tables)
+    return Plot(
+        panels.figure,
+        f"Look-up tables of {filter or 'the detector'}",
+        f"What the tables of {whose}, add to the pixels of a star, at every node"
+        f" ({'; '.join(parts)}). The largest shift is {size_of(largest)}.",
+        f"Map of the shifts at the nodes; the largest is {size_of(largest)}.",
+    )
+
+
+def _arrows(table: LookupTable) -> Arrows:
+    x, y = (a.ravel() for a in np.meshgrid(*table.nodes()))
+    du, dv = (a.ravel() for a in table.values)
+    return Arrows(x, y, du, dv, min(table.step))
+
+
+@REPORT.figure(
+    "campaign-tables",
+    needs=("campaign.tables",),
+    each=lambda r: _figures_by_filter(r, "table_errors", known=True),
+)
+def table_errors(r: ReportInput, filter: str) -> Plot:
+    """Standard errors of the nodes along x and y, in one scale of colours."""
+    c = campaign_of(r)
+    chips = _by_chip(c, filter)
+    tables = [t for t in c.tables if t.filter == filter]
+    every = np.concatenate([t.sigma.ravel() for t in tables if t.sigma is not None])
+    # a few nodes without stars must not flatten all others
+    low, high = float(every.min()), float(np.quantile(every, 0.995))
+    scale = display_scale("pix", high)
+    panels = ChipPanels(r.mosaic, 2, colorbar=True)
+    panels.frame()
+    grids: list[Grid | None] = []
+    titles = []
+    for k, table in enumerate(chips):
+        for axis in (0, 1):
+            if table is None or table.sigma is None:
+                grids.append(None)
+                titles.append(panels.title(k, "none"))
+                continue
+            sigma = table.sigma[axis] * scale.factor
+            grids.append(Grid(*table.nodes(), sigma))
+            titles.append(panels.title(k, f"σ of {'xy'[axis]}, median {np.median(sigma):.3g}"))
+    scalar_map(
+        panels,
+        grids,
+        titles,
+        label=f"σ of a node [{scale.unit}]",
+        norm=Normalize(low * scale.factor, high * scale.factor),
+    )
+    rows = c.section("tables").get("chips", ())
+    known = {(row["chip"], row.get("filter") or ""): row for row in rows}
+    parts, worst = [], 0.0
+    for t in tables:
+        if t.sigma is None:
+            continue
+        row = known.get((t.chip, filter), {})
+        median = row.get("sigma_median") or float(np.median(t.sigma))
+        parts.append(f"{c.chip_name(t.chip)} {size_of(median)}")
+        worst = max(worst, float(t.sigma.max()))
+    return Plot(
+        panels.figure,
+        f"Errors of the look-up tables{' of ' + filter if filter else ''}",
+        f"Standard error of every node along x and along y; at the median {', '.join(parts)}, at"
+        f" worst {size_of(worst)}.",
+        f"Maps of the errors of the nodes; the median is {', '.join(parts)}.",
+    )

@@ -1,0 +1,134 @@
+"""Released files, and two exposures laid on each other through the old files and the new ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesdist.report.arrows import Arrows, magnification_of, vector_map
+from bayesdist.report.campaign import OverlapTest
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput, campaign_of
+from bayesdist.report.numbers import MISSING, count, number, size_of
+from bayesdist.report.panels import Panels
+from bayesdist.report.registry import Plot
+from bayesdist.report.style import WIDTH, figure_style, new_figure, nice_below
+from bayesdist.report.texttable import TextTable
+
+__all__ = [
+    "overlap",
+    "released_files",
+]
+
+MIN_STARS_PER_CELL = 5  # to be drawn, and to count
+
+_KINDS = {
+    "IDCTAB": "IDCTAB: polynomial and its drift",
+    "D2IMFILE": "D2IMFILE: tables of the detector",
+    "NPOLFILE": "NPOLFILE: tables of the filter",
+}
+
+
+@REPORT.table("campaign-release", needs=("campaign",))
+def released_files(r: ReportInput) -> TextTable | None:
+    """Files for pipelines, with their dates; None where none were written."""
+    c = campaign_of(r)
+    files = [p for p in c.summary.get("products") or () if p["kind"] in _KINDS]
+    if not files:
+        return None
+    release = c.config.get("products", {}).get("release") or {}
+    years = {p["name"]: p["years"] for p in release.get("period", ())}
+    rows = []
+    for p in files:
+        period = p.get("period")
+        dates = "all" if period is None else "{:g} to {:g}".format(*years.get(period, (0, 0)))
+        lost = max((abs(one["mas"]) for one in p.get("lost", ())), default=None)
+        rows.append(
+            (p["path"], _KINDS[p["kind"]], dates, MISSING if lost is None else number(lost, 2))
+        )
+    return TextTable(
+        "Released files",
+        ("File", "What it is", "Dates", "Drift that it cannot hold, at most [mas]"),
+        tuple(rows),
+        words=(0, 1, 2),
+    )
+
+
+@REPORT.figure("campaign-release", needs=("campaign.overlap",))
+def overlap(r: ReportInput) -> Plot:
+    """What shift, rotation and scale leave between two exposures: old files and new.
+
+    Figures 27 and 28 of ACS ISR 2015-06.
+    """
+    t = campaign_of(r).overlap
+    assert t is not None
+    states = {"old": (t.binned_old, t.old), "new": (t.binned_new, t.new)}
+    panels, arrows, titles, largest = _panels(t), [], [], {}
+    for which, (binned, found) in states.items():
+        one = Arrows.of_cells(binned, MIN_STARS_PER_CELL)
+        largest[which] = float(one.length.max(initial=0.0))
+        arrows.append(
+            Arrows(
+                one.x - 0.5 + t.corner[0],
+                one.y - 0.5 + t.corner[1],
+                one.du,
+                one.dv,
+                one.step,
+                np.ones(one.x.size, bool),
+            )
+        )
+        name = "known distortion" if which == "old" else "this run"
+        rms = float(np.sqrt(np.mean(found.rms**2)))
+        titles.append(f"{name}: largest {largest[which]:.3f}, rms {rms:.3f} pix")
+    length = arrows[0].length
+    typical = float(np.quantile(length, 0.95)) if length.size else 1.0
+    vector_map(
+        panels,
+        arrows,
+        titles,
+        magnification=magnification_of(1.1 * arrows[0].step, typical),
+        key=nice_below(typical),
+        pad=20,
+    )
+    a, b = t.names
+    days = abs(t.epochs[1] - t.epochs[0])
+    rolls = ""
+    if np.isfinite(t.pa_v3).all():
+        rolls = f" and PA_V3 {t.pa_v3[0]:.0f}° and {t.pa_v3[1]:.0f}°"
+    old, new = (float(np.sqrt(np.mean(x.rms**2))) for x in (t.old, t.new))
+    text = (
+        f"{a} and {b} ({t.epochs[0]:.2f} and {t.epochs[1]:.2f}, {days:.1f} years apart{rolls}):"
+        f" {count(t.n_stars)} shared stars, corrected for distortion and brought onto each other by"
+        " shift, rotation and scale; mean of what is left in each cell of"
+        f" {MIN_STARS_PER_CELL} stars or more. Left: through the known distortion that the matching"
+        " started from; right: through tables, polynomial and drift of this run, without anything"
+        f" fitted to these two exposures. Largest cell {size_of(largest['old'])} and"
+        f" {size_of(largest['new'])}; rms of an axis over the stars"
+        f" {size_of(old)} and {size_of(new)}."
+    )
+    if t.with_motions:
+        text += " The catalogue's proper motions between the two dates are taken out."
+    text += f" Pixels of {t.pixel_mas:g} mas; both panels have one scale."
+    return Plot(
+        panels.figure,
+        "Two exposures laid on each other",
+        text,
+        "Residual vectors between two exposures, with a pattern on the left and little on the"
+        f" right: rms {size_of(old)} and {size_of(new)}.",
+    )
+
+
+def _panels(t: OverlapTest) -> Panels:
+    """Two panels of the area that both exposures see."""
+    size = np.ptp(t.new.position, axis=0)
+    middle, half = np.array(t.corner) + size / 2, 0.56 * size
+    aspect = float(np.clip(size[1] / size[0], 0.5, 1.6))
+    with figure_style():
+        figure = new_figure(WIDTH, 0.5 * WIDTH * aspect + 0.9, layout="compressed")
+        axes = figure.subplots(1, 2, sharex=True, sharey=True)
+        for ax in axes:
+            ax.set_aspect("equal")
+            ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
+            ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
+            ax.set_xlabel(r"$\xi$ [pix]")
+        axes[0].set_ylabel(r"$\eta$ [pix]")
+    return Panels(figure, [[ax] for ax in axes], ("", ""))

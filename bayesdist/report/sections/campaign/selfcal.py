@@ -1,0 +1,191 @@
+"""A self-calibration: its gauge, how exposures and stars came about, the stars."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput, SelfcalResults
+from bayesdist.report.numbers import MISSING, count, display_scale, number, percent, with_mas
+from bayesdist.report.registry import Plot
+from bayesdist.report.style import CYCLE, INK, PALE, WIDTH, figure_style, new_figure
+from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+__all__ = [
+    "selfcal",
+    "selfcal_tables",
+]
+
+MAX_STARS_DRAWN = 20_000  # more only hide each other
+
+
+@REPORT.table("selfcal", needs=("selfcal",))
+def selfcal_tables(r: ReportInput) -> tuple[TextTable, ...]:
+    """Gauge, detections, exposures and stars."""
+    found = r.selfcal
+    assert found is not None
+    return (_gauge(found), _detections(found), _exposures(found, r), _stars(found, r))
+
+
+def _gauge(found: SelfcalResults) -> TextTable:
+    rows = [
+        (
+            str(row["name"]).replace("_", " "),
+            str(row["state"]),
+            _sigma(row["sigma_detections"], row["unit"]),
+            _sigma(row["sigma_fixed"], row["unit"]),
+            _edge(row["sigma_fixed"], row["edge_pix"]),
+            str(row["fixed_by"]) or MISSING,
+        )
+        for row in found.gauge
+    ]
+    heads = (
+        "Property",
+        "From detections",
+        "σ from these",
+        "σ as fixed",
+        "at the edge [pix]",
+        "Fixed by",
+    )
+    return TextTable(
+        "What detections alone cannot tell, and what fixes it",
+        heads,
+        tuple(rows),
+        words=(0, 1, 5),
+        note=f"{found.words} Relative positions do not depend on any of it: their errors are in"
+        " the maps of that name.",
+    )
+
+
+def _sigma(value: Any, unit: Any) -> str:
+    value = float(value)
+    return f"{number(value, 2)} {unit}".strip() if np.isfinite(value) else MISSING
+
+
+def _edge(sigma: Any, edge: Any) -> str:
+    value = float(sigma) * float(edge)
+    return number(value, 2) if np.isfinite(value) else MISSING
+
+
+def _detections(found: SelfcalResults) -> TextTable:
+    s = found.summary
+    d = s["detections"]
+    return listing(
+        "Detections and stars",
+        {
+            "Detections read": count(d["read"]),
+            **{f"Cut: {reason}": count(n) for reason, n in d["cut"].items()},
+            **{reason[0].upper() + reason[1:]: count(n) for reason, n in d["unused"].items()},
+            "Detections used": count(d["used"]),
+            "Stars": count(s["n_stars"]),
+            "Detections of a star, median and most": f"{number(s['per_star']['median'])}, "
+            f"{count(s['per_star']['most'])}",
+            "Ambiguous groups": count(s["n_ambiguous"]),
+            "Rounds of grouping and solving": count(s["rounds"]),
+        },
+    )
+
+
+def _exposures(found: SelfcalResults, r: ReportInput) -> TextTable:
+    rows = [
+        (
+            str(row["exposure"]),
+            count(row["detections"]),
+            percent(float(row["share_common"])),
+            number(float(row["rms"])),
+            number(float(row["shift_u"]), 6),
+            number(float(row["shift_v"]), 6),
+            number(float(row["rotation"]), 6),
+        )
+        for row in found.matching[:MAX_ROWS]
+    ]
+    heads = (
+        *("Exposure", "Detections", "In common", "rms on an axis [pix]"),
+        *(f"Shift u [{r.unit}]", f"Shift v [{r.unit}]", "Rotation [deg]"),
+    )
+    return TextTable(
+        "Exposures",
+        heads,
+        tuple(rows),
+        note="In common: of the detections that lie where another exposure looks. "
+        + further(len(found.matching)),
+        detail=True,
+    )
+
+
+def _stars(found: SelfcalResults, r: ReportInput) -> TextTable:
+    s = found.summary["stars"]
+    mas = r.scale_mas
+    return listing(
+        "The catalogue of the stars",
+        {
+            "Stars": count(s["n"]),
+            "Radius of the error, median": with_mas(s["radius_median"], s["unit"], mas),
+            "The same for a known distortion": with_mas(s["radius_own_median"], s["unit"], mas),
+            "With two detections alone": count(s["n_two_detections"]),
+            "Doubtful": count(s["n_doubtful"]),
+            "Reference stars": count(s["n_reference"]),
+        },
+        note="All stars with their covariances: stars.ecsv. Their errors hold those of distortion"
+        " and exposures, which stars have in common, in the gauge of the run.",
+    )
+
+
+@REPORT.figure("selfcal", needs=("selfcal",))
+def selfcal(r: ReportInput) -> Plot:
+    """The field with its exposures, and the errors of the stars."""
+    found = r.selfcal
+    assert found is not None
+    stars = found.stars[:: max(1, -(-len(found.stars) // MAX_STARS_DRAWN))]
+    with figure_style():
+        fig = new_figure(WIDTH, 0.5 * WIDTH)
+        field, errors = fig.subplots(1, 2)
+        field.plot(stars["u"], stars["v"], ".", ms=1.5, color=PALE, mec="none", zorder=1)
+        strong = (0.4, 0.5) if len(found.outlines) > 30 else (0.9, 0.9)
+        field.add_collection(
+            LineCollection(found.outlines, colors=CYCLE[0], linewidths=strong[0], alpha=strong[1])
+        )
+        field.set_aspect("equal")
+        field.autoscale_view()
+        field.set_xlabel(f"u [{r.unit}]")
+        field.set_ylabel(f"v [{r.unit}]")
+        field.set_title(f"{count(len(found.matching))} exposures")
+        _errors(errors, stars, r.unit)
+        for ax in (field, errors):
+            ax.tick_params(colors=INK)
+    s = found.summary["stars"]
+    size = with_mas(s["radius_median"], s["unit"], r.scale_mas)
+    return Plot(
+        fig,
+        "Exposures and stars",
+        f"Outlines of the exposures over the {count(s['n'])} stars that were found, and the errors"
+        f" of these, {size} at the median, in the gauge of the run.",
+        f"Outlines of exposures over stars, and errors of the stars, median {size}.",
+    )
+
+
+def _errors(ax: Axes, stars: Table, unit: str) -> None:
+    radius = np.hypot(stars["sigma_u"], stars["sigma_v"])
+    own = np.hypot(stars["sigma_own_u"], stars["sigma_own_v"])
+    scale = display_scale(unit, float(np.median(radius)))
+    by_mag = "mag" in stars.colnames
+    x = np.asarray(stars["mag"] if by_mag else stars["n"], float)
+    for values, color, label in (
+        (radius, CYCLE[0], "with distortion and frames"),
+        (own, CYCLE[1], "of a known distortion"),
+    ):
+        ax.plot(
+            x, np.asarray(values) * scale.factor, ".", ms=2, mec="none", color=color, label=label
+        )
+    ax.set_yscale("log")
+    ax.set_xlabel("magnitude" if by_mag else "detections")
+    ax.set_ylabel(f"radius of the error (1 σ) [{scale.unit}]")
+    ax.set_title("Errors of the stars")
+    ax.legend(markerscale=4)

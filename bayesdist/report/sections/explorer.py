@@ -1,0 +1,170 @@
+"""Numbers that a page carries so that it can compute the budget, and show maps, by itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import to_hex
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from bayesdist.assess.budget.surface import BudgetSurface, SurfaceProduct
+from bayesdist.assess.drawn import CENTROID
+from bayesdist.assess.terms.fields import MODEL
+from bayesdist.assess.terms.given import LOCAL, MEASURED
+from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numbers import ladder
+from bayesdist.report.style import CYCLE, SEQUENTIAL
+
+__all__ = ["budget_data", "map_data"]
+
+Float = NDArray[np.float64]
+
+MOMENT_DIGITS = 7  # quadratic forms of them cancel in part
+MAP_DIGITS = 5
+MOST_POINTS = 65  # of a map on the longer side: no pointer tells more of them apart
+_COLORS = 12
+
+
+@REPORT.data(needs=("surface",))
+def budget_data(r: ReportInput) -> dict[str, Any]:
+    """The budget as a function of position, epoch and magnitude."""
+    s = r.surface
+    assert s is not None
+    nodes = s.spans[0].nodes
+    parts = [
+        {"name": name, "kind": "systematic", "source": s.sources.get(name, MEASURED)}
+        for name in s.parts
+    ]
+    return _common(r) | {
+        "terms": list(s.model.basis(s.model.chips[0].number).terms),
+        "grid": list(s.grid),
+        "epoch": s.epoch,
+        "years": [nodes[0], s.spans[-1].nodes[-1]] if nodes else None,
+        "parts": parts,
+        "joint": MODEL,
+        "spans": [
+            {
+                "nodes": list(span.nodes),
+                "moments": {
+                    str(chip): {part: _triangles(m) for part, m in parts.items()}
+                    for chip, parts in span.moments.items()
+                },
+            }
+            for span in s.spans
+        ],
+        "local": [
+            {
+                "name": t.name,
+                "kind": LOCAL,
+                "source": t.source,
+                "sigma": {
+                    str(chip): [_short(v[..., axis], MAP_DIGITS) for axis in (0, 1)]
+                    for chip, v in t.sigma.items()
+                },
+            }
+            for t in s.local
+        ],
+        "given": [
+            {"name": t.name, "kind": t.kind, "source": t.source, "sigma": list(sigma)}
+            for t, sigma in zip(s.terms, s.sigmas, strict=True)
+        ],
+        "centroid": _centroid(s),
+        "products": [_product(term) for term in s.products],
+        "cycle": list(CYCLE),
+    }
+
+
+@REPORT.data()
+def map_data(r: ReportInput) -> dict[str, Any]:
+    """The maps that a pointer reads: radial uncertainty and pixel area."""
+    chips = r.chips
+    layers = []
+    for k, first in enumerate(chips[0].maps):
+        radii = [c.maps[k].radius for c in chips]
+        layers.append(_layer(f"Uncertainty, {first.kind}", r.unit, radii))
+    layers.append(_layer("Pixel area, relative", "", [c.area.area for c in chips], digits=7))
+    return _common(r) | {"layers": layers}
+
+
+def _common(r: ReportInput) -> dict[str, Any]:
+    colors = matplotlib.colormaps[SEQUENTIAL](np.linspace(0.0, 1.0, _COLORS))
+    return {
+        "unit": r.unit,
+        "scale_mas": r.scale_mas,
+        "ladders": {unit: ladder(unit) for unit in (r.unit, "mas")},
+        "colors": [to_hex(c) for c in colors],
+        "chips": [
+            {
+                "number": c.chip.number,
+                "name": c.chip.name or f"chip {c.chip.number}",
+                "size": list(c.chip.size),
+                "place": list(c.place),
+            }
+            for c in r.chips
+        ],
+    }
+
+
+def _layer(name: str, unit: str, maps: list[Float], digits: int = MAP_DIGITS) -> dict[str, Any]:
+    thin = [m[:: _step(m.shape[0]), :: _step(m.shape[1])] for m in maps]
+    return {
+        "name": name,
+        "unit": unit,
+        "digits": digits - 2,
+        "maps": [{"shape": list(m.shape[::-1]), "values": _short(m, digits)} for m in thin],
+    }
+
+
+def _step(n: int) -> int:
+    """Every how many points are kept, so that the outermost ones are among them."""
+    steps = [k for k in range(1, n) if (n - 1) % k == 0 and (n - 1) // k < MOST_POINTS]
+    return steps[0] if steps else 1
+
+
+def _triangles(moments: Float) -> list[list[list[float | None]]]:
+    """By node and axis, the upper triangle row by row; what stands twice is added up."""
+    K = moments.shape[-1]
+    i, j = np.triu_indices(K)
+    values = moments[..., i, j] * np.where(i == j, 1.0, 2.0)
+    return [[_short(v, MOMENT_DIGITS) for v in node] for node in values]
+
+
+def _product(term: SurfaceProduct) -> dict[str, Any]:
+    """Displacements on the grid, by span, chip, node and axis."""
+    spans = [
+        {
+            str(chip): [[_short(one[:, axis], MAP_DIGITS) for axis in (0, 1)] for one in nodes]
+            for chip, nodes in shifts.items()
+        }
+        for shifts in term.shifts
+    ]
+    return {"name": term.name, "kind": PRODUCT, "source": term.source, "spans": spans}
+
+
+def _short(values: Float, digits: int) -> list[float | None]:
+    """Numbers of so many digits; null where there is none."""
+    return [float(f"{v:.{digits - 1}e}") if np.isfinite(v) else None for v in np.ravel(values)]
+
+
+def _centroid(s: BudgetSurface) -> dict[str, Any] | None:
+    """Knots of the interpolation: logarithms of the errors, and their slopes."""
+    errors = s.centroid
+    if errors is None:
+        return None
+    out: dict[str, Any] = {"name": CENTROID, "kind": "random", "source": MEASURED}
+    out["mag"] = [float(m) for m in errors.mag]
+    logs = [np.log(sigma) for sigma in (errors.sigma_u, errors.sigma_v)]
+    slopes = [
+        PchipInterpolator(errors.mag, log).derivative()(errors.mag)
+        if len(errors.mag) > 1
+        else np.zeros(1)
+        for log in logs
+    ]
+    out["log"] = [_short(log, MOMENT_DIGITS) for log in logs]
+    out["slope"] = [_short(slope, MOMENT_DIGITS) for slope in slopes]
+    return out

@@ -1,0 +1,58 @@
+"""In which system coefficients and errors are given, in plain words.
+
+What all frames have in common is a change of the polynomials: shift and rotation of a solution mean
+nothing before it is said where they are zero.
+"""
+
+from __future__ import annotations
+
+from bayesdist.report.context import ReportInput
+
+__all__ = ["gauge_mark", "gauge_note", "gauge_of_maps", "gauge_of_new_exposure"]
+
+
+def gauge_mark(r: ReportInput) -> str:
+    """What a caption says of the gauge; empty for a single system, where there is no choice."""
+    return ", in the fit's own gauge" if r.fit.model.n_frame else ""
+
+
+def gauge_note(r: ReportInput) -> str:
+    """What the fit's own gauge is, as sentences; empty where there is no choice."""
+    model = r.fit.model
+    if not model.n_frame:
+        return ""
+    first = model.exposures[0]
+    if model.gauge == "first":
+        return f"The fit's own gauge: the polynomials are those of exposure {first}, as it lies."
+    chip = model.chips[0].name
+    return (
+        f"The fit's own gauge: exposure {first} is held where its own stars on {chip} put it, so"
+        f" that shift and rotation of {chip} are near zero, and not exactly zero. The linear terms"
+        f" against time are in another gauge, in which they are."
+    )
+
+
+def gauge_of_maps(r: ReportInput) -> str:
+    """Whether shift and rotation count in the maps of the uncertainty; empty without frames."""
+    if not r.fit.model.n_frame:
+        return ""
+    if r.selfcal is not None:
+        return (
+            "What the gauge holds by convention, shift and rotation of the detector as a whole"
+            " among them unless something fixes them, has no error here."
+        )
+    first = r.fit.model.exposures[0]
+    return (
+        "Shift and rotation of the detector as a whole count as errors here, relative to exposure"
+        f" {first}."
+    )
+
+
+def gauge_of_new_exposure(r: ReportInput) -> str:
+    """For whom budget and margins of a campaign are; empty for other runs."""
+    if r.campaign is None:
+        return ""
+    return (
+        "For a new exposure whose shift and rotation are fitted by whoever uses it: what a shift"
+        " and a rotation of all chips together take up is no error here."
+    )

@@ -1,0 +1,202 @@
+"""The error budget: how much each term gives, and where which one is largest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.patches import Patch
+
+from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.fields import Grid, scalar_map
+from bayesdist.report.numbers import MISSING, display_scale, percent, with_mas
+from bayesdist.report.panels import ChipPanels
+from bayesdist.report.registry import Plot
+from bayesdist.report.sections.gauge import gauge_of_new_exposure
+from bayesdist.report.style import (
+    CYCLE,
+    INK,
+    OUTLINE,
+    PALETTE,
+    WIDTH,
+    figure_style,
+    new_figure,
+)
+from bayesdist.report.texttable import TextTable
+
+__all__ = [
+    "budget_dominating",
+    "budget_table",
+    "budget_terms",
+    "is_total",
+]
+
+AS_ABOVE = "as above"  # of the rows of single chips
+_MOST_PANELS = 3  # chips whose bars stand beside those of the detector
+_KIND_COLORS = {
+    "random": PALETTE["sky"],
+    "systematic": PALETTE["blue"],
+    "local": PALETTE["green"],
+    PRODUCT: OUTLINE,
+}
+# one above the other, as both axes are often equal
+_AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}
+_MARKER_STYLE = {"ms": 5.5, "color": PALETTE["yellow"], "mec": INK, "mew": 0.7, "zorder": 4}
+
+
+def is_total(row: Mapping[str, str | float]) -> bool:
+    """Whether a row of `ErrorBudget.rows` is the sum of the others."""
+    return row["kind"] == "total"
+
+
+@REPORT.table("budget", needs=("budget",))
+def budget_table(r: ReportInput) -> TextTable:
+    """The error budget, the total last."""
+    assert r.budget is not None
+    unit, mas = r.budget.unit, r.scale_mas
+    names = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
+    rows = r.budget.rows_by_chip() if r.several else r.budget.rows()
+    out = [
+        (
+            str(row["name"]),
+            *((names[str(row["chip"])],) if r.several else ()),
+            str(row["kind"]),
+            AS_ABOVE if str(row.get("chip", "all")) != "all" else str(row["source"]) or MISSING,
+            *(r.marked(with_mas(float(row[k]), unit, mas)) for k in ("u", "v", "radial")),
+            _known_to(row),
+        )
+        for row in rows
+    ]
+    of_chip = ("Chip",) if r.several else ()
+    heads = ("Term", *of_chip, "Kind", "Source", "u", "v", "Radial", "Known to")
+    epoch = r.budget.epoch
+    when = "" if epoch is None else f" at epoch {epoch:.2f}"
+    return TextTable(
+        f"Error budget{when}: rms over the detector, 1 σ",
+        heads,
+        tuple(out),
+        words=tuple(range(len(heads) - 4)),
+        leading=len(r.budget.rows()),  # those of all chips together
+        stacked=(heads.index("Radial"),),
+        note="The parts of the model are correlated and enter the total jointly, by draws;"
+        " independent terms are added in quadrature. The total therefore need not be the root of"
+        f" the sum of squares.{_of_products(rows)} {gauge_of_new_exposure(r)}".rstrip(),
+    )
+
+
+def _known_to(row: Mapping[str, Any]) -> str:
+    """How well a term is known itself."""
+    error, size = row["radial_error"], float(row["radial"])
+    if error is None or not size > 0:
+        return MISSING
+    return "exact" if error == 0 else percent(error / size, 2)
+
+
+def _of_products(rows: Sequence[Mapping[str, Any]]) -> str:
+    if all(row["kind"] != PRODUCT for row in rows):
+        return ""
+    return (
+        " Rows of kind product say what a file differs by from the solution, the same in every"
+        " draw: they come on top, in quadrature, for whoever uses that file, and are in no total."
+    )
+
+
+@REPORT.figure("budget", needs=("budget",))
+def budget_terms(r: ReportInput) -> Plot:
+    """Bars of each term's radial rms over the detector, with its two axes marked.
+
+    Each of up to three chips has a panel beside that of the whole detector.
+    """
+    budget = r.budget
+    assert budget is not None
+    rows = budget.rows()
+    parts = {"all chips": rows}
+    if 1 < len(budget.chips) <= _MOST_PANELS:
+        parts |= {n: b.rows() for n, b in zip(r.mosaic.names, budget.chips, strict=True)}
+    largest = max(float(row["radial"]) for part in parts.values() for row in part)
+    scale = display_scale(budget.unit, largest)
+    with figure_style():
+        fig = new_figure(WIDTH, (1.1 if len(parts) == 1 else 1.3) + 0.34 * len(rows))
+        axes = fig.subplots(1, len(parts), sharey=True, squeeze=False)[0]
+        for ax, (name, part) in zip(axes, parts.items(), strict=True):
+            _bars(ax, part, scale.factor)
+            # a number beyond its bar takes more of a narrow panel
+            room = 1.12 if len(parts) == 1 else 1.12 + 0.12 * len(parts)
+            ax.set_xlim(0, largest * scale.factor * room or 1.0)
+            over = "the detector" if len(parts) == 1 else name
+            ax.set_xlabel(f"rms over {over} [{scale.unit}]")
+        axes[0].set_yticks(np.arange(len(rows)), [fill(str(row["name"]), 26) for row in rows])
+        axes[0].invert_yaxis()
+        present = {row["kind"] for row in rows if not is_total(row)}
+        kinds = [k for k in _KIND_COLORS if k in present]
+        handles = [Patch(color=_KIND_COLORS[k], label=f"{k}, radial") for k in kinds]
+        handles.append(Patch(color=INK, label="total, radial"))
+        for key, (marker, _) in _AXIS_MARKERS.items():
+            handles += axes[0].plot([], [], marker, label=f"{key} alone", **_MARKER_STYLE)
+        fig.legend(handles=handles, loc="outside upper left", ncols=len(handles))
+    *terms, total = (row for row in rows if row["kind"] != PRODUCT)
+    top = max(terms, key=lambda row: row["radial"])
+    return Plot(
+        fig,
+        "Error budget by term",
+        f"The largest term is {top['name']}, {r.length(top['radial'])}, of a total of"
+        f" {r.length(total['radial'])} (radial rms over the detector).",
+        f"Bars of the budget's terms; the largest is {top['name']}.",
+    )
+
+
+def _bars(ax: Axes, rows: Sequence[Mapping[str, str | float]], factor: float) -> None:
+    place = np.arange(len(rows))
+    radial = np.array([row["radial"] for row in rows], float) * factor
+    colors = [INK if is_total(row) else _KIND_COLORS.get(str(row["kind"]), OUTLINE) for row in rows]
+    ax.barh(place, radial, height=0.62, color=colors, zorder=2)
+    for key, (marker, shift) in _AXIS_MARKERS.items():
+        values = np.array([row[key] for row in rows], float) * factor
+        ax.plot(values, place + shift, marker, **_MARKER_STYLE)
+    for k, value in enumerate(radial):
+        ax.annotate(f"{value:.3g}", (value, k), (5, 0), textcoords="offset points", va="center")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.tick_params(axis="y", length=0)
+
+
+@REPORT.figure("budget", needs=("budget",))
+def budget_dominating(r: ReportInput) -> Plot:
+    """Map of the term that contributes most at each position."""
+    budget = r.budget
+    assert budget is not None
+    share = budget.share
+    present = np.flatnonzero(share)
+    colors = [CYCLE[k % len(CYCLE)] for k in range(len(present))]
+    panels = ChipPanels(r.mosaic)
+    panels.frame()
+    scalar_map(
+        panels,
+        [Grid(b.x, b.y, np.searchsorted(present, b.dominant).astype(float)) for b in budget.chips],
+        r.mosaic.names,
+        norm=BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present)),
+        cmap=ListedColormap(colors),
+    )
+    handles = [
+        Patch(color=c, label=f"{_shortened(budget.names[k])} ({100 * share[k]:.0f} %)")
+        for c, k in zip(colors, present, strict=True)
+    ]
+    with figure_style():
+        panels.figure.legend(handles=handles, loc="outside upper left", ncols=2)
+    top = int(share.argmax())
+    return Plot(
+        panels.figure,
+        "Dominating term",
+        f"Where which term is largest: {budget.names[top]} on {percent(share[top], 2)} of the grid."
+        " A better calibration helps only where a term of the model leads.",
+        f"Map of the dominating term, mostly {budget.names[top]}.",
+    )
+
+
+def _shortened(name: str, width: int = 40) -> str:
+    return name if len(name) <= width else name[: width - 1] + "…"

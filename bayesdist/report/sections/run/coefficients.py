@@ -1,0 +1,180 @@
+"""The parameters: Legendre, time dependence and frames, monomial."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numbers import MISSING, interval, number, rounded
+from bayesdist.report.sections.gauge import gauge_mark, gauge_note
+from bayesdist.report.texttable import MAX_ROWS, TextTable, further
+
+__all__ = [
+    "coefficient_tables",
+]
+
+_ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
+_SMALL = 1e-3  # below it a number without a unit is shown in 10^-6
+
+
+@REPORT.table("coefficients")
+def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
+    """Legendre coefficients, then time dependence and frames, then monomial coefficients."""
+    kinds = {p.name: p.kind for p in r.fit.model.parameters}
+    rows = list(r.coefficients)
+    mark, held = gauge_mark(r), r.held
+    groups = []
+    for names in (("polynomial",), ("tdd", "frame")):
+        every = [row for row in rows if kinds.get(str(row["name"])) in names]
+        free = [row for row in every if str(row["name"]) not in held]
+        groups.append((free, [str(row["name"]) for row in every if str(row["name"]) in held]))
+    (polynomial, fixed), (others, fixed_others) = groups
+    legendre = _parameter_table(
+        r,
+        f"Legendre coefficients [{r.unit}]{mark}: formal error beside posterior error",
+        polynomial,
+        with_unit=False,
+    )
+    out = [replace(legendre, note=_notes(gauge_note(r), _held_note(r, fixed)))]
+    if others:
+        table = _parameter_table(
+            r,
+            f"Time dependence and exposure frames{mark}",
+            others[:MAX_ROWS],
+            with_unit=True,
+        )
+        note = _notes(_held_note(r, fixed_others), further(len(others)))
+        out.append(replace(table, note=note, detail=True))
+    out += [_monomial_table(r, chip.number) for chip in r.fit.model.chips]
+    return tuple(out)
+
+
+def _notes(*sentences: str) -> str:
+    return " ".join(s for s in sentences if s)
+
+
+def _held_note(r: ReportInput, names: list[str]) -> str:
+    """Parameters that are no measurements, those of one term together."""
+    if not names:
+        return ""
+    terms: dict[str, list[str]] = {}
+    for name in names:
+        term, _, kind = name.rpartition(".")
+        terms.setdefault(term, []).append(kind)
+    texts = [
+        f"{term} ({', '.join(kinds)})" if term else ", ".join(kinds)
+        for term, kinds in terms.items()
+    ]
+    if r.selfcal is not None:
+        return (
+            "Held by the gauge, and therefore not shown: the detections say nothing of what these"
+            f" parameters stand for: {'; '.join(texts)}."
+        )
+    return (
+        "Held, and therefore not shown: a prior alone says what these parameters are, and the data"
+        f" add nothing to it: {'; '.join(texts)}."
+    )
+
+
+def _readable(row: Any) -> tuple[float, str]:
+    """Factor and unit in which a parameter is shown: small ratios and angles by the million."""
+    unit = str(row["unit"] or "")
+    largest = max(abs(float(row["value"])), float(row["sigma"]))
+    return (1e6, "10⁻⁶") if not unit and largest < _SMALL else (1.0, unit or "none")
+
+
+def _parameter_table(
+    r: ReportInput, caption: str, rows: list[Any], *, with_unit: bool
+) -> TextTable:
+    known = set(r.coefficients.colnames)
+
+    def cell(row: Any, key: str, factor: float = 1.0) -> Any:
+        value = row[key] if key in known else None
+        return value if value is None or value is np.ma.masked else factor * value
+
+    out = []
+    for row in rows:
+        factor, unit = _readable(row) if with_unit else (1.0, "")
+        sigma, sd = cell(row, "sigma", factor), cell(row, "sd", factor)
+        ratio = None
+        if number(sigma) != MISSING and number(sd) != MISSING and float(sigma) > 0:
+            ratio = float(sd) / float(sigma)
+        sampled = (
+            rounded(cell(row, "mean", factor), sd),
+            number(sd, 2),
+            number(ratio),
+            interval(cell(row, "lo68", factor), cell(row, "hi68", factor), sd),
+            interval(cell(row, "lo95", factor), cell(row, "hi95", factor), sd),
+        )
+        rhat = cell(row, "rhat")
+        out.append(
+            (
+                str(row["name"]),
+                rounded(cell(row, "value", factor), sigma),
+                number(sigma, 2),
+                *(r.marked(c) for c in sampled),
+                number(rhat, 4),
+                number(cell(row, "ess_bulk"), 3),
+                *((unit,) if with_unit else ()),
+            )
+        )
+    heads = (
+        "Name",
+        "Least squares",
+        "Formal σ",
+        "Posterior mean",
+        "sd",
+        "sd / σ",
+        "68 %",
+        "95 %",
+        "R-hat",
+        "ESS",
+    )
+    columns = (*heads, *(("Unit",) if with_unit else ()))
+    # where an interval is that of the sd and convergence was judged as a whole, paper does without
+    on_paper = tuple(k for k, name in enumerate(columns) if name not in _ON_SCREEN)
+    return TextTable(caption, columns, tuple(out), words=(0, len(heads)), on_paper=on_paper)
+
+
+def _monomial_table(r: ReportInput, chip: int) -> TextTable:
+    """Coefficients of (x - xref)^i (y - yref)^j with the errors that carry over."""
+    model = r.fit.model
+    basis = model.basis(chip)
+    gauge = gauge_note(r) if chip == model.chips[0].number else ""
+    name = model.chips[model.chip_code(chip)].name if r.several else chip
+    cells = []
+    for axis in (0, 1):
+        where = r.fit.model.coefficient_slice(chip, axis)
+        for solution in (r.fit, r.posterior):
+            if solution is None:
+                cells.append([(MISSING, MISSING)] * basis.n_terms)
+                continue
+            cov = np.asarray(solution.cov)[where, where]
+            values, covariance = basis.to_monomials(np.asarray(solution.mean)[where], cov)
+            sigma = np.sqrt(np.diag(covariance))
+            texts = [(rounded(c, s), number(s, 2)) for c, s in zip(values, sigma, strict=True)]
+            if solution is r.posterior:
+                texts = [(r.marked(c), r.marked(s)) for c, s in texts]
+            cells.append(texts)
+    rows = []
+    for axis in (0, 1):
+        formal, posterior = cells[2 * axis : 2 * axis + 2]
+        for (i, j), f, p in zip(basis.terms, formal, posterior, strict=True):
+            rows.append(("uv"[axis], str(i), str(j), *f, *p))
+    x, y = basis.reference_pixel
+    return TextTable(
+        f"Monomial coefficients, chip {name}: of (x − {x:g})^i (y − {y:g})^j"
+        f" [{r.unit}/pix^(i + j)]{gauge_mark(r)}",
+        ("Axis", "i", "j", "Least squares", "Formal σ", "Posterior mean", "sd"),
+        tuple(rows),
+        note=_notes(
+            "Monomial coefficients are strongly correlated: their errors must not be combined as"
+            " if they were independent. The covariance stands in the products.",
+            gauge,
+        ),
+        detail=True,
+    )

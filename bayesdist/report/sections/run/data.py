@@ -1,0 +1,202 @@
+"""What came in, with errors by magnitude."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numbers import MISSING, count, display_scale, number
+from bayesdist.report.registry import Plot
+from bayesdist.report.style import INK, PALETTE, SEQUENTIAL, WIDTH, figure_style, new_figure
+from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, short_paths
+
+if TYPE_CHECKING:
+    from bayesdist.data import MagnitudeErrors
+
+__all__ = [
+    "data_tables",
+    "residuals_by_magnitude",
+]
+
+Float = NDArray[np.float64]
+
+
+@REPORT.table("data")
+def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
+    """What was read, what was rejected, errors by magnitude, exposures."""
+    m, fit, words = r.stars.table, r.fit, r.words
+    partial = ", of the sample" if r.stars.partial else ""
+    pairs = {
+        "Sources": ", ".join(short_paths(m.sources)),
+        "Rows read": count(m.n_rows),
+        words.all_things.capitalize(): count(r.stars.n_total),
+        f"Used by the {words.chooser}": count(fit.n_used),
+        "Unit of u, v": m.unit,
+        "Exposures": count(np.count_nonzero(r.exposures.n)),
+        "Filters": ", ".join(f for f in m.filter_names if f) or MISSING,
+    }
+    if m.epoch is not None:
+        pairs[f"Epochs [yr]{partial}"] = f"{np.min(m.epoch):.2f} to {np.max(m.epoch):.2f}"
+    if m.mag is not None and np.isfinite(m.mag).any():
+        pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
+    pairs[f"Errors of the {words.things}"] = (
+        "by magnitude, see below"
+        if r.magnitude_errors is not None
+        else str(r.setting("data", "sigma", "as given"))
+    )
+    reasons = [(f"{k} (reading)", count(v)) for k, v in m.rejected.items()]
+    reasons += [(f"{k} ({words.chooser})", count(v)) for k, v in fit.rejected.items()]
+    rejected = TextTable(
+        "Rows left out, by reason",
+        ("Reason", "Rows"),
+        tuple(reasons) or (("none", "0"),),
+        note=f"The posterior uses all {words.all_things}: the mixture takes the place of rejection."
+        if r.posterior is not None
+        else "",
+    )
+    note = f"Figures and tables of single {words.things} show {r.sample}." if partial else ""
+    out = [listing("Input", pairs, note), rejected]
+    if r.magnitude_errors is not None:
+        out.append(_magnitude_table(r))
+    if len(m.exposure_names) > 1:
+        out.append(_exposure_table(r))
+    return tuple(out)
+
+
+def _magnitude_table(r: ReportInput) -> TextTable:
+    e = r.magnitude_errors
+    assert e is not None
+    scale = display_scale(r.unit, np.concatenate([e.sigma_u, e.sigma_v]))
+    rows = tuple(
+        (f"{mag:.2f}", count(n), number(su * scale.factor), number(sv * scale.factor))
+        for mag, n, su, sv in zip(e.mag, e.n, e.sigma_u, e.sigma_v, strict=True)
+    )
+    return TextTable(
+        "Errors by magnitude, estimated from the residuals",
+        (
+            "Magnitude",
+            r.words.things.capitalize(),
+            f"σ u [{scale.unit}]",
+            f"σ v [{scale.unit}]",
+        ),
+        rows,
+        words=(),
+        detail=True,
+    )
+
+
+def _exposure_table(r: ReportInput) -> TextTable:
+    names, fit, sums = r.stars.table.exposure_names, r.fit, r.exposures
+    scale = display_scale(r.unit, [fit.rms_u, fit.rms_v])
+    flagged = r.flagged
+    rows = tuple(
+        (
+            names[k],
+            count(sums.n[k]),
+            count(sums.n_used[k]),
+            *(number(rms[k] * scale.factor) for rms in sums.rms),
+            MISSING if flagged is None else r.marked(count(flagged[k])),
+        )
+        for k in np.flatnonzero(sums.n)
+    )
+    return TextTable(
+        "Exposures",
+        (
+            "Exposure",
+            r.words.things.capitalize(),
+            "Used",
+            f"rms u [{scale.unit}]",
+            f"rms v [{scale.unit}]",
+            "Outliers (P > 0.5)",
+        ),
+        rows[:MAX_ROWS],
+        note=further(len(rows)),
+        detail=True,
+    )
+
+
+@REPORT.figure("data", when=lambda r: bool(_magnitudes(r).any()))
+def residuals_by_magnitude(r: ReportInput) -> Plot:
+    """Density of the residuals against magnitude, with the errors assigned to each magnitude."""
+    words, known = r.words, _magnitudes(r)
+    text = f"Residuals grow towards faint stars; colour counts {words.things}."
+    if r.magnitude_errors is not None:
+        text += " The lines are ±1 σ as assigned to each magnitude: about two thirds of the"
+        text += f" {words.things} lie between them"
+        text += ", or somewhat more, because the stars were fitted to them." if words.taken else "."
+    if r.sample:
+        text += f" Drawn from {r.sample}."
+    assert r.stars.table.mag is not None
+    return Plot(
+        _density(
+            r.stars.table.mag[known],
+            r.stars.residual[known],
+            unit=r.unit,
+            errors=r.magnitude_errors,
+            shown=f"sampled {words.things}" if r.stars.partial else words.things,
+        ),
+        "Residuals against magnitude",
+        text,
+        "Two density plots of the residuals in u and v against magnitude, widening to faint stars.",
+    )
+
+
+def _magnitudes(r: ReportInput) -> NDArray[np.bool_]:
+    """Stars (N,) whose magnitude is known."""
+    mag = r.stars.table.mag
+    return np.zeros(len(r.stars.table), bool) if mag is None else np.isfinite(mag)
+
+
+def _density(
+    mag: Float, residual: Float, *, unit: str, errors: MagnitudeErrors | None, shown: str
+) -> Figure:
+    """Hexagons that count residuals, an axis of these in each panel."""
+    reach = _magnitude_reach(residual, errors)
+    scale = display_scale(unit, reach)
+    low, high = np.quantile(mag, [0.002, 0.998])  # a few very bright stars must not fill the plot
+    pad = 0.02 * max(high - low, 0.1)
+    with figure_style():
+        fig = new_figure(WIDTH, 3.2)
+        axes = fig.subplots(1, 2, sharey=True)
+        for ax, axis, values in zip(axes, "uv", residual.T, strict=True):
+            inside = (np.abs(values) <= reach) & (
+                np.abs(2 * mag - low - high) <= high - low + 2 * pad
+            )
+            hexagons = ax.hexbin(
+                mag[inside],
+                values[inside] * scale.factor,
+                gridsize=(45, 30),
+                extent=(low - pad, high + pad, -reach * scale.factor, reach * scale.factor),
+                mincnt=1,
+                norm=LogNorm(vmin=1),
+                cmap=SEQUENTIAL,
+                linewidths=0.1,
+            )
+            if errors is not None:
+                grid = np.linspace(low - pad, high + pad, 200)
+                sigma = np.asarray(errors.at(grid)["uv".index(axis)]) * scale.factor
+                for edge in (-sigma, sigma):
+                    ax.plot(grid, edge, color="white", lw=2.6)
+                    ax.plot(grid, edge, color=PALETTE["vermilion"], lw=1.3)
+            ax.axhline(0.0, color=INK, lw=0.5)
+            ax.set_xlim(low - pad, high + pad)
+            ax.set_ylim(-reach * scale.factor, reach * scale.factor)
+            ax.set_title(f"{axis}: {int((~inside).sum())} of {values.size} {shown} lie outside")
+            ax.set_xlabel("magnitude [mag]")
+        axes[0].set_ylabel(f"residual [{scale.unit}]")
+        fig.colorbar(hexagons, ax=axes, label=f"{shown} per hexagon", fraction=0.04, pad=0.01)
+    return fig
+
+
+def _magnitude_reach(residual: Float, errors: MagnitudeErrors | None) -> float:
+    """Height of the plot: the faintest stars' errors with room, and not the outliers."""
+    if errors is not None:
+        return 4.0 * float(max(np.max(errors.sigma_u), np.max(errors.sigma_v)))
+    scatter = 1.4826 * float(np.median(np.abs(residual)))
+    return 8.0 * scatter or 1.0

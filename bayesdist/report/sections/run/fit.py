@@ -1,0 +1,173 @@
+"""The least-squares fit in numbers, statistics and tests of its residuals."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess import residual_statistics
+from bayesdist.diagnose.score.result import FAMILY_LEVEL, POWER
+from bayesdist.infer.skew import skew_of
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numbers import MISSING, count, display_scale, number, rounded, with_mas
+from bayesdist.report.texttable import TextTable, listing
+
+__all__ = [
+    "fit_tables",
+    "score_test_table",
+]
+
+
+@REPORT.table("fit")
+def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
+    """The linear fit in figures, and statistics of its residuals."""
+    fit, model, stars = r.fit, r.fit.model, r.stars
+    mas, words = r.scale_mas, r.words
+    pairs = {
+        "Polynomial order": str(model.order),
+        "Parameters": f"{count(model.n_params)} ({count(model.n_polynomial)} polynomial)",
+        "Chips": ", ".join(c.name or str(c.number) for c in model.chips),
+        "Frame of each exposure": model.frames,
+        "Time-dependent terms": _drifting(r),
+        "Chi-square / degrees of freedom": f"{number(fit.chi2, 6)} / {count(fit.dof)} ="
+        f" {number(fit.chi2 / fit.dof if fit.dof > 0 else None)}",
+        "rms of u": with_mas(fit.rms_u, r.unit, mas),
+        "rms of v": with_mas(fit.rms_v, r.unit, mas),
+        f"{words.things} used, left out".capitalize(): f"{count(fit.n_used)}, "
+        f"{count(fit.n_rejected)}",
+        "Condition of the scaled normal matrix": number(fit.condition, 2),
+    }
+    scale = display_scale(r.unit, [fit.rms_u, fit.rms_v])
+    names = ("mean", "sigma", "min", "max", "median", "p01", "p99")
+    heads = ("Mean", "σ", "Min", "Max", "Median", "1 %", "99 %")
+    rows = []
+    for chip, here in _chips_of_stars(r):
+        for axis, values in zip("uv", stars.fit_residual[here].T, strict=True):
+            if values.size:
+                s = residual_statistics(values * scale.factor)
+                rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
+    if r.held:
+        pairs["Parameters"] += f", {count(len(r.held))} of them held by {words.holder}"
+    return (
+        listing(words.fit.capitalize(), pairs),
+        *((_skew_table(r),) if r.setting("fit", "skew", False) else ()),
+        TextTable(
+            f"Residuals of the {words.things} used [{scale.unit}]",
+            ("Chip, axis" if r.several else "Axis", *heads),
+            tuple(rows),
+            note=_residual_note(r),
+        ),
+    )
+
+
+def _residual_note(r: ReportInput) -> str:
+    notes = [f"From {r.sample}."] if r.sample else []
+    if r.words.taken:
+        notes.append(
+            "The stars were fitted to these detections, so that residuals are smaller than errors."
+        )
+    return " ".join(notes)
+
+
+def _skew_table(r: ReportInput) -> TextTable:
+    """The skew that the linear terms of each chip hold."""
+    rows = []
+    for c in r.chips:
+        for name, solution in (("least squares", r.fit), ("posterior", r.posterior)):
+            if solution is None:
+                continue
+            skew = skew_of(solution, chip=c.chip.number)
+            cells = [
+                rounded(1e6 * skew.value, 1e6 * skew.sigma),
+                number(1e6 * skew.sigma, 2),
+                number(skew.significance, 3),
+            ]
+            if name == "posterior":
+                cells = [r.marked(text) for text in cells]
+            rows.append((f"{c.chip.name}, {name}" if r.several else name, *cells))
+    note = "The angle from the image of a row to that of a column is 90° plus the skew. It is held"
+    note += " by the linear terms, which are all free: beside them there is no further parameter."
+    weight = r.setting("fit", "radial_weight", 1.0)
+    if weight != 1.0:
+        note += (
+            f" With {weight:g} times the weight in the corners the weights of the fit are not the"
+            " inverse variances: its σ allows for that, but is larger than it need be, and"
+            " chi-square does not test a skew of zero."
+        )
+    return TextTable(
+        "Skew of the axes at the reference pixel [10⁻⁶ rad]",
+        ("Chip, solution" if r.several else "Solution", "Skew", "σ", "Skew / σ"),
+        tuple(rows),
+        note=note,
+    )
+
+
+def _drifting(r: ReportInput) -> str:
+    """Terms whose drift was asked for, and which constants may step beside them."""
+    model = r.fit.model
+    time = model.time
+    if time is None:
+        return "none"
+    drift = r.setting("model", "tdd", {})
+    asked = [tuple(term) for term in drift.get("terms", time.terms)]
+    text = ", ".join(f"{a}_{i}_{j}" for a, i, j in asked)
+    steps = {
+        p.chip
+        for p in model.parameters
+        if p.kind == "tdd"
+        and (p.i, p.j) == (0, 0)
+        and (p.axis, p.i, p.j) not in asked
+        and p.name not in r.held
+    }
+    if not steps:
+        return text
+    chips = ", ".join(c.name for c in model.chips if c.number in steps)
+    breaks = ", ".join(f"{b:.2f}" for b in time.breaks)
+    return f"{text}; besides, the constants of {chips} may step at {breaks}"
+
+
+def _chips_of_stars(r: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
+    """Stars (N,) used of all chips and, where there are several, of each; what rows begin with."""
+    table, used = r.stars.table, r.stars.used
+    if not r.several:
+        return [("", used)]
+    numbers = table.chip_number
+    each = [(f"{c.chip.name}, ", used & (numbers == c.chip.number)) for c in r.chips]
+    return [("all, ", used), *each]
+
+
+@REPORT.table("fit", needs=("score_tests",))
+def score_test_table(r: ReportInput) -> TextTable:
+    """What the residuals were asked, and what they say."""
+    seen = [t.smallest for t in r.score_tests if np.isfinite(t.smallest)]
+    scale = display_scale(r.unit, seen or [1.0])
+    rows = tuple(
+        (
+            t.name if t.unit == r.unit else f"{t.name}, per year",
+            f"{number(t.statistic, 3)} ({number(t.dof, 3)})",
+            "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
+            number(t.size * scale.factor, 2),
+            number(t.smallest * scale.factor, 2) if np.isfinite(t.smallest) else MISSING,
+            f"found: {t.remedy}" if t.significant else "nothing found",
+        )
+        for t in r.score_tests
+    )
+    return TextTable(
+        "Score tests of the residuals",
+        (
+            "Test",
+            "Statistic (dof)",
+            "p",
+            f"Size [{scale.unit}]",
+            f"Would have seen [{scale.unit}]",
+            "Result",
+        ),
+        rows,
+        words=(0, 5),
+        stacked=(5,),
+        note=f"Found: more than chance at {FAMILY_LEVEL:g} over all these tests together (Holm)."
+        " Size: rms over the detector; of the noise rms difference of its standard deviations; of"
+        " the gap its drift, and of motions their rms, in a year;"
+        f" beside it the smallest that would have been seen with probability {POWER:g}.",
+    )

@@ -1,0 +1,232 @@
+"""Held-out stars against their prediction."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.patches import Rectangle
+from scipy.stats import binom
+
+from bayesdist.diagnose.holdout.validation import DOUBTFUL, HeldOutTruth
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import Check, ReportInput
+from bayesdist.report.numbers import count, number, probability
+from bayesdist.report.panels import chip_axes
+from bayesdist.report.registry import Plot
+from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
+from bayesdist.report.texttable import TextTable
+
+if TYPE_CHECKING:
+    from bayesdist.diagnose.holdout.tests import HeldTest
+
+__all__ = [
+    "holdout",
+    "holdout_checks",
+    "holdout_coverage",
+    "holdout_table",
+]
+
+_WHAT = ("u", "v, given u", "distance")
+_LEAST_RANGE = 0.3  # of the factor on the errors, above 1: chance alone must not look dramatic
+_FEWEST = 20  # stars of a region that is coloured
+_MOST_TESTS = 12
+_KEY = 3.0  # length of the arrow in the key, in sigma
+
+
+def holdout_checks(found: HeldOutTruth | None) -> tuple[Check, ...]:
+    """The verdict of the held-out stars as rows of the status; none where there are none.
+
+    Parameters
+    ----------
+    found : HeldOutTruth or None
+
+    Returns
+    -------
+    tuple of Check
+    """
+    if found is None:
+        return ()
+    return (
+        Check(
+            f"Held-out stars ({count(found.n)})",
+            f"{found.verdict}" if found.level != "pass" else f"agree, {probability(found.p_value)}",
+            f"p at least {number(DOUBTFUL, 1)}",
+            found.level,
+        ),
+    )
+
+
+def _with_coverage(r: ReportInput) -> bool:
+    return r.held_out is not None and bool(r.held_out.coverage)
+
+
+@REPORT.table("holdout", needs=("held_out",), when=_with_coverage)
+def holdout_coverage(r: ReportInput) -> TextTable:
+    """Coverage of the held-out stars along each axis."""
+    found = r.held_out
+    assert found is not None
+    rows = tuple(
+        (
+            c.axis,
+            f"{c.level:g} σ",
+            count(c.n),
+            f"{c.value:.3f}",
+            f"{c.interval[0]:.3f} to {c.interval[1]:.3f}",
+            f"{c.expected:.3f}",
+        )
+        for c in found.coverage
+    )
+    heads = ("Axis", "Within", "Stars", "Fraction", "95 % interval", "Predicted")
+    note = "False matches are part of the prediction; the interval is that of independent stars."
+    return TextTable("Coverage of the held-out stars", heads, rows, words=(0, 1), note=note)
+
+
+@REPORT.table("holdout", needs=("held_out",))
+def holdout_table(r: ReportInput) -> TextTable:
+    """The tests that tell most."""
+    found = r.held_out
+    assert found is not None
+    shown = found.tests[:_MOST_TESTS]
+    rows = tuple(
+        (
+            _question(test, found.unit),
+            test.where,
+            count(test.n),
+            number(test.value, 3),
+            number(test.expected, 3),
+            number(test.p_value, 2),
+            number(test.p_corrected, 2),
+        )
+        for test in shown
+    )
+    heads = ("Test", "Where", "Stars", "Found", "Predicted", "p", "p, corrected")
+    note = (
+        f"The {len(shown)} most telling of {len(found.tests)} tests, all in holdout.ecsv; corrected"
+        " for their number after Holm (1979)."
+    )
+    return TextTable("Tests of the held-out stars", heads, rows, words=(0, 1), note=note)
+
+
+def _question(test: HeldTest, unit: str) -> str:
+    return {
+        "offset": f"offset, largest [{unit}]" if test.together else f"offset [{unit}]",
+        "spread": "residuals / predicted",
+        "distribution": "largest difference of distributions",
+        "tails": "fraction of stars",
+        "deviation": "deviation from other exposures",
+    }[test.name]
+
+
+@REPORT.figure("holdout", needs=("held_out",), printed=lambda r: r.campaign is None)
+def holdout(r: ReportInput) -> Plot:
+    """Predictive probabilities, and residuals by region in units of their prediction."""
+    found, mosaic = r.held_out, r.mosaic
+    assert found is not None
+    rows, columns = (max(place[k] for place in mosaic.places) + 1 for k in (0, 1))
+    aspect = max(ny / nx for nx, ny in mosaic.sizes)
+    panel = min(0.75 * WIDTH / columns, 4.4)
+    height = 1.9 + rows * (panel * aspect + 0.7)
+    with figure_style():
+        fig = new_figure(WIDTH, height)
+        parts = fig.subfigures(2, 1, height_ratios=[1.9, height - 1.9], squeeze=False)
+        top, bottom = parts[:, 0]
+        for k, ax in enumerate(top.subplots(1, 3, sharey=True)):
+            _histogram(ax, found, k)
+        grid = bottom.subplots(rows, columns, squeeze=False)
+        panels = [grid[place] for place in mosaic.places]
+        limit = _limit(found)
+        norm = TwoSlopeNorm(1.0, 1.0 / limit, limit)
+        for k, (size, name) in enumerate(zip(mosaic.sizes, mosaic.names, strict=True)):
+            drawn = _regions(panels[k], found, k, size, norm)
+            panels[k].set_title(name or "Regions")
+        for ax in grid.ravel():
+            ax.set_visible(ax in panels)
+        bar = bottom.colorbar(drawn, ax=panels, shrink=0.9, aspect=25)
+        bar.set_label("residuals / predicted [no unit]")
+    n_tests = len(found.tests)
+    whole = f", {len(found.exposures)} whole exposures among them" if found.exposures else ""
+    return Plot(
+        fig,
+        "Held-out stars against their prediction",
+        f"{count(found.n)} stars that the fit has not seen{whole}. Top: where each lies in its"
+        " predicted distribution, false matches and the posterior's own error included; level"
+        " within the band (99 % of a bin) if the prediction is right. Bottom: the residuals of"
+        " each region in units of those predicted (1: as predicted), and the mean offset in its"
+        f" own sigma. Of {n_tests} tests the most telling, corrected for their number:"
+        f" {found.verdict}.",
+        f"Histograms of predictive probabilities and a map of normalised residuals: "
+        f"{found.verdict}.",
+    )
+
+
+def _histogram(ax: Axes, found: HeldOutTruth, k: int) -> None:
+    counts = found.pit[k]
+    bins = len(counts)
+    low, high = binom.ppf([0.005, 0.995], found.n, 1 / bins) * bins / found.n
+    ax.axhspan(low, high, color=CYCLE[0], alpha=0.18, lw=0)
+    ax.axhline(1.0, color=INK, lw=0.8)
+    ax.stairs(counts * bins / found.n, np.linspace(0, 1, bins + 1), color=CYCLE[0], lw=1.3)
+    ax.set_xlim(0, 1)
+    ax.set_ylim(0, max(2.0, 1.1 * float(counts.max()) * bins / found.n))
+    ax.set_xlabel("predicted probability of less")
+    ax.set_title(_WHAT[k])
+    if k == 0:
+        ax.set_ylabel("stars / predicted")
+
+
+def _limit(found: HeldOutTruth) -> float:
+    """Largest factor that the colours show."""
+    good = found.region_scale[found.region_n >= _FEWEST]
+    far = np.exp(np.abs(np.log(good)).max()) if good.size else 1.0
+    return float(np.clip(far, 1 + _LEAST_RANGE, 4.0))
+
+
+def _regions(
+    ax: Axes, found: HeldOutTruth, k: int, size: tuple[float, float], norm: TwoSlopeNorm
+) -> PatchCollection:
+    """Regions of one chip: their colour is the factor, their arrow the offset in sigma."""
+    chips = list(dict.fromkeys(bin_.chip for bin_ in found.regions))
+    mine = [
+        b
+        for b, bin_ in enumerate(found.regions)
+        if bin_.chip == chips[k] and found.region_n[b] >= _FEWEST
+    ]
+    boxes = []
+    for b in mine:
+        x0, x1, y0, y1 = found.regions[b].limits
+        boxes.append(Rectangle((x0, y0), x1 - x0, y1 - y0))
+    drawn = PatchCollection(boxes, cmap="RdBu_r", norm=norm, ec="white", lw=0.6)
+    drawn.set_array(found.region_scale[mine])
+    ax.add_collection(drawn)
+    chip_axes(ax, size)
+    if not mine:
+        return drawn
+    edges = np.array([found.regions[b].limits for b in mine])
+    length = 0.28 * float(np.median(edges[:, 1] - edges[:, 0])) / _KEY  # pixels of one sigma
+    arrows = ax.quiver(
+        edges[:, :2].mean(axis=1),
+        edges[:, 2:].mean(axis=1),
+        *(found.region_offset[mine].T * length),
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        width=0.005,
+        color=INK,
+        ec="white",
+        lw=0.4,
+    )
+    if k == 0:
+        ax.quiverkey(
+            arrows,
+            0.9,
+            1.05,
+            _KEY * length,
+            f"offset of {_KEY:g} σ",
+            labelpos="W",
+            coordinates="axes",
+        )
+    return drawn

@@ -1,0 +1,266 @@
+"""The distortion over the detector, and how well it is known there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bayesdist.report.arrows import (
+    Arrows,
+    cross_map,
+    magnification_of,
+    spacing,
+    square_cells,
+    vector_map,
+)
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.fields import Grid, contour_levels, scalar_map
+from bayesdist.report.numbers import display_scale, number, size_of, with_mas
+from bayesdist.report.panels import ChipPanels
+from bayesdist.report.registry import Plot
+from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
+from bayesdist.report.style import nice_below
+from bayesdist.report.texttable import TextTable
+
+if TYPE_CHECKING:
+    from bayesdist.assess import VectorMap
+
+__all__ = [
+    "distortion",
+    "distortion_non_linear",
+    "formal_uncertainty",
+    "map_table",
+    "pixel_area",
+    "uncertainty_radius",
+]
+
+
+@REPORT.table("maps")
+def map_table(r: ReportInput) -> TextTable:
+    """Extremes of the uncertainty maps."""
+    rows = []
+    for c in r.chips:
+        for m in c.maps:
+            cells = [
+                with_mas(v, m.unit, r.scale_mas)
+                for v in (m.sigma_u_max, m.sigma_v_max, m.radius_max, float(np.median(m.radius)))
+            ]
+            cells.append("({:.0f}, {:.0f})".format(*m.position_of_max))
+            if m is not c.formal_map:
+                cells = [r.marked(text) for text in cells]
+            name = f"{c.chip.name}, {m.kind}" if r.several else m.kind
+            rows.append((name, *cells))
+    first = r.chips[0].formal_map
+    when = "" if first.epoch is None else f", epoch {first.epoch:.2f}"
+    which = "each chip" if r.several else f"chip {first.chip}"
+    return TextTable(
+        f"Uncertainty of the position, 1 σ, {which}{when}{gauge_mark(r)}",
+        (
+            "Chip, solution" if r.several else "Solution",
+            "Largest σ u",
+            "Largest σ v",
+            "Max radius",
+            "Median radius",
+            "At pixel",
+        ),
+        tuple(rows),
+        note=gauge_of_maps(r),
+    )
+
+
+@REPORT.figure("maps", printed=True)
+def distortion(r: ReportInput) -> Plot:
+    """Vectors from each array position to where the distortion puts it.
+
+    As section 4 of the WISE distortion report, with the zeroth order suppressed.
+    """
+    v, where = _longest(r, "displacement")
+    notes = {c.chip.name: c.displacement.part_note for c in r.chips}
+    note = v.part_note
+    if len(set(notes.values())) > 1:
+        note = "; ".join(f"{name} {text}" for name, text in notes.items())
+    return Plot(
+        _flow(r, [c.displacement for c in r.chips]),
+        "Distortion, zeroth order suppressed",
+        f"Vectors run from the array position to where the distortion puts it, {note}; the"
+        f" largest is {r.length(v.length_max)} at {where}, ringed."
+        f"{_suppressed(r)}",
+        f"Vector-flow diagram of the distortion, largest vector {r.length(v.length_max)}.",
+    )
+
+
+@REPORT.figure("maps")
+def distortion_non_linear(r: ReportInput) -> Plot:
+    """Vectors of the non-linear part, as Figure 4.1 of the ACS handbook."""
+    v, where = _longest(r, "non_linear")
+    return Plot(
+        _flow(r, [c.non_linear for c in r.chips]),
+        "Distortion, non-linear part",
+        f"Only {v.part_note}: what remains beyond shift, scale, rotation and skew, at most"
+        f" {r.length(v.length_max)} at {where}, ringed.",
+        f"Vector diagram of the non-linear part, largest vector {r.length(v.length_max)}.",
+    )
+
+
+def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
+    """Vectors along x and y of each chip, in its pixels, whatever the unit of u and v."""
+    chips, sizes = [Arrows.of_map(v) for v in vectors], [c.chip.size for c in r.chips]
+    lengths = [float(np.hypot(*v.on_detector).max()) for v in vectors]
+    # one and a half grid steps do not yet hide neighbours, as they flow alike
+    M = min(
+        magnification_of(1.5 * one.step, length) for one, length in zip(chips, lengths, strict=True)
+    )
+    reach = max(one.reach(M, size) for one, size in zip(chips, sizes, strict=True))
+    panels = ChipPanels(r.mosaic)
+    panels.frame(reach + 0.02 * r.mosaic.longest_side)
+    titles = []
+    for k, (one, length) in enumerate(zip(chips, lengths, strict=True)):
+        assert one.ring is not None
+        x, y = one.ring
+        text = f"largest {size_of(length, digits=4)} at ({x:.0f}, {y:.0f})"
+        titles.append(panels.title(k, text))
+    vector_map(panels, chips, titles, magnification=M, key=nice_below(max(lengths) / 1.5))
+    return panels.figure
+
+
+def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
+    """The vectors of the chip where the longest one is, and its place in words."""
+    worst = max(r.chips, key=lambda c: getattr(c, which).length_max)
+    vectors: VectorMap = getattr(worst, which)
+    x, y = vectors.position_of_max
+    return vectors, f"pixel ({x:.0f}, {y:.0f}){r.on_chip(worst.chip)}"
+
+
+def _suppressed(r: ReportInput) -> str:
+    if not r.several:
+        return ""
+    return (
+        " Each chip is compared with its own array: gap and rotation between the chips are not"
+        " shown. All panels have one scale."
+    )
+
+
+@REPORT.figure("maps")
+def formal_uncertainty(r: ReportInput) -> Plot:
+    """Four vectors from each position, to (±sigma_u, ±sigma_v).
+
+    As section 6 of the WISE distortion report, which draws them 2000 times larger than the
+    detector.
+    """
+    maps = [m for c in r.chips for m in c.maps]
+    largest = max(m.radius_max for m in maps)
+    widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
+    # beyond half a grid step crosses overlap: a few do, in the corners, so that the inner ones show
+    every = 2 if r.several else 1  # panels of several chips are small
+    steps = []
+    for m in maps:
+        rows, columns = square_cells(m.x, m.y, every)
+        steps.append(spacing(m.x[columns], m.y[rows]))
+    M = nice_below(0.8 * min(steps) / max(widest, 1e-300))
+    panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
+    panels.frame(M * widest + 0.02 * r.mosaic.longest_side)
+    titles = [
+        panels.title(k, f"{m.kind}, max radius {size_of(m.radius_max, m.unit)}", ", ")
+        for k, c in enumerate(r.chips)
+        for m in c.maps
+    ]
+    cross_map(panels, maps, titles, magnification=M, key=nice_below(largest), every=every)
+    by_kind = [
+        max(maps, key=lambda m: m.radius_max)
+        for maps in zip(*(c.maps for c in r.chips), strict=True)
+    ]
+    found = " and ".join(f"{r.length(m.radius_max)} ({m.kind})" for m in by_kind)
+    return Plot(
+        panels.figure,
+        "Formal-uncertainty diagram",
+        "From each place four vectors to all combinations of ±1 σ in u and ±1 σ in v, enlarged as"
+        f" stated above the panels; the largest radius is {found}.",
+        f"Crosses of ±1 sigma over the detector; largest radius {found}.",
+    )
+
+
+@REPORT.figure("maps", printed=True)
+def uncertainty_radius(r: ReportInput) -> Plot:
+    """Radial uncertainty hypot(sigma_u, sigma_v), all maps in one colour scale."""
+    maps = [m for c in r.chips for m in c.maps]
+    scale = display_scale(r.unit, max(m.radius_max for m in maps))
+    grids = [Grid(m.x, m.y, m.radius * scale.factor, m.position_of_max) for m in maps]
+    panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
+    panels.frame()
+    kinds = [(k, m.kind) for k, c in enumerate(r.chips) for m in c.maps]
+    scalar_map(
+        panels,
+        grids,
+        [
+            panels.title(k, f"{kind}: {g.values.min():.3g} to {g.values.max():.3g}", ", ")
+            for (k, kind), g in zip(kinds, grids, strict=True)
+        ],
+        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
+        label=f"radius (1 σ) [{scale.unit}]",
+    )
+    figure = panels.figure
+    text = "Radial uncertainty hypot(σ u, σ v), its largest place ringed."
+    if r.selfcal is not None:
+        text += (
+            " That of relative positions is the same whatever fixes place, rotation and scale (and"
+            " skew, where all exposures have one roll angle); the other is that of the run's gauge."
+        )
+        return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
+    pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
+    ratios = [p.radius / f.radius for f, p in pairs if p is not None]
+    if ratios:
+        low, high = (number(float(end(ratios))) for end in (np.min, np.max))
+        text += (
+            f" The posterior's is {low} to {high} times the formal one;"
+            " above 1, least squares with rejection is too sure of itself."
+        )
+    return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
+
+
+@REPORT.figure("maps", printed=lambda r: r.campaign is None)
+def pixel_area(r: ReportInput) -> Plot:
+    """Contours of the pixel area relative to that at the reference pixel, in percent.
+
+    As Figure 4.5 of the ACS handbook, which gives the same ratio without subtracting one.
+    """
+    areas = [c.area for c in r.chips]
+    grids = [Grid(a.x, a.y, 100.0 * (a.area - 1.0)) for a in areas]
+    panels = ChipPanels(r.mosaic, colorbar=True)
+    panels.frame()
+    scalar_map(
+        panels,
+        grids,
+        [
+            panels.title(k, f"relative area {a.area.min():.5g} to {a.area.max():.5g}")
+            for k, a in enumerate(areas)
+        ],
+        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
+        label="pixel area − area at reference pixel [%]",
+        labelled=True,
+    )
+    low, high = min(a.area.min() for a in areas), max(a.area.max() for a in areas)
+    sigma = max(float(a.sigma.max()) for a in areas)
+    own, between = "", ""
+    if r.several:
+        own = " of each chip"
+        first, *others = r.chips
+        ratios = ", ".join(
+            f"{c.area.reference_area / first.area.reference_area:.5f} ({c.chip.name})"
+            for c in others
+        )
+        between = (
+            f" The reference pixels themselves cover, relative to that of {first.chip.name}:"
+            f" {ratios}."
+        )
+    return Plot(
+        panels.figure,
+        "Pixel area",
+        f"Relative to the reference pixel{own} the area runs from {low:.5f} to"
+        f" {high:.5f}, known to {number(sigma, 2)} at worst: flat-fielded"
+        f" point-source photometry is to be multiplied by it.{between}",
+        "Contour map of the relative pixel area.",
+    )

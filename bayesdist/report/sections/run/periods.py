@@ -1,0 +1,226 @@
+"""Change with time: the verdict, tables of the periods, and the difference of the ends."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bayesdist.report.arrows import CHANCE, Arrows, magnification_of, spacing, vector_map
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numbers import (
+    MISSING,
+    count,
+    display_scale,
+    number,
+    probability,
+    rounded,
+    size_of,
+    with_mas,
+)
+from bayesdist.report.panels import ChipPanels
+from bayesdist.report.registry import Plot
+from bayesdist.report.style import nice_below
+from bayesdist.report.texttable import TextTable, listing
+
+if TYPE_CHECKING:
+    from bayesdist.assess.periods import TimeVariation
+    from bayesdist.assess.wise import StatisticsTable
+    from bayesdist.model import Chip
+
+__all__ = [
+    "period_differences",
+    "period_tables",
+]
+
+GRID = 17  # vectors along the longer side
+_CLEAR = 3.0  # sigmas beyond which a coefficient is counted
+
+
+@REPORT.table("periods", needs=("periods",))
+def period_tables(r: ReportInput) -> tuple[TextTable, ...]:
+    """Verdict, periods, coefficients of the ends, and residuals."""
+    found = r.periods
+    assert found is not None
+    out = [_verdict(found), _periods(found, r), _coefficients(found)]
+    for chip, table in zip(found.comparison.model.chips, found.residuals, strict=True):
+        out.append(_residuals(table, r.on_chip(chip)))
+    return (*out, _patterns(found, r))
+
+
+def _verdict(found: TimeVariation) -> TextTable:
+    comparison = found.comparison
+    return listing(
+        "Does the distortion change?",
+        {
+            "Models": found.verdict,
+            "Residuals": found.pattern_sentence,
+            "Errors": f"All quoted errors are multiplied by {number(comparison.error_scale)}, with"
+            " which the models of the periods have a chi-square of 1 for each degree of freedom.",
+            **({"To be known": " ".join(found.cautions)} if found.cautions else {}),
+        },
+    )
+
+
+def _periods(found: TimeVariation, r: ReportInput) -> TextTable:
+    comparison, mas = found.comparison, r.scale_mas
+    rows = []
+    ends = (found.last, found.first, found.ends)
+    each = [(name, None, found.changes[name]) for name in comparison.names]
+    for name, against, change in (*each, ends):
+        z = np.abs(comparison.coefficients(name, against).z)
+        start, stop = found.spans[name]
+        n = comparison.counts[comparison.names.index(name)]
+        x, y = change.at
+        rows.append(
+            (
+                name if against is None else f"{name} against {against}",
+                f"{(start + stop) / 2:.3f}" if against is None else MISSING,
+                count(n) if against is None else MISSING,
+                with_mas(change.largest, r.unit, mas),
+                with_mas(change.sigma, r.unit, mas, 2),
+                f"({x:.0f}, {y:.0f}){_chip(found, change.chip)}",
+                with_mas(change.noise_95, r.unit, mas),
+                probability(change.p_value),
+                probability(change.p_field),
+                f"{int((z > _CLEAR).sum())} of {len(z)}, {number(z.max(), 2)}",
+            )
+        )
+    chance = 2 * comparison.means.shape[1] * 0.00135
+    return TextTable(
+        "Models of the periods against the combined model",
+        (
+            "Period (MJD)",
+            "Year",
+            "Pairs",
+            "Largest difference",
+            "σ there",
+            "At pixel",
+            "95 % of noise",
+            "p of the largest",
+            "p of the field",
+            f"Coefficients beyond {_CLEAR:g} σ, largest",
+        ),
+        tuple(rows),
+        words=(0, 5, 7, 8),
+        note="95 % of noise: what noise alone makes of the largest difference over the array, which"
+        " p of the largest refers to; p of the field is that of all coefficients together."
+        f" By chance {number(chance, 2)} coefficients of a row lie beyond {_CLEAR:g} σ.",
+    )
+
+
+def _chip(found: TimeVariation, chip: int) -> str:
+    chips = found.comparison.model.chips
+    return "" if len(chips) == 1 else next(f" of {c.name}" for c in chips if c.number == chip)
+
+
+def _coefficients(found: TimeVariation) -> TextTable:
+    change = found.comparison.coefficients(found.last, found.first)
+    scale = display_scale(found.comparison.model.unit, change.sigma)
+    rows = []
+    for k, name in enumerate(change.names):
+        difference, sigma = change.difference[k] * scale.factor, change.sigma[k] * scale.factor
+        cells = (rounded(difference, sigma), number(sigma, 2), number(change.z[k], 2))
+        rows.append((name, *cells, number(change.p_value[k], 2)))
+    half = (len(rows) + 1) // 2
+    blank = ("",) * 5
+    paired = [(*rows[k], *(rows[k + half] if k + half < len(rows) else blank)) for k in range(half)]
+    heads = ("Coefficient", f"Difference [{scale.unit}]", "σ", "z", "p")
+    return TextTable(
+        f"Legendre coefficients: {found.last} minus {found.first}",
+        (*heads, *heads),
+        tuple(paired),
+        words=(0, 5),
+        note="Differences of the other periods from the combined model, and monomial ones:"
+        " periods.ecsv.",
+    )
+
+
+def _residuals(table: StatisticsTable, on_chip: str) -> TextTable:
+    """Table C-1."""
+    unit = table.unit
+    names = ("mean", "sigma", "min", "max", "median", "p01", "p99")
+    heads = ("Mean", "σ", "Min", "Max", "Median", "1 %", "99 %")
+    rows = [
+        (
+            row.label,
+            *(rounded(row.value[n], row.error[n]) for n in names),
+            number(row.error["sigma"], 2),
+            number(row.noise_free["sigma"], 3),
+        )
+        for row in table.rows
+    ]
+    first = table.rows[0]
+    return TextTable(
+        f"Mean residuals of bins{on_chip} about the one model of all data [{unit}]",
+        ("Period/axis", *heads, "σ of σ", "σ, no noise"),
+        tuple(rows),
+        note=f"{count(first.n_bins)} bins. A drift would make the residuals of all periods"
+        " together wider than those of one, beyond what noise adds to the smaller sets: compare"
+        " the last column.",
+    )
+
+
+def _patterns(found: TimeVariation, r: ReportInput) -> TextTable:
+    rows = []
+    for chip, several in zip(found.comparison.model.chips, found.patterns, strict=True):
+        for one in several:
+            head = f"{one.period}/{one.axis}{r.on_chip(chip)}"
+            rms = with_mas(one.rms, r.unit, r.scale_mas, 2)
+            cells = (number(one.p_value, 2), rms, number(one.correlation, 2), count(one.n_bins))
+            rows.append((head, *cells))
+    return TextTable(
+        "Patterns of the residuals: each period against all the others",
+        ("Period/axis", "p", "rms of the differences, no noise", "Correlation", "Bins"),
+        tuple(rows),
+        note="p: probability of such differences of the bins by chance. The correlation is near 1"
+        " where one pattern stays that stands out of the noise.",
+    )
+
+
+@REPORT.figure("periods", needs=("periods",), printed=lambda r: r.campaign is None)
+def period_differences(r: ReportInput) -> Plot:
+    """Map of the latest model minus the earliest one.
+
+    Vectors that noise would make as long at their place in more than 5 of 100 cases are pale.
+    """
+    found = r.periods
+    assert found is not None
+    comparison, unit = found.comparison, found.comparison.model.unit
+    longest = r.mosaic.longest_side
+    chips, lengths = [], []
+    for chip in comparison.model.chips:
+        f = comparison.field(found.last, found.first, chip=chip, grid=_grid(chip, longest))
+        gx, gy = (a.ravel() for a in np.meshgrid(f.x, f.y))
+        clear = (f.p_value < CHANCE).ravel()
+        chips.append(Arrows(gx, gy, f.du.ravel(), f.dv.ravel(), spacing(f.x, f.y), clear))
+        lengths.append(float(chips[-1].length.max()))
+    largest = max(lengths)
+    M = magnification_of(2.0 * min(one.step for one in chips), largest)
+    panels = ChipPanels(r.mosaic)
+    panels.frame(0.02 * longest + M * largest)
+    titles = [
+        panels.title(k, f"MJD {found.last} − {found.first},\nlargest {size_of(here, unit)}")
+        for k, here in enumerate(lengths)
+    ]
+    vector_map(panels, chips, titles, magnification=M, key=nice_below(largest / 1.5), unit=unit)
+    change, mas = found.ends, r.scale_mas
+    x, y = change.at
+    size = with_mas(change.largest, r.unit, mas)
+    return Plot(
+        panels.figure,
+        "Difference of the latest and the earliest period",
+        f"Positions by the model of {found.last} minus those by the model of {found.first}. Dark"
+        " vectors differ from zero beyond 2 σ at their place (both axes taken together); neighbours"
+        f" share their coefficients and are dark together. The largest is {size} at pixel"
+        f" ({x:.0f}, {y:.0f}){_chip(found, change.chip)}; noise alone makes up to"
+        f" {with_mas(change.noise_95, r.unit, mas)} in 95 of 100 cases"
+        f" ({probability(change.p_value)}).",
+        f"Map of difference vectors between two periods; the largest is {size}.",
+    )
+
+
+def _grid(chip: Chip, longest: float) -> tuple[int, int]:
+    nx, ny = (max(3, round(GRID * side / longest)) for side in chip.size)
+    return nx, ny

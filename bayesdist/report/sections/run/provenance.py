@@ -1,0 +1,92 @@
+"""The files that were written, and what made the result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.numbers import MISSING, count, number, percent
+from bayesdist.report.sections.checks import check_cells
+from bayesdist.report.texttable import Level, TextTable, listing, short_paths
+
+__all__ = [
+    "config_table",
+    "product_table",
+    "provenance_tables",
+]
+
+_DETAILS = ("stages", "timings")
+_PRINTED = {"inputs": 4, "versions": 3}  # rows on paper
+
+
+@REPORT.table("products", needs=("products",))
+def product_table(r: ReportInput) -> TextTable:
+    """Files with what was checked on each as written."""
+    rows: list[tuple[str, ...]] = []
+    for product in r.products:
+        head = product.path, product.what
+        for check in product.checks:
+            rows.append((*head, check.name, *check_cells(check)))
+            head = "", ""
+        if not product.checks:
+            rows.append((*head, MISSING, MISSING, MISSING, Level("note")))
+    heads = ("File", "What it is", "Check", "Found", "Limit", "Status")
+    return TextTable("Files written", heads, tuple(rows), words=tuple(range(6)), stacked=(3, 4))
+
+
+@REPORT.table("provenance")
+def provenance_tables(r: ReportInput) -> tuple[TextTable, ...]:
+    """What made the result: single values first, then one table for each group."""
+    single = {k: _plain(v) for k, v in r.provenance.items() if not isinstance(v, Mapping)}
+    if r.posterior is not None:
+        s = r.posterior.sampler
+        single["sampler"] = (
+            f"{s.method}; {s.ensembles} ensembles of {s.walkers} walkers, {count(s.steps)} steps,"
+            f" {count(s.passes)} passes over the data, acceptance {percent(s.acceptance, 2)},"
+            f" {number(s.wall_s)} s, seed {s.seed}"
+        )
+    named = {k[:1].upper() + k[1:]: v for k, v in single.items()}
+    out = [listing("Run", named)] if named else []
+    for key, value in r.provenance.items():
+        if isinstance(value, Mapping):
+            unit = " [s]" if key == "timings" else ""
+            names = short_paths(value) if key == "inputs" else map(str, value)
+            out.append(
+                listing(
+                    f"{key.capitalize()}{unit}",
+                    dict(zip(names, map(_plain, value.values()), strict=True)),
+                    detail=key in _DETAILS,
+                    leading=_PRINTED.get(key, 0),
+                )
+            )
+    return tuple(out)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: MISSING}[value]
+    if isinstance(value, float | np.floating):
+        return f"{value:.6g}" if np.isfinite(value) else MISSING
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(v) for v in value) or MISSING
+    if isinstance(value, Mapping):
+        return ", ".join(f"{k} = {_plain(v)}" for k, v in value.items()) or MISSING
+    return str(value)
+
+
+@REPORT.table("provenance")
+def config_table(r: ReportInput) -> TextTable | None:
+    """The resolved configuration, one key a row."""
+    pairs: dict[str, str] = {}
+    for section, value in r.config.items():
+        if isinstance(value, Mapping):
+            pairs.update({f"{section}.{key}": _plain(v) for key, v in value.items()})
+        elif isinstance(value, list | tuple):  # blocks: [[budget]], [[requirement]], [[chip]]
+            pairs.update({f"{section} {k}": _plain(v) for k, v in enumerate(value, start=1)})
+        else:
+            pairs[str(section)] = _plain(value)
+    return listing("Resolved configuration", pairs, detail=True) if pairs else None

@@ -1,0 +1,320 @@
+"""Residuals against what the fitted mixture says that they should be, and over the detector."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
+
+from bayesdist.report.arrows import (
+    CHANCE,
+    Arrows,
+    magnification_of,
+    significant_cells,
+    vector_map,
+)
+from bayesdist.report.contents import REPORT
+from bayesdist.report.context import ReportInput
+from bayesdist.report.mosaic import Mosaic
+from bayesdist.report.numbers import display_scale
+from bayesdist.report.panels import ChipPanels, Panels
+from bayesdist.report.registry import Plot
+from bayesdist.report.style import PALETTE, WIDTH, figure_style, new_figure, nice_below
+
+if TYPE_CHECKING:
+    from bayesdist.assess import BinnedResiduals
+
+__all__ = [
+    "MixtureCurve",
+    "residual_histogram",
+    "residual_panels",
+    "residual_vectors",
+]
+
+Float = NDArray[np.float64]
+
+_SIGMA_BINS = 200
+
+
+@dataclass(frozen=True)
+class MixtureCurve:
+    """Distribution of one axis of the residuals under the fitted mixture.
+
+    Parameters
+    ----------
+    sigma : ndarray, shape (N,)
+        Quoted error of each star on this axis.
+    fraction : float
+        Outlier fraction f.
+    jitter : float
+        j, added in quadrature to every quoted error.
+    scale : float
+        s_out of a Gaussian outlier component, or the match radius of a uniform one.
+    outliers : str
+        'gaussian', 'uniform' or 'none'.
+    taken : ndarray, shape (N,), or float
+        Share of the variance of each residual that fitted places of the stars take out of it.
+    """
+
+    sigma: Float
+    fraction: float = 0.0
+    jitter: float = 0.0
+    scale: float = 0.0
+    outliers: str = "none"
+    taken: Float | float = 0.0
+
+    def expected(self, edges: ArrayLike) -> tuple[Float, Float]:
+        """Stars expected in each bin: of the good component, and of the outliers.
+
+        Parameters
+        ----------
+        edges : array_like, shape (B + 1,)
+            Bin edges, in the unit of `sigma`.
+
+        Returns
+        -------
+        good, outlying : ndarray, shape (B,)
+        """
+        edges = np.asarray(edges, float)
+        sigma, weight = self._widths()
+        good = weight @ np.diff(ndtr(edges / sigma[:, None]), axis=1)
+        n = float(self.sigma.size)
+        outlying = n * np.diff(self._outlier_cdf(edges))
+        f = 0.0 if self.outliers == "none" else self.fraction
+        return (1.0 - f) * good, f * outlying
+
+    def _widths(self) -> tuple[Float, Float]:
+        """Total widths that occur, and how many stars have each (binned where there are many)."""
+        total = np.hypot(self.sigma, self.jitter) * np.sqrt(1.0 - self.taken)
+        values, counts = np.unique(total, return_counts=True)
+        if values.size > _SIGMA_BINS:
+            # in equal steps of log width; the mean square in a bin keeps the variance exact
+            edges = np.geomspace(values[0], values[-1], _SIGMA_BINS + 1)
+            which = np.clip(np.searchsorted(edges, total, side="right") - 1, 0, _SIGMA_BINS - 1)
+            counts = np.bincount(which, minlength=_SIGMA_BINS)
+            square = np.bincount(which, weights=total**2, minlength=_SIGMA_BINS)
+            keep = counts > 0
+            values, counts = np.sqrt(square[keep] / counts[keep]), counts[keep]
+        return values, counts.astype(float)
+
+    def _outlier_cdf(self, edges: Float) -> Float:
+        if self.outliers == "gaussian":
+            return ndtr(edges / self.scale)
+        if self.outliers == "uniform":  # one axis of a uniform disc: a semicircle
+            t = np.clip(edges / self.scale, -1.0, 1.0)
+            return 0.5 + (t * np.sqrt(1.0 - t**2) + np.arcsin(t)) / np.pi
+        return np.zeros_like(edges)
+
+
+def _mixture_curves(r: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
+    """What the results say of the distribution of the residuals in u and in v.
+
+    Without quoted errors the rms of the fit stands in for them.
+    """
+    f, matches = r.fit, r.stars.table
+    sigmas = [
+        np.full(len(matches), rms) if sigma is None else np.asarray(sigma, float)
+        for sigma, rms in ((matches.sigma_u, f.rms_u), (matches.sigma_v, f.rms_v))
+    ]
+    if r.posterior is None:
+        return MixtureCurve(sigmas[0]), MixtureCurve(sigmas[1])
+    mixture = r.posterior.mixture
+    jitter = mixture.jitter if mixture.jitter is not None else r.sampled_mean("j")
+    taken = 0.0 if r.stars.taken is None else r.stars.taken
+    uniform = mixture.model == "uniform"
+    scale = float(mixture.match_radius) if uniform else r.sampled_mean("s_out")
+    u, v = (
+        MixtureCurve(s, r.sampled_mean("f"), float(jitter), scale, mixture.model, taken)
+        for s in sigmas
+    )
+    return u, v
+
+
+@REPORT.figure("fit", printed=lambda r: r.campaign is None)
+def residual_histogram(r: ReportInput) -> Plot:
+    """Histograms of the two axes: the core, and everything on a logarithmic scale of counts."""
+    words = r.words
+    if r.posterior is None:
+        text = (
+            "The line is what the quoted errors alone predict;"
+            f" {words.things} above it in the wings are outliers."
+        )
+    else:
+        text = (
+            f"The line is the fitted mixture summed over the {words.things}' own errors"
+            f"{words.taken}, not a fit to the bars: it should follow them in the core (top) and in"
+            " the wings (bottom, logarithmic)."
+        )
+        if r.posterior.mixture.model != "none":
+            text += f" The dashed part is {words.false}."
+    if r.sample:
+        text += f" Drawn from {r.sample}."
+    return Plot(
+        _histograms(
+            r.stars.residual,
+            _mixture_curves(r),
+            unit=r.unit,
+            sampled=r.stars.partial,
+            things=words.things,
+        ),
+        "Residual histograms",
+        text,
+        "Histograms of residuals in u and v, core and full range, under the expected curve.",
+    )
+
+
+def _histograms(
+    residual: Float,
+    curves: tuple[MixtureCurve, MixtureCurve],
+    *,
+    unit: str,
+    sampled: bool,
+    things: str,
+) -> Figure:
+    """Two rows of panels: the core, and everything."""
+    width = max(float(np.sqrt(np.median(c.sigma**2 + c.jitter**2))) for c in curves)
+    widest = max(float(np.sqrt(np.max(c.sigma**2 + c.jitter**2))) for c in curves)
+    core = min(6.0 * width, 4.0 * widest)
+    tail = max(float(np.abs(residual).max()), 1.2 * core) * 1.02
+    everything = "whole sample" if sampled else f"all {things}"
+    with figure_style():
+        fig = new_figure(WIDTH, 4.9)
+        axes = fig.subplots(2, 2, sharey="row")
+        for column, (axis, curve) in enumerate(zip("uv", curves, strict=True)):
+            for row, (reach, bins) in enumerate(((core, 81), (tail, 121))):
+                ax = axes[row, column]
+                scale = display_scale(unit, reach)
+                _histogram(ax, residual[:, column], curve, reach, bins, scale.factor, things)
+                ax.set_xlabel(f"residual in {axis} [{scale.unit}]")
+            axes[0, column].set_title(f"{axis}: core")
+            axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
+            axes[1, column].set_yscale("log")
+        # curves fall far below one star: they are not what the axis is for
+        most = [np.histogram(r, np.linspace(-tail, tail, 122))[0].max() for r in residual.T]
+        axes[1, 0].set_ylim(0.5, 2.0 * max(*most, 1))
+        for ax in axes[:, 0]:
+            ax.set_ylabel(f"{things} of the sample per bin" if sampled else f"{things} per bin")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper left", ncols=len(labels))
+    return fig
+
+
+def _histogram(
+    ax: Axes,
+    values: Float,
+    curve: MixtureCurve,
+    reach: float,
+    bins: int,
+    factor: float,
+    things: str,
+) -> None:
+    edges = np.linspace(-reach, reach, bins + 1)
+    counts, _ = np.histogram(values, edges)
+    good, outlying = curve.expected(edges)
+    middle = (edges[1:] + edges[:-1]) / 2 * factor
+    ax.stairs(counts, edges * factor, fill=True, color="#C5CED8", label=things, zorder=1)
+    ax.plot(middle, good + outlying, color=PALETTE["blue"], label="expected", zorder=3)
+    if curve.outliers != "none":
+        ax.plot(
+            middle,
+            outlying,
+            color=PALETTE["vermilion"],
+            ls="--",
+            label="of these, outliers",
+            zorder=4,
+        )
+    ax.set_xlim(-reach * factor, reach * factor)
+
+
+@REPORT.figure("fit", printed=lambda r: r.campaign is None)
+def residual_vectors(r: ReportInput) -> Plot:
+    """Mean residual vector of each cell of the detector; pale ones are what noise would give."""
+    panels = residual_panels([c.binned for c in r.chips], r.mosaic, unit=r.unit)
+    filled = sum(int((np.asarray(c.binned.count) > 0).sum()) for c in r.chips)
+    significant = sum(int(significant_cells(c.binned).sum()) for c in r.chips)
+    chance = CHANCE * filled
+    axes, which, cannot = "", "", "the polynomial cannot follow"
+    if r.fit.model.frames not in ("none", "shift"):  # they turn u and v
+        axes = (
+            ", along the axes of the polynomials, before the exposures' frames turn them: what"
+            " belongs to the detector adds up however exposures are rolled"
+        )
+    if r.campaign is not None:
+        which = (
+            " These are the residuals of the joint fit, with all tables, in the cells of the test"
+            " for structure (see the status)."
+        )
+        if r.campaign.tables:
+            cannot = "neither tables nor polynomial follow"
+            if significant < chance / 2:
+                which += " They are fewer than by chance, as the tables follow these very stars."
+    if r.words.taken:
+        which = (
+            " Stars were fitted to these very detections, so that fewer may do so than by chance:"
+            " the status has the test that allows for it."
+        )
+    return Plot(
+        panels.figure,
+        "Binned residuals",
+        f"Mean residual of each cell{axes}; dark arrows differ from zero by more than 2 σ."
+        f" {significant} of {filled} cells do, and chance alone would give {chance:.0f}:"
+        " neighbouring dark arrows that point the same way would be structure that"
+        f" {cannot}.{which}",
+        f"Map of binned residual vectors; {significant} of {filled} cells are significant.",
+    )
+
+
+def residual_panels(
+    binned: Sequence[BinnedResiduals],
+    mosaic: Mosaic,
+    *,
+    unit: str,
+    magnification: float | None = None,
+    key: float | None = None,
+) -> Panels:
+    """Panels with the mean residual of each cell.
+
+    Parameters
+    ----------
+    binned : sequence of BinnedResiduals
+        One for each chip; all are drawn to the same scale.  Empty cells hold NaN and stay empty.
+    mosaic : Mosaic
+    unit : str
+        Of the residuals.
+    magnification : float, optional
+        Pixels of the axes for one unit of the vectors; a round number by default.
+    key : float, optional
+        Length of the arrow that states the scale; that of a typical vector by default.
+
+    Returns
+    -------
+    Panels
+    """
+    chips = [Arrows.of_cells(b) for b in binned]
+    length = np.concatenate([c.length for c in chips])
+    # one bad cell with three stars must not flatten all others
+    typical = float(np.quantile(length, 0.95)) if length.size else 0.0
+    panels = ChipPanels(mosaic)
+    panels.frame(0.03 * mosaic.longest_side)
+    titles = [
+        panels.title(
+            k,
+            f"{c.n_clear} of {c.x.size} cells significant,\n{CHANCE * c.x.size:.0f} by chance",
+        )
+        for k, c in enumerate(chips)
+    ]
+    vector_map(
+        panels,
+        chips,
+        titles,
+        magnification=magnification or magnification_of(1.1 * min(c.step for c in chips), typical),
+        key=key or nice_below(typical),
+        unit=unit,
+    )
+    return panels

@@ -1,0 +1,99 @@
+"""Structure in residuals is found where it is, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.polynomial import legendre
+from scipy.stats import binom
+
+from bayesdist.assess import Misfit, binned_sums, misfit_of, partitions_for
+from bayesdist.diagnose.residuals.misfit import worst_misfit
+from bayesdist.model import Chip
+
+SIZE = (1000.0, 800.0)
+
+
+def _stars(n, rng):
+    x, y = rng.uniform(0.5, 1000.5, n), rng.uniform(0.5, 800.5, n)
+    return x, y, 0.05 * rng.standard_normal((n, 2)) * np.exp(0.5 * rng.normal(size=(n, 1)))
+
+
+def _misfit(x, y, r, order=None):
+    partitions = partitions_for(len(x))
+    sums = {k: binned_sums(x, y, *r.T, bins=b, size=SIZE) for k, b in partitions.items()}
+    return misfit_of(sums, order=order, unit="pix")
+
+
+def test_noise_is_no_structure():
+    """200 data sets of noise: no more than chance falls below one per cent."""
+    rng = np.random.default_rng(1)
+    p = []
+    for _ in range(200):
+        x, y, r = _stars(3000, rng)
+        p.append(_misfit(x, y, r).p_value)
+    p = np.array(p)
+    assert (p < 0.01).sum() <= binom.ppf(0.999, 200, 0.01)
+    assert p.min() > 1e-4
+
+
+@pytest.mark.parametrize("order", [1, 4, 7])
+def test_what_a_polynomial_leaves_of_noise_is_no_structure(order):
+    """200 data sets, fitted by numpy: p-values are those of chance, in no partition too small."""
+    rng = np.random.default_rng(order)
+    p = []
+    for _ in range(200):
+        x, y, r = _stars(3000, rng)
+        X, Y = (x - 500.5) / 500, (y - 400.5) / 400
+        i, j = np.array([(i, j) for i in range(order + 1) for j in range(order + 1 - i)]).T
+        design = legendre.legvander2d(X, Y, [order, order])[:, i * (order + 1) + j]
+        left = r - design @ np.linalg.lstsq(design, r, rcond=None)[0]
+        p.append(_misfit(x, y, left, order).p_value)
+    p = np.array(p)
+    for level in (0.01, 0.1, 0.3):
+        # three tests share the probability: Bonferroni leaves them a little too careful
+        assert (p < level).sum() <= binom.ppf(0.999, 200, level)
+    assert (p < 0.3).sum() >= binom.ppf(0.001, 200, 0.2)
+
+
+def test_a_step_in_a_column_is_found_with_its_size():
+    rng = np.random.default_rng(2)
+    x, y, r = _stars(6000, rng)
+    r[:, 0] += np.where(np.abs(x - 700) < 20, 0.08, 0.0)
+    found = _misfit(x, y, r)
+    assert found.significant and found.partition == "columns"
+    assert abs(found.structure - 0.08 * np.sqrt(0.04)) < 0.004  # 4 % of the columns
+    assert "columns" in found.sentence and "pix" in found.sentence
+
+
+def test_a_wave_over_the_field_is_found_in_cells():
+    rng = np.random.default_rng(3)
+    x, y, r = _stars(6000, rng)
+    r[:, 1] += 0.03 * np.sin(x / 60) * np.sin(y / 60)
+    found = _misfit(x, y, r)
+    assert found.significant and found.partition == "cells"
+
+
+def test_the_worst_of_several_chips_pays_for_their_number():
+    """The smallest of n uniform probabilities is below p / n with probability p, about."""
+    a, b = (Chip(k, name, SIZE, (1.0, 1.0)) for k, name in ((1, "A"), (2, "B")))
+    found = [Misfit(0.3, "cells", 0.01, "pix", a), Misfit(2e-5, "rows", 0.02, "pix", b)]
+    worst = worst_misfit(found)
+    assert (worst.chip, worst.p_value, worst.partition) == (b, 4e-5, "rows")
+    assert worst.significant and "of chip B" in worst.sentence
+    assert worst_misfit(found[:1]) == found[0]
+    # both beyond what a double holds: the larger structure is named
+    gone = [Misfit(0.0, "cells", 0.01, "pix", a), Misfit(0.0, "cells", 0.03, "pix", b)]
+    assert worst_misfit(gone).chip == b
+    rng = np.random.default_rng(4)
+    p = [
+        worst_misfit([Misfit(q, "cells", 0.0, "pix", a) for q in rng.uniform(size=5)]).p_value
+        for _ in range(2000)
+    ]
+    low, high = binom.ppf([0.001, 0.999], 2000, 0.1)
+    # 1 - (1 - p / n)^n: a little less than p
+    assert low - 0.005 * 2000 <= (np.array(p) < 0.1).sum() <= high
+
+
+def test_the_detector_is_named_where_there_is_one_chip():
+    assert "of the detector," in Misfit(0.0, "cells", 0.1, "pix").sentence

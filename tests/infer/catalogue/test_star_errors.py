@@ -1,0 +1,299 @@
+"""One star, one error: against dense formulas, closed forms and repeated catalogues."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy import stats
+from threadpoolctl import threadpool_limits
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.infer import GaussianPriors, fit_linear
+from bayesdist.infer.catalogue import star_errors as module
+from bayesdist.infer.catalogue.star_errors import star_covariance, with_star_errors
+from bayesdist.infer.exposures.hierarchy import fit_hierarchical
+from bayesdist.infer.transforms import linear_terms, reference_gauge
+from bayesdist.model import DistortionModel
+
+from ..small_campaign import campaign, shared_stars
+from ..support import CHIP, SIZE, UNCLIPPED, columns_of, legendre_design, simulated
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def some(seed=1, n_stars=70):
+    """Frames, drift, two chips, uneven errors; any star may be anywhere."""
+    model, matches, _ = campaign(seed, 4, 80, order=2)
+    rng = np.random.default_rng(seed)
+    n, code = len(matches), rng.integers(n_stars, size=len(matches))
+    catalogue = {
+        "sigma_u": rng.uniform(0.0, 0.02, n_stars),
+        "sigma_v": rng.uniform(0.0, 0.02, n_stars),
+        "motion_u": rng.uniform(0.0, 0.01, n_stars),
+        "motion_v": rng.uniform(0.0, 0.01, n_stars),
+        "epoch0": rng.uniform(2003.0, 2006.0, n_stars),
+    }
+    dt = matches.epoch - catalogue["epoch0"][code]
+    matches = matches.with_sigma(
+        *(
+            np.sqrt(
+                rng.uniform(0.01, 0.05, n) ** 2
+                + catalogue[f"sigma_{a}"][code] ** 2
+                + (dt * catalogue[f"motion_{a}"][code]) ** 2
+            )
+            for a in "uv"
+        )
+    )
+    named = {
+        f"{e}.{kind}": (0.0, 1e-5)
+        for e in model.exposures
+        for kind in ("scale", "shear_plus", "shear_cross")
+    }
+    fit = fit_linear(matches, model, priors=GaussianPriors.of(model, named), clip_chi2=4.0)
+    return model, matches, fit, code, catalogue
+
+
+def dense(fit, matches, code, catalogue, weight):
+    """The covariance of all matches' catalogue errors, carried through the fit."""
+    J = fit.model.jacobian(fit.mean, matches.x, matches.y, **columns_of(matches))
+    W = np.stack([weight / matches.sigma_u**2, weight / matches.sigma_v**2], axis=1)
+    response = np.einsum("pq,naq,na->pna", fit.cov, J, W)  # of the parameters to each match
+    same = code[:, None] == code
+    dt = matches.epoch - catalogue["epoch0"][code]
+    total, counted = np.zeros_like(fit.cov), np.zeros_like(fit.cov)
+    for axis, letter in enumerate("uv"):
+        position = catalogue[f"sigma_{letter}"][code] ** 2
+        motion = catalogue[f"motion_{letter}"][code] ** 2
+        C = same * (position + motion * np.outer(dt, dt))
+        R = response[:, :, axis]
+        total += R @ C @ R.T
+        counted += R @ np.diag(np.diag(C)) @ R.T
+    return total, counted
+
+
+@pytest.mark.parametrize("scratch", [64_000_000, 16 * 100 * 7])
+def test_it_is_the_dense_formula(scratch, monkeypatch):
+    """Also in pieces of a few stars, and with one star several times in one exposure."""
+    monkeypatch.setattr(module, "SCRATCH", scratch)
+    _, matches, fit, code, catalogue = some()
+    used = fit.uses(matches)
+    assert 0 < (~used).sum() < 100
+    pairs = {tuple(p) for p in np.column_stack([code, matches.exposure, matches.chip])}
+    assert len(pairs) < len(matches)  # some do stand twice
+    found = star_covariance(fit, matches, star=code, **catalogue)
+    total, counted = dense(fit, matches, code, catalogue, used.astype(float))
+    scale = np.sqrt(np.diag(total))
+    unit = np.outer(scale, scale)
+    np.testing.assert_allclose(found.total / unit, total / unit, atol=1e-10)
+    np.testing.assert_allclose(found.counted / unit, counted / unit, atol=1e-10)
+    np.testing.assert_allclose(found.extra / unit, (total - counted) / unit, atol=1e-10)
+
+
+@pytest.mark.parametrize("frames", [True, False])
+def test_motions_are_the_part_that_is_left_without_errors_of_positions(frames):
+    _, matches, fit, code, catalogue = some(3)
+    options = {"star": code, "frames": frames}
+    found = star_covariance(fit, matches, **options, **catalogue)
+    exact = catalogue | {"sigma_u": 0.0, "sigma_v": 0.0}
+    alone = star_covariance(fit, matches, **options, **exact).total
+    scale = np.sqrt(np.diag(found.total))
+    np.testing.assert_allclose(
+        found.motions / np.outer(scale, scale), alone / np.outer(scale, scale), atol=1e-10
+    )
+    still = catalogue | {"motion_u": 0.0, "motion_v": 0.0}
+    assert star_covariance(fit, matches, **options, **still).motions is None
+
+
+def test_without_the_frames_the_polynomials_are_the_same():
+    """And the frames follow by regression: nothing else is said of them."""
+    model, matches, fit, code, catalogue = some(11)
+    whole, part = (
+        star_covariance(fit, matches, star=code, frames=f, **catalogue) for f in (True, False)
+    )
+    n = model.n_distortion
+    for a, b in ((whole.total, part.total), (whole.counted, part.counted)):
+        scale = np.sqrt(np.diag(a))
+        unit = np.outer(scale, scale)
+        np.testing.assert_allclose(b[:n, :n] / unit[:n, :n], a[:n, :n] / unit[:n, :n], atol=1e-10)
+        assert b.shape == a.shape
+        # what the polynomials do not explain of the frames is left as it was
+        cov, gain = fit.cov + b, np.linalg.solve(fit.cov[:n, :n], fit.cov[:n, n:])
+        left = cov[n:, n:] - cov[n:, :n] @ gain
+        before = fit.cov[n:, n:] - fit.cov[n:, :n] @ gain
+        size = np.sqrt(np.diag(before))
+        np.testing.assert_allclose(
+            left / np.outer(size, size), before / np.outer(size, size), atol=1e-6
+        )
+
+
+def test_memberships_weigh_the_matches():
+    _, matches, fit, code, catalogue = some(2)
+    weight = np.random.default_rng(0).uniform(size=len(matches))
+    found = star_covariance(fit, matches, star=code, weight=weight, included=False, **catalogue)
+    total, _ = dense(fit, matches, code, catalogue, weight)
+    scale = np.sqrt(np.diag(total))
+    np.testing.assert_allclose(
+        found.total / np.outer(scale, scale), total / np.outer(scale, scale), atol=1e-10
+    )
+    assert not found.counted.any()
+
+
+def test_the_column_of_the_table_is_used():
+    _, matches, fit, code, catalogue = some(3)
+    a = star_covariance(fit, matches._with(star=code), **catalogue)
+    b = star_covariance(fit, matches, star=code, **catalogue)
+    np.testing.assert_array_equal(a.extra, b.extra)
+
+
+def test_stars_that_are_seen_once_add_nothing():
+    model, matches, _ = simulated(4, 200, order=2)
+    fit = fit_linear(matches, model)
+    found = star_covariance(
+        fit, matches, 0.03, 0.04, star=np.random.default_rng(0).permutation(200)
+    )
+    scale = np.sqrt(np.diag(found.total))
+    assert (scale > 0).all()
+    np.testing.assert_allclose(found.extra / np.outer(scale, scale), 0, atol=1e-12)
+
+
+def repeated(n_stars=60, n_exposures=9, order=2):
+    """The same stars on the same pixels in every exposure."""
+    rng = np.random.default_rng(5)
+    x, y = rng.uniform(1, SIZE[0], n_stars), rng.uniform(1, SIZE[1], n_stars)
+    # a table does not hold a star twice: not quite the same pixel
+    x, y = (np.tile(p, n_exposures) + 1e-9 * np.arange(n_stars * n_exposures) for p in (x, y))
+    table = MatchTable(
+        x,
+        y,
+        x,
+        y,
+        sigma_u=np.full(x.size, np.hypot(0.02, 0.05)),
+        sigma_v=np.full(x.size, np.hypot(0.02, 0.03)),
+        star=np.tile(np.arange(n_stars), n_exposures),
+    )
+    return DistortionModel(order, (CHIP,)), table, n_exposures
+
+
+def test_more_exposures_of_the_same_pixels_do_not_help_against_the_catalogue():
+    """Closed form: centroids of 0.02 px average over 9 exposures, the catalogue's errors do not."""
+    model, matches, n = repeated()
+    fit = fit_linear(matches, model, **UNCLIPPED)
+    solution = with_star_errors(fit, star_covariance(fit, matches, 0.05, 0.03))
+    A = legendre_design(2, matches.x[:60], matches.y[:60])
+    inverse = np.linalg.inv(A.T @ A)
+    K = model.n_terms
+    for axis, c in enumerate((0.05, 0.03)):
+        rows = slice(axis * K, (axis + 1) * K)
+        np.testing.assert_allclose(fit.cov[rows, rows], (0.02**2 + c**2) / n * inverse, rtol=1e-5)
+        np.testing.assert_allclose(
+            solution.cov[rows, rows], (0.02**2 / n + c**2) * inverse, rtol=1e-5
+        )
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def test_repeated_catalogues():
+    """Simulated from the beginning: catalogue, proper motions, centroids, the fit, 200 times."""
+    rng = np.random.default_rng(6)
+    centroid = 0.01
+    epochs = [2002.5, 2003.5, 2004.5, 2005.5, 2006.8]
+    shared = shared_stars(rng, 100, epochs, order=2, centroid=centroid, position=0.02, motion=0.01)
+    model, matches = shared.model, shared.matches
+    fit = fit_linear(matches, model, **UNCLIPPED)
+    solution = with_star_errors(fit, shared.covariance(fit))
+    distance, naive = [], []
+    some = matches.select(np.arange(40))
+    J = model.jacobian(shared.theta, some.x, some.y, exposure=some.exposure, chip=some.chip_number)
+    far = []
+    for _ in range(200):
+        error = centroid * rng.standard_normal((len(matches), 2)) + shared.catalogue_errors(rng)
+        one = fit_linear(shared.with_errors(error), model, **UNCLIPPED)
+        d = one.mean - fit.mean
+        distance.append(d @ np.linalg.solve(solution.cov, d))
+        naive.append(d @ np.linalg.solve(fit.cov, d))
+        far.append(J @ d)
+    D = model.n_params
+    assert stats.kstest(distance, stats.chi2(D).cdf).pvalue > 1e-3
+    assert stats.kstest(naive, stats.chi2(D).cdf).pvalue < 1e-6
+    # and of positions: the error of a map over the detector
+    rms = np.mean(np.square(far), axis=0)
+    expected = np.einsum("nap,pq,naq->na", J, solution.cov, J)
+    formal = np.einsum("nap,pq,naq->na", J, fit.cov, J)
+    assert rms.sum() == pytest.approx(expected.sum(), rel=0.1)
+    assert expected.sum() > 1.15 * formal.sum()
+
+
+def test_draws_are_spread_to_the_covariance():
+    _, matches, fit, code, catalogue = some(7)
+    solution = with_star_errors(fit, star_covariance(fit, matches, star=code, **catalogue))
+    draws = solution.draws(4000, np.random.default_rng(1))
+    white = np.linalg.solve(np.linalg.cholesky(solution.cov), (draws - solution.mean).T)
+    assert stats.kstest((white**2).sum(axis=0), stats.chi2(len(fit.mean)).cdf).pvalue > 1e-3
+    assert stats.kstest(white.ravel(), "norm").pvalue > 1e-3
+    np.testing.assert_array_equal(
+        solution.draws(5, np.random.default_rng(1)).shape, (5, fit.mean.size)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Skewed:
+    """A posterior that is no Gaussian: gamma variables."""
+
+    model: DistortionModel
+    mean: np.ndarray
+    cov: np.ndarray
+    convergence = "judged"
+    approximation = ""
+
+    def draws(self, n, rng):
+        z = (rng.gamma(4.0, size=(n, self.mean.size)) - 4.0) / 2.0
+        return self.mean + z @ np.linalg.cholesky(self.cov).T
+
+
+def test_a_posterior_keeps_its_shape_and_stays_one():
+    _, matches, fit, code, catalogue = some(8)
+    posterior = Skewed(fit.model, fit.mean, fit.cov)
+    found = star_covariance(posterior, matches, star=code, weight=fit.uses(matches), **catalogue)
+    solution = with_star_errors(posterior, found)
+    assert solution.convergence == "judged" and solution.approximation == ""
+    assert not hasattr(with_star_errors(fit, found), "convergence")
+    first = (solution.draws(20_000, np.random.default_rng(2)) - solution.mean)[:, 0]
+    assert first.std() / solution.sigma[0] == pytest.approx(1, abs=0.03)
+    assert stats.skew(first) == pytest.approx(1.0, abs=0.15)  # 2 / sqrt(4)
+
+
+def test_views_carry_it_on():
+    """The gauge of the enlarged solution, and a hierarchical fit as its source."""
+    model, matches, _ = campaign(9, 10, 150, order=2)
+    # what is seen in one place of the detector is one star: errors that add up
+    x, y = np.int64(matches.x // 400), np.int64(matches.y // 400)
+    code = (matches.chip * 11 + x) * 6 + y
+    found = fit_hierarchical(matches, model)
+    stars = star_covariance(found, matches, 0.01, 0.01, star=code)
+    wide = with_star_errors(found, stars)
+    a, b = (linear_terms(reference_gauge(s), 1, epoch=2004.5) for s in (wide, found))
+    np.testing.assert_array_equal(a.values, b.values)
+    few = ("A_1", "A_2", "A_3", "B_1", "B_2")
+    assert (a.select(*few).sigma > b.select(*few).sigma).all()
+    draws = wide.draws(2000, np.random.default_rng(4))
+    np.testing.assert_allclose(draws.std(axis=0) / wide.sigma, 1, atol=0.12)
+
+
+def test_what_is_wrong_is_said():
+    _, matches, fit, code, _ = some(10)
+    with pytest.raises(InputError, match="do not say which star is which"):
+        star_covariance(fit, matches, 0.01, 0.01)
+    for wrong in (code[:-1], code - 5, code.astype(float)):
+        with pytest.raises(InputError, match="star codes have shape"):
+            star_covariance(fit, matches, 0.01, 0.01, star=wrong)
+    with pytest.raises(InputError, match=r"sigma_v has shape \(3,\)"):
+        star_covariance(fit, matches, 0.01, [0.1, 0.2, 0.3], star=code)
+    with pytest.raises(InputError, match=r"sigma_u is -0\.01"):
+        star_covariance(fit, matches, -0.01, 0.01, star=code)
+    with pytest.raises(InputError, match="need the catalogue's epoch"):
+        star_covariance(fit, matches, 0.01, 0.01, motion_u=0.1, motion_v=0.1, star=code)
+    with pytest.raises(InputError, match=r"sigma_u: the quoted errors of \d+ matches are smaller"):
+        star_covariance(fit, matches, 0.03, 0.01, star=code)
+    star_covariance(fit, matches, 0.03, 0.01, star=code, included=False)

@@ -1,0 +1,104 @@
+"""The posterior of stars matched in circles by NumPyro's NUTS, on a density written down anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.polynomial.legendre import leggauss, legvander2d
+
+from bayesdist.infer import OutlierMixture, fit_linear, sample
+from tests.infer.by_nuts import nuts_draws
+
+from ..selected import SIDE, selected
+
+pytestmark = pytest.mark.slow
+numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+
+NODES = 24  # of the integral over one axis, within 1e-8 for circles of three sigma
+
+
+def _nuts(matches, fit, start, radius: float, draws: int, seed: int):
+    """Draws of theta, j, logit f and log s_out, of Gaussian outliers."""
+    import jax
+    import jax.numpy as jnp
+    import numpyro.distributions as dist
+    from jax.scipy.special import erf
+
+    jax.config.update("jax_enable_x64", True)
+    order, K = fit.model.order, fit.model.n_terms
+    X, Y = 2 * (matches.x - 0.5) / SIDE - 1, 2 * (matches.y - 0.5) / SIDE - 1
+    V = legvander2d(X, Y, [order] * 2).reshape(len(X), order + 1, order + 1)
+    phi = jnp.array(np.stack([V[:, i, j] for i, j in fit.model.basis().terms], axis=1))
+    data = jnp.array(np.stack([matches.u, matches.v]))
+    nominal = jnp.array(np.stack([matches.u_nominal, matches.v_nominal]))
+    s2 = jnp.array(matches.sigma_u**2)  # of both axes
+    scale = float(matches.sigma_u[0])
+    root = jnp.array(np.linalg.cholesky(fit.cov))
+    t, w = leggauss(NODES)
+    across, half = radius * np.sin(t * np.pi / 2), radius * np.cos(t * np.pi / 2)
+    weight = jnp.array(half * w * np.pi / 2)
+    across, half = jnp.array(across), jnp.array(half)
+
+    def normal(r, s2):
+        return -0.5 * (r**2 / s2 + jnp.log(2 * jnp.pi * s2)).sum(axis=0)
+
+    def log_mass(d, s2):
+        """Of a round Gaussian in the circle about d (2, N)."""
+        s = jnp.sqrt(s2)[..., None]
+        first = jnp.exp(-0.5 * ((d[0][:, None] + across) / s) ** 2) / (s * np.sqrt(2 * np.pi))
+        ends = [(d[1][:, None] + sign * half) / (s * np.sqrt(2)) for sign in (1, -1)]
+        return jnp.log((first * 0.5 * (erf(ends[0]) - erf(ends[1])) * weight).sum(axis=1))
+
+    def density():
+        flat = dist.ImproperUniform(dist.constraints.real, (), (2 * K,))
+        one = dist.ImproperUniform(dist.constraints.real, (), ())
+        theta = start + root @ numpyro.sample("z", flat)
+        log_j, logit_f = numpyro.sample("log_j", one), numpyro.sample("logit_f", one)
+        log_s = numpyro.sample("log_s", one)
+        j, f, excess2 = jnp.exp(log_j), jax.nn.sigmoid(logit_f), jnp.exp(2 * log_s)
+        prior = dist.StudentT(4.0, 0.0, scale).log_prob(j) + log_j
+        prior += dist.Beta(1.0, 9.0).log_prob(f) + jnp.log(f) + jnp.log1p(-f)
+        core2 = scale**2 + j**2
+        prior += dist.InverseGamma(1.0, 25 * core2).log_prob(excess2) + jnp.log(2 * excess2)
+        out2 = core2 + excess2
+        numpyro.deterministic("log_s_out", 0.5 * jnp.log(out2))
+        model = jnp.stack([phi @ theta[:K], phi @ theta[K:]])
+        r, d = data - model, nominal - model
+        good = jnp.log1p(-f) + normal(r, s2 + j**2) - log_mass(d, s2 + j**2)
+        bad = jnp.log(f) + normal(r, out2) - log_mass(d, jnp.broadcast_to(out2, s2.shape))
+        numpyro.factor("posterior", prior + jnp.logaddexp(good, bad).sum())
+        numpyro.deterministic("theta", theta)
+
+    first = {
+        "z": np.zeros(2 * K),
+        "log_j": np.log(0.3 * scale),
+        "logit_f": -3.0,
+        "log_s": np.log(5 * scale),
+    }
+    got = nuts_draws(density, first, draws, seed)
+    return np.column_stack([got["theta"], np.exp(got["log_j"]), got["logit_f"], got["log_s_out"]])
+
+
+def test_agrees_with_nuts(full, capsys):
+    _, _, matches, radius = selected(3, 3.0, 1000 if full else 300, order=1)
+    fit = fit_linear(matches, selected(3, 3.0, 1, order=1)[0])
+    mixture = OutlierMixture("gaussian", match_radius=radius)
+    posterior = sample(fit, matches, outliers=mixture, target_ess=20_000, seed=5)
+    assert posterior.convergence.converged
+    h = {k: v.ravel() for k, v in posterior.hyper.items()}
+    logit = np.log(h["f"]) - np.log1p(-h["f"])
+    ours = np.column_stack([posterior.flat, h["j"], logit, np.log(h["s_out"])])
+    nuts = _nuts(matches, fit, posterior.mean, radius, 8000 if full else 2000, seed=3)
+    sd = nuts.std(axis=0)
+    shift = np.abs(ours.mean(axis=0) - nuts.mean(axis=0)) / sd
+    ratio = ours.std(axis=0) / sd
+    with capsys.disabled():
+        print(
+            f"\n{len(matches)} stars in circles, {len(sd)} parameters; means differ by at most "
+            f"{shift.max():.3f} sd, sd ratio {ratio.min():.4f} to {ratio.max():.4f}"
+        )
+    assert shift.max() < 0.1
+    assert np.abs(ratio - 1).max() < 0.05
+    # which is far from what least squares says
+    pull = np.abs(fit.mean - ours[:, : len(fit.mean)].mean(axis=0)) / sd[: len(fit.mean)]
+    assert pull.max() > 3

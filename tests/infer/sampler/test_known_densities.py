@@ -1,0 +1,187 @@
+"""Means and variances of known densities come out within three Monte-Carlo errors.
+
+Three densities, three moves.  The Monte-Carlo errors come from the effective sample size, so that
+chains that claim more than they know fail as much as chains that are wrong; three standard errors
+hold for all parameters of a run together.  That the test can fail is shown with moves that are
+wrong in the usual ways.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from emcee.moves import DEMove, MHMove
+from scipy import special, stats
+
+from bayesdist.infer import Limits, OutlierMixture
+from bayesdist.infer.density.grid import build_proposal
+from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.sampler import ensembles as sampler
+from bayesdist.infer.sampler.convergence import diagnose
+
+from ..fakes import FakeTarget, advanced, ensembles_of, gaussian_proposal
+from ..oracle import JitterOracle
+from ..support import UNCLIPPED, simulated, target_of
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
+
+MOVES = {"independence": (1.0, 0.0, 0.0), "pCN": (0.0, 1.0, 0.0), "DE": (0.0, 0.0, 1.0)}
+STEPS = {"independence": 600, "pCN": 2000, "DE": 2000}
+WALKERS, SEEDS = 48, (1, 2, 3, 4)
+
+
+@dataclass(frozen=True)
+class Known:
+    target: object
+    proposal: GridProposal
+    mean: np.ndarray
+    sd: np.ndarray
+    checked: np.ndarray  # parameters with known moments
+
+
+def correlated_gaussian() -> Known:
+    """Ten dimensions, correlations up to 0.9; the proposal is shifted and a third too wide."""
+    n = 10
+    sd = np.geomspace(0.1, 10.0, n)
+    corr = 0.9 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    cov, mean = corr * np.outer(sd, sd), np.linspace(-5, 5, n)
+    precision = np.linalg.inv(cov)
+
+    def log_density(x):
+        return -0.5 * np.einsum("ni,ij,nj->n", x - mean, precision, x - mean)
+
+    target = FakeTarget(log_density, n)
+    proposal = gaussian_proposal(mean + 0.3 * sd, 1.35 * cov)
+    return Known(target, proposal, mean, sd, np.arange(n))
+
+
+def skewed() -> Known:
+    """Skew-normal marginals (Azzalini 1985), then mixed linearly."""
+    alpha, n = np.array([4.0, -3.0, 2.0]), 3
+    delta = alpha / np.sqrt(1 + alpha**2)
+    mix = np.array([[1.0, 0.0, 0.0], [0.7, 0.5, 0.0], [-0.4, 0.3, 2.0]])
+    inverse = np.linalg.inv(mix)
+    own_mean, own_var = delta * np.sqrt(2 / np.pi), 1 - 2 * delta**2 / np.pi
+
+    def log_density(y):
+        x = y @ inverse.T
+        return (-0.5 * x**2 + special.log_ndtr(alpha * x)).sum(axis=1)
+
+    target = FakeTarget(log_density, n)
+    proposal = gaussian_proposal(mix @ (0.5 * own_mean), mix @ mix.T)
+    sd = np.sqrt((mix**2) @ own_var)
+    return Known(target, proposal, mix @ own_mean, sd, np.arange(n))
+
+
+def jitter_at_its_bound() -> Known:
+    """25 stars whose quoted errors are right: log j by quadrature, theta by the closed form."""
+    model, matches, _ = simulated(51, 25, order=1)
+    target, fit = target_of(model, matches, OutlierMixture("none"), **UNCLIPPED)
+    arrays = build_proposal(target, fit).to_arrays()
+    coarse = {k: v.copy() if k == "held" else v[::4].copy() for k, v in arrays.items()}
+    coarse["mode"] += 0.4 * fit.sigma
+    coarse["at"] += 0.3
+    oracle = JitterOracle.of(1, matches)
+    t = oracle.log_j
+    mean_t = oracle.expect(t)
+    sd = np.sqrt(oracle.expect(oracle.variance) * np.diag(oracle.unit_cov))
+    sd_t = np.sqrt(oracle.expect((t - mean_t) ** 2))
+    mean = np.append(oracle.centre, mean_t)
+    proposal = GridProposal.from_arrays(target.n_theta, ("j",), coarse)
+    return Known(target, proposal, mean, np.append(sd, sd_t), np.arange(len(mean)))
+
+
+DENSITIES = {
+    "correlated Gaussian": correlated_gaussian,
+    "skewed": skewed,
+    "jitter at its bound": jitter_at_its_bound,
+}
+
+
+@pytest.fixture(scope="module", params=DENSITIES.values(), ids=DENSITIES)
+def known(request) -> Known:
+    return request.param()
+
+
+def deviations(known: Known, move: str, steps: int) -> SimpleNamespace:
+    """Errors of mean and sd of every parameter, in Monte-Carlo errors."""
+    rng = np.random.default_rng(9)
+    first = known.proposal.draw(len(SEEDS) * WALKERS, rng)
+    runs = ensembles_of(known.target, known.proposal, first, MOVES[move], WALKERS, SEEDS)
+    blocks = advanced(runs, first.reshape(len(SEEDS), WALKERS, -1), steps)
+    chains = np.array([runs.psi(block) for block in blocks])[:, steps // 5 :]
+    coupled = move == "DE"
+    c = diagnose(chains, known.target.names, np.zeros(100), Limits(), coupled=coupled)
+    flat = chains.reshape(-1, chains.shape[-1])
+    # the delta method knows the walkers only: where they are coupled, their ESS is scaled down
+    inflate = 1.0
+    if coupled:
+        alone = diagnose(chains, known.target.names, np.zeros(100), Limits(), coupled=False)
+        inflate = np.sqrt(alone.ess_bulk / c.ess_bulk)
+    accepted = np.mean([block.accepted.mean() for block in blocks]) / steps
+    return SimpleNamespace(
+        mean=(flat.mean(axis=0) - known.mean) / c.mcse_mean,
+        sd=(flat.std(axis=0) - known.sd) / (c.mcse_sd * inflate),
+        ess=min(c.ess_bulk_min, c.ess_tail_min),
+        accepted=accepted,
+    )
+
+
+def limit(n: int) -> float:
+    """Three standard errors for n numbers together (Bonferroni)."""
+    return float(stats.norm.isf(stats.norm.sf(3.0) / n))
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_moments(known, move, full, capsys):
+    found = deviations(known, move, STEPS[move] * (10 if full else 1))
+    with capsys.disabled():
+        print(
+            f"\n{move}: ESS {found.ess:.0f}, acceptance {found.accepted:.2f}, largest deviation of "
+            f"a mean {np.abs(found.mean).max():.2f}, of a sd {np.abs(found.sd).max():.2f} MCSE"
+        )
+    assert found.ess > 300
+    assert 0.1 < found.accepted < 0.95  # no perfect proposal, which would need no correction
+    most = limit(2 * len(known.mean))
+    assert np.abs(found.mean).max() < most
+    assert np.abs(found.sd).max() < most
+
+
+# -- moves that are wrong --------------------------------------------------------------------------
+
+
+class _Shrinking(DEMove):
+    """Differential evolution that forgets nothing but likes the middle."""
+
+    def get_proposal(self, s, c, random):
+        q, _ = super().get_proposal(s, c, random)
+        return q, 0.05 * ((s**2).sum(axis=1) - (q**2).sum(axis=1))
+
+
+def _no_ratio(self, numbers, random):
+    new, factors = _propose(self, numbers, random)
+    return new, np.zeros_like(factors)
+
+
+def _no_reference(step):
+    return MHMove(lambda c, r: (np.sqrt(1 - step**2) * c + step * r.standard_normal(c.shape), 0.0))
+
+
+_propose = sampler._Replay.propose
+WRONG = {
+    "independence": (sampler._Replay, "propose", _no_ratio),
+    "pCN": (sampler, "_crank_nicolson", _no_reference),
+    "DE": (sampler, "DEMove", _Shrinking),
+}
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_wrong_moves_are_found(move, monkeypatch):
+    known = correlated_gaussian()
+    monkeypatch.setattr(*WRONG[move])
+    found = deviations(known, move, STEPS[move])
+    worst = max(np.abs(found.mean).max(), np.abs(found.sd).max())
+    assert worst > 2 * limit(2 * len(known.mean))

@@ -1,0 +1,57 @@
+"""Nodes of the proposal where, on the way, a star lies between two modes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.selfcal import proposal
+from bayesdist.infer.selfcal.information import Information
+from bayesdist.infer.selfcal.solve import solve
+from bayesdist.infer.selfcal.target import SelfTarget
+
+from .fields import field, problem_of
+
+
+def indefinite(when):
+    """`expand` with a negative curvature in those passes for which `when(observed, k)` is true."""
+    passes = {True: 0, False: 0}
+    expand = proposal.expand
+
+    def wrapped(*args, observed=True):
+        passes[observed] += 1
+        found = expand(*args, observed=observed)
+        if when(observed, passes[observed]):
+            return replace(found, curvature=-found.curvature)
+        return found
+
+    return wrapped
+
+
+@pytest.fixture(scope="module")
+def target():
+    simulated = field(6, 5, 70, order=2, disturbed=0.04)
+    problem, _ = problem_of(simulated, least=3)
+    K = simulated.model.n_terms
+    free = np.setdiff1d(np.arange(simulated.model.n_params), [0, 1, K, K + 1])
+    return SelfTarget(solve(problem, simulated.theta, free, Information.none(simulated.theta)))
+
+
+def test_nodes_are_found_past_an_indefinite_curvature(target, monkeypatch):
+    plain = proposal.propose(target)
+    monkeypatch.setattr(proposal, "expand", indefinite(lambda observed, k: observed and k == 2))
+    found = proposal.propose(target)
+    sigma = np.sqrt(np.diag(target.solution.cov)[target.solution.free])
+    assert len(found.nodes) == len(plain.nodes)
+    for a, b in zip(found.nodes, plain.nodes, strict=True):
+        assert np.abs((a.mode - b.mode)[:-1] / sigma).max() < 0.1
+        assert a.log_marginal == pytest.approx(b.log_marginal, abs=0.3)
+
+
+def test_what_is_indefinite_with_any_weights_is_refused(target, monkeypatch):
+    monkeypatch.setattr(proposal, "expand", indefinite(lambda *_: True))
+    with pytest.raises(DegenerateError, match="do not determine"):
+        proposal.propose(target)
