@@ -11,7 +11,6 @@ from bayesdist.data.campaign import CampaignMatches, ExposureReport, match_campa
 from bayesdist.data.catalog import ReferenceCatalog, catalog_from_table, read_catalog
 from bayesdist.data.exposure_log import Exposure, ExposureLog
 from bayesdist.data.exposures import exposure_of_headers, read_exposures, write_exposures
-from bayesdist.data.files import atomic_path, is_leftover, remove_leftovers, sha256_of
 from bayesdist.data.from_table import matches_from_table
 from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
 from bayesdist.data.linear_map import LinearMap
@@ -69,7 +68,6 @@ __all__ = [
     "StarCuts",
     "StarList",
     "accept_radial",
-    "atomic_path",
     "bluest",
     "catalog_from_table",
     "centroid_errors",
@@ -79,7 +77,6 @@ __all__ = [
     "find_similarity",
     "fit_transform",
     "input_files",
-    "is_leftover",
     "linear_moments",
     "match_campaign",
     "match_table",
@@ -98,12 +95,10 @@ __all__ = [
     "read_rvb",
     "read_solutions",
     "read_star_lists",
-    "remove_leftovers",
     "rereference",
     "rvb_bands",
     "search_radius",
     "select_motions",
-    "sha256_of",
     "star_list_of_hst1pass",
     "stream_rvb",
     "tangent_plane",

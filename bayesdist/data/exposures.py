@@ -14,12 +14,12 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from bayesdist.data.exposure_log import NUMBERS, Exposure, ExposureLog
-from bayesdist.data.files import atomic_path
 from bayesdist.data.naming import find_columns
 from bayesdist.data.tables import read_table
 from bayesdist.data.units import conversion
 from bayesdist.data.values import SourceColumn
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 
 __all__ = [
     "Exposure",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
+from bayesdist.files import atomic_path
 
 if TYPE_CHECKING:
     import pyarrow

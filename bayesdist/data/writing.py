@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bayesdist.data.files import made_folder
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.parquet_write import labelled, save_parquet
 from bayesdist.data.pieces import PIECE
 from bayesdist.errors import InputError
+from bayesdist.files import made_folder
 
 if TYPE_CHECKING:
     import pyarrow

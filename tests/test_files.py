@@ -5,8 +5,8 @@ import hashlib
 
 import pytest
 
-from bayesdist.data.files import atomic_path, made_folder, sha256_of
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path, made_folder, sha256_of
 
 
 def test_a_file_appears_only_when_the_block_succeeds(tmp_path):
