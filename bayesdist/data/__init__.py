@@ -10,7 +10,7 @@ from bayesdist.data.aberration import velocity_aberration
 from bayesdist.data.campaign import CampaignMatches, ExposureReport, match_campaign
 from bayesdist.data.catalog import ReferenceCatalog, catalog_from_table, read_catalog
 from bayesdist.data.exposure_log import Exposure, ExposureLog
-from bayesdist.data.exposures import exposure_of_headers, read_exposures, write_exposures
+from bayesdist.data.exposures import read_exposures, write_exposures
 from bayesdist.data.from_table import matches_from_table
 from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
 from bayesdist.data.linear_map import LinearMap
@@ -29,9 +29,9 @@ from bayesdist.data.pieces import PIECE, Piece
 from bayesdist.data.preparing import centroid_errors, neutralise_aberration, with_centroid_errors
 from bayesdist.data.readers import FORMATS, input_files, read_matches
 from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
-from bayesdist.data.rvb_accept import RadialLimit, accept_radial
+from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.data.rvb_linear import fit_transform, linear_moments
-from bayesdist.data.rvb_pairs import RvbPairs, bluest, colour_between
+from bayesdist.data.rvb_pairs import RvbPairs
 from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
 from bayesdist.data.rvb_solutions import read_solutions
 from bayesdist.data.rvb_transform import RvbTransform, rereference, transformed
@@ -67,13 +67,9 @@ __all__ = [
     "SelectedPairs",
     "StarCuts",
     "StarList",
-    "accept_radial",
-    "bluest",
     "catalog_from_table",
     "centroid_errors",
-    "colour_between",
     "derive_motions",
-    "exposure_of_headers",
     "find_similarity",
     "fit_transform",
     "input_files",

@@ -170,10 +170,7 @@ def match_campaign(
     *,
     cuts: StarCuts | None = None,
     radius: float | None = None,
-    hint_rotation: float | Mapping[str, float] | None = None,
-    scale: tuple[float, float] = (0.97, 1.03),
     mirrored: Sequence[bool] = (False,),
-    need_all_chips: bool = False,
     skip: bool = False,
 ) -> CampaignMatches:
     """Match the star lists of many exposures with a catalogue.
@@ -196,19 +193,11 @@ def match_campaign(
     radius : float, optional
         Search radius; by default it is taken from the scatter of the pairs, ring by ring around the
         middle of the detector (`search_radius`), below that where chance takes over.
-    hint_rotation : float or mapping of str to float, optional
-        Rotation from the start's plane to the catalogue's in degrees, for all exposures or by name,
-        good to half a degree.  The shift is then voted for; exposures without hint are found by
-        their patterns.
-    scale : tuple of float, optional
-        Smallest and largest scale from the start's plane to the catalogue.
     mirrored : sequence of bool, optional
         Whether the catalogue is taken with the sign of u changed; of several, those that follow are
         tried where the first matches no exposure.  East of a sky with north up is to the left: a
         detector that is read out as the sky is seen has the parity that is opposite to (u, v) of a
         tangent plane.
-    need_all_chips : bool, optional
-        Whether an exposure without detections on a chip that others have is an error.
     skip : bool, optional
         Whether exposures that do not match, or lose all their detections to the cuts, are left out
         and counted.  More than a fifth of them, or the first two, are an error all the same.
@@ -221,9 +210,9 @@ def match_campaign(
     ------
     InputError
         When an exposure is not in the log, stands in two lists, loses all its detections to the
-        cuts, lacks a chip that it must have, or shows another field: then with the best number of
-        coincidences, and with the scale or the mirror image that would match.  When in most
-        exposures one chip does not match where another does.
+        cuts, or shows another field: then with the best number of coincidences, and with the scale
+        or the mirror image that would match.  When in most exposures one chip does not match where
+        another does.
     """
     check_campaign(lists, log, catalog)
     cuts = StarCuts() if cuts is None else cuts
@@ -237,23 +226,12 @@ def match_campaign(
     for one, (good, rejected) in zip(lists, passed, strict=True):
         where = f"{one.source}, exposure {one.exposure}"
         missing = tuple(chip for chip in chips if not (one.chip[good] == chip).any())
-        if missing and need_all_chips and good.any():
-            raise InputError(
-                f"has no detections on chip {missing[0]}",
-                where=where,
-                do="leave the exposure out or do not ask for all chips",
-            )
         epoch = log[one.exposure].epoch
-        hint = hint_rotation
-        if isinstance(hint, Mapping):
-            hint = hint.get(one.exposure)
         plane = _started(start, one, epoch)
         try:
             if not good.any():
                 raise all_cut(one, rejected, where)
-            match, view = _matched(
-                one, good, plane, views, epoch, radius=radius, hint=hint, scale=scale, where=where
-            )
+            match, view = _matched(one, good, plane, views, epoch, radius=radius, where=where)
             views = [view]
         except InputError as error:
             reason = ""
@@ -306,8 +284,6 @@ def _matched(
     epoch: float,
     *,
     radius: float | None,
-    hint: float | None,
-    scale: tuple[float, float],
     where: str,
 ) -> tuple[ExposureMatch, _View]:
     """The match with the first of these views that gives one.
@@ -327,8 +303,6 @@ def _matched(
                 view.at(epoch),
                 view.index,
                 radius=radius,
-                hint=hint,
-                scale=scale,
                 source=where,
             )
             return found, view

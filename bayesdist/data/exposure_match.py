@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.linear_map import LEAST, LinearMap, best_similarity, iterated_map
-from bayesdist.data.matching import match_to_catalog
 from bayesdist.data.pairs import (
     beats_chance,
     chance_rate,
@@ -84,8 +83,6 @@ def match_exposure(
     patterns: PatternIndex,
     *,
     radius: float | None,
-    hint: float | None,
-    scale: tuple[float, float],
     source: str,
 ) -> ExposureMatch:
     """Match an exposure.
@@ -101,7 +98,7 @@ def match_exposure(
         At the epoch of the exposure.
     patterns : PatternIndex
         Of the catalogue, at an epoch not far from it.
-    radius, hint, scale
+    radius : float or None
         As `match_campaign`.
     source : str
         For errors.
@@ -117,10 +114,7 @@ def match_exposure(
     """
     rows = np.flatnonzero(good)
     points, chip = plane[rows], stars.chip[rows]
-    if hint is None:
-        first, coincidences = _by_patterns(stars, good, plane, catalog, patterns, scale, source)
-    else:
-        first, coincidences = _by_vote(stars, good, plane, catalog, hint, source)
+    first, coincidences = _by_patterns(stars, good, plane, catalog, patterns, source)
     nearby = _around(first(points), catalog)
     reference = np.column_stack([catalog.u, catalog.v])[nearby]
     tree = cKDTree(reference)
@@ -267,7 +261,6 @@ def _by_patterns(
     plane: Float,
     catalog: ReferenceCatalog,
     patterns: PatternIndex,
-    scale: tuple[float, float],
     source: str,
 ) -> tuple[LinearMap, int]:
     """First linear map, and how many stars agreed on it.
@@ -283,7 +276,6 @@ def _by_patterns(
                 plane[which],
                 patterns,
                 mag=None if stars.mag is None else stars.mag[which],
-                scale=scale,
                 source=source,
                 reference_name=catalog.source,
             )
@@ -305,28 +297,6 @@ def _by_patterns(
         0.15 * patterns.spacing,
     )
     return (found.map if rough is None else rough), found.coincidences
-
-
-def _by_vote(
-    stars: StarList,
-    good: Bool,
-    plane: Float,
-    catalog: ReferenceCatalog,
-    hint: float,
-    source: str,
-) -> tuple[LinearMap, int]:
-    """First linear map where the rotation is known."""
-    turn = np.radians(hint)
-    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    voted = match_to_catalog(
-        plane[good, 0],
-        plane[good, 1],
-        catalog,
-        mag=None if stars.mag is None else stars.mag[good],
-        start=LinearMap(matrix, np.zeros(2), np.median(plane[good], axis=0)),
-        source=source,
-    )
-    return voted.transformation, voted.coincidences
 
 
 def _around(points: Float, catalog: ReferenceCatalog) -> Int:
