@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 from astropy.table import Table
 
-from bayesdist.data.from_table import matches_from_table
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.usual_names import ALIASES
+from bayesdist.data.reading.table import matches_from_table
+from bayesdist.data.tables.names import ALIASES
 
 __all__ = ["COLUMNS", "is_astrometrynet", "matches_from_corr"]
 

@@ -11,18 +11,17 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import is_on_sky, plane_unit, position_unit
-from bayesdist.data.from_table import with_sky_columns
-from bayesdist.data.missing import without_missing
-from bayesdist.data.naming import find_columns
-from bayesdist.data.parallax import parallax_factors
-from bayesdist.data.quantities import Quantities
-from bayesdist.data.sky import sky_columns
-from bayesdist.data.tables import read_table
-from bayesdist.data.tangent import mean_direction, tangent_jacobian, tangent_plane
-from bayesdist.data.units import check_unit, conversion
-from bayesdist.data.usual_names import ALIASES
-from bayesdist.data.values import SourceColumn, row_number
+from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
+from bayesdist.data.reading.table import with_sky_columns
+from bayesdist.data.sky.earth import parallax_factors
+from bayesdist.data.sky.positions import sky_columns
+from bayesdist.data.sky.tangent import mean_direction, tangent_jacobian, tangent_plane
+from bayesdist.data.tables.checks import without_missing
+from bayesdist.data.tables.column import SourceColumn, row_number
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import ALIASES, find_columns
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.units import check_unit, conversion
 from bayesdist.errors import InputError
 
 __all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]

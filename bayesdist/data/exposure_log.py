@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.aberration import velocity_aberration
+from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.errors import InputError
 
 __all__ = ["NUMBERS", "Exposure", "ExposureLog"]

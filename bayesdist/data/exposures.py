@@ -13,10 +13,10 @@ from astropy.table import Column, MaskedColumn, Table
 from numpy.typing import NDArray
 
 from bayesdist.data.exposure_log import NUMBERS, Exposure, ExposureLog
-from bayesdist.data.naming import find_columns
-from bayesdist.data.tables import read_table
-from bayesdist.data.units import conversion
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import find_columns
+from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.pairs import mutual_pairs
+from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.errors import InputError
 
 __all__ = ["FrameStars", "pairs_in_frames"]

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.added_errors import AddedErrors
-from bayesdist.data.duplicates import first_duplicate
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
 from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
-from bayesdist.data.missing import absent, counted
 from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
-from bayesdist.data.units import check_unit, conversion, unit_of, without_unit
+from bayesdist.data.tables.checks import absent, counted
+from bayesdist.data.tables.repeated import first_duplicate
+from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
 
 __all__ = ["MatchTable"]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.voting import mean_spacing
+from bayesdist.data.matching.voting import mean_spacing
 from bayesdist.errors import InputError
 
 __all__ = ["MotionErrorLine", "derive_motions", "motion_error_line", "select_motions"]

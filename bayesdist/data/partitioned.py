@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.parquet_files import describe_part
 from bayesdist.data.parts import MatchPart, Whole, match_part, scan, tangent_point_of
 from bayesdist.data.pieces import PIECE, Piece, even_edges, every_kth
-from bayesdist.data.readers import (
+from bayesdist.data.reading.read import (
     check_sigma,
     exposure_names,
     input_files,
     refuse_missing_errors,
 )
+from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 
 __all__ = ["PartPiece", "PartitionedMatches", "open_matches"]

@@ -11,20 +11,20 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import (
+from bayesdist.data.reading.columns import (
     match_columns,
     needed_columns,
     nominal_columns,
     plane_unit,
     position_unit,
 )
-from bayesdist.data.duplicates import buckets_for, first_repetition
-from bayesdist.data.parquet_files import ParquetPart, RowBlock
-from bayesdist.data.quantities import Quantities
-from bayesdist.data.sky import sky_columns
-from bayesdist.data.tangent import direction_of, direction_sum
-from bayesdist.data.usual_names import origin_of
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.sky.positions import sky_columns
+from bayesdist.data.sky.tangent import direction_of, direction_sum
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.names import origin_of
+from bayesdist.data.tables.parquet import ParquetPart, RowBlock
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.repeated import buckets_for, first_repetition
 from bayesdist.errors import InputError
 
 __all__ = ["MatchPart", "Whole", "match_part", "scan", "tangent_point_of"]

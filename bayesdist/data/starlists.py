@@ -12,11 +12,10 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.hst1pass import Hst1passList, is_hst1pass, read_hst1pass
-from bayesdist.data.naming import find_columns
-from bayesdist.data.readers import exposure_names, input_files
-from bayesdist.data.tables import TABLE_SUFFIXES, read_lines, read_table
-from bayesdist.data.usual_names import BASIC
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.reading.read import exposure_names, input_files
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import TABLE_SUFFIXES, read_lines, read_table
+from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.errors import FormatError, InputError
 
 __all__ = ["StarCuts", "StarList", "read_star_lists", "star_list_of_hst1pass"]

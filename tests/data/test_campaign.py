@@ -13,14 +13,14 @@ from bayesdist.data import (
     read_hst1pass,
     read_matchup,
 )
-from bayesdist.data.campaign import match_campaign
 from bayesdist.data.exposures import Exposure, ExposureLog
-from bayesdist.data.match_doubts import match_doubts
-from bayesdist.data.mismatch import mismatch_reason
-from bayesdist.data.patterns import pattern_index
+from bayesdist.data.matching.campaign import match_campaign
+from bayesdist.data.matching.match_doubts import match_doubts
+from bayesdist.data.matching.mismatch import mismatch_reason
+from bayesdist.data.matching.search_radius import search_radius
+from bayesdist.data.matching.similarity import pattern_index
 from bayesdist.data.preparing import neutralise_aberration, with_centroid_errors
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists
-from bayesdist.data.tolerance import search_radius
 from bayesdist.errors import InputError
 from tests.data.sky import ZERO_POINT, campaign, positions, start
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bayesdist.data.aberration import velocity_aberration
 from bayesdist.data.exposures import (
     Exposure,
     ExposureLog,
     read_exposures,
     write_exposures,
 )
+from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.errors import InputError
 
 LOG = ExposureLog(

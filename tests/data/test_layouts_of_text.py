@@ -11,9 +11,9 @@ from astropy.io import fits
 from astropy.table import Table
 
 from bayesdist.data import matches_from_table, open_matches, read_matches
-from bayesdist.data.chip_labels import numbered
-from bayesdist.data.text_tables import is_text_table
-from bayesdist.data.usual_names import ALIASES
+from bayesdist.data.reading.chips import numbered
+from bayesdist.data.tables.names import ALIASES
+from bayesdist.data.tables.text import is_text_table
 from bayesdist.errors import InputError
 
 

@@ -19,7 +19,7 @@ from bayesdist.data import (
     neutralise_aberration,
     write_partitioned,
 )
-from bayesdist.data.match_doubts import match_doubts
+from bayesdist.data.matching.match_doubts import match_doubts
 from bayesdist.errors import InputError
 from bayesdist.model import Chip
 from bayesdist.products import read_idctab

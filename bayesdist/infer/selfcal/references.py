@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.linear_map import LEAST, LinearMap, iterated_map
+from bayesdist.data.matching.linear_map import LEAST, LinearMap, iterated_map
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 

@@ -18,20 +18,20 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.campaign_faults import (
+from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.exposures import ExposureLog
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.matching.exposure import ExposureMatch, match_exposure
+from bayesdist.data.matching.mismatch import mismatch_reason
+from bayesdist.data.matching.reports import (
     all_cut,
     check_campaign,
     failure,
     refuse_astray,
     too_many,
 )
-from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.exposure_match import ExposureMatch, match_exposure
-from bayesdist.data.exposures import ExposureLog
-from bayesdist.data.matches import MatchTable
+from bayesdist.data.matching.similarity import PatternIndex, pattern_index
 from bayesdist.data.merging import encoded, merged_counts
-from bayesdist.data.mismatch import mismatch_reason
-from bayesdist.data.patterns import PatternIndex, pattern_index
 from bayesdist.data.starlists import StarCuts, StarList
 from bayesdist.errors import InputError
 

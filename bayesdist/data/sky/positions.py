@@ -14,11 +14,11 @@ from astropy.coordinates import Angle, SkyCoord
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from bayesdist.data.parallax import parallax_factors
-from bayesdist.data.quantities import Quantities
-from bayesdist.data.tangent import mean_direction
-from bayesdist.data.units import conversion
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.sky.earth import parallax_factors
+from bayesdist.data.sky.tangent import mean_direction
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
 
 __all__ = ["MOTIONS", "SKY_QUANTITIES", "SPARED", "ReferenceSky", "reference_sky", "sky_columns"]

@@ -1,4 +1,4 @@
-"""Velocity aberration: the scale that the motion of the telescope gives to the sky.
+"""What the motion of the Earth does to positions: parallax, and the scale of aberration.
 
     VAFACTOR = sqrt(1 - b^2) / (1 - n . b),    b = velocity / c
 
@@ -12,14 +12,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
     from astropy.time import Time
 
-__all__ = ["velocity_aberration"]
+__all__ = ["parallax_factors", "velocity_aberration"]
+
+Float = NDArray[np.float64]
 
 _LIGHT = 299_792.458  # km/s
 
@@ -77,3 +79,35 @@ def velocity_aberration(
     a, d = np.radians([ra, dec])
     n = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
     return float(np.sqrt(1.0 - speed2) / (1.0 - n @ b))
+
+
+def parallax_factors(epoch: ArrayLike, ra: float, dec: float) -> Float:
+    """Displacement towards east and north per unit of parallax, seen from the Earth.
+
+    A satellite in low orbit is within 5e-5 au of its centre.
+
+    Parameters
+    ----------
+    epoch : array_like, shape (E,)
+        Decimal (Julian) years.
+    ra, dec : float
+        Degrees, ICRS.
+
+    Returns
+    -------
+    ndarray, shape (E, 2)
+
+    Notes
+    -----
+    Green, Spherical Astronomy (1985), section 8; the Earth's place by astropy's own ephemeris
+    (ERFA's epv00), which needs no file.
+    """
+    from astropy.coordinates import get_body_barycentric
+    from astropy.time import Time
+
+    time = Time(np.atleast_1d(np.asarray(epoch, float)), format="jyear", scale="tdb")
+    earth = get_body_barycentric("earth", time, ephemeris="builtin").xyz.to_value("au")
+    a, d = np.radians([ra, dec])
+    east = np.array([-np.sin(a), np.cos(a), 0.0])
+    north = np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)])
+    return -np.stack([east @ earth, north @ earth], axis=1)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from bayesdist.data.linear_map import SAMPLE
+from bayesdist.data.matching.linear_map import SAMPLE
 
 __all__ = ["beats_chance", "chance_rate", "hull_of", "inside_hull", "mutual_pairs", "overlap"]
 

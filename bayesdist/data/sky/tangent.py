@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.values import Place, row_number
+from bayesdist.data.tables.column import Place, row_number
 from bayesdist.errors import InputError
 
 __all__ = [

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.chip_labels import numbered_chips
-from bayesdist.data.naming import find_columns
-from bayesdist.data.quantities import Quantities
-from bayesdist.data.sky import SKY_QUANTITIES, reference_sky
-from bayesdist.data.tangent import mean_direction, tangent_jacobian, tangent_plane
-from bayesdist.data.units import check_unit, conversion
-from bayesdist.data.usual_names import ALIASES, PAIRS
-from bayesdist.data.values import SourceColumn, year_of
+from bayesdist.data.reading.chips import numbered_chips
+from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
+from bayesdist.data.sky.tangent import mean_direction, tangent_jacobian, tangent_plane
+from bayesdist.data.tables.column import SourceColumn, year_of
+from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.units import check_unit, conversion
 from bayesdist.errors import InputError
 
 __all__ = [

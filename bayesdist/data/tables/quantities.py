@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from bayesdist.data.usual_names import known_unit
-from bayesdist.data.values import Place, SourceColumn, row_number
+from bayesdist.data.tables.column import Place, SourceColumn, row_number
+from bayesdist.data.tables.names import known_unit
 
 __all__ = ["Columns", "Quantities"]
 

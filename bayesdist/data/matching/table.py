@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.linear_map import LEAST, LinearMap, iterated_map
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.pairs import beats_chance, mutual_pairs, overlap
-from bayesdist.data.voting import mean_spacing, vote_offset
+from bayesdist.data.matching.linear_map import LEAST, LinearMap, iterated_map
+from bayesdist.data.matching.pairs import beats_chance, mutual_pairs, overlap
+from bayesdist.data.matching.voting import mean_spacing, vote_offset
 from bayesdist.errors import InputError
 
 __all__ = ["Matching", "match_table", "match_to_catalog"]

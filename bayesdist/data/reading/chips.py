@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.values import EncodedColumn, SourceColumn
+from bayesdist.data.tables.column import EncodedColumn, SourceColumn
 from bayesdist.errors import InputError
 
 __all__ = ["numbered", "numbered_chips", "text_labels"]

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.campaign import CampaignMatches
 from bayesdist.data.exposure_log import ExposureLog
+from bayesdist.data.matching.campaign import CampaignMatches
 
 __all__ = ["match_doubts"]
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.tables import naming_faults, parquet_column, parquet_units
-from bayesdist.data.values import EncodedColumn, Place
+from bayesdist.data.tables.column import EncodedColumn, Place
+from bayesdist.data.tables.files import naming_faults, parquet_column, parquet_units
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:

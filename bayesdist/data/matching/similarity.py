@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.linear_map import LinearMap
-from bayesdist.data.pairs import chance_rate, hull_of
-from bayesdist.data.triangle_votes import Candidate, Level, candidates
-from bayesdist.data.voting import mean_spacing
+from bayesdist.data.matching.linear_map import LinearMap
+from bayesdist.data.matching.pairs import chance_rate, hull_of
+from bayesdist.data.matching.triangle_votes import Candidate, Level, candidates
+from bayesdist.data.matching.voting import mean_spacing
 from bayesdist.errors import InputError
 
 __all__ = ["PatternIndex", "Similarity", "find_similarity", "pattern_index"]

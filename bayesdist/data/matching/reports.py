@@ -9,12 +9,12 @@ import numpy as np
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposure_log import ExposureLog
-from bayesdist.data.mismatch import MIRRORED
+from bayesdist.data.matching.mismatch import MIRRORED
 from bayesdist.data.starlists import StarList
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
-    from bayesdist.data.campaign import ExposureReport
+    from bayesdist.data.matching.campaign import ExposureReport
 
 __all__ = ["all_cut", "check_campaign", "failure", "refuse_astray", "too_many"]
 

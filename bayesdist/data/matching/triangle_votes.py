@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.triangles import Triangles, triangles_of
+from bayesdist.data.matching.triangles import Triangles, triangles_of
 
 __all__ = ["Candidate", "Level", "candidates"]
 

@@ -16,7 +16,7 @@ from astropy.io import fits
 from astropy.table import Column, MaskedColumn, Table, vstack
 from astropy.table.meta import get_header_from_yaml
 
-from bayesdist.data.text_tables import is_text_table, parse_text_table
+from bayesdist.data.tables.text import is_text_table, parse_text_table
 from bayesdist.errors import FormatError, InputError
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.linear_map import LEAST, LinearMap, best_similarity, iterated_map
-from bayesdist.data.pairs import (
+from bayesdist.data.matching.linear_map import LEAST, LinearMap, best_similarity, iterated_map
+from bayesdist.data.matching.pairs import (
     beats_chance,
     chance_rate,
     hull_of,
@@ -18,10 +18,10 @@ from bayesdist.data.pairs import (
     mutual_pairs,
     overlap,
 )
-from bayesdist.data.patterns import PatternIndex, find_similarity
-from bayesdist.data.smooth_map import smooth_map
+from bayesdist.data.matching.search_radius import SearchRadius, search_radius
+from bayesdist.data.matching.similarity import PatternIndex, find_similarity
+from bayesdist.data.matching.smooth_map import smooth_map
 from bayesdist.data.starlists import StarList
-from bayesdist.data.tolerance import SearchRadius, search_radius
 from bayesdist.errors import InputError
 
 __all__ = ["ExposureMatch", "match_exposure"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.patterns import PatternIndex, find_similarity
+from bayesdist.data.matching.similarity import PatternIndex, find_similarity
 from bayesdist.errors import InputError
 
 __all__ = ["MIRRORED", "mismatch_reason"]

@@ -14,19 +14,18 @@ from astropy.table import Table
 
 from bayesdist.data.astrometrynet import COLUMNS as CORR_COLUMNS
 from bayesdist.data.astrometrynet import is_astrometrynet, matches_from_corr
-from bayesdist.data.chip_labels import numbered, text_labels
-from bayesdist.data.from_table import matches_from_table, sky_positions
 from bayesdist.data.hst1pass import is_hst1pass, is_matchup, read_hst1pass, read_matchup
 from bayesdist.data.magnitude_errors import no_magnitudes
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.matching import match_table
-from bayesdist.data.missing import absent
-from bayesdist.data.naming import find_columns
-from bayesdist.data.tables import TABLE_SUFFIXES, is_binary, is_fits, read_lines, read_table
-from bayesdist.data.tangent import mean_direction
-from bayesdist.data.text_tables import is_text_table
-from bayesdist.data.usual_names import ALIASES
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.matching.table import match_table
+from bayesdist.data.reading.chips import numbered, text_labels
+from bayesdist.data.reading.table import matches_from_table, sky_positions
+from bayesdist.data.sky.tangent import mean_direction
+from bayesdist.data.tables.checks import absent
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import TABLE_SUFFIXES, is_binary, is_fits, read_lines, read_table
+from bayesdist.data.tables.names import ALIASES, find_columns
+from bayesdist.data.tables.text import is_text_table
 from bayesdist.errors import FormatError, InputError
 
 __all__ = [

@@ -11,14 +11,13 @@ from astropy.table import Table
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import is_on_sky, match_columns, needed_columns
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.missing import absent, check_not_finite, without_missing
-from bayesdist.data.naming import find_columns
-from bayesdist.data.quantities import Quantities
-from bayesdist.data.sky import MOTIONS, SPARED, sky_columns
-from bayesdist.data.usual_names import ALIASES, PAIRS, origin_of
-from bayesdist.data.values import row_number
+from bayesdist.data.reading.columns import is_on_sky, match_columns, needed_columns
+from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
+from bayesdist.data.tables.checks import absent, check_not_finite, without_missing
+from bayesdist.data.tables.column import row_number
+from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
+from bayesdist.data.tables.quantities import Quantities
 from bayesdist.errors import InputError
 
 __all__ = ["as_table", "matches_from_table", "own_epoch", "sky_positions", "with_sky_columns"]

@@ -13,8 +13,8 @@ from astropy.time import Time
 from numpy.typing import NDArray
 
 from bayesdist.data.merging import encoded
-from bayesdist.data.missing import absent
-from bayesdist.data.units import unit_of
+from bayesdist.data.tables.checks import absent
+from bayesdist.data.tables.units import unit_of
 from bayesdist.errors import InputError
 
 __all__ = ["EncodedColumn", "Place", "SourceColumn", "row_number", "year_of"]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.linear_map import LinearMap, iterated_map
-from bayesdist.data.patterns import PatternIndex, find_similarity, pattern_index
+from bayesdist.data.matching.linear_map import LinearMap, iterated_map
+from bayesdist.data.matching.similarity import PatternIndex, find_similarity, pattern_index
 from bayesdist.errors import InputError
 
 __all__ = ["MutualFrames", "mutual_frames", "refuse_duplicates"]

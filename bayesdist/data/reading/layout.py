@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.data.columns import needed_columns
-from bayesdist.data.from_table import own_epoch, with_sky_columns
-from bayesdist.data.parquet_files import describe_part
-from bayesdist.data.quantities import Columns
-from bayesdist.data.readers import input_files, kind_of
-from bayesdist.data.tables import read_table
-from bayesdist.data.usual_names import origin_of
+from bayesdist.data.reading.columns import needed_columns
+from bayesdist.data.reading.read import input_files, kind_of
+from bayesdist.data.reading.table import own_epoch, with_sky_columns
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import origin_of
+from bayesdist.data.tables.parquet import describe_part
+from bayesdist.data.tables.quantities import Columns
 
 __all__ = ["TableLayout", "table_layout"]
 
