@@ -26,6 +26,7 @@ from bayesdist.data.motions import (
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
 from bayesdist.data.pieces import PIECE, Piece
 from bayesdist.data.preparing import centroid_errors, neutralise_aberration, with_centroid_errors
+from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.read import FORMATS, input_files, read_matches
 from bayesdist.data.reading.table import matches_from_table
 from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
@@ -59,6 +60,7 @@ __all__ = [
     "PartitionedMatches",
     "Piece",
     "RadialLimit",
+    "ReadOptions",
     "ReferenceCatalog",
     "RvbPairs",
     "RvbSelection",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.reading.columns import match_columns
-from bayesdist.data.reading.read import check_sigma, refuse_missing_errors
+from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
 from bayesdist.data.rvb_array import ArrayCheck
 from bayesdist.data.rvb_files import (
     ARRAY_SIZE,
@@ -223,7 +223,7 @@ def _pairs(
         unread |= {"sigma_u", "sigma_v"}
     plain = {key: name for key, name in file.found.items() if key not in unread}
     quantities = Quantities(table, plain, file.source, place)
-    out = match_columns(quantities, unit=unit, pixel_origin=pixel_origin)
+    out = match_columns(quantities, ReadOptions(unit=unit, pixel_origin=pixel_origin))
     if "mjd" in file.found and "epoch" not in file.found:
         column = file.column(table, "mjd", place)
         out["epoch"] = SourceColumn(

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.reading.chips import numbered_chips
+from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
 from bayesdist.data.sky.tangent import mean_direction, tangent_jacobian, tangent_plane
 from bayesdist.data.tables.column import SourceColumn, year_of
-from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
+from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.data.tables.quantities import Quantities
 from bayesdist.data.tables.units import check_unit, conversion
 from bayesdist.errors import InputError
 
 __all__ = [
+    "columns_read",
     "is_on_sky",
     "match_columns",
     "needed_columns",
@@ -127,8 +130,9 @@ def needed_columns(
     ----------
     names : iterable of str
         Columns of the table.
-    columns, source, read_sigma
-        As `matches_from_table`.
+    columns, read_sigma
+        As `ReadOptions`.
+    source : str
 
     Returns
     -------
@@ -160,24 +164,41 @@ def needed_columns(
     return {key: name for key, name in found.items() if key not in unread}
 
 
-def match_columns(
-    quantities: Quantities,
-    *,
-    unit: str | None = None,
-    pixel_origin: int = 1,
-    tangent_point: tuple[float, float] | None = None,
-    epoch: float | str | None = None,
-    catalogue_epoch: float | None = None,
-    chips: Mapping[str, int] | None = None,
-) -> dict[str, Any]:
+def columns_read(
+    names: Sequence[str], header: Mapping[str, Any], options: ReadOptions, *, source: str
+) -> tuple[dict[str, str], ReadOptions, tuple[str, ...]]:
+    """Column of each quantity, the options with the origin of the pixels, and notes about it.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Columns of the table.
+    header : mapping
+        Its keywords.
+    options : ReadOptions
+    source : str
+
+    Raises
+    ------
+    InputError
+        As `needed_columns`.
+    """
+    found = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
+    if options.pixel_origin is not None:
+        return found, options, ()
+    origin, why = origin_of(found["x"], names, header)
+    notes = (f"the first pixel is taken as {origin}: {why}",) if why else ()
+    return found, replace(options, pixel_origin=origin), notes
+
+
+def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:
     """What a MatchTable is made of, from some rows of a table.
 
     Parameters
     ----------
     quantities : Quantities
         Columns as `needed_columns` finds them.
-    unit, pixel_origin, tangent_point, epoch, catalogue_epoch, chips
-        As `matches_from_table`.
+    options : ReadOptions
 
     Returns
     -------
@@ -191,33 +212,34 @@ def match_columns(
     """
     found, column = quantities.found, quantities.__getitem__
     out: dict[str, Any] = {}
-    out["x"], out["y"] = (_pixels(column(key), pixel_origin) for key in ("x", "y"))
+    out["x"], out["y"] = (_pixels(column(key), options.pixel_origin) for key in ("x", "y"))
     if "epoch" in found:
-        if epoch is not None:
+        if options.epoch is not None:
             raise InputError(
                 "an epoch of the exposures is given, and the table has a column of it",
                 where=column("epoch").where,
                 do='leave one of them out (columns = {epoch = ""})',
             )
         out["epoch"] = column("epoch").years()
-    elif epoch is not None:
-        out["epoch"] = np.full(len(quantities), year_of(epoch, where="data.epoch"))
+    elif options.epoch is not None:
+        year = year_of(options.epoch, where="data.epoch")
+        out["epoch"] = np.full(len(quantities), year)
     if "ra" in found:
-        out |= _projected(quantities, unit, tangent_point, out.get("epoch"), catalogue_epoch)
+        out |= _projected(quantities, options, out.get("epoch"))
     else:
-        if tangent_point is not None:
+        if options.tangent_point is not None:
             raise InputError(
                 "a tangent point is given, but the reference positions are u, v",
                 where=quantities.source,
                 do="name the columns ra and dec, or leave the tangent point out",
             )
         out["u"], out["v"] = (column(key).numbers() for key in ("u", "v"))
-        out["unit"] = position_unit((column("u"), column("v")), unit)
+        out["unit"] = position_unit((column("u"), column("v")), options.unit)
     for key in ("sigma_u", "sigma_v"):
         if key in found:
             out[key] = _sigma(column(key), out["unit"])
-    nominal = nominal_columns(found, source=quantities.source, tangent_point=tangent_point)
-    for key in nominal:
+    at = options.tangent_point
+    for key in nominal_columns(found, source=quantities.source, tangent_point=at):
         out[key] = _in_unit(column(key), out["unit"])
     if "mag" in found:
         out["mag"] = column("mag").numbers()
@@ -237,12 +259,15 @@ def match_columns(
     if "star" in found:
         out["star"] = column("star").integers()
     if "chip" in found:
-        out["chip"], out["chip_numbers"], out["chip_names"] = numbered_chips(column("chip"), chips)
+        out["chip"], out["chip_numbers"], out["chip_names"] = numbered_chips(
+            column("chip"), options.chips
+        )
     return out
 
 
-def _pixels(column: SourceColumn, pixel_origin: int) -> Float:
+def _pixels(column: SourceColumn, pixel_origin: int | None) -> Float:
     """FITS 1-based pixels."""
+    pixel_origin = 1 if pixel_origin is None else pixel_origin
     if pixel_origin not in (0, 1):
         raise InputError(
             f"pixel_origin is {pixel_origin}", where=column.source, do="set it to 0 or 1"
@@ -256,17 +281,12 @@ def _pixels(column: SourceColumn, pixel_origin: int) -> Float:
     return column.numbers() + (1 - pixel_origin)
 
 
-def _projected(
-    quantities: Quantities,
-    unit: str | None,
-    tangent_point: tuple[float, float] | None,
-    epoch: Float | None,
-    catalogue_epoch: float | None,
-) -> dict[str, Any]:
+def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None) -> dict[str, Any]:
     """Positions on the tangent plane, their errors and motions."""
-    unit, where = plane_unit(unit, source=quantities.source), quantities.source
-    sky = reference_sky(quantities, epoch=epoch, catalogue_epoch=catalogue_epoch)
-    point = mean_direction(sky.ra, sky.dec) if tangent_point is None else tangent_point
+    where, point = quantities.source, options.tangent_point
+    unit = plane_unit(options.unit, source=where)
+    sky = reference_sky(quantities, epoch=epoch, catalogue_epoch=options.catalogue_epoch)
+    point = mean_direction(sky.ra, sky.dec) if point is None else point
     u, v = tangent_plane(sky.ra, sky.dec, point, where=where, place=quantities.place)
     out: dict[str, Any] = {"u": u, "v": v, "unit": unit, "notes": sky.notes}
     out["tangent_point"] = (float(point[0]), float(point[1]))

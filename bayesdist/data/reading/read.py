@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from astropy.table import Table
 from bayesdist.data.astrometrynet import COLUMNS as CORR_COLUMNS
 from bayesdist.data.astrometrynet import is_astrometrynet, matches_from_corr
 from bayesdist.data.hst1pass import is_hst1pass, is_matchup, read_hst1pass, read_matchup
-from bayesdist.data.magnitude_errors import no_magnitudes
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.chips import numbered, text_labels
+from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
 from bayesdist.data.reading.table import matches_from_table, sky_positions
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.checks import absent
@@ -30,12 +30,10 @@ from bayesdist.errors import FormatError, InputError
 
 __all__ = [
     "FORMATS",
-    "check_sigma",
     "exposure_names",
     "input_files",
     "kind_of",
     "read_matches",
-    "refuse_missing_errors",
 ]
 
 FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")
@@ -90,32 +88,6 @@ def _expanded(path: Path) -> list[Path]:
     return found
 
 
-@dataclass(frozen=True)
-class _Options:
-    """What the user says about all files."""
-
-    columns: Mapping[str, str] | None
-    unit: str | None
-    read_sigma: bool
-    pixel_origin: int | None
-    tangent_point: tuple[float, float] | None
-    epoch: float | str | None = None
-    catalogue_epoch: float | None = None
-    chips: Mapping[str, int] | None = None
-    not_finite: str = "refuse"
-
-    def refuse(self, source: str, kind: str, *names: str) -> None:
-        """Refuse options that a format leaves no room for."""
-        blank = _Options(None, None, True, None, None)
-        for name in names:
-            if getattr(self, name) != getattr(blank, name):
-                raise InputError(
-                    f"option {name!r} is given, but the format {kind} fixes it",
-                    where=source,
-                    do=f"leave {name!r} out or set the format to 'table'",
-                )
-
-
 def read_matches(
     path: PathLike | Sequence[PathLike] | Any,
     *,
@@ -143,18 +115,8 @@ def read_matches(
         'hst1pass' (lists with raw and corrected positions),
         'matchup' (such lists beside the MATCHUP master that they are then matched with),
         'astrometry.net' (corr.fits), or 'auto': by name and content.
-    columns : mapping of str to str, optional
-        Column of each quantity, as in `matches_from_table`.
-    unit : {'pix', 'arcsec', 'mas', 'deg'}, optional
-        Unit of u and v, where the file does not say.
-    sigma : {'columns', 'by_magnitude'} or float, optional
-        Where errors come from: from columns; left to be estimated from residuals by magnitude (they
-        are then None); or one number, in the unit of u and v.
-    pixel_origin, epoch, catalogue_epoch, chips, not_finite
-        As `matches_from_table`.
-    tangent_point : tuple of float, optional
-        RA and Dec in degrees of the plane for sky positions; by default the mean direction of all
-        stars.
+    columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
+        As `ReadOptions`.
 
     Returns
     -------
@@ -169,11 +131,10 @@ def read_matches(
         raise InputError(
             f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(FORMATS)}"
         )
-    check_sigma(sigma)
-    options = _Options(
+    options = ReadOptions(
         columns,
         unit,
-        sigma == "columns",
+        sigma,
         pixel_origin,
         tangent_point,
         epoch,
@@ -188,7 +149,7 @@ def read_matches(
                 where="format",
                 do="leave it out",
             )
-        return _with_errors(_read_table(IN_MEMORY, path, None, options), sigma)
+        return _with_errors(matches_from_table(path, options, source=IN_MEMORY), sigma)
     files = input_files(path)
     kinds = [kind_of(file, columns) if format == "auto" else format for file in files]
     masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
@@ -200,45 +161,11 @@ def read_matches(
     return _with_errors(table, sigma)
 
 
-def check_sigma(sigma: str | float) -> None:
-    """Refuse what the option `sigma` cannot be."""
-    if isinstance(sigma, str):
-        good = sigma in ("columns", "by_magnitude")
-    else:
-        good = not isinstance(sigma, bool) and bool(np.isfinite(sigma)) and sigma > 0
-    if not good:
-        raise InputError(
-            f"sigma is {sigma!r}",
-            where="data.sigma",
-            do="set it to 'columns', 'by_magnitude' or a positive number",
-        )
-
-
 def _with_errors(table: MatchTable, sigma: str | float) -> MatchTable:
     refuse_missing_errors(sigma, table.has_sigma, table.has_mag, where=", ".join(table.sources))
     if isinstance(sigma, str):
         return table
     return table.with_sigma(float(sigma), float(sigma))
-
-
-def refuse_missing_errors(
-    sigma: str | float, has_sigma: bool, has_mag: bool, *, where: str
-) -> None:
-    """Refuse matches that lack the columns which the option `sigma` asks for.
-
-    Raises
-    ------
-    InputError
-        For 'columns' without errors and 'by_magnitude' without magnitudes.
-    """
-    if sigma == "columns" and not has_sigma:
-        raise InputError(
-            "holds no errors of the positions",
-            where=where,
-            do="name sigma_u and sigma_v, or set sigma to 'by_magnitude' or a number",
-        )
-    if sigma == "by_magnitude" and not has_mag:
-        raise no_magnitudes(where)
 
 
 def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
@@ -281,7 +208,7 @@ def exposure_names(files: Sequence[Path]) -> list[str]:
 
 
 def _read_plain(
-    files: Sequence[Path], kinds: Sequence[str], options: _Options, *, in_parts: bool
+    files: Sequence[Path], kinds: Sequence[str], options: ReadOptions, *, in_parts: bool
 ) -> MatchTable:
     """Files that hold matches themselves."""
     names: Sequence[str | None] = exposure_names(files)
@@ -296,7 +223,9 @@ def _read_plain(
     readers: dict[str, Callable[[Path, str | None], MatchTable]] = {
         "hst1pass": lambda file, name: _read_list(file, name, options),
         "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
-        "table": lambda file, name: _read_table(str(file), tables[file], name, options),
+        "table": lambda file, name: matches_from_table(
+            tables[file], options, source=str(file), exposure_name=name
+        ),
     }
     return MatchTable.concatenate(
         [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
@@ -304,8 +233,8 @@ def _read_plain(
 
 
 def _with_common_point(
-    tables: Mapping[Path, Table], kinds: Iterable[str], options: _Options
-) -> _Options:
+    tables: Mapping[Path, Table], kinds: Iterable[str], options: ReadOptions
+) -> ReadOptions:
     """One tangent point for all files: each by itself would choose its own."""
     if options.tangent_point is not None or len(tables) < 2:
         return options
@@ -319,7 +248,7 @@ def _with_common_point(
     return replace(options, tangent_point=mean_direction(ra, dec))
 
 
-def _with_common_chips(tables: Mapping[Path, Table], options: _Options) -> _Options:
+def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> ReadOptions:
     """One numbering of the chips of all files, where these give names."""
     if options.chips is not None or len(tables) < 2:
         return options
@@ -333,45 +262,23 @@ def _with_common_chips(tables: Mapping[Path, Table], options: _Options) -> _Opti
     return replace(options, chips=numbered(names)) if names else options
 
 
-def _read_table(source: str, data: Any, name: str | None, options: _Options) -> MatchTable:
-    return matches_from_table(
-        data,
-        options.columns,
-        source=source,
-        unit=options.unit,
-        read_sigma=options.read_sigma,
-        pixel_origin=options.pixel_origin,
-        tangent_point=options.tangent_point,
-        exposure_name=name,
-        epoch=options.epoch,
-        catalogue_epoch=options.catalogue_epoch,
-        chips=options.chips,
-        not_finite=options.not_finite,
-    )
-
-
-def _read_list(file: Path, name: str | None, options: _Options) -> MatchTable:
+def _read_list(file: Path, name: str | None, options: ReadOptions) -> MatchTable:
     options.refuse(str(file), "hst1pass", "columns", "pixel_origin", "tangent_point", "epoch")
     if options.unit not in (None, "pix"):
         options.refuse(str(file), "hst1pass", "unit")
     return read_hst1pass(file).matches(name=name)
 
 
-def _read_corr(file: Path, table: Table, name: str | None, options: _Options) -> MatchTable:
+def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> MatchTable:
     options.refuse(str(file), "astrometry.net", "columns", "pixel_origin")
     if options.unit not in (None, "arcsec"):
         options.refuse(str(file), "astrometry.net", "unit")
-    return matches_from_corr(
-        table,
-        source=str(file),
-        tangent_point=options.tangent_point,
-        exposure_name=name,
-        epoch=options.epoch,
-        not_finite=options.not_finite,
-    )
+    return matches_from_corr(table, options, source=str(file), exposure_name=name)
 
 
-def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: _Options) -> MatchTable:
+def _read_with_master(
+    files: Sequence[Path], kinds: Sequence[str], options: ReadOptions
+) -> MatchTable:
     """hst1pass lists, matched with the MATCHUP master among the files."""
     masters: list[Path] = []
     lists: list[Path] = []
