@@ -16,7 +16,7 @@ from bayesdist.data.reading.table import with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.positions import sky_columns
 from bayesdist.data.sky.tangent import mean_direction, tangent_jacobian, tangent_plane
-from bayesdist.data.tables.checks import without_missing
+from bayesdist.data.tables.checks import check_values, one_length, without_missing
 from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import ALIASES, find_columns
@@ -102,26 +102,14 @@ class ReferenceCatalog:
                     do="give both or neither",
                 )
         names = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
-        for name in names:
-            if getattr(self, name) is None:
-                continue
-            values = np.ascontiguousarray(getattr(self, name), np.float64)
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        for name, values in one_length(given, where=self.source).items():
             object.__setattr__(self, name, values)
-            if values.shape != (n,):
-                raise InputError(
-                    f"column {name!r} has shape {values.shape}, but 'u' has {n} rows",
-                    where=self.source,
-                    do="give columns of one length",
-                )
-            good = np.isfinite(values) & ((values >= 0) | (not name.startswith("sigma")))
-            if not good.all():
-                bad = int(np.argmin(good))
-                must = "finite and not negative" if name.startswith("sigma") else "finite"
-                raise InputError(
-                    f"value is {values[bad]:g}, and must be {must}",
-                    where=f"{self.source}, row {bad + 1}, column {name!r}",
-                    do="correct the row or drop it",
-                )
+        check_values(
+            {name: getattr(self, name) for name in given},
+            place=lambda row: f"{self.source}, row {row + 1}",
+            not_negative=[name for name in given if name.startswith("sigma")],
+        )
         star = np.ascontiguousarray(np.arange(n) if self.star is None else self.star, np.int64)
         object.__setattr__(self, "star", star)
         if star.shape != (n,) or star.min() < 0:

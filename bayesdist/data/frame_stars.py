@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matching.pairs import mutual_pairs
+from bayesdist.data.tables.checks import check_values, one_length
 from bayesdist.errors import InputError
 
 __all__ = ["FrameStars", "pairs_in_frames"]
@@ -42,26 +43,13 @@ class FrameStars:
     frame: Int
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "sigma", "frame"):
-            kind = np.int64 if name == "frame" else np.float64
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
-        n = self.x.shape
-        if n == (0,) or any(a.shape != n for a in (self.y, self.sigma, self.frame)) or len(n) != 1:
-            raise InputError(
-                "the columns of a list of stars are empty or differ in length",
-                where="x, y, sigma, frame",
-                do="give four columns of one length",
-            )
-        for name in ("x", "y", "sigma"):
-            values = getattr(self, name)
-            good = np.isfinite(values) & ((values > 0) if name == "sigma" else True)
-            if not good.all():
-                bad = int(np.argmin(good))
-                raise InputError(
-                    f"value is {values[bad]:g}",
-                    where=f"row {bad + 1}, column {name!r}",
-                    do="correct the row or drop it",
-                )
+        given = {name: getattr(self, name) for name in ("x", "y", "sigma", "frame")}
+        if not np.size(self.x):
+            raise InputError("a list holds no stars", where="column 'x'", do="give one with stars")
+        arrays = one_length(given, integers=("frame",), where="list of stars")
+        for name, values in arrays.items():
+            object.__setattr__(self, name, values)
+        check_values(arrays, place=lambda row: f"list of stars, row {row + 1}", positive=("sigma",))
 
     def __len__(self) -> int:
         return len(self.x)

@@ -1,8 +1,8 @@
-"""Rows that lack a value: left out and counted by reason, or refused."""
+"""Columns of one length with finite values; rows that lack one are counted by reason or refused."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,76 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["NOT_FINITE", "absent", "check_not_finite", "counted", "without_missing"]
+__all__ = [
+    "NOT_FINITE",
+    "absent",
+    "check_not_finite",
+    "check_values",
+    "counted",
+    "one_length",
+    "without_missing",
+]
 
 Bool = NDArray[np.bool_]
 
 NOT_FINITE = ("refuse", "reject")
+
+
+def one_length(
+    columns: Mapping[str, Any], *, integers: Collection[str] = (), where: str
+) -> dict[str, NDArray[Any]]:
+    """Contiguous float64 arrays, those of `integers` int64, as long as the first of them.
+
+    They are in the machine's byte order, which columns of FITS tables are not.
+
+    Raises
+    ------
+    InputError
+        Naming the first column of another length.
+    """
+    arrays = {
+        name: np.ascontiguousarray(values, np.int64 if name in integers else np.float64)
+        for name, values in columns.items()
+    }
+    first = next(iter(arrays))
+    for name, values in arrays.items():
+        if values.shape != (arrays[first].size,):
+            raise InputError(
+                f"column {name!r} has shape {values.shape}, but {first!r} has "
+                f"{arrays[first].size} rows",
+                where=where,
+                do="give columns of one length",
+            )
+    return arrays
+
+
+def check_values(
+    columns: Mapping[str, NDArray[Any]],
+    *,
+    place: Callable[[int], str],
+    positive: Collection[str] = (),
+    not_negative: Collection[str] = (),
+) -> None:
+    """Refuse columns with values that are not finite, or not positive where they must be.
+
+    Raises
+    ------
+    InputError
+        Naming the row by its `place`, and the column.
+    """
+    for name, values in columns.items():
+        good, must = np.isfinite(values), "finite"
+        if name in positive:
+            good, must = good & (values > 0), "finite and positive"
+        elif name in not_negative:
+            good, must = good & (values >= 0), "finite and not negative"
+        if not good.all():
+            bad = int(np.argmin(good))
+            raise InputError(
+                f"value is {values[bad]:g}, and must be {must}",
+                where=f"{place(bad)}, column {name!r}",
+                do="correct the row or drop it",
+            )
 
 
 def check_not_finite(value: str) -> None:
