@@ -12,8 +12,9 @@ from bayesdist.data.exposures import read_exposures, write_exposures
 from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.matching.campaign import CampaignMatches, ExposureReport, match_campaign
+from bayesdist.data.matching.campaign import CampaignMatches, match_campaign
 from bayesdist.data.matching.linear_map import LinearMap
+from bayesdist.data.matching.reports import ExposureReport
 from bayesdist.data.matching.search_radius import SearchRadius, search_radius
 from bayesdist.data.matching.similarity import find_similarity, pattern_index
 from bayesdist.data.matching.table import Matching, match_table, match_to_catalog

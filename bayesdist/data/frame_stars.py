@@ -1,4 +1,4 @@
-"""Positions in many frames, and pairs within a radius that depends on the place on the detector."""
+"""Stars of many frames, each with its error."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.data.tables.checks import check_values, one_length
 from bayesdist.errors import InputError
 
-__all__ = ["FrameStars", "pairs_in_frames"]
+__all__ = ["FrameStars"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -58,32 +56,3 @@ class FrameStars:
     def points(self) -> Float:
         """Positions (N, 2)."""
         return np.column_stack([self.x, self.y])
-
-
-def pairs_in_frames(
-    position: Float, frame: Int, reference: FrameStars, radius: Float
-) -> tuple[Int, Int]:
-    """Pairs that are each other's nearest within their frame.
-
-    Parameters
-    ----------
-    position : ndarray, shape (N, 2)
-        Of the detections, corrected.
-    frame : ndarray of int, shape (N,)
-    reference : FrameStars
-    radius : ndarray, shape (N,)
-        Largest distance of the partner of each detection.
-
-    Returns
-    -------
-    index, reference_index : ndarray of int, shape (n_pairs,)
-        No index stands twice.
-    """
-    reach = float(radius.max())
-    # frames lie on top of each other, out of each other's reach
-    apart = 2.0 * reach
-    points = np.column_stack([position, apart * frame])
-    others = np.column_stack([reference.points, apart * reference.frame])
-    index, partner, distance = mutual_pairs(points, others, cKDTree(others), reach)
-    near = distance <= radius[index]
-    return index[near], partner[near]

@@ -20,7 +20,7 @@ _LEAST = 40  # stars in a bin
 _MOST = 25  # bins
 _FEWEST = 10  # stars in all, below which no scatter is worth the name
 _CLIP = 4.0  # sigmas beyond which a star has no part in the scatter
-_NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
+MAD_TO_SIGMA = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 _SMALL_SAMPLE = 0.31  # relative bias of the median of |z| over n stars is +0.31 / n
 _LOG_VARIANCE = 1.36  # variance of ln(scatter) times n: the median of |z| is 37 % efficient
 _TURN = 9.0  # gain in chi-square that a rise towards the bright end must bring to be believed
@@ -164,13 +164,13 @@ def _bins(mag: Float) -> list[Int]:
 def _scatter(residuals: Float) -> Float:
     """Scatter (2,) of residuals (2, n), unmoved by stars far out."""
     size = np.abs(residuals)
-    scale = _NORMAL * np.median(size, axis=1)
+    scale = MAD_TO_SIGMA * np.median(size, axis=1)
     for _ in range(20):
         # one membership for both axes, as in the outlier model
         near = (size <= _CLIP * scale[:, None]).all(axis=0)
         if not near.any():
             break
-        new = _NORMAL * np.median(size[:, near], axis=1)
+        new = MAD_TO_SIGMA * np.median(size[:, near], axis=1)
         if np.allclose(new, scale, rtol=1e-12, atol=0.0):
             break
         scale = new

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.matching.voting import mean_spacing
 from bayesdist.errors import InputError
 
@@ -25,7 +26,6 @@ Line: TypeAlias = "float | Callable[[Float], ArrayLike]"
 _IN_BIN = 200  # stars of a bin in magnitude
 _MOST = 40  # bins
 _ABOVE = 2.5  # scatters above the median, in the logarithm: 0.6 % of a log-normal distribution
-_NORMAL = 1.4826022185056018
 _FLOOR = 0.05  # scatter of ln(sigma) at least: errors all alike are no reason to reject the next
 
 
@@ -180,7 +180,7 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
     for part in parts:
         log = np.log(np.maximum(sigma[part], np.finfo(float).tiny))
         middle = float(np.median(log))
-        scatter = max(_NORMAL * float(np.median(np.abs(log - middle))), _FLOOR)
+        scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(log - middle))), _FLOOR)
         knots.append((float(np.median(catalog.mag[part])), np.exp(middle + _ABOVE * scatter)))
     mag, line = np.array(knots).T
     return MotionErrorLine(mag, line)

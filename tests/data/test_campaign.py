@@ -15,10 +15,8 @@ from bayesdist.data import (
 )
 from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.data.matching.campaign import match_campaign
-from bayesdist.data.matching.match_doubts import match_doubts
-from bayesdist.data.matching.mismatch import mismatch_reason
 from bayesdist.data.matching.search_radius import search_radius
-from bayesdist.data.matching.similarity import pattern_index
+from bayesdist.data.matching.similarity import mismatch_reason, pattern_index
 from bayesdist.data.preparing import neutralise_aberration, with_centroid_errors
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists
 from bayesdist.errors import InputError
@@ -234,7 +232,7 @@ def test_a_chip_that_lies_elsewhere_is_said(rng):
     catalog, lists, log, _, _ = campaign(rng, 5)
     found = match_campaign((turned(lists[0]), *lists[1:]), log, catalog, start)
     assert [one.astray for one in found.reports] == [(1,), (), (), (), ()]
-    said = match_doubts(found, log)
+    said = found.warnings(log)
     assert any("chip 1 hardly match in exposure e0" in text for text in said)
     with pytest.raises(InputError, match="in 5 of 5 exposures the detections of chip 1 do not"):
         match_campaign([turned(one) for one in lists], log, catalog, start)
@@ -244,16 +242,16 @@ def test_odd_exposures_are_named_and_others_are_not(rng):
     catalog, lists, log, _, _ = campaign(rng, 8)
     # the lists of this sky know no aberration
     still = ExposureLog(tuple(replace(one, vafactor=1.0) for one in log))
-    assert match_doubts(match_campaign(lists, still, catalog, start), still) == []
+    assert match_campaign(lists, still, catalog, start).warnings(still) == []
     thin = lists[5].select(rng.random(len(lists[5])) < 0.5)
     found = match_campaign((*lists[:5], thin, *lists[6:]), still, catalog, start)
-    (said,) = match_doubts(found, still)
+    (said,) = found.warnings(still)
     assert "completeness" in said and "e5 (0.4" in said
     wrong = ExposureLog(
         tuple(replace(one, vafactor=1.00019 if one.name == "e3" else 1.0) for one in log)
     )
     found = match_campaign(lists, wrong, catalog, start)
-    (said,) = match_doubts(found, wrong)
+    (said,) = found.warnings(wrong)
     assert "scale" in said and "e3 (-1.9e-04)" in said
 
 

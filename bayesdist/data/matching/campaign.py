@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -22,22 +22,22 @@ from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching.exposure import ExposureMatch, match_exposure
-from bayesdist.data.matching.mismatch import mismatch_reason
 from bayesdist.data.matching.reports import (
+    ExposureReport,
     all_cut,
     check_campaign,
     failure,
+    match_warnings,
     refuse_astray,
     too_many,
 )
-from bayesdist.data.matching.similarity import PatternIndex, pattern_index
+from bayesdist.data.matching.similarity import PatternIndex, mismatch_reason, pattern_index
 from bayesdist.data.merging import encoded, merged_counts
 from bayesdist.data.starlists import StarCuts, StarList
 from bayesdist.errors import InputError
 
 __all__ = [
     "CampaignMatches",
-    "ExposureReport",
     "match_campaign",
 ]
 
@@ -46,72 +46,6 @@ Start = Callable[[Float, Float, NDArray[np.int64], float], ArrayLike]
 
 _UNMATCHED = "no counterpart in the catalogue"
 _LEFT_OUT = "exposure left out"
-_ASTRAY = 0.2  # of the matched share of the best chip: a chip below lies elsewhere
-_ENOUGH = 20  # detections of a chip, of which that can be said
-
-
-@dataclass(frozen=True)
-class ExposureReport:
-    """How an exposure was matched.
-
-    Parameters
-    ----------
-    exposure, filter : str
-    epoch : float
-    detected : int
-        Detections in the list.
-    rejected : dict of str to int
-        Those that the cuts left out, by reason.
-    matched : int
-    per_chip : dict of int to int
-        Matched on each chip of the campaign.
-    missing_chips : tuple of int
-        Chips of the campaign without a detection that passed the cuts.
-    astray : tuple of int
-        Chips whose detections hardly match, where those of another chip do.
-    expected : int
-        Catalogue stars in the footprint of the detections and within their range of magnitudes.
-    completeness : float
-        Part of `expected` that is matched.
-    false_rate : float
-        Probability that a detection without counterpart in the catalogue is matched by chance.
-    false_share : float
-        Part of the matches that are expected to be false for that reason.
-    rotation : float
-        From the start's positions to the catalogue, degrees anticlockwise, in [0, 360).
-    scale : float
-    offset : tuple of float
-        Where the middle of the detections comes to lie, in the catalogue's unit.
-    radius : tuple of float
-        Smallest and largest search radius over the detector.
-    rms : float
-        Of the distances of the pairs, after the linear transformation and a cubic for each chip.
-    zero_point : float or None
-        Median of the catalogue's magnitudes less those of the list.
-    coincidences : int
-        Stars that agreed on rotation and shift.
-    """
-
-    exposure: str
-    filter: str
-    epoch: float
-    detected: int
-    rejected: Mapping[str, int]
-    matched: int
-    per_chip: Mapping[int, int]
-    missing_chips: tuple[int, ...]
-    astray: tuple[int, ...]
-    expected: int
-    completeness: float
-    false_rate: float
-    false_share: float
-    rotation: float
-    scale: float
-    offset: tuple[float, float]
-    radius: tuple[float, float]
-    rms: float
-    zero_point: float | None
-    coincidences: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +69,10 @@ class CampaignMatches:
     reports: tuple[ExposureReport, ...]
     left_out: Mapping[str, str] = field(default_factory=dict)
     mirrored: bool = False
+
+    def warnings(self, log: ExposureLog) -> list[str]:
+        """What a reader has to know of the matching, as `match_warnings`."""
+        return match_warnings(self.reports, self.left_out, log)
 
     def summary(self) -> Table:
         """The reports as a table, a row for each exposure; chips and reasons are columns."""
@@ -221,17 +159,26 @@ def match_campaign(
     mean_epoch = float(np.mean([log[one.exposure].epoch for one in lists]))
     views = [_View(catalog, one, mean_epoch) for one in mirrored]
     found: list[ExposureMatch] = []
-    reports: list[ExposureReport] = []
     failed: dict[str, InputError] = {}
     for one, (good, rejected) in zip(lists, passed, strict=True):
         where = f"{one.source}, exposure {one.exposure}"
-        missing = tuple(chip for chip in chips if not (one.chip[good] == chip).any())
-        epoch = log[one.exposure].epoch
-        plane = _started(start, one, epoch)
+        exposure = log[one.exposure]
+        plane = _started(start, one, exposure.epoch)
         try:
             if not good.any():
                 raise all_cut(one, rejected, where)
-            match, view = _matched(one, good, plane, views, epoch, radius=radius, where=where)
+            match = partial(
+                match_exposure,
+                one,
+                good,
+                plane,
+                exposure=exposure,
+                chips=chips,
+                rejected=rejected,
+                radius=radius,
+                source=where,
+            )
+            pairs, view = _matched(match, views, exposure.epoch)
             views = [view]
         except InputError as error:
             reason = ""
@@ -241,17 +188,17 @@ def match_campaign(
             if reason or not skip or too_many(len(failed), len(found), len(lists)):
                 raise failure(failed, reason, len(lists), mirrored) from error
             continue
-        found.append(match)
-        reports.append(_report(one, good, log, match, rejected, tuple(chips), missing))
-    refuse_astray(reports, catalog)
+        found.append(pairs)
+    refuse_astray([one.report for one in found], catalog)
     kept = [one for one in lists if one.exposure not in failed]
     shown = catalog.mirrored() if views[0].mirrored else catalog
-    table = _table(kept, log, shown, found, reports)
+    table = _table(kept, log, shown, found)
     if failed:
         n = sum(len(one) for one in lists) - table.n_rows
         table = replace(table, n_rows=table.n_rows + n, rejected={**table.rejected, _LEFT_OUT: n})
     left_out = {k: e.cause for k, e in failed.items()}
-    return CampaignMatches(table, tuple(reports), left_out, views[0].mirrored)
+    reports = tuple(one.report for one in found)
+    return CampaignMatches(table, reports, left_out, views[0].mirrored)
 
 
 class _View:
@@ -277,14 +224,9 @@ class _View:
 
 
 def _matched(
-    stars: StarList,
-    good: NDArray[np.bool_],
-    plane: Float,
+    match: Callable[[ReferenceCatalog, PatternIndex], ExposureMatch],
     views: Sequence[_View],
     epoch: float,
-    *,
-    radius: float | None,
-    where: str,
 ) -> tuple[ExposureMatch, _View]:
     """The match with the first of these views that gives one.
 
@@ -296,16 +238,7 @@ def _matched(
     errors = []
     for view in views:
         try:
-            found = match_exposure(
-                stars,
-                good,
-                plane,
-                view.at(epoch),
-                view.index,
-                radius=radius,
-                source=where,
-            )
-            return found, view
+            return match(view.at(epoch), view.index), view
         except InputError as error:
             errors.append(error)
     first = errors[0]
@@ -327,52 +260,14 @@ def _started(start: Start, stars: StarList, epoch: float) -> Float:
     return plane
 
 
-def _report(
-    stars: StarList,
-    good: NDArray[np.bool_],
-    log: ExposureLog,
-    match: ExposureMatch,
-    rejected: Mapping[str, int],
-    chips: tuple[int, ...],
-    missing: tuple[int, ...],
-) -> ExposureReport:
-    exposure = log[stars.exposure]
-    asked = {chip: int((stars.chip[good] == chip).sum()) for chip in chips}
-    matched = {chip: int((stars.chip[match.index] == chip).sum()) for chip in chips}
-    share = {chip: matched[chip] / n for chip, n in asked.items() if n >= _ENOUGH}
-    best = max(share.values(), default=0.0)
-    return ExposureReport(
-        exposure=exposure.name,
-        filter=exposure.filter,
-        epoch=exposure.epoch,
-        detected=len(stars),
-        rejected=dict(rejected),
-        matched=len(match.index),
-        per_chip=matched,
-        missing_chips=missing,
-        astray=tuple(chip for chip, part in share.items() if part < _ASTRAY * best),
-        expected=match.expected,
-        completeness=match.completeness,
-        false_rate=match.false_rate,
-        false_share=match.false_share,
-        rotation=match.rotation,
-        scale=match.scale,
-        offset=match.offset,
-        radius=match.radius,
-        rms=float(np.sqrt(np.mean(match.distance**2))),
-        zero_point=match.zero_point,
-        coincidences=match.coincidences,
-    )
-
-
 def _table(
     lists: Sequence[StarList],
     log: ExposureLog,
     catalog: ReferenceCatalog,
     found: Sequence[ExposureMatch],
-    reports: Sequence[ExposureReport],
 ) -> MatchTable:
     """All matches, with the columns that every list has."""
+    reports = [one.report for one in found]
     sizes = [len(match.index) for match in found]
 
     def joined(values: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.matching.linear_map import LEAST, LinearMap, best_similarity, iterated_map
+from bayesdist.data.exposure_log import Exposure
+from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, best_similarity, iterated_map
 from bayesdist.data.matching.pairs import (
     beats_chance,
     chance_rate,
@@ -18,6 +20,7 @@ from bayesdist.data.matching.pairs import (
     mutual_pairs,
     overlap,
 )
+from bayesdist.data.matching.reports import ExposureReport
 from bayesdist.data.matching.search_radius import SearchRadius, search_radius
 from bayesdist.data.matching.similarity import PatternIndex, find_similarity
 from bayesdist.data.matching.smooth_map import smooth_map
@@ -30,6 +33,8 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
+_ASTRAY = 0.2  # of the matched share of the best chip: a chip below lies elsewhere
+_ENOUGH = 20  # detections of a chip, of which that can be said
 _CHANCE = 0.1  # chance matches of a detection within the largest radius that is looked at
 _SEVERAL = 10.0  # radii by which detections are displaced to see what chance gives
 _BRIGHT = 2000  # stars of the first linear map, and of the last check
@@ -43,36 +48,25 @@ _RANGE = (1.0, 99.0)  # percentiles of magnitude that count as the range of a li
 
 @dataclass(frozen=True, eq=False)
 class ExposureMatch:
-    """Pairs of an exposure; as `ExposureReport` where the names are the same.
+    """Pairs of an exposure.
 
     Parameters
     ----------
+    report : ExposureReport
     index, catalog_index : ndarray of int, shape (n,)
         Rows of the list and of the catalogue.
-    distance : ndarray, shape (n,)
-        Between the two after all transformations.
     u, v : ndarray, shape (n,)
         Of the catalogue.
     sigma : tuple of ndarray, shape (n,), or None
         Errors of the catalogue.
     """
 
+    report: ExposureReport
     index: Int
     catalog_index: Int
-    distance: Float
     u: Float
     v: Float
     sigma: tuple[Float, Float] | None
-    expected: int
-    completeness: float
-    false_rate: float
-    false_share: float
-    rotation: float
-    scale: float
-    offset: tuple[float, float]
-    radius: tuple[float, float]
-    zero_point: float | None
-    coincidences: int
 
 
 def match_exposure(
@@ -82,6 +76,9 @@ def match_exposure(
     catalog: ReferenceCatalog,
     patterns: PatternIndex,
     *,
+    exposure: Exposure,
+    chips: Sequence[int],
+    rejected: Mapping[str, int],
     radius: float | None,
     source: str,
 ) -> ExposureMatch:
@@ -98,6 +95,11 @@ def match_exposure(
         At the epoch of the exposure.
     patterns : PatternIndex
         Of the catalogue, at an epoch not far from it.
+    exposure : Exposure
+    chips : sequence of int
+        Those of the campaign.
+    rejected : mapping of str to int
+        Detections that are not good, by reason.
     radius : float or None
         As `match_campaign`.
     source : str
@@ -160,13 +162,18 @@ def match_exposure(
     sigma = None
     if catalog.sigma_u is not None and catalog.sigma_v is not None:
         sigma = (catalog.sigma_u[partner], catalog.sigma_v[partner])
-    return ExposureMatch(
-        index=rows[index],
-        catalog_index=partner,
-        distance=pairs.distance,
-        u=catalog.u[partner],
-        v=catalog.v[partner],
-        sigma=sigma,
+    asked = {one: int((chip == one).sum()) for one in chips}
+    per_chip = {one: int((chip[index] == one).sum()) for one in chips}
+    report = ExposureReport(
+        exposure=exposure.name,
+        filter=exposure.filter,
+        epoch=exposure.epoch,
+        detected=len(stars),
+        rejected=dict(rejected),
+        matched=len(index),
+        per_chip=per_chip,
+        missing_chips=tuple(one for one, n in asked.items() if not n),
+        astray=_astray(asked, per_chip),
         expected=int(expected.sum()),
         completeness=matched / max(int(expected.sum()), 1),
         false_rate=false_rate,
@@ -175,9 +182,20 @@ def match_exposure(
         scale=float(abs(turn)),
         offset=(float(centre[0]), float(centre[1])),
         radius=(float(allowed.radius.min()), float(allowed.radius.max())),
+        rms=float(np.sqrt(np.mean(pairs.distance**2))),
         zero_point=zero_point,
         coincidences=coincidences,
     )
+    return ExposureMatch(
+        report, rows[index], partner, catalog.u[partner], catalog.v[partner], sigma
+    )
+
+
+def _astray(asked: Mapping[int, int], matched: Mapping[int, int]) -> tuple[int, ...]:
+    """Chips whose detections hardly match, where those of another chip do."""
+    share = {chip: matched[chip] / n for chip, n in asked.items() if n >= _ENOUGH}
+    best = max(share.values(), default=0.0)
+    return tuple(chip for chip, part in share.items() if part < _ASTRAY * best)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,16 +227,16 @@ def _settled(
     allowed = SearchRadius(np.zeros(1), np.array([largest]))
     chance = min(chance_rate(start, tree, largest, _SEVERAL * largest), 0.99)
     moved = start
-    index, partner, distance = mutual_pairs(moved, reference, tree, largest)
+    index, partner, distance = mutual_pairs(moved, reference, largest, tree=tree)
     for left in reversed(range(_ROUNDS)):
-        if len(index) < LEAST:
+        if len(index) < MIN_PAIRS:
             return None
         before = len(index)
         moved = start + smooth_map(start, chip, reference[partner] - start[index], index)(
             start, chip
         )
         widest = float(allowed.radius.max())
-        index, partner, distance = mutual_pairs(moved, reference, tree, widest)
+        index, partner, distance = mutual_pairs(moved, reference, widest, tree=tree)
         growing = len(index) > _GROWTH * before and left > 1
         if not fixed and not growing and len(index):
             unpaired = np.ones(len(moved), bool)
@@ -233,7 +251,7 @@ def _settled(
         if not growing and (fixed or widest < largest):
             break
     sample = moved[:: -(-len(moved) // _BRIGHT)]
-    if len(index) < LEAST or not beats_chance(sample, reference, tree, distance):
+    if len(index) < MIN_PAIRS or not beats_chance(sample, reference, tree, distance):
         return None
     return _Pairs(moved, allowed, index, partner, distance)
 

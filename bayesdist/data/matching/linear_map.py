@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = ["LEAST", "SAMPLE", "LinearMap", "best_similarity", "iterated_map"]
+__all__ = [
+    "MIN_PAIRS",
+    "SAMPLE",
+    "LinearMap",
+    "RobustFit",
+    "best_similarity",
+    "iterated_map",
+    "robust_fit",
+]
 
 Float = NDArray[np.float64]
+Solution = TypeVar("Solution")
 
 SAMPLE = 20_000  # detections that the iterations use
 _FIRST = 150  # detections of the first round
 _ROUNDS = 25
-LEAST = 6  # pairs that a linear map needs to be more than its own fit
+MIN_PAIRS = 6  # that a linear map needs to be more than its own fit
+_CLIP = 3.0  # times the median distance: 3.5 sigma of a circular normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,20 +105,55 @@ def iterated_map(
     return current
 
 
-def _robust_linear(p: Float, q: Float) -> tuple[Float, Float] | None:
-    """Least-squares matrix and shift from p to q, with pairs far from them left out."""
-    use = np.ones(len(p), bool)
-    design = np.column_stack([p, np.ones(len(p))])
-    for _ in range(5):
-        if use.sum() < LEAST:
+class RobustFit(NamedTuple, Generic[Solution]):
+    """A fit, the distances of all pairs from it (N,), and which lie near (N,)."""
+
+    solution: Solution
+    away: Float
+    use: NDArray[np.bool_]
+
+
+def robust_fit(
+    fit: Callable[[NDArray[np.bool_]], tuple[Solution, Float] | None],
+    n: int,
+    *,
+    least: int,
+    rounds: int = 5,
+    slack: float = 0.0,
+    reach: float = np.inf,
+) -> RobustFit[Solution] | None:
+    """A fit to N pairs, repeated without those beyond three median distances until none changes.
+
+    `fit` gives for pairs by mask (N,) the solution and the distances (N,) of all from it, or None
+    where they do not determine it.  None, too, where fewer than `least` pairs are given.  `slack`
+    is what rounding makes of a distance of 0; no pair beyond `reach` is used.
+    """
+    found, use = None, np.ones(n, bool)
+    for _ in range(rounds):
+        if use.sum() < least:
+            break
+        fitted = fit(use)
+        if fitted is None:
             return None
-        solution, _, rank, _ = np.linalg.lstsq(design[use], q[use], rcond=None)
-        if rank < 3:
-            return None
-        distance = np.hypot(*(q - design @ solution).T)
-        # 3 x the median radius is 3.5 sigma of a circular normal
-        kept = distance <= 3.0 * np.median(distance[use]) + 1e-12 * np.abs(q).max()
+        solution, away = fitted
+        kept = away <= min(_CLIP * float(np.median(away[use])) + slack, reach)
+        found = RobustFit(solution, away, kept)
         if (kept == use).all():
             break
         use = kept
-    return np.asarray(solution[:2].T), np.asarray(solution[2])
+    return found
+
+
+def _robust_linear(p: Float, q: Float) -> tuple[Float, Float] | None:
+    """Least-squares matrix and shift from p to q, with pairs far from them left out."""
+    design = np.column_stack([p, np.ones(len(p))])
+
+    def fit(use: NDArray[np.bool_]) -> tuple[Float, Float] | None:
+        solution, _, rank, _ = np.linalg.lstsq(design[use], q[use], rcond=None)
+        return (solution, np.hypot(*(q - design @ solution).T)) if rank == 3 else None
+
+    slack = 1e-12 * float(np.abs(q).max(initial=0.0))
+    found = robust_fit(fit, len(p), least=MIN_PAIRS, slack=slack)
+    if found is None or found.use.sum() < MIN_PAIRS:
+        return None
+    return np.asarray(found.solution[:2].T), np.asarray(found.solution[2])

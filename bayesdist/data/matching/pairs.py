@@ -60,7 +60,13 @@ def overlap(points: Float, reference: Float) -> tuple[int, float]:
 
 
 def mutual_pairs(
-    points: Float, reference: Float, tree: cKDTree, radius: float
+    points: Float,
+    reference: Float,
+    radius: float | Float,
+    *,
+    tree: cKDTree | None = None,
+    frame: Int | None = None,
+    reference_frame: Int | None = None,
 ) -> tuple[Int, Int, Float]:
     """Pairs that are each other's nearest within a radius.
 
@@ -68,9 +74,12 @@ def mutual_pairs(
     ----------
     points : ndarray, shape (N, 2)
     reference : ndarray, shape (M, 2)
-    tree : cKDTree
-        Of `reference`.
-    radius : float
+    radius : float or ndarray, shape (N,)
+        One for all, or the largest distance of the partner of each point.
+    tree : cKDTree, optional
+        Of `reference`, where it is there already.
+    frame, reference_frame : ndarray of int, shape (N,) and (M,), optional
+        Only points of equal number are paired.
 
     Returns
     -------
@@ -78,14 +87,22 @@ def mutual_pairs(
         No index stands twice.
     distance : ndarray
     """
-    distance, forth = tree.query(points, distance_upper_bound=radius, workers=-1)
+    reach = float(np.max(radius))
+    if frame is not None and reference_frame is not None:
+        # frames lie on top of each other, out of each other's reach
+        points = np.column_stack([points, 2.0 * reach * frame])
+        reference = np.column_stack([reference, 2.0 * reach * reference_frame])
+    tree = cKDTree(reference) if tree is None else tree
+    distance, forth = tree.query(points, distance_upper_bound=reach, workers=-1)
     found = np.flatnonzero(forth < len(reference))
     partners = forth[found]
     asked = np.unique(partners)
-    _, back = cKDTree(points).query(reference[asked], distance_upper_bound=radius, workers=-1)
+    _, back = cKDTree(points).query(reference[asked], distance_upper_bound=reach, workers=-1)
     own = np.full(len(reference), -1, np.int64)
     own[asked] = back
     mutual = found[own[partners] == found]
+    if np.ndim(radius):
+        mutual = mutual[distance[mutual] <= np.asarray(radius)[mutual]]
     return mutual, forth[mutual].astype(np.int64), distance[mutual]
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
+
+from bayesdist.data.matching.linear_map import robust_fit
 
 __all__ = ["SmoothMap", "smooth_map"]
 
@@ -17,7 +20,6 @@ _ORDER = 3
 _POWERS = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]
 _LEAST = 20 * len(_POWERS)  # pairs of a chip; with fewer, what is fitted is their noise
 _MOST = 4000  # that a fit uses: beyond, their noise has no part in it any more
-_CLIP = 3.0  # times the median distance: 3.5 sigma of a circular normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,22 +71,19 @@ def smooth_map(points: Float, chip: Int, residual: Float, index: Int) -> SmoothM
         if len(here) < _LEAST:
             continue
         here = here[:: -(-len(here) // _MOST)]
-        design, wanted = _terms(points[index[here]], low, high), residual[here]
-        use = np.ones(len(wanted), bool)
-        for _ in range(6):
-            values = _solved(design[use], wanted[use])
-            away = np.hypot(*(wanted - design @ values).T)
-            kept = away <= _CLIP * np.median(away[use])
-            if (kept == use).all() or kept.sum() < _LEAST:
-                break
-            use = kept
-        coefficients[number] = values
+        fit = partial(_cubic, _terms(points[index[here]], low, high), residual[here])
+        found = robust_fit(fit, len(here), least=_LEAST, rounds=6)
+        assert found is not None
+        coefficients[number] = found.solution
     return SmoothMap(low, high, coefficients)
 
 
-def _solved(design: Float, wanted: Float) -> Float:
-    """Least squares; Legendre polynomials leave normal equations well conditioned."""
-    return np.linalg.pinv(design.T @ design, hermitian=True) @ (design.T @ wanted)
+def _cubic(design: Float, wanted: Float, use: NDArray[np.bool_]) -> tuple[Float, Float]:
+    """Coefficients by least squares, and distances of all pairs from them."""
+    # Legendre polynomials leave normal equations well conditioned
+    normal, right = design[use].T @ design[use], design[use].T @ wanted[use]
+    values = np.linalg.pinv(normal, hermitian=True) @ right
+    return values, np.hypot(*(wanted - design @ values).T)
 
 
 def _terms(points: Float, low: Float, high: Float) -> Float:

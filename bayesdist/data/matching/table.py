@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.matching.linear_map import LEAST, LinearMap, iterated_map
+from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.data.matching.pairs import beats_chance, mutual_pairs, overlap
 from bayesdist.data.matching.voting import mean_spacing, vote_offset
 from bayesdist.errors import InputError
@@ -121,7 +121,7 @@ def match_to_catalog(
         where=source,
         do="check the field, the orientation, the scale and the largest offset",
     )
-    if vote.log10_chance > _LOG10_CHANCE or vote.count < LEAST:
+    if vote.log10_chance > _LOG10_CHANCE or vote.count < MIN_PAIRS:
         raise failure
 
     tree = cKDTree(reference)
@@ -142,8 +142,8 @@ def match_to_catalog(
         fine.matrix @ start.matrix, fine(start(origin[None]))[0] - origin, origin
     )
     found = transformation(points)
-    index, catalog_index, distance = mutual_pairs(found, reference, tree, radius)
-    few = len(index) < LEAST or len(index) < min(_ENOUGH, 0.5 * min(len(points), n_over))
+    index, catalog_index, distance = mutual_pairs(found, reference, radius, tree=tree)
+    few = len(index) < MIN_PAIRS or len(index) < min(_ENOUGH, 0.5 * min(len(points), n_over))
     if few or not beats_chance(found, reference, tree, distance):
         raise failure
     return Matching(

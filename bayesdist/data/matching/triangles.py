@@ -1,15 +1,19 @@
-"""Triangles of neighbouring stars, by what shift and rotation leave as it is."""
+"""Triangles of neighbouring stars, and their votes for a rotation, a scale and a shift."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = ["Triangles", "triangles_of"]
+from bayesdist.data.matching.linear_map import robust_fit
+
+__all__ = ["Candidate", "Level", "Triangles", "candidates", "triangles_of"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -17,6 +21,10 @@ Complex = NDArray[np.complex128]
 
 _FLATTEST = 0.15  # shortest to longest side: below, a small error turns the shape around
 _ALIKE = 0.985  # sides nearer to each other than this may change places
+_ANCHORS = 500  # stars of the list that triangles are made around
+_NEIGHBOURS = (5, 6)  # of each, in the list and in the reference
+_CANDIDATES = 3  # peaks of a vote that are looked at
+_VOTES = 400_000  # at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,3 +99,138 @@ def _described(stars: Complex, corners: Int) -> Triangles:
         log_size=np.log(sides[:, 0]),
         left=((b - a) * np.conj(c - a)).imag < 0,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """The brightest reference stars and their triangles.
+
+    Parameters
+    ----------
+    stars : ndarray of complex, shape (M,)
+        Positions x + i y.
+    """
+
+    stars: Complex
+
+    @cached_property
+    def triangles(self) -> Triangles:
+        """Of each star with two of its nearest neighbours."""
+        return triangles_of(self.stars, np.arange(len(self.stars)), _NEIGHBOURS[1])
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """w = turn z + target.
+
+    Parameters
+    ----------
+    turn, target : complex
+    agreeing : int
+        Stars that the map brings together, of the triangles that voted for it.
+    slack : float
+        Median of their distances: how far the map may be off.
+    """
+
+    turn: complex
+    target: complex
+    agreeing: int
+    slack: float
+
+
+def candidates(
+    stars: Complex, level: Level, tolerance: float, scale: tuple[float, float]
+) -> Iterator[Candidate]:
+    """Peaks of the vote of all pairs of triangles of equal shape.
+
+    Parameters
+    ----------
+    stars : ndarray of complex, shape (N,)
+        Positions from the middle of the list, brightest first where magnitudes are known.
+    level : Level
+    tolerance : float
+        Of the logarithms of side ratios.
+    scale : tuple of float
+        Smallest and largest.
+
+    Yields
+    ------
+    Candidate
+        The best supported first.
+    """
+    # evenly over the ranks, so that a clump of false bright detections is not all
+    anchors = np.unique(np.linspace(0, len(stars) - 1, min(_ANCHORS, len(stars))).astype(int))
+    own = triangles_of(stars, anchors, _NEIGHBOURS[0])
+    i, j = _alike(own, level.triangles, tolerance, scale)
+    if not len(i):
+        return
+    z, w = stars[own.corners[i]], level.stars[level.triangles.corners[j]]
+    middle_z, middle_w = z.mean(axis=1, keepdims=True), w.mean(axis=1, keepdims=True)
+    dz, dw = z - middle_z, w - middle_w
+    turn = (np.conj(dz) * dw).sum(axis=1) / (np.abs(dz) ** 2).sum(axis=1)
+    kept = (np.abs(turn) > scale[0]) & (np.abs(turn) < scale[1])
+    i, j, turn = i[kept], j[kept], turn[kept]
+    if not len(i):
+        return
+    target = middle_w[kept, 0] - turn * middle_z[kept, 0]
+    lever = float(np.sqrt(np.mean(np.abs(stars) ** 2)))
+    votes = np.stack([target.real, target.imag, lever * turn.real, lever * turn.imag], axis=-1)
+    reach = 3.0 * tolerance * lever
+    near = cKDTree(votes)
+    support = near.query_ball_point(votes, reach, return_length=True, workers=-1)
+    for _ in range(_CANDIDATES):
+        peak = int(np.argmax(support))
+        if support[peak] < 2:
+            return
+        members = np.array(near.query_ball_point(votes[peak], 2.0 * reach))
+        support[members] = 0
+        pairs = np.stack(
+            [own.corners[i[members]].ravel(), level.triangles.corners[j[members]].ravel()], axis=-1
+        )
+        fitted = _fitted(stars, level.stars, np.unique(pairs, axis=0), reach)
+        if fitted is not None:
+            yield fitted
+
+
+def _alike(
+    own: Triangles, theirs: Triangles, tolerance: float, scale: tuple[float, float]
+) -> tuple[Int, Int]:
+    """Pairs of triangles of one shape, handedness and, within the range of scales, size."""
+    low, high = np.log(scale[0]), np.log(scale[1])
+    # the size counts in units that make its range as wide as the tolerance
+    unit = tolerance / (0.5 * (high - low) + tolerance)
+    found: list[tuple[Int, Int]] = []
+    for hand in (False, True):
+        a, b = np.flatnonzero(own.left == hand), np.flatnonzero(theirs.left == hand)
+        if not (len(a) and len(b)):
+            continue
+        first = np.column_stack([own.shape[a], unit * (own.log_size[a] + 0.5 * (low + high))])
+        second = np.column_stack([theirs.shape[b], unit * theirs.log_size[b]])
+        pairs = cKDTree(first).sparse_distance_matrix(
+            cKDTree(second), tolerance * np.sqrt(2.0), output_type="ndarray"
+        )
+        found.append((a[pairs["i"]], b[pairs["j"]]))
+    if not found:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    i, j = (np.concatenate(one) for one in zip(*found, strict=True))
+    every = -(-len(i) // _VOTES) or 1
+    return i[::every], j[::every]
+
+
+def _fitted(stars: Complex, others: Complex, pairs: Int, reach: float) -> Candidate | None:
+    """Least-squares similarity of pairs of stars that belong together."""
+    z, w = stars[pairs[:, 0]], others[pairs[:, 1]]
+
+    def fit(use: NDArray[np.bool_]) -> tuple[tuple[complex, complex], NDArray[np.float64]]:
+        middle_z, middle_w = z[use].mean(), w[use].mean()
+        dz, dw = z[use] - middle_z, w[use] - middle_w
+        turn = complex((np.conj(dz) * dw).sum() / (np.abs(dz) ** 2).sum())
+        target = complex(middle_w - turn * middle_z)
+        return (turn, target), np.abs(w - turn * z - target)
+
+    slack = 1e-9 * float(np.abs(w).max(initial=0.0))
+    found = robust_fit(fit, len(z), least=3, slack=slack, reach=reach)
+    if found is None or found.use.sum() < 3:
+        return None
+    agreeing = min(len(np.unique(pairs[found.use, axis])) for axis in (0, 1))
+    return Candidate(*found.solution, agreeing, float(np.median(found.away[found.use])))
