@@ -27,8 +27,9 @@ from bayesdist.data.motions import (
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
 from bayesdist.data.pieces import PIECE, Piece
 from bayesdist.data.preparing import centroid_errors, neutralise_aberration, with_centroid_errors
+from bayesdist.data.reading.formats import FORMATS, input_files
 from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.reading.read import FORMATS, input_files, read_matches
+from bayesdist.data.reading.read import read_matches
 from bayesdist.data.reading.table import matches_from_table
 from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
 from bayesdist.data.rvb_accept import RadialLimit
@@ -42,7 +43,7 @@ from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists, star_list_of_hst1pass
 from bayesdist.data.tables.units import UNITS
-from bayesdist.data.writing import write_partitioned
+from bayesdist.data.write import write_partitioned
 
 __all__ = [
     "FORMATS",

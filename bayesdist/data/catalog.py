@@ -15,7 +15,7 @@ from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
 from bayesdist.data.reading.table import with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.positions import sky_columns
-from bayesdist.data.sky.tangent import mean_direction, tangent_jacobian, tangent_plane
+from bayesdist.data.sky.tangent import onto_plane
 from bayesdist.data.tables.checks import check_values, one_length, without_missing
 from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.files import read_table
@@ -374,8 +374,9 @@ def catalog_from_table(
     quantities = Quantities(table, found, source, lambda index: row_number(int(rows[index])))
     column = quantities.__getitem__
     if on_sky:
-        plane_unit(unit, source=source)
-    base = "deg" if on_sky else position_unit((column("u"), column("v")), unit)
+        base = plane_unit(unit, source=source)
+    else:
+        base = position_unit((column("u"), column("v")), unit)
 
     def values(key: str, per_year: str = "") -> Float:
         own, where = column(key).unit, column(key).where
@@ -392,9 +393,7 @@ def catalog_from_table(
         return numbers * factor
 
     out: dict[str, Any] = {}
-    if on_sky:
-        out["u"], out["v"] = sky_columns(quantities)
-    else:
+    if not on_sky:
         out |= {key: values(key) for key in ("u", "v")}
     for pair in _PAIRS:
         if pair[0] in found:
@@ -408,8 +407,17 @@ def catalog_from_table(
         out["star"] = rows
     out["epoch"] = column("epoch").years() if "epoch" in found else epoch
     if on_sky:
-        out |= _on_plane(out, tangent_point, source)
-        base = "arcsec"
+        sigma, motion, sigma_motion = (
+            np.stack([out.pop(key) for key in pair]) if pair[0] in out else None for pair in _PAIRS
+        )
+        out |= onto_plane(
+            *sky_columns(quantities),
+            tangent_point,
+            sigma=sigma,
+            motion=motion,
+            sigma_motion=sigma_motion,
+            where=source,
+        )
     return ReferenceCatalog(**out, unit=base, source=source, notes=notes)
 
 
@@ -421,23 +429,3 @@ def _identities(column: SourceColumn) -> Int:
         again = int(np.setdiff1d(np.arange(len(star)), first)[0])
         raise column.fail(again, f"star {star[again]} stands twice")
     return star
-
-
-def _on_plane(
-    sky: Mapping[str, Any], point: tuple[float, float] | None, source: str
-) -> dict[str, Any]:
-    """Positions, motions and errors on the sky in degrees, brought to the plane in arcsec."""
-    ra, dec = sky["u"], sky["v"]
-    point = mean_direction(ra, dec) if point is None else point
-    u, v = tangent_plane(ra, dec, point, where=source)
-    J = 3600.0 * tangent_jacobian(ra, dec, point, where=source)
-    out: dict[str, Any] = {"u": u, "v": v, "tangent_point": (float(point[0]), float(point[1]))}
-    if "pm_u" in sky:
-        pm = np.stack([sky["pm_u"], sky["pm_v"]], axis=-1)
-        out["pm_u"], out["pm_v"] = np.einsum("nij,nj->in", J, pm)
-    for pair in (("sigma_u", "sigma_v"), ("sigma_pm_u", "sigma_pm_v")):
-        if pair[0] in sky:
-            variance = np.stack([sky[key] for key in pair], axis=-1) ** 2
-            out[pair[0]], out[pair[1]] = np.sqrt(np.einsum("nij,nj->in", J**2, variance))
-    out |= {key: 3600.0 * sky[key] for key in _PARALLAX if key in sky}
-    return out

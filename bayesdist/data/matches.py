@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.added_errors import AddedErrors
+from bayesdist.data.labels import merged_codes, merged_counts, merged_optional
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
-from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
 from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
 from bayesdist.data.tables.checks import absent, check_values, counted, one_length
 from bayesdist.data.tables.repeated import first_duplicate

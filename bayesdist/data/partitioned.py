@@ -21,8 +21,8 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.parts import MatchPart, Whole, match_part, scan, tangent_point_of
 from bayesdist.data.pieces import PIECE, Piece, even_edges, every_kth
+from bayesdist.data.reading.formats import exposure_names, input_files
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
-from bayesdist.data.reading.read import exposure_names, input_files
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 

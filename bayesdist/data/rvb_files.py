@@ -11,7 +11,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.data.pieces import PIECE
-from bayesdist.data.reading.read import input_files
+from bayesdist.data.reading.formats import input_files
 from bayesdist.data.tables.column import Place, SourceColumn, row_number
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import BASIC, find_columns

@@ -12,7 +12,7 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.hst1pass import Hst1passList, is_hst1pass, read_hst1pass
-from bayesdist.data.reading.read import exposure_names, input_files
+from bayesdist.data.reading.formats import exposure_names, input_files
 from bayesdist.data.tables.checks import check_values, counted, one_length
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import TABLE_SUFFIXES, read_lines, read_table

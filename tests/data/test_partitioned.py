@@ -20,7 +20,7 @@ from bayesdist.data import MagnitudeErrors, MatchTable, open_matches, pieces, re
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.partitioned import PartPiece
 from bayesdist.data.tables import repeated as duplicates_module
-from bayesdist.data.writing import write_partitioned
+from bayesdist.data.write import write_partitioned
 from bayesdist.errors import FormatError, InputError
 
 ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour")

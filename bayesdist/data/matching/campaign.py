@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposures import ExposureLog
+from bayesdist.data.labels import merged_counts
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching.exposure import ExposureMatch, match_exposure
 from bayesdist.data.matching.reports import (
@@ -32,8 +33,8 @@ from bayesdist.data.matching.reports import (
     too_many,
 )
 from bayesdist.data.matching.similarity import PatternIndex, mismatch_reason, pattern_index
-from bayesdist.data.merging import encoded, merged_counts
 from bayesdist.data.starlists import StarCuts, StarList
+from bayesdist.data.tables.column import encoded
 from bayesdist.errors import InputError
 
 __all__ = [

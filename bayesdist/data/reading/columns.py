@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.data.reading.chips import numbered_chips
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
-from bayesdist.data.sky.tangent import mean_direction, tangent_jacobian, tangent_plane
+from bayesdist.data.sky.tangent import onto_plane
 from bayesdist.data.tables.column import SourceColumn, year_of
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.data.tables.quantities import Quantities
@@ -283,29 +283,22 @@ def _pixels(column: SourceColumn, pixel_origin: int | None) -> Float:
 
 def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None) -> dict[str, Any]:
     """Positions on the tangent plane, their errors and motions."""
-    where, point = quantities.source, options.tangent_point
+    where = quantities.source
     unit = plane_unit(options.unit, source=where)
     sky = reference_sky(quantities, epoch=epoch, catalogue_epoch=options.catalogue_epoch)
-    point = mean_direction(sky.ra, sky.dec) if point is None else point
-    u, v = tangent_plane(sky.ra, sky.dec, point, where=where, place=quantities.place)
-    out: dict[str, Any] = {"u": u, "v": v, "unit": unit, "notes": sky.notes}
-    out["tangent_point"] = (float(point[0]), float(point[1]))
-    if sky.sigma is None and sky.motion is None:
-        return out
-    J = tangent_jacobian(sky.ra, sky.dec, point, where=where)
-    if sky.sigma is not None:
-        good = (sky.sigma > 0).all(axis=0)
-        if not good.all():
-            bad = int(np.argmin(good))
-            raise quantities["sigma_ra"].fail(bad, "the error of the position is not positive")
-        variance = np.einsum("nij,jn->in", J**2, sky.sigma**2)
-        out["sigma_u"], out["sigma_v"] = np.sqrt(variance)
-    if sky.motion is not None:
-        out["pm_u"], out["pm_v"] = np.einsum("nij,jn->in", J, sky.motion)
-    if sky.sigma_motion is not None:
-        variance = np.einsum("nij,jn->in", J**2, sky.sigma_motion**2)
-        out["sigma_pm_u"], out["sigma_pm_v"] = np.sqrt(variance)
-    return out
+    if sky.sigma is not None and not (sky.sigma > 0).all():
+        bad = int(np.argmin((sky.sigma > 0).all(axis=0)))
+        raise quantities["sigma_ra"].fail(bad, "the error of the position is not positive")
+    return {"unit": unit, "notes": sky.notes} | onto_plane(
+        sky.ra,
+        sky.dec,
+        options.tangent_point,
+        sigma=sky.sigma,
+        motion=sky.motion,
+        sigma_motion=sky.sigma_motion,
+        where=where,
+        place=quantities.place,
+    )
 
 
 def plane_unit(unit: str | None, *, source: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.data.reading.columns import needed_columns
-from bayesdist.data.reading.read import input_files, kind_of
+from bayesdist.data.reading.formats import input_files, kind_of
 from bayesdist.data.reading.table import own_epoch, with_sky_columns
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import origin_of

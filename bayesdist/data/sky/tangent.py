@@ -9,6 +9,8 @@ Calabretta & Greisen 2002, A&A 395, 1077, Section 5.1.3, written as standard coo
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -20,6 +22,7 @@ __all__ = [
     "direction_of",
     "direction_sum",
     "mean_direction",
+    "onto_plane",
     "plane_axes",
     "sky_of_plane",
     "tangent_jacobian",
@@ -155,6 +158,51 @@ def tangent_jacobian(
     out[..., 0, 1] = -np.sin(d0) * np.sin(delta) / D**2
     out[..., 1, 0] = np.sin(d) * np.sin(delta) / D**2
     out[..., 1, 1] = np.cos(delta) / D**2
+    return out
+
+
+def onto_plane(
+    ra: Float,
+    dec: Float,
+    point: tuple[float, float] | None,
+    *,
+    sigma: Float | None = None,
+    motion: Float | None = None,
+    sigma_motion: Float | None = None,
+    where: str = "",
+    place: Place = row_number,
+) -> dict[str, Any]:
+    """Columns u, v, tangent_point of stars, and sigma_u, pm_u, sigma_pm_u where these are given.
+
+    Parameters
+    ----------
+    ra, dec : ndarray, shape (N,)
+        Degrees.
+    point : tuple of float or None
+        Tangent point; None is the mean direction.
+    sigma, motion, sigma_motion : ndarray, shape (2, N), optional
+        Standard errors, proper motions and their errors to the east (with the factor cos(dec)) and
+        to the north, in seconds of arc (per year).
+    where, place
+        As `tangent_plane`.
+
+    Returns
+    -------
+    dict
+        In seconds of arc.
+    """
+    point = mean_direction(ra, dec) if point is None else point
+    u, v = tangent_plane(ra, dec, point, where=where, place=place)
+    out: dict[str, Any] = {"u": u, "v": v, "tangent_point": (float(point[0]), float(point[1]))}
+    if sigma is None and motion is None:
+        return out
+    J = tangent_jacobian(ra, dec, point, where=where)
+    if motion is not None:
+        out["pm_u"], out["pm_v"] = np.einsum("nij,jn->in", J, motion)
+    for name, errors in (("sigma", sigma), ("sigma_pm", sigma_motion)):
+        if errors is not None:
+            variance = np.einsum("nij,jn->in", J**2, errors**2)
+            out[f"{name}_u"], out[f"{name}_v"] = np.sqrt(variance)
     return out
 
 

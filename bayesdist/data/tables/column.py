@@ -12,12 +12,11 @@ from astropy.table import Column
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from bayesdist.data.merging import encoded
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.units import unit_of
 from bayesdist.errors import InputError
 
-__all__ = ["EncodedColumn", "Place", "SourceColumn", "row_number", "year_of"]
+__all__ = ["EncodedColumn", "Place", "SourceColumn", "encoded", "row_number", "year_of"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -30,6 +29,30 @@ _YEARS = (1800.0, 2200.0)  # epochs outside are a wrong unit, not a date
 def row_number(index: int) -> str:
     """Name of a row, counted from 1."""
     return f"row {index + 1}"
+
+
+def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[Any, ...]]:
+    """Codes of values, and the values that they stand for.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+    ordered : bool
+        Labels sorted; otherwise in the order of their first appearance.
+
+    Returns
+    -------
+    codes : ndarray of int, shape (N,)
+    labels : tuple
+    """
+    unique, first, codes = np.unique(values, return_index=True, return_inverse=True)
+    codes = codes.astype(np.int64)
+    if not ordered:
+        by_appearance = np.argsort(first)
+        position = np.empty_like(by_appearance)
+        position[by_appearance] = np.arange(len(by_appearance))
+        unique, codes = unique[by_appearance], position[codes]
+    return codes.astype(np.int64), tuple(unique.tolist())
 
 
 @dataclass(frozen=True, eq=False)

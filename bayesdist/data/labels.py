@@ -10,34 +10,10 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["encoded", "merged_codes", "merged_counts", "merged_optional"]
+__all__ = ["merged_codes", "merged_counts", "merged_optional"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-
-
-def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[Any, ...]]:
-    """Codes of values, and the values that they stand for.
-
-    Parameters
-    ----------
-    values : ndarray, shape (N,)
-    ordered : bool
-        Labels sorted; otherwise in the order of their first appearance.
-
-    Returns
-    -------
-    codes : ndarray of int, shape (N,)
-    labels : tuple
-    """
-    unique, first, codes = np.unique(values, return_index=True, return_inverse=True)
-    codes = codes.astype(np.int64)
-    if not ordered:
-        by_appearance = np.argsort(first)
-        position = np.empty_like(by_appearance)
-        position[by_appearance] = np.arange(len(by_appearance))
-        unique, codes = unique[by_appearance], position[codes]
-    return codes.astype(np.int64), tuple(unique.tolist())
 
 
 def merged_codes(
