@@ -21,19 +21,7 @@ def merged_codes(
 ) -> tuple[Int, tuple[Any, ...]]:
     """One numbering for codes with labels of their own.
 
-    Parameters
-    ----------
-    codes : sequence of ndarray of int
-    labels : sequence of tuple
-        What the codes of each array stand for.
-    ordered : bool
-        Labels sorted; otherwise in the order of their first appearance.
-
-    Returns
-    -------
-    codes : ndarray of int
-        All arrays, joined.
-    labels : tuple
+    Labels stand in the order of their first appearance, or sorted; the codes are joined.
     """
     every: list[Any] = list(dict.fromkeys(label for own in labels for label in own))
     if ordered:
@@ -58,13 +46,7 @@ def merged_counts(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
 def merged_optional(
     name: str, arrays: Sequence[Float | None], sources: Sequence[str]
 ) -> Float | None:
-    """A column that all tables have, joined; None where none has it.
-
-    Raises
-    ------
-    InputError
-        When only some have it.
-    """
+    """A column that all tables have, joined; None where none has it, an error where some have."""
     present = [a for a in arrays if a is not None]
     if not present:
         return None

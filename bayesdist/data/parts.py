@@ -135,21 +135,7 @@ def match_part(
 ) -> MatchPart:
     """What a file holds, by the names and units of its columns alone.
 
-    Parameters
-    ----------
-    part : ParquetPart
-    options : ReadOptions
-    exposure_name : str or None
-        Of the one exposure, where there is no column of them.
-
-    Returns
-    -------
-    MatchPart
-
-    Raises
-    ------
-    InputError
-        For missing columns and units.
+    Missing columns and units are refused.
     """
     source = str(part.path)
     found, options, notes = columns_read(part.colnames, {}, options, source=source)

@@ -184,13 +184,7 @@ def labelled(codes: NDArray[np.int64], labels: Sequence[str | int]) -> pyarrow.D
 def save_parquet(
     table: pyarrow.Table, path: str | os.PathLike[str], *, rows_per_group: int | None = None
 ) -> None:
-    """Write a table; pages carry checksums, so that damage is seen.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
-    """
+    """Write a table; pages carry checksums, so that damage is seen."""
     import pyarrow
     import pyarrow.parquet
 

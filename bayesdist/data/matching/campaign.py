@@ -229,13 +229,7 @@ def _matched(
     views: Sequence[_View],
     epoch: float,
 ) -> tuple[ExposureMatch, _View]:
-    """The match with the first of these views that gives one.
-
-    Raises
-    ------
-    InputError
-        That of the first view.
-    """
+    """The match with the first of these views that gives one; else the error of the first view."""
     errors = []
     for view in views:
         try:

@@ -19,18 +19,9 @@ _DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)
 
 
 def hull_of(points: Float) -> tuple[Float, float]:
-    """Half-planes that bound the points, and the area between them.
+    """Half-planes a x + b y + c <= 0 around points (N, 2) as rows (K, 3), and the area in them.
 
-    Parameters
-    ----------
-    points : ndarray, shape (N, 2)
-
-    Returns
-    -------
-    equations : ndarray, shape (K, 3)
-        ``a x + b y + c <= 0`` inside; the box of the points where they have no hull.
-    area : float
-        Positive.
+    Of points without a hull their box, and no area is less than the smallest number.
     """
     try:
         hull = ConvexHull(points)
@@ -107,24 +98,11 @@ def mutual_pairs(
 
 
 def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float) -> float:
-    """How many of the points find a neighbour where none belongs: when all are displaced.
+    """Fraction of points (N, 2) that find a neighbour where none belongs: when all are displaced.
 
-    Unlike a formula with a mean density this knows of gradients and clusters.
-
-    Parameters
-    ----------
-    points : ndarray, shape (N, 2)
-    tree : cKDTree
-        Of the reference positions.
-    radius : float or ndarray, shape (N,)
-        Largest distance of a neighbour, of each point.
-    step : float
-        Displacement, in eight directions; so large that true pairs are out of reach.
-
-    Returns
-    -------
-    float
-        Between 0 and 1.
+    Unlike a formula with a mean density this knows of gradients and clusters.  `radius`, one or
+    (N,), is the largest distance of a neighbour, `step` the displacement in eight directions: so
+    large that true pairs are out of reach.
     """
     every = -(-len(points) * len(_DIRECTIONS) // _PROBES)
     sample = points[::every]
@@ -141,19 +119,7 @@ def beats_chance(points: Float, reference: Float, tree: cKDTree, distance: Float
     """Whether true pairs are there: displaced detections must find far fewer neighbours.
 
     Two dense clusters laid over each other give many pairs, but as many when one is moved a little.
-
-    Parameters
-    ----------
-    points : ndarray, shape (N, 2)
-    reference : ndarray, shape (M, 2)
-    tree : cKDTree
-        Of `reference`.
-    distance : ndarray
-        Of the pairs that were found.
-
-    Returns
-    -------
-    bool
+    `distance` is that of the pairs that were found, `tree` that of the reference positions.
     """
     reach = max(float(np.median(distance)), 1e-9 * float(np.abs(reference).max()))
     sample = points[:: -(-len(points) // SAMPLE)]

@@ -166,16 +166,8 @@ def failure(
 ) -> InputError:
     """The first failure, with what is known of the others.
 
-    Parameters
-    ----------
-    failed : mapping of str to InputError
-        By exposure.
-    reason : str
-        As `mismatch_reason`.
-    n : int
-        Exposures.
-    tried : sequence of bool
-        Whether the catalogue was taken mirrored.
+    `failed` is by exposure, `reason` that of `mismatch_reason`, and `tried` says whether the
+    catalogue was taken mirrored.
     """
     first = next(iter(failed.values()))
     cause, do = first.cause, first.do

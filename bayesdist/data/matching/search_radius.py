@@ -28,12 +28,7 @@ _LEAST = 1e-3  # of the largest radius: pairs without any scatter still have rou
 class SearchRadius:
     """Largest distance of a pair, by the distance from the centre of the detections.
 
-    Parameters
-    ----------
-    rho : ndarray, shape (R,)
-        Middle of each ring, rising.
-    radius : ndarray, shape (R,)
-        Linear between the middles, constant beyond.
+    It is linear between the middles `rho` (R,) of rings, rising, and constant beyond.
     """
 
     rho: Float

@@ -279,19 +279,9 @@ def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> t
 
 
 def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) -> str:
-    """What would bring a list together with a reference list that it does not match as it is.
+    """The scale or mirror image by which a list (N, 2) would match a reference list, as a clause.
 
-    Parameters
-    ----------
-    plane : ndarray, shape (N, 2)
-        Positions after the known distortion.
-    mag : ndarray, shape (N,), or None
-    reference : PatternIndex
-
-    Returns
-    -------
-    str
-        A clause that names the scale or the mirror image; empty when nothing helps.
+    Empty when nothing helps.
     """
     ratios = [factor for one in _RATIOS for factor in (one, 1.0 / one)]
     tries = [(1.0, _NEAR, False), *((one, _WITHIN, False) for one in ratios), (1.0, _NEAR, True)]

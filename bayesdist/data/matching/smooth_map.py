@@ -24,14 +24,10 @@ _MOST = 4000  # that a fit uses: beyond, their noise has no part in it any more
 
 @dataclass(frozen=True, eq=False)
 class SmoothMap:
-    """A displacement by chip and place; none for chips with too few pairs.
+    """A displacement by chip and position; none for chips with too few pairs.
 
-    Parameters
-    ----------
-    low, high : ndarray, shape (2,)
-        Box of the positions.
-    coefficients : dict of int to ndarray, shape (10, 2)
-        Of products of Legendre polynomials, for each chip.
+    `low` and `high` bound the positions; `coefficients` (10, 2) of each chip are those of products
+    of Legendre polynomials.
     """
 
     low: Float
@@ -50,19 +46,8 @@ class SmoothMap:
 def smooth_map(points: Float, chip: Int, residual: Float, index: Int) -> SmoothMap:
     """Cubics through the residuals of pairs, chip by chip, with those far off left out.
 
-    Parameters
-    ----------
-    points : ndarray, shape (N, 2)
-        Positions of all detections.
-    chip : ndarray of int, shape (N,)
-    residual : ndarray, shape (n, 2)
-        What must be added to the points of the pairs.
-    index : ndarray of int, shape (n,)
-        Which points they are.
-
-    Returns
-    -------
-    SmoothMap
+    `points` (N, 2) and `chip` (N,) are of all detections, `residual` (n, 2) is what must be added
+    to those of `index` (n,).
     """
     low, high = points.min(axis=0), points.max(axis=0)
     coefficients: dict[int, Float] = {}

@@ -31,16 +31,9 @@ _VOTES = 400_000  # at most
 class Triangles:
     """Triangles, their corners in the order of the opposite sides, longest first.
 
-    Parameters
-    ----------
-    corners : ndarray of int, shape (T, 3)
-        Indices of the stars.
-    shape : ndarray, shape (T, 2)
-        Logarithms of the middle and the shortest side in units of the longest.
-    log_size : ndarray, shape (T,)
-        Logarithm of the longest side.
-    left : ndarray of bool, shape (T,)
-        Whether the corners go round anticlockwise: a mirror changes it.
+    `shape` (T, 2) holds the logarithms of the middle and the shortest side in units of the longest,
+    `log_size` (T,) that of the longest.  `left` says whether the corners (T, 3), indices of stars,
+    go round anticlockwise: a mirror changes it.
     """
 
     corners: Int
@@ -53,21 +46,9 @@ class Triangles:
 
 
 def triangles_of(stars: Complex, anchors: Int, neighbours: int) -> Triangles:
-    """Triangles of each anchor with two of its nearest neighbours.
+    """Triangles of each anchor with two of its nearest `neighbours`, of stars x + i y (N,).
 
-    Parameters
-    ----------
-    stars : ndarray of complex, shape (N,)
-        Positions x + i y.
-    anchors : ndarray of int
-        Stars that the triangles are made around.
-    neighbours : int
-        How many of the nearest ones take part.
-
-    Returns
-    -------
-    Triangles
-        Each once, without the nearly flat and the nearly isosceles ones.
+    Each once, without the nearly flat and the nearly isosceles ones.
     """
     points = np.stack([stars.real, stars.imag], axis=-1)
     neighbours = min(neighbours, len(stars) - 1)
@@ -103,13 +84,7 @@ def _described(stars: Complex, corners: Int) -> Triangles:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """The brightest reference stars and their triangles.
-
-    Parameters
-    ----------
-    stars : ndarray of complex, shape (M,)
-        Positions x + i y.
-    """
+    """The brightest reference stars x + i y (M,) and their triangles."""
 
     stars: Complex
 
@@ -123,13 +98,8 @@ class Level:
 class Candidate:
     """w = turn z + target.
 
-    Parameters
-    ----------
-    turn, target : complex
-    agreeing : int
-        Stars that the map brings together, of the triangles that voted for it.
-    slack : float
-        Median of their distances: how far the map may be off.
+    `agreeing` stars are brought together by it, of the triangles that voted for it; `slack`, the
+    median of their distances, says how far the map may be off.
     """
 
     turn: complex
@@ -141,22 +111,10 @@ class Candidate:
 def candidates(
     stars: Complex, level: Level, tolerance: float, scale: tuple[float, float]
 ) -> Iterator[Candidate]:
-    """Peaks of the vote of all pairs of triangles of equal shape.
+    """Peaks of the vote of all pairs of triangles of equal shape, the best supported first.
 
-    Parameters
-    ----------
-    stars : ndarray of complex, shape (N,)
-        Positions from the middle of the list, brightest first where magnitudes are known.
-    level : Level
-    tolerance : float
-        Of the logarithms of side ratios.
-    scale : tuple of float
-        Smallest and largest.
-
-    Yields
-    ------
-    Candidate
-        The best supported first.
+    `stars` (N,) are positions x + i y from the middle of the list, brightest first where magnitudes
+    are known; `tolerance` is that of the logarithms of side ratios.
     """
     # evenly over the ranks, so that a clump of false bright detections is not all
     anchors = np.unique(np.linspace(0, len(stars) - 1, min(_ANCHORS, len(stars))).astype(int))

@@ -113,17 +113,7 @@ def _electorates(
 
 
 def mean_spacing(points: Float) -> float:
-    """Distance between neighbours if the points were a square grid.
-
-    Parameters
-    ----------
-    points : ndarray, shape (N, 2)
-
-    Returns
-    -------
-    float
-        Positive.
-    """
+    """Distance between neighbours if the points (N, 2) were a square grid; positive."""
     extent = np.ptp(points, axis=0)
     area = float(np.prod(np.maximum(extent, extent.max() * 1e-3)))
     return float(np.sqrt(area / len(points))) or 1.0

@@ -39,18 +39,10 @@ def numbered(names: Iterable[str]) -> dict[str, int]:
 def numbered_chips(
     column: SourceColumn, chips: Mapping[str, int] | None
 ) -> tuple[Int, tuple[int, ...], tuple[str, ...]]:
-    """Codes of the chips, their numbers in rising order, and their names where they have such.
+    """Codes (N,) of the chips, their numbers in rising order, and their names where they have such.
 
-    Parameters
-    ----------
-    column : SourceColumn
-    chips : mapping of str to int, optional
-        Number of each name; by default from 1 in the order of the names.
-
-    Raises
-    ------
-    InputError
-        For numbers that are not whole, and a name without a number.
+    `chips` gives the number of each name; by default from 1 in the order of the names.  Numbers
+    that are not whole and names without a number are refused.
     """
     names = text_labels(column)
     if not names:

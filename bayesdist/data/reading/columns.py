@@ -34,23 +34,9 @@ Float = NDArray[np.float64]
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
-    """Unit of a pair of position columns, from the file or else from the option.
+    """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or else the option.
 
-    Parameters
-    ----------
-    pair : tuple of SourceColumn
-    unit : str or None
-        What the user says.
-
-    Returns
-    -------
-    str
-        'pix', 'arcsec', 'mas' or 'deg'.
-
-    Raises
-    ------
-    InputError
-        Where both say nothing, where they contradict each other, or where the two columns do.
+    Refused where both say nothing, where they contradict each other, or where the columns do.
     """
     if unit is not None:
         check_unit(unit, where="unit")
@@ -87,22 +73,9 @@ def is_on_sky(
     columns: Mapping[str, str] | None,
     source: str,
 ) -> bool:
-    """True where ra, dec are the reference positions, not u, v.
+    """True where ra, dec are the reference positions, not u, v; refused when the user names both.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Columns of the table.
-    found : mapping of str to str
-        Column of each quantity.
-    columns : mapping of str to str, or None
-        As the user names them.
-    source : str
-
-    Raises
-    ------
-    InputError
-        When the user names both.
+    `found` is the column of each quantity, `columns` what the user names.
     """
     named = {key for key, column in (columns or {}).items() if column}
     plane, sky = named & {"u", "v"}, named & {"ra", "dec"}
@@ -124,26 +97,7 @@ def needed_columns(
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity that is read from a table.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Columns of the table.
-    columns, read_sigma
-        As `ReadOptions`.
-    source : str
-
-    Returns
-    -------
-    dict of str to str
-        With either u and v or ra and dec.
-
-    Raises
-    ------
-    InputError
-        For a missing column.
-    """
+    """Column of each quantity that is read: x, y, either u, v or ra, dec, and others there are."""
     names = list(names)
     found = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
     on_sky = is_on_sky(names, found, columns, source)
@@ -167,22 +121,7 @@ def needed_columns(
 def columns_read(
     names: Sequence[str], header: Mapping[str, Any], options: ReadOptions, *, source: str
 ) -> tuple[dict[str, str], ReadOptions, tuple[str, ...]]:
-    """Column of each quantity, the options with the origin of the pixels, and notes about it.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Columns of the table.
-    header : mapping
-        Its keywords.
-    options : ReadOptions
-    source : str
-
-    Raises
-    ------
-    InputError
-        As `needed_columns`.
-    """
+    """Column of each quantity, the options with the origin of the pixels, and notes about it."""
     found = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
     if options.pixel_origin is not None:
         return found, options, ()
@@ -192,24 +131,7 @@ def columns_read(
 
 
 def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:
-    """What a MatchTable is made of, from some rows of a table.
-
-    Parameters
-    ----------
-    quantities : Quantities
-        Columns as `needed_columns` finds them.
-    options : ReadOptions
-
-    Returns
-    -------
-    dict
-        Arguments of `MatchTable`: the columns, their labels, unit and tangent point.
-
-    Raises
-    ------
-    InputError
-        As `matches_from_table`.
-    """
+    """Arguments of `MatchTable` from some rows of a table, with columns as `needed_columns`."""
     found, column = quantities.found, quantities.__getitem__
     out: dict[str, Any] = {}
     out["x"], out["y"] = (_pixels(column(key), options.pixel_origin) for key in ("x", "y"))
@@ -317,16 +239,8 @@ def nominal_columns(
 ) -> tuple[str, ...]:
     """'u_nominal' and 'v_nominal' where a table has them, else nothing.
 
-    Parameters
-    ----------
-    found, source, tangent_point
-        As of `match_columns`.
-
-    Raises
-    ------
-    InputError
-        For one without the other; beside sky positions, where no tangent point is given: the plane
-        on which they lie is not to depend on which stars were matched.
+    Refused is one without the other; and both beside sky positions where no tangent point is given:
+    the plane on which they lie is not to depend on which stars were matched.
     """
     keys = tuple(key for key in ("u_nominal", "v_nominal") if key in found)
     if len(keys) == 1:

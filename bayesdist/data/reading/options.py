@@ -102,13 +102,7 @@ def check_sigma(sigma: str | float) -> None:
 def refuse_missing_errors(
     sigma: str | float, has_sigma: bool, has_mag: bool, *, where: str
 ) -> None:
-    """Refuse matches that lack the columns which the option `sigma` asks for.
-
-    Raises
-    ------
-    InputError
-        For 'columns' without errors and 'by_magnitude' without magnitudes.
-    """
+    """Refuse matches that lack the columns which the option `sigma` asks for."""
     if sigma == "columns" and not has_sigma:
         raise InputError(
             "holds no errors of the positions",

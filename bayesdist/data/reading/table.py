@@ -46,20 +46,7 @@ def as_table(data: Any, source: str) -> Table:
 def sky_positions(
     data: Any, columns: Mapping[str, str] | None = None, *, source: str = "table"
 ) -> tuple[Float, Float] | None:
-    """Right ascension and declination, where the reference positions of a table are on the sky.
-
-    Parameters
-    ----------
-    data, source
-        As `matches_from_table`.
-    columns : mapping of str to str, optional
-        As `ReadOptions`.
-
-    Returns
-    -------
-    tuple of ndarray, shape (N,), or None
-        Degrees; None where u and v are columns of the table.
-    """
+    """Degrees (N,) of ra and of dec where the reference positions are on the sky, else None."""
     table = with_sky_columns(as_table(data, source))
     found = find_columns(table.colnames, columns, ALIASES, source=source, pairs=PAIRS)
     if not is_on_sky(table.colnames, found, columns, source):
@@ -74,15 +61,7 @@ def sky_positions(
 def with_sky_columns(table: Table) -> Table:
     """A table whose SkyCoord columns are columns of ra and dec, in degrees.
 
-    Parameters
-    ----------
-    table : astropy Table
-
-    Returns
-    -------
-    astropy Table
-        The table itself where it has no such column; `skycoord` becomes `skycoord.ra`,
-        `skycoord.dec` (ICRS).
+    `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS); without such it is the table itself.
     """
     coordinates = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
     if not coordinates:

@@ -61,23 +61,7 @@ class ReferenceSky:
 
 
 def sky_columns(quantities: Quantities) -> tuple[Float, Float]:
-    """Right ascension and declination of some rows of a table, as they stand.
-
-    Parameters
-    ----------
-    quantities : Quantities
-        With ra and dec.
-
-    Returns
-    -------
-    tuple of ndarray, shape (N,)
-        Degrees.
-
-    Raises
-    ------
-    InputError
-        For what is no position.
-    """
+    """Right ascension and declination (N,) in degrees, as they stand in some rows of a table."""
     ra, dec = (_degrees(quantities[key], key) for key in ("ra", "dec"))
     beyond = np.abs(dec) > 90.0
     if beyond.any():
@@ -115,27 +99,12 @@ def reference_sky(
     epoch: Float | None = None,
     catalogue_epoch: float | None = None,
 ) -> ReferenceSky:
-    """Positions at the epoch of the exposures, with errors and motions where the table has them.
+    """Positions at `epoch`, with errors and motions where the table has them.
 
-    Parameters
-    ----------
-    quantities : Quantities
-        With ra and dec; used beside them, where they are there: sigma_ra, sigma_dec, pm_ra, pm_dec
-        and their errors, corr_ra and corr_dec (of position and motion on one axis), parallax and
-        its error, catalogue_epoch.
-    epoch : ndarray, shape (N,), optional
-        Decimal years of the exposures.
-    catalogue_epoch : float, optional
-        Decimal year of the positions, where there is no column of it.
-
-    Returns
-    -------
-    ReferenceSky
-
-    Raises
-    ------
-    InputError
-        For what is no number, half a pair, and units that are missing or wrong.
+    `epoch` (N,) is that of the exposures, `catalogue_epoch` that of the positions where there is no
+    column of it.  Used beside ra and dec, where they are there: sigma_ra, sigma_dec, pm_ra, pm_dec
+    and their errors, corr_ra and corr_dec (of position and motion on one axis), parallax and its
+    error.  Refused are half a pair, and units that are missing or wrong.
     """
     ra, dec = sky_columns(quantities)
     sigma = _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")

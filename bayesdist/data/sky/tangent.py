@@ -51,17 +51,9 @@ def mean_direction(ra: ArrayLike, dec: ArrayLike) -> tuple[float, float]:
 
 
 def direction_sum(ra: ArrayLike, dec: ArrayLike) -> tuple[int, int, int]:
-    """Sum of unit vectors, exact to the last digit: sums of parts add up to that of the whole.
+    """Sum of unit vectors in units of 2^-62, from ra and dec (N,) in degrees.
 
-    Parameters
-    ----------
-    ra, dec : array_like, shape (N,)
-        Degrees.
-
-    Returns
-    -------
-    tuple of int
-        Components in units of 2^-62.
+    It is exact to the last digit: sums of parts add up to that of the whole.
     """
     a, d = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     x, y, z = (_exact_sum(c) for c in (np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)))
@@ -140,17 +132,9 @@ def tangent_plane(
 def tangent_jacobian(
     ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], *, where: str = ""
 ) -> Float:
-    """Derivatives of (xi, eta) by small steps to the east and to the north at each position.
+    """Derivatives (N, 2, 2) of (xi, eta) by small steps to the east and to the north.
 
-    Parameters
-    ----------
-    ra, dec, point, where
-        As `tangent_plane`.
-
-    Returns
-    -------
-    ndarray, shape (N, 2, 2)
-        ``J[:, 0, 1]`` is d xi / d dec; a step to the east counts as d ra cos(dec).
+    ``J[:, 0, 1]`` is d xi / d dec; a step to the east counts as d ra cos(dec).
     """
     delta, d, d0, D = _angles(ra, dec, point, where, row_number)
     out = np.empty((*np.shape(D), 2, 2))

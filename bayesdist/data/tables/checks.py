@@ -31,11 +31,6 @@ def one_length(
     """Contiguous float64 arrays, those of `integers` int64, as long as the first of them.
 
     They are in the machine's byte order, which columns of FITS tables are not.
-
-    Raises
-    ------
-    InputError
-        Naming the first column of another length.
     """
     arrays = {
         name: np.ascontiguousarray(values, np.int64 if name in integers else np.float64)
@@ -62,10 +57,7 @@ def check_values(
 ) -> None:
     """Refuse columns with values that are not finite, or not positive where they must be.
 
-    Raises
-    ------
-    InputError
-        Naming the row by its `place`, and the column.
+    The row is named by its `place`.
     """
     for name, values in columns.items():
         good, must = np.isfinite(values), "finite"
@@ -93,18 +85,7 @@ def check_not_finite(value: str) -> None:
 
 
 def absent(column: Any, *, not_finite: bool) -> Bool:
-    """Boolean mask of the rows of a column that have no value.
-
-    Parameters
-    ----------
-    column : astropy Column, Quantity, Time or array, shape (N,)
-    not_finite : bool
-        Count NaN and infinity as no value, too.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-    """
+    """Boolean mask (N,) of the rows without a value: masked or, if asked for, not finite."""
     mask = np.array(np.broadcast_to(getattr(column, "mask", False), np.shape(column)), bool)
     if mask.ndim > 1:  # a column of arrays, which is refused elsewhere
         return np.zeros(len(mask), bool)
@@ -117,15 +98,7 @@ def absent(column: Any, *, not_finite: bool) -> Bool:
 
 
 def counted(reasons: Sequence[tuple[str, Bool]], n: int) -> tuple[Bool, dict[str, int]]:
-    """Boolean mask of the rows that stay, and how many others go for the first of their reasons.
-
-    Parameters
-    ----------
-    reasons : sequence of (str, ndarray of bool)
-        Rows that go for each.
-    n : int
-        Rows.
-    """
+    """Boolean mask of the n rows that stay, and how many others go, by their first reason."""
     stay, counts = np.ones(n, bool), dict[str, int]()
     for reason, gone in reasons:
         new = int((stay & gone).sum())
@@ -144,31 +117,11 @@ def without_missing(
     spared: frozenset[str],
     motions: frozenset[str],
 ) -> tuple[Bool, dict[str, int]]:
-    """Boolean mask of the rows that have a value in every column that is read.
+    """Boolean mask (N,) of the rows with a value in every column that is read.
 
-    Parameters
-    ----------
-    table : astropy Table
-    found : mapping of str to str
-        Column of each quantity.
-    source : str
-    reject : bool
-        Leave rows out whose value is not finite, too.
-    spared : frozenset of str
-        Quantities whose missing values do no harm.
-    motions : frozenset of str
-        Quantities of which NaN means that a star has none, as catalogues write it.
-
-    Returns
-    -------
-    stay : ndarray of bool, shape (N,)
-    counts : dict of str to int
-        Rows left out, by reason.
-
-    Raises
-    ------
-    InputError
-        When no row is left.
+    The others are counted by reason.  `reject` leaves out what is not finite, too; missing values
+    of `spared` quantities do no harm; in `motions` NaN means that a star has none, as catalogues
+    write it.  No row left is an error.
     """
     reasons = []
     for key, name in found.items():

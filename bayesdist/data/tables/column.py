@@ -32,19 +32,7 @@ def row_number(index: int) -> str:
 
 
 def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[Any, ...]]:
-    """Codes of values, and the values that they stand for.
-
-    Parameters
-    ----------
-    values : ndarray, shape (N,)
-    ordered : bool
-        Labels sorted; otherwise in the order of their first appearance.
-
-    Returns
-    -------
-    codes : ndarray of int, shape (N,)
-    labels : tuple
-    """
+    """Codes (N,) of values, and the values themselves: sorted, or in the order of appearance."""
     unique, first, codes = np.unique(values, return_index=True, return_inverse=True)
     codes = codes.astype(np.int64)
     if not ordered:
@@ -351,11 +339,5 @@ def _all_numbers(texts: Iterable[Any]) -> bool:
 
 
 def year_of(date: float | str, *, where: str) -> float:
-    """Decimal year of a year or an ISO date.
-
-    Raises
-    ------
-    InputError
-        For what is no date.
-    """
+    """Decimal year of a year or an ISO date; anything else is refused."""
     return float(SourceColumn(np.array([date]), where, "epoch").years()[0])

@@ -90,13 +90,7 @@ def naming_faults(path: Path, where: str = "") -> Iterator[None]:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text file, with their ends.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read or is no text.
-    """
+    """Lines of a text file, with their ends; what cannot be read or is no text is refused."""
     with reading(path), path.open(encoding="utf-8", newline="") as stream:
         return stream.readlines()
 

@@ -141,30 +141,12 @@ def find_columns(
     source: str,
     pairs: Iterable[tuple[str, str]] = (),
 ) -> dict[str, str]:
-    """Which column of a file is what.
+    """Which column of a file is what, for the quantities that it has.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Columns of the file.
-    mapping : mapping of str to str, or None
-        Column for each quantity that the user names; an empty name leaves the quantity out.
-    aliases : mapping of str to tuple of str
-        Usual names, in lower case, for quantities that `mapping` does not name.
-    source : str
-        File, for the error.
-    pairs : iterable of (str, str), optional
-        Quantities whose names go together: usual names of which the file has both come first.
-
-    Returns
-    -------
-    dict of str to str
-        Quantities that the file has.
-
-    Raises
-    ------
-    InputError
-        For an unknown quantity, or a column that is not in the file; the nearest name is given.
+    `mapping` gives what the user names (an empty name leaves a quantity out), `aliases` the usual
+    names, in lower case, for the rest; of `pairs` the names go together: those of which the file
+    has both come first.  An unknown quantity, or a column that is not in the file, is refused with
+    the nearest name.
     """
     names = list(names)
     found: dict[str, str] = {}
@@ -208,17 +190,9 @@ def _nearest(name: str, choices: Iterable[str]) -> str:
 
 
 def known_unit(name: str, names: Iterable[str]) -> str | None:
-    """Unit that a column has by its name, where its file gives none.
+    """Unit that a column has by its name, where its file gives none, or None.
 
-    Parameters
-    ----------
-    name : str
-    names : iterable of str
-        All columns of the file: a catalogue is recognised by two of its names beside this one.
-
-    Returns
-    -------
-    str or None
+    A catalogue is recognised by two of its `names` beside this one.
     """
     name, others = name.lower(), {other.lower() for other in names}
     if name in _DAYS:
@@ -230,23 +204,9 @@ def known_unit(name: str, names: Iterable[str]) -> str | None:
 
 
 def origin_of(column: str, names: Iterable[str], header: Mapping[str, Any]) -> tuple[int, str]:
-    """Coordinate of the centre of the first pixel, and why it is that.
+    """Coordinate (0 or 1) of the centre of the first pixel, and why it is that.
 
-    Parameters
-    ----------
-    column : str
-        Of x.
-    names : iterable of str
-        All columns.
-    header : mapping
-        Keywords of the file.
-
-    Returns
-    -------
-    origin : int
-        0 or 1.
-    why : str
-        Empty where nothing is said of it, and 1 is FITS's own.
+    `column` is that of x; the reason is empty where nothing is said of it, and 1 is FITS's own.
     """
     for key, value in header.items():
         if str(key).lower() in _ORIGIN_KEYS and str(value).strip() in ("0", "1"):

@@ -31,19 +31,7 @@ _SHIFT = np.uint64(29)
 
 
 def first_duplicate(keys: Keys) -> tuple[int, int] | None:
-    """A pair of rows that agree in all keys.
-
-    Parameters
-    ----------
-    keys : sequence of ndarray, shape (N,)
-        Of 8 bytes an element; -0.0 and 0.0 are equal.
-
-    Returns
-    -------
-    tuple of int, or None
-        Indices of a row and of its first repetition, the pair that `first_repetition` names; None
-        where no row repeats.
-    """
+    """Indices of a row and of its first repetition in all keys (N,); None where no row repeats."""
     return first_repetition(lambda: (keys,), 1)
 
 

@@ -47,25 +47,10 @@ def _kind(lines: Sequence[str]) -> str | None:
 
 
 def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
-    """Table of lines of text.
+    """Table of lines of text, with their ends; a row of an IPAC table that is cut short is refused.
 
-    Parameters
-    ----------
-    lines : sequence of str
-        With their ends: an IPAC table, the ASCII_HEAD catalogue of SExtractor, a table of IRAF's
-        daophot, or columns under a line of names, with "#" before it or not, separated by blanks,
-        commas or tabs.
-    where : str
-        File, for errors.
-
-    Returns
-    -------
-    astropy.table.Table
-
-    Raises
-    ------
-    FormatError
-        When the lines are none of these, or a row of an IPAC table is cut short.
+    Known are an IPAC table, the ASCII_HEAD catalogue of SExtractor, a table of IRAF's daophot, and
+    columns under a line of names, with "#" before it or not, separated by blanks, commas or tabs.
     """
     ended = not lines or lines[-1].endswith("\n")
     lines = [line.rstrip("\r\n") for line in lines]

@@ -28,13 +28,7 @@ _SPELLINGS = {
 
 
 def check_unit(unit: str, *, where: str = "unit") -> str:
-    """The unit itself, when it is one of `UNITS`.
-
-    Raises
-    ------
-    InputError
-        For any other.
-    """
+    """The unit itself, when it is one of `UNITS`; any other is refused."""
     if unit not in UNITS:
         do = length_advice(unit) or f"choose one of {', '.join(UNITS)}"
         raise InputError(f"unit is {unit!r}", where=where, do=do)
@@ -53,19 +47,7 @@ def length_advice(unit: str) -> str:
 
 
 def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
-    """Unit of a table's column, None where it has none.
-
-    Parameters
-    ----------
-    column : astropy Column, Quantity or array
-    where : str
-        File and column, for the error.
-
-    Raises
-    ------
-    InputError
-        For a unit that nobody knows.
-    """
+    """Unit of a table's column, None where it has none; one that nobody knows is refused."""
     unit = getattr(column, "unit", None)
     if unit is None:
         return None
@@ -81,13 +63,7 @@ def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
 
 
 def conversion(unit: apu.UnitBase, to: str, *, where: str) -> float:
-    """Factor that brings values of `unit` to `to`.
-
-    Raises
-    ------
-    InputError
-        When the two measure different things, as pixels and angles do.
-    """
+    """Factor that brings values of `unit` to `to`; an error where they measure different things."""
     try:
         return float(unit.to(apu.Unit(to)))
     except apu.UnitConversionError:
