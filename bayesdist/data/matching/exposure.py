@@ -33,17 +33,17 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_ASTRAY = 0.2  # of the matched share of the best chip: a chip below lies elsewhere
-_ENOUGH = 20  # detections of a chip, of which that can be said
-_CHANCE = 0.1  # chance matches of a detection within the largest radius that is looked at
-_SEVERAL = 10.0  # radii by which detections are displaced to see what chance gives
-_BRIGHT = 2000  # stars of the first linear map, and of the last check
+_ASTRAY_FRACTION = 0.2  # of the matched share of the best chip: a chip below lies elsewhere
+_MIN_DETECTIONS_ON_CHIP = 20  # detections of a chip, of which that can be said
+_CHANCE_RATE = 0.1  # chance matches of a detection within the largest radius that is looked at
+_DISPLACEMENT = 10.0  # radii by which detections are displaced to see what chance gives
+_BRIGHT_STARS = 2000  # stars of the first linear map, and of the last check
 _MARGIN = 0.1  # of the field, around it
-_ROUNDS = 12  # of a cubic for each chip, and then the radius that follows
-_ALONE = 100  # unpaired detections that say where such detections lie
-_IMPURE = 0.1  # of the pairs by chance: more, and the field is not understood
-_GROWTH = 1.01  # of the pairs, while the cubic is still reaching out
-_RANGE = (1.0, 99.0)  # percentiles of magnitude that count as the range of a list
+_MAX_ROUNDS = 12  # of a cubic for each chip, and then the radius that follows
+_MIN_UNPAIRED = 100  # unpaired detections that say where such detections lie
+_MAX_FALSE_FRACTION = 0.1  # of the pairs by chance: more, and the field is not understood
+_GROWTH_FACTOR = 1.01  # of the pairs, while the cubic is still reaching out
+_MAG_PERCENTILES = (1.0, 99.0)  # percentiles of magnitude that count as the range of a list
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ def match_exposure(
     reference = np.column_stack([catalog.u, catalog.v])[nearby]
     tree = cKDTree(reference)
     n_over, area = overlap(first(points), reference)
-    largest = float(np.sqrt(-np.log1p(-_CHANCE) * area / (np.pi * n_over)))
+    largest = float(np.sqrt(-np.log1p(-_CHANCE_RATE) * area / (np.pi * n_over)))
     if radius is not None:
         largest = radius
     linear = iterated_map(points, reference, tree, first, 2.0 * largest, largest)
@@ -139,11 +139,11 @@ def match_exposure(
     if pairs is None:
         raise failure
     moved, allowed, index, partner = pairs.moved, pairs.allowed, pairs.index, pairs.partner
-    false_rate = _false_rate(pairs, rho, reference, _SEVERAL * largest)
+    false_rate = _false_rate(pairs, rho, reference, _DISPLACEMENT * largest)
     # matched = true + rate (all - true)
     true = max((len(index) - false_rate * len(points)) / (1.0 - min(false_rate, 0.99)), 0.0)
     false_share = float(np.clip(1.0 - true / len(index), 0.0, 1.0))
-    if radius is None and false_share > _IMPURE:
+    if radius is None and false_share > _MAX_FALSE_FRACTION:
         raise InputError(
             f"of {len(index)} pairs with {catalog.source} {false_share:.0%} are there by chance: "
             "they do not crowd near zero distance",
@@ -193,9 +193,9 @@ def match_exposure(
 
 def _astray(asked: Mapping[int, int], matched: Mapping[int, int]) -> tuple[int, ...]:
     """Chips whose detections hardly match, where those of another chip do."""
-    share = {chip: matched[chip] / n for chip, n in asked.items() if n >= _ENOUGH}
+    share = {chip: matched[chip] / n for chip, n in asked.items() if n >= _MIN_DETECTIONS_ON_CHIP}
     best = max(share.values(), default=0.0)
-    return tuple(chip for chip, part in share.items() if part < _ASTRAY * best)
+    return tuple(chip for chip, part in share.items() if part < _ASTRAY_FRACTION * best)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,10 +225,10 @@ def _settled(
     the pairs need, unless it is fixed, and the cubic is fitted once more.
     """
     allowed = SearchRadius(np.zeros(1), np.array([largest]))
-    chance = min(chance_rate(start, tree, largest, _SEVERAL * largest), 0.99)
+    chance = min(chance_rate(start, tree, largest, _DISPLACEMENT * largest), 0.99)
     moved = start
     index, partner, distance = mutual_pairs(moved, reference, largest, tree=tree)
-    for left in reversed(range(_ROUNDS)):
+    for left in reversed(range(_MAX_ROUNDS)):
         if len(index) < MIN_PAIRS:
             return None
         before = len(index)
@@ -237,7 +237,7 @@ def _settled(
         )
         widest = float(allowed.radius.max())
         index, partner, distance = mutual_pairs(moved, reference, widest, tree=tree)
-        growing = len(index) > _GROWTH * before and left > 1
+        growing = len(index) > _GROWTH_FACTOR * before and left > 1
         if not fixed and not growing and len(index):
             unpaired = np.ones(len(moved), bool)
             unpaired[index] = False
@@ -250,7 +250,7 @@ def _settled(
         index, partner, distance = index[near], partner[near], distance[near]
         if not growing and (fixed or widest < largest):
             break
-    sample = moved[:: -(-len(moved) // _BRIGHT)]
+    sample = moved[:: -(-len(moved) // _BRIGHT_STARS)]
     if len(index) < MIN_PAIRS or not beats_chance(sample, reference, tree, distance):
         return None
     return _Pairs(moved, allowed, index, partner, distance)
@@ -267,7 +267,7 @@ def _false_rate(pairs: _Pairs, rho: Float, reference: Float, step: float) -> flo
         return 0.0
     asked = np.ones(len(pairs.moved), bool)
     asked[pairs.index] = False
-    if asked.sum() < _ALONE:
+    if asked.sum() < _MIN_UNPAIRED:
         asked[:] = True
     radius = pairs.allowed(rho[asked])
     return chance_rate(pairs.moved[asked], cKDTree(reference[free]), radius, step)
@@ -307,7 +307,7 @@ def _by_patterns(
     if stars.mag is not None:
         rows = rows[np.argsort(stars.mag[rows], kind="stable")]
     rough = iterated_map(
-        plane[rows[:_BRIGHT]],
+        plane[rows[:_BRIGHT_STARS]],
         patterns.positions,
         patterns.tree,
         found.map,
@@ -333,7 +333,7 @@ def _range(
     if stars.mag is None or catalog.mag is None:
         return None, np.ones(len(catalog), bool)
     zero_point = float(np.median(catalog.mag[partner] - stars.mag[rows][index]))
-    low, high = np.percentile(stars.mag[rows], _RANGE) + zero_point
+    low, high = np.percentile(stars.mag[rows], _MAG_PERCENTILES) + zero_point
     return zero_point, (catalog.mag >= low) & (catalog.mag <= high)
 
 

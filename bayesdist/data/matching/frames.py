@@ -22,9 +22,9 @@ __all__ = ["MutualFrames", "mutual_frames", "refuse_duplicates"]
 
 Float = NDArray[np.float64]
 
-BRIGHT = 3000  # stars of an exposure that are used
+BRIGHT_STARS = 3000  # stars of an exposure that are used
 WIDE, NARROW = 0.3, 0.1  # of the spacing: reach of the linear map, first and last
-SAME = 0.5  # share of equal positions above which two exposures are one
+MAX_COMMON_FRACTION = 0.5  # share of equal positions above which two exposures are one
 SCALES = (0.97, 1.03)
 
 
@@ -112,7 +112,7 @@ def refuse_duplicates(
     rows = [{tuple(row) for row in np.round(one, 6).tolist()} for one in pixels]
     for b in range(len(rows)):
         for a in range(b):
-            if len(rows[a] & rows[b]) > SAME * min(len(rows[a]), len(rows[b])):
+            if len(rows[a] & rows[b]) > MAX_COMMON_FRACTION * min(len(rows[a]), len(rows[b])):
                 raise InputError(
                     f"exposures {names[a]} and {names[b]} have the same detections",
                     where=source,
@@ -162,9 +162,9 @@ def _onto(points: Float, mag: Float | None, index: PatternIndex) -> LinearMap | 
 
 
 def _brightest(plane: Float, mag: Float | None) -> NDArray[np.int64]:
-    if mag is None or len(plane) <= BRIGHT:
+    if mag is None or len(plane) <= BRIGHT_STARS:
         return np.arange(len(plane))
-    return np.sort(np.argsort(mag, kind="stable")[:BRIGHT])
+    return np.sort(np.argsort(mag, kind="stable")[:BRIGHT_STARS])
 
 
 def _of(mags: Sequence[Float] | None, e: int, rows: NDArray[np.int64]) -> Float | None:

@@ -18,7 +18,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 FINE = 16  # cells in a linking length: detections of one cell are friends without being asked
-MOST_EXTENT = 3.0  # linking lengths that a group may span: a longer one is a chain of stars
+MAX_EXTENT = 3.0  # linking lengths that a group may span: a longer one is a chain of stars
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def friends_of_friends(places: Float, exposure: Int, length: float) -> Friends:
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     _, group_of_cell = connected_components(graph, directed=False)
     group = group_of_cell[of_cell]
-    group, n_chains, broken = _without_chains(places, group, MOST_EXTENT * length)
+    group, n_chains, broken = _without_chains(places, group, MAX_EXTENT * length)
     star, n_doubled = _one_of_each(places, exposure, group)
     n_dropped = int((star == NO_STAR).sum()) - broken
     good = star != NO_STAR

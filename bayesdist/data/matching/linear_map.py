@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 __all__ = [
+    "MAX_SAMPLE",
     "MIN_PAIRS",
-    "SAMPLE",
     "LinearMap",
     "RobustFit",
     "best_similarity",
@@ -23,9 +23,9 @@ __all__ = [
 Float = NDArray[np.float64]
 Solution = TypeVar("Solution")
 
-SAMPLE = 20_000  # detections that the iterations use
-_FIRST = 150  # detections of the first round
-_ROUNDS = 25
+MAX_SAMPLE = 20_000  # detections that the iterations use
+_FIRST_SAMPLE = 150  # detections of the first round
+_MAX_ROUNDS = 25
 MIN_PAIRS = 6  # that a linear map needs to be more than its own fit
 _CLIP = 3.0  # times the median distance: 3.5 sigma of a circular normal
 
@@ -89,9 +89,9 @@ def iterated_map(
         None where too few pairs are left, or they lie on a line.
     """
     outwards = np.argsort(((points - start.origin) ** 2).sum(axis=1))
-    current, size, reach = start, _FIRST, max(reach, radius)
-    for _ in range(_ROUNDS):
-        sample = points[outwards[:size][:: -(-min(size, len(points)) // SAMPLE)]]
+    current, size, reach = start, _FIRST_SAMPLE, max(reach, radius)
+    for _ in range(_MAX_ROUNDS):
+        sample = points[outwards[:size][:: -(-min(size, len(points)) // MAX_SAMPLE)]]
         distance, nearest = tree.query(current(sample), distance_upper_bound=reach, workers=-1)
         near = np.isfinite(distance)
         origin = start.origin

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from bayesdist.data.matching.linear_map import SAMPLE
+from bayesdist.data.matching.linear_map import MAX_SAMPLE
 
 __all__ = ["beats_chance", "chance_rate", "hull_of", "inside_hull", "mutual_pairs", "overlap"]
 
@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_PROBES = 20_000  # displaced detections that say what chance gives
+_MAX_PROBES = 20_000  # displaced detections that say what chance gives
 _DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)
 
 
@@ -104,7 +104,7 @@ def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float
     (N,), is the largest distance of a neighbour, `step` the displacement in eight directions: so
     large that true pairs are out of reach.
     """
-    every = -(-len(points) * len(_DIRECTIONS) // _PROBES)
+    every = -(-len(points) * len(_DIRECTIONS) // _MAX_PROBES)
     sample = points[::every]
     reach = np.broadcast_to(radius, len(points))[::every]
     found = 0
@@ -122,7 +122,7 @@ def beats_chance(points: Float, reference: Float, tree: cKDTree, distance: Float
     `distance` is that of the pairs that were found, `tree` that of the reference positions.
     """
     reach = max(float(np.median(distance)), 1e-9 * float(np.abs(reference).max()))
-    sample = points[:: -(-len(points) // SAMPLE)]
+    sample = points[:: -(-len(points) // MAX_SAMPLE)]
 
     def neighbours(shift: complex) -> int:
         moved = sample + np.array([shift.real, shift.imag])

@@ -27,14 +27,14 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-_MOST_LEFT_OUT = 0.2  # of the exposures: beyond, the campaign itself is wrong
-_AT_FIRST = 2  # exposures that fail before any has matched
+_MAX_FRACTION_LEFT_OUT = 0.2  # of the exposures: beyond, the campaign itself is wrong
+_MAX_FAILURES_AT_FIRST = 2  # exposures that fail before any has matched
 _MIN_EXPOSURES = 5  # exposures, of which one can be called odd
-_SIGMAS = 5.0  # of the other exposures
-_LACKING = 0.15  # of completeness, at least
-_FALSE = 0.05  # of the matches, at least
-_SCALE = 2e-5  # at least: less is what telescopes breathe
-_NAMED = 5  # exposures in a sentence
+_ODD_SIGMAS = 5.0  # of the other exposures
+_MIN_COMPLETENESS_STEP = 0.15  # of completeness, at least
+_MIN_FALSE_STEP = 0.05  # of the matches, at least
+_MIN_SCALE_STEP = 2e-5  # at least: less is what telescopes breathe
+_MAX_NAMED = 5  # exposures in a sentence
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def all_cut(stars: StarList, rejected: Mapping[str, int], where: str) -> InputEr
 
 def too_many(failed: int, matched: int, n: int) -> bool:
     """Whether so many exposures failed that the campaign itself is wrong."""
-    return failed > _MOST_LEFT_OUT * n or (not matched and failed >= _AT_FIRST)
+    return failed > _MAX_FRACTION_LEFT_OUT * n or (not matched and failed >= _MAX_FAILURES_AT_FIRST)
 
 
 def failure(
@@ -242,9 +242,9 @@ def match_warnings(
          for one, full in zip(reports, whole, strict=True)]
     )  # fmt: skip
     for what, values, odd, form in (
-        ("completeness", completeness, _away(-completeness, _LACKING) > 0, ".2f"),
-        ("share of false matches", false, _away(false, _FALSE) > 0, ".2f"),
-        ("scale", scale - _median(scale), np.abs(_away(scale, _SCALE)) > 0, "+.1e"),
+        ("completeness", completeness, _away(-completeness, _MIN_COMPLETENESS_STEP) > 0, ".2f"),
+        ("share of false matches", false, _away(false, _MIN_FALSE_STEP) > 0, ".2f"),
+        ("scale", scale - _median(scale), np.abs(_away(scale, _MIN_SCALE_STEP)) > 0, "+.1e"),
     ):
         named = [
             f"{one.exposure} ({value:{form}})"
@@ -265,10 +265,10 @@ def _median(values: Float) -> float:
 def _away(values: Float, least: float) -> Float:
     """Distances from the median where they are large in both ways; else 0."""
     d = np.nan_to_num(values - _median(values))
-    limit = max(_SIGMAS * MAD_TO_SIGMA * _median(np.abs(values - _median(values))), least)
+    limit = max(_ODD_SIGMAS * MAD_TO_SIGMA * _median(np.abs(values - _median(values))), least)
     return np.where(np.abs(d) > limit, d, 0.0)
 
 
 def _listed(texts: Sequence[str]) -> str:
-    more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
-    return ", ".join(texts[:_NAMED]) + more
+    more = f" and {len(texts) - _MAX_NAMED} more" if len(texts) > _MAX_NAMED else ""
+    return ", ".join(texts[:_MAX_NAMED]) + more

@@ -17,11 +17,11 @@ __all__ = ["SearchRadius", "search_radius"]
 
 Float = NDArray[np.float64]
 
-_IN_RING = 100  # pairs of a ring at least
-_RINGS = 8
-_SHARE = 0.98  # of the true pairs, within half the radius
-_WIDER = 2.0
-_LEAST = 1e-3  # of the largest radius: pairs without any scatter still have rounding errors
+_MIN_PAIRS_IN_RING = 100  # pairs of a ring at least
+_MAX_RINGS = 8
+_TRUE_PAIRS_WITHIN = 0.98  # of the true pairs, within half the radius
+_MARGIN = 2.0
+_MIN_RADIUS = 1e-3  # of the largest radius: pairs without any scatter still have rounding errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def search_radius(
     SearchRadius
         At most `largest`.
     """
-    rings = int(np.clip(len(rho) // _IN_RING, 1, _RINGS))
+    rings = int(np.clip(len(rho) // _MIN_PAIRS_IN_RING, 1, _MAX_RINGS))
     order = np.argsort(rho, kind="stable")
     edges = np.concatenate(
         [[-np.inf], [rho[part[0]] for part in np.array_split(order, rings)[1:]], [np.inf]]
@@ -83,7 +83,7 @@ def search_radius(
         true = max((len(found) - chance * all_detections) / (1.0 - chance), 0.5 * len(found))
         false = len(found) - true
         excess = np.arange(1, len(found) + 1) - false * (found / largest) ** 2
-        within = found[int(np.argmax(excess >= _SHARE * true))]
+        within = found[int(np.argmax(excess >= _TRUE_PAIRS_WITHIN * true))]
         middles.append(float(np.median(rho[inside])))
-        radii.append(float(np.clip(_WIDER * within, _LEAST * largest, largest)))
+        radii.append(float(np.clip(_MARGIN * within, _MIN_RADIUS * largest, largest)))
     return SearchRadius(np.array(middles), np.array(radii))

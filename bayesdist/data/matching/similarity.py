@@ -34,22 +34,22 @@ __all__ = [
 Float = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_FEWEST = 60  # stars of the shallowest try
-_SHALLOWEST = 400  # reference stars of the first level; each further one has three times as many
-_DEEPER = 3
+_MIN_STARS_TRIED = 60  # stars of the shallowest try
+_STARS_OF_FIRST_LEVEL = 400  # each further one has three times as many
+_LEVEL_FACTOR = 3
 _TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: what is left of a distortion
 _DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of what the mean density suggests
-_CHECKED = 1000  # stars that a candidate is checked with
-_SIGMAS = 8.0  # by which its coincidences must beat chance
-_LEAST = 6  # stars that agree
+_STARS_CHECKED = 1000  # stars that a candidate is checked with
+_CHANCE_SIGMAS = 8.0  # by which its coincidences must beat chance
+_MIN_AGREEING = 6  # stars that agree
 
 # ratios of arcsec, mas, degrees and pixels of 0.05 arcsec
 _RATIOS = (20.0, 50.0, 1000.0, 3600.0, 72_000.0, 3.6e6)
-_WITHIN = 1.1  # of such a ratio; pixels have other sizes, too
-_NEAR = 1.4  # a scale that is only badly known
-_SAME = 0.03  # what the matching allows for
-_AGREEING = 5.0  # stars that have a neighbour, for each whose triangles agree
-_SURE = 16.0  # standard deviations of chance: of many tries one may well have half of it
+_RATIO_TOLERANCE = 1.1  # of such a ratio; pixels have other sizes, too
+_WIDE_SCALE = 1.4  # a scale that is only badly known
+_SCALE_TOLERANCE = 0.03  # what the matching allows for
+_STARS_FOR_EACH_AGREEING = 5.0  # stars that have a neighbour, for each whose triangles agree
+_CLEAR_SIGMAS = 16.0  # standard deviations of chance: of many tries one may well have half of it
 MIRRORED = "its mirror image"
 
 
@@ -155,10 +155,10 @@ def pattern_index(positions: ArrayLike, mag: ArrayLike | None = None) -> Pattern
     if mag is not None:
         stars = stars[np.argsort(np.asarray(mag, float), kind="stable")]
         sizes = []
-        size = _SHALLOWEST
+        size = _STARS_OF_FIRST_LEVEL
         while size < len(points):
             sizes.append(size)
-            size *= _DEEPER
+            size *= _LEVEL_FACTOR
         sizes.append(len(points))
     return PatternIndex(points, tuple(Level(stars[:n]) for n in sizes), hull_of(points)[1])
 
@@ -225,10 +225,10 @@ def find_similarity(
             found, expected = _support(candidate, bright, reference)
             best = max(best, (found, expected))
             if (
-                candidate.agreeing >= _LEAST
-                and found - expected > _SIGMAS * np.sqrt(expected)
+                candidate.agreeing >= _MIN_AGREEING
+                and found - expected > _CHANCE_SIGMAS * np.sqrt(expected)
                 and found > 2.0 * expected
-                and found >= _LEAST
+                and found >= _MIN_AGREEING
             ):
                 return Similarity(
                     rotation=float(np.degrees(np.angle(candidate.turn)) % 360.0),
@@ -256,20 +256,20 @@ def _tries(
         for level in reference.levels:
             even = len(level.stars) * area / reference.area
             last = level is reference.levels[-1]
-            if even < _FEWEST and not last:
+            if even < _MIN_STARS_TRIED and not last:
                 continue
             if not ranked:
                 if last:
                     yield tolerance, level, n
                 continue
-            sizes = [int(np.clip(even * depth, min(_FEWEST, n), n)) for depth in _DEPTHS]
+            sizes = [int(np.clip(even * depth, min(_MIN_STARS_TRIED, n), n)) for depth in _DEPTHS]
             for size in dict.fromkeys(sizes):
                 yield tolerance, level, size
 
 
 def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> tuple[int, float]:
     """Stars that have a reference star near them, and how many have one by chance."""
-    sample = stars[:: -(-len(stars) // _CHECKED)]
+    sample = stars[:: -(-len(stars) // _STARS_CHECKED)]
     moved = candidate.turn * sample + candidate.target
     points = np.stack([moved.real, moved.imag], axis=-1)
     reach = float(np.clip(3.0 * candidate.slack, 0.02 * reference.spacing, 0.2 * reference.spacing))
@@ -284,7 +284,11 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
     Empty when nothing helps.
     """
     ratios = [factor for one in _RATIOS for factor in (one, 1.0 / one)]
-    tries = [(1.0, _NEAR, False), *((one, _WITHIN, False) for one in ratios), (1.0, _NEAR, True)]
+    tries = [
+        (1.0, _WIDE_SCALE, False),
+        *((one, _RATIO_TOLERANCE, False) for one in ratios),
+        (1.0, _WIDE_SCALE, True),
+    ]
     best, reason = 0.0, ""
     # a wrong unit is found or dismissed in no time, a mirror image is not: it comes last
     for ratio, within, mirrored in tries:
@@ -299,10 +303,10 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
         except InputError:
             continue
         # shrunk onto a crowded place any list finds neighbours; but few of its triangles agree
-        if _AGREEING * found.coincidences < found.found:
+        if _STARS_FOR_EACH_AGREEING * found.coincidences < found.found:
             continue
         scale = ratio * found.scale
-        as_it_is = abs(scale - 1.0) < _SAME
+        as_it_is = abs(scale - 1.0) < _SCALE_TOLERANCE
         if as_it_is and not mirrored:  # then neither scale nor image is what is wrong
             continue
         sigmas = (found.found - found.expected) / np.sqrt(found.expected)
@@ -314,6 +318,6 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
         reason = (
             f"{image} does match{at}: {found.found} stars, where chance gives {found.expected:.1f}"
         )
-        if best > _SURE:
+        if best > _CLEAR_SIGMAS:
             break
     return reason

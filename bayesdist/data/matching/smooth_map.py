@@ -18,8 +18,8 @@ Int = NDArray[np.int64]
 
 _ORDER = 3
 _POWERS = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]
-_LEAST = 20 * len(_POWERS)  # pairs of a chip; with fewer, what is fitted is their noise
-_MOST = 4000  # that a fit uses: beyond, their noise has no part in it any more
+_MIN_PAIRS_ON_CHIP = 20 * len(_POWERS)  # pairs of a chip; with fewer, what is fitted is their noise
+_MAX_PAIRS_FITTED = 4000  # that a fit uses: beyond, their noise has no part in it any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +53,11 @@ def smooth_map(points: Float, chip: Int, residual: Float, index: Int) -> SmoothM
     coefficients: dict[int, Float] = {}
     for number in np.unique(chip).tolist():
         here = np.flatnonzero(chip[index] == number)
-        if len(here) < _LEAST:
+        if len(here) < _MIN_PAIRS_ON_CHIP:
             continue
-        here = here[:: -(-len(here) // _MOST)]
+        here = here[:: -(-len(here) // _MAX_PAIRS_FITTED)]
         fit = partial(_cubic, _terms(points[index[here]], low, high), residual[here])
-        found = robust_fit(fit, len(here), least=_LEAST, rounds=6)
+        found = robust_fit(fit, len(here), least=_MIN_PAIRS_ON_CHIP, rounds=6)
         assert found is not None
         coefficients[number] = found.solution
     return SmoothMap(low, high, coefficients)

@@ -22,7 +22,7 @@ Int = NDArray[np.int64]
 
 _LOG10_CHANCE = -4.0  # a vote that chance wins more often than this is no match
 _FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows
-_ENOUGH = 15  # pairs that convince although most stars have none
+_CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,9 @@ def match_to_catalog(
     )
     found = transformation(points)
     index, catalog_index, distance = mutual_pairs(found, reference, radius, tree=tree)
-    few = len(index) < MIN_PAIRS or len(index) < min(_ENOUGH, 0.5 * min(len(points), n_over))
+    few = len(index) < MIN_PAIRS or len(index) < min(
+        _CONVINCING_PAIRS, 0.5 * min(len(points), n_over)
+    )
     if few or not beats_chance(found, reference, tree, distance):
         raise failure
     return Matching(

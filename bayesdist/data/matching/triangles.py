@@ -19,12 +19,12 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Complex = NDArray[np.complex128]
 
-_FLATTEST = 0.15  # shortest to longest side: below, a small error turns the shape around
-_ALIKE = 0.985  # sides nearer to each other than this may change places
-_ANCHORS = 500  # stars of the list that triangles are made around
+_MIN_SIDE_RATIO = 0.15  # shortest to longest side: below, a small error turns the shape around
+_MAX_SIDE_RATIO = 0.985  # sides nearer to each other than this may change places
+_MAX_ANCHORS = 500  # stars of the list that triangles are made around
 _NEIGHBOURS = (5, 6)  # of each, in the list and in the reference
-_CANDIDATES = 3  # peaks of a vote that are looked at
-_VOTES = 400_000  # at most
+_MAX_CANDIDATES = 3  # peaks of a vote that are looked at
+_MAX_VOTES = 400_000  # at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +70,10 @@ def _described(stars: Complex, corners: Int) -> Triangles:
     order = np.argsort(-sides, axis=1)
     corners = np.take_along_axis(corners, order, axis=1)
     sides = np.take_along_axis(sides, order, axis=1)
-    good = (sides[:, 2] > _FLATTEST * sides[:, 0]) & (sides[:, 1] < _ALIKE * sides[:, 0])
-    good &= sides[:, 2] < _ALIKE * sides[:, 1]
+    good = (sides[:, 2] > _MIN_SIDE_RATIO * sides[:, 0]) & (
+        sides[:, 1] < _MAX_SIDE_RATIO * sides[:, 0]
+    )
+    good &= sides[:, 2] < _MAX_SIDE_RATIO * sides[:, 1]
     corners, sides = corners[good], sides[good]
     a, b, c = stars[corners].T
     return Triangles(
@@ -117,7 +119,7 @@ def candidates(
     are known; `tolerance` is that of the logarithms of side ratios.
     """
     # evenly over the ranks, so that a clump of false bright detections is not all
-    anchors = np.unique(np.linspace(0, len(stars) - 1, min(_ANCHORS, len(stars))).astype(int))
+    anchors = np.unique(np.linspace(0, len(stars) - 1, min(_MAX_ANCHORS, len(stars))).astype(int))
     own = triangles_of(stars, anchors, _NEIGHBOURS[0])
     i, j = _alike(own, level.triangles, tolerance, scale)
     if not len(i):
@@ -136,7 +138,7 @@ def candidates(
     reach = 3.0 * tolerance * lever
     near = cKDTree(votes)
     support = near.query_ball_point(votes, reach, return_length=True, workers=-1)
-    for _ in range(_CANDIDATES):
+    for _ in range(_MAX_CANDIDATES):
         peak = int(np.argmax(support))
         if support[peak] < 2:
             return
@@ -171,7 +173,7 @@ def _alike(
     if not found:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     i, j = (np.concatenate(one) for one in zip(*found, strict=True))
-    every = -(-len(i) // _VOTES) or 1
+    every = -(-len(i) // _MAX_VOTES) or 1
     return i[::every], j[::every]
 
 

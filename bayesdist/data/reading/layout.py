@@ -21,9 +21,9 @@ __all__ = ["TableLayout", "table_layout"]
 
 PathLike = str | os.PathLike[str]
 
-LOOKED_AT = 200_000  # rows of a large table, for what its columns may be
-MOST_CHIPS = 200
-FEWEST_ON_CHIP = 20  # rows: flags and qualities have values that are rare
+MAX_ROWS_READ = 200_000  # rows of a large table, for what its columns may be
+MAX_CHIPS = 200
+MIN_ROWS_ON_CHIP = 20  # rows: flags and qualities have values that are rare
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def table_layout(
         return None
     if file.suffix.lower() == ".parquet":
         part = describe_part(file)
-        table: Columns = next(part.blocks(part.colnames, size=LOOKED_AT))
+        table: Columns = next(part.blocks(part.colnames, size=MAX_ROWS_READ))
         header: Mapping[str, Any] = {}
     else:
         table = with_sky_columns(read_table(file))
@@ -110,6 +110,6 @@ def _values_like_chips(column: Any) -> int:
     if values.ndim != 1 or values.dtype.kind not in "iuSU" or getattr(column, "unit", None):
         return 0
     unique, counts = np.unique(values, return_counts=True)
-    if not 2 <= len(unique) <= MOST_CHIPS or counts.min() < FEWEST_ON_CHIP:
+    if not 2 <= len(unique) <= MAX_CHIPS or counts.min() < MIN_ROWS_ON_CHIP:
         return 0
     return len(unique)
