@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -326,7 +326,7 @@ class DistortionModel(ParameterLayout):
     def to_dict(self) -> dict[str, Any]:
         """The structure as JSON-able data, for files."""
         values = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
-        return json.loads(json.dumps(values, default=asdict))
+        return json.loads(json.dumps(values, default=_plain))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> DistortionModel:
@@ -354,3 +354,8 @@ class DistortionModel(ParameterLayout):
             where="model",
             do="fit again",
         )
+
+
+def _plain(value: Any) -> Any:
+    """A dataclass as a dict, and a number of numpy as one of Python."""
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value.item()

@@ -324,6 +324,14 @@ def test_dict_round_trip_through_json(frames, gauge):
     assert DistortionModel.from_dict(json.loads(json.dumps(still.to_dict()))) == still
 
 
+def test_numbers_of_numpy_are_described_as_plain_ones():
+    chip = Chip(np.int64(2), "b", (np.float64(64.0), 32.0), (32.0, 16.0))
+    model = DistortionModel(np.int64(2), (chip,), origin=tuple(np.array([1.5, 2.0])))
+    text = json.dumps(model.to_dict())
+    assert DistortionModel.from_dict(json.loads(text)) == model
+    assert repr(model.to_dict()) == repr(json.loads(text))
+
+
 def test_errors_of_the_structure():
     with pytest.raises(InputError, match=r"unknown kind of frame 'twist'.*shift_rotation"):
         model_of("twist")
