@@ -16,7 +16,7 @@ from bayesdist.data.reading.table import with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.positions import sky_columns
 from bayesdist.data.sky.tangent import onto_plane
-from bayesdist.data.tables.checks import check_values, one_length, without_missing
+from bayesdist.data.tables.checks import check_values, one_length, refuse_half, without_missing
 from bayesdist.data.tables.column import SourceColumn, row_number
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import ALIASES, find_columns
@@ -94,15 +94,10 @@ class ReferenceCatalog:
         n = np.size(self.u)
         if n == 0:
             raise InputError("holds no stars", where=self.source, do="give a catalogue with stars")
-        for pair in _PAIRS:
-            if (getattr(self, pair[0]) is None) != (getattr(self, pair[1]) is None):
-                raise InputError(
-                    f"has only one of {pair[0]!r} and {pair[1]!r}",
-                    where=self.source,
-                    do="give both or neither",
-                )
         names = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        for pair, what in zip(_PAIRS, ("errors", "motions", "errors of motions"), strict=True):
+            refuse_half(pair, given, where=self.source, what=what)
         for name, values in one_length(given, where=self.source).items():
             object.__setattr__(self, name, values)
         check_values(

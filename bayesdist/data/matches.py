@@ -14,7 +14,7 @@ from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.labels import merged_codes, merged_counts, merged_optional
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
 from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
-from bayesdist.data.tables.checks import absent, check_values, counted, one_length
+from bayesdist.data.tables.checks import absent, check_values, counted, one_length, refuse_half
 from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
@@ -240,20 +240,9 @@ class MatchTable:
 
     def _check_values(self) -> None:
         check_unit(self.unit, where=", ".join(self.sources))
-        if (self.sigma_u is None) != (self.sigma_v is None):
-            missing = "sigma_u" if self.sigma_u is None else "sigma_v"
-            raise InputError(
-                f"column {missing!r} is missing beside its partner",
-                where=", ".join(self.sources),
-                do="give both errors or neither",
-            )
-        if (self.u_nominal is None) != (self.v_nominal is None):
-            missing = "u_nominal" if self.u_nominal is None else "v_nominal"
-            raise InputError(
-                f"column {missing!r} is missing beside its partner",
-                where=", ".join(self.sources),
-                do="give nominal positions in both axes or in none",
-            )
+        present, where = set(self._array_names()), ", ".join(self.sources)
+        refuse_half(_SIGMAS, present, where=where, what="errors")
+        refuse_half(_NOMINAL, present, where=where, what="nominal positions")
         names_of = {**_CODES, "source": "sources"}
         for name, labels in names_of.items():
             codes = getattr(self, name)

@@ -21,6 +21,7 @@ from bayesdist.data.reading.columns import (
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import sky_columns
 from bayesdist.data.sky.tangent import direction_of, direction_sum
+from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.parquet import ParquetPart, RowBlock
 from bayesdist.data.tables.quantities import Quantities
@@ -140,14 +141,7 @@ def match_part(
     source = str(part.path)
     found, options, notes = columns_read(part.colnames, {}, options, source=source)
     found.pop("flux", None)  # magnitudes of all rows or of none: that takes all of them
-    if "sigma_u" in found or "sigma_v" in found:
-        for key in ("sigma_u", "sigma_v"):
-            if key not in found:
-                raise InputError(
-                    f"column {key!r} is missing beside its partner",
-                    where=source,
-                    do="give both errors or neither",
-                )
+    refuse_half(("sigma_u", "sigma_v"), found, where=source, what="errors")
     nominal_columns(found, source=source, tangent_point=options.tangent_point)
     if "ra" in found:
         own = plane_unit(options.unit, source=source)

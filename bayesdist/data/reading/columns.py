@@ -14,6 +14,7 @@ from bayesdist.data.reading.chips import numbered_chips
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
 from bayesdist.data.sky.tangent import onto_plane
+from bayesdist.data.tables.checks import refuse_half
 from bayesdist.data.tables.column import SourceColumn, year_of
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.data.tables.quantities import Quantities
@@ -242,14 +243,9 @@ def nominal_columns(
     Refused is one without the other; and both beside sky positions where no tangent point is given:
     the plane on which they lie is not to depend on which stars were matched.
     """
-    keys = tuple(key for key in ("u_nominal", "v_nominal") if key in found)
-    if len(keys) == 1:
-        missing = "v_nominal" if keys[0] == "u_nominal" else "u_nominal"
-        raise InputError(
-            f"column {missing!r} is missing beside its partner",
-            where=source,
-            do="give nominal positions in both axes or in none",
-        )
+    pair = ("u_nominal", "v_nominal")
+    refuse_half(pair, found, where=source, what="nominal positions")
+    keys = tuple(key for key in pair if key in found)
     if keys and "ra" in found and tangent_point is None:
         raise InputError(
             "nominal positions stand beside ra and dec, and the tangent point of their plane is "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ __all__ = [
     "check_values",
     "counted",
     "one_length",
+    "refuse_half",
     "without_missing",
 ]
 
@@ -71,6 +72,17 @@ def check_values(
                 f"value is {values[bad]:g}, and must be {must}",
                 where=f"{place(bad)}, column {name!r}",
                 do="correct the row or drop it",
+            )
+
+
+def refuse_half(pair: tuple[str, str], present: Container[str], *, where: str, what: str) -> None:
+    """Refuse one column of a pair without the other."""
+    for name, partner in (pair, pair[::-1]):
+        if partner in present and name not in present:
+            raise InputError(
+                f"column {name!r} is missing beside its partner",
+                where=where,
+                do=f"give {what} in both axes or in none",
             )
 
 
