@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 
@@ -21,6 +22,7 @@ ROOT = Path(bayesdist.__file__).parent
 # Packages on one floor do not see each other; each may import what lies on the floors before.
 FLOORS = (
     ("errors",),
+    ("files",),
     ("data", "model"),
     ("infer", "simulate"),
     ("calibration",),
@@ -60,6 +62,13 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+@cache
+def parsed(name: str) -> ast.Module:
+    """Syntax tree of a module."""
+    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
+
+
+@cache
 def imports_of(name: str, *, at_import_time: bool = False) -> set[str]:
     """Full dotted names that a module imports; `from a import b` gives a.b where that is a module.
 
@@ -91,7 +100,7 @@ def imports_of(name: str, *, at_import_time: bool = False) -> set[str]:
         for child in ast.iter_child_nodes(node):
             visit(child)
 
-    visit(ast.parse(path.read_text(encoding="utf-8")))
+    visit(parsed(name))
     return out
 
 
@@ -126,7 +135,7 @@ def test_imports_go_downwards(name):
 
 def _only_the_version(name: str) -> bool:
     """Whether all that a module takes from the package's root is `__version__`."""
-    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(name)):
         if isinstance(node, ast.Import) and any(a.name == "bayesdist" for a in node.names):
             return False
         if isinstance(node, ast.ImportFrom) and node.module == "bayesdist" and not node.level:

@@ -30,7 +30,7 @@ from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_I
 from bayesdist.assess.terms.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.assess.terms.given import GIVEN, said_by_user
 from bayesdist.assess.terms.parameters import LINEAR_KINDS, LinearTerm
-from bayesdist.data.units import length_advice
+from bayesdist.data.tables.units import length_advice
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods

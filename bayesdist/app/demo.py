@@ -13,8 +13,8 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
 from bayesdist.data import MatchTable
-from bayesdist.data.files import atomic_path, made_folder
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path, made_folder
 from bayesdist.simulate import Truth, simulate_wise
 
 __all__ = ["demo", "simulation_config", "write_simulation"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bayesdist.data.layout import TableLayout
+from bayesdist.data.reading.layout import TableLayout
 from bayesdist.errors import InputError
 
 __all__ = ["column_lines", "columns_of_options", "quoted"]

@@ -17,8 +17,8 @@ from bayesdist.app.output import refuse_existing
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import Session, write_table
-from bayesdist.data import atomic_path
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.files import atomic_path
 from bayesdist.infer.compare.order import select_order
 from bayesdist.infer.compare.order_result import OrderSelection
 from bayesdist.model.basis import MAX_ORDER

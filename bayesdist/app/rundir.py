@@ -24,9 +24,9 @@ from bayesdist.app.config import Config, load_config, load_text
 from bayesdist.app.config_errors import as_config_error
 from bayesdist.app.selfcal.files import selfcal_files
 from bayesdist.app.star_files import FOLDER, PAIRS, part_files
-from bayesdist.data import atomic_path, input_files, is_leftover, remove_leftovers, sha256_of
-from bayesdist.data.files import made_folder
+from bayesdist.data import input_files
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path, is_leftover, made_folder, remove_leftovers, sha256_of
 
 __all__ = ["RunDirectory", "as_json", "write_json"]
 

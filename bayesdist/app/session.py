@@ -40,7 +40,7 @@ from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.centroid import centroid_scatter
 from bayesdist.assess.terms.correlated import STRUCTURE
 from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
+from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.data.holdout import Split
 from bayesdist.diagnose import ScoreTest, score_tests
 from bayesdist.diagnose.holdout.predictive import Predictive
@@ -49,6 +49,7 @@ from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.diagnose.residuals.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.diagnose.residuals.quoted import error_scale, error_scale_sentence
 from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
+from bayesdist.files import atomic_path
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.screen import progress_bar, table_text
-from bayesdist.data import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 from bayesdist.model import DistortionModel
 from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
 from bayesdist.simulate.acs import AcsCampaign, acs_solution, simulate_acs, write_acs

@@ -11,8 +11,8 @@ import numpy as np
 from bayesdist.app.bands.stand_in import STAND_IN_TURN, write_stand_in
 from bayesdist.app.demo import simulation_config, write_simulation
 from bayesdist.app.screen import table_text
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 from bayesdist.simulate import simulate_wise
 from bayesdist.simulate.wise import WiseSet, wise_set, write_wise_set
 

@@ -6,18 +6,18 @@ been checked.  What outgrows the memory is Parquet: `open_matches` leaves it on 
 `PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such files.
 """
 
-from bayesdist.data.aberration import velocity_aberration
-from bayesdist.data.campaign import CampaignMatches, ExposureReport, match_campaign
 from bayesdist.data.catalog import ReferenceCatalog, catalog_from_table, read_catalog
 from bayesdist.data.exposure_log import Exposure, ExposureLog
-from bayesdist.data.exposures import exposure_of_headers, read_exposures, write_exposures
-from bayesdist.data.files import atomic_path, is_leftover, remove_leftovers, sha256_of
-from bayesdist.data.from_table import matches_from_table
+from bayesdist.data.exposures import read_exposures, write_exposures
 from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
-from bayesdist.data.linear_map import LinearMap
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.matching import Matching, match_table, match_to_catalog
+from bayesdist.data.matching.campaign import CampaignMatches, match_campaign
+from bayesdist.data.matching.linear_map import LinearMap
+from bayesdist.data.matching.reports import ExposureReport
+from bayesdist.data.matching.search_radius import SearchRadius, search_radius
+from bayesdist.data.matching.similarity import find_similarity, pattern_index
+from bayesdist.data.matching.table import Matching, match_table, match_to_catalog
 from bayesdist.data.motions import (
     MotionErrorLine,
     derive_motions,
@@ -25,23 +25,25 @@ from bayesdist.data.motions import (
     select_motions,
 )
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
-from bayesdist.data.patterns import find_similarity, pattern_index
 from bayesdist.data.pieces import PIECE, Piece
 from bayesdist.data.preparing import centroid_errors, neutralise_aberration, with_centroid_errors
-from bayesdist.data.readers import FORMATS, input_files, read_matches
+from bayesdist.data.reading.formats import FORMATS, input_files
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.reading.read import read_matches
+from bayesdist.data.reading.table import matches_from_table
 from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
-from bayesdist.data.rvb_accept import RadialLimit, accept_radial
+from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.data.rvb_linear import fit_transform, linear_moments
-from bayesdist.data.rvb_pairs import RvbPairs, bluest, colour_between
+from bayesdist.data.rvb_pairs import RvbPairs
 from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
 from bayesdist.data.rvb_solutions import read_solutions
 from bayesdist.data.rvb_transform import RvbTransform, rereference, transformed
 from bayesdist.data.rvb_write import write_rvb
+from bayesdist.data.sky.earth import velocity_aberration
+from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.data.starlists import StarCuts, StarList, read_star_lists, star_list_of_hst1pass
-from bayesdist.data.tangent import mean_direction, tangent_plane
-from bayesdist.data.tolerance import SearchRadius, search_radius
-from bayesdist.data.units import UNITS
-from bayesdist.data.writing import write_partitioned
+from bayesdist.data.tables.units import UNITS
+from bayesdist.data.write import write_partitioned
 
 __all__ = [
     "FORMATS",
@@ -60,6 +62,7 @@ __all__ = [
     "PartitionedMatches",
     "Piece",
     "RadialLimit",
+    "ReadOptions",
     "ReferenceCatalog",
     "RvbPairs",
     "RvbSelection",
@@ -68,18 +71,12 @@ __all__ = [
     "SelectedPairs",
     "StarCuts",
     "StarList",
-    "accept_radial",
-    "atomic_path",
-    "bluest",
     "catalog_from_table",
     "centroid_errors",
-    "colour_between",
     "derive_motions",
-    "exposure_of_headers",
     "find_similarity",
     "fit_transform",
     "input_files",
-    "is_leftover",
     "linear_moments",
     "match_campaign",
     "match_table",
@@ -98,12 +95,10 @@ __all__ = [
     "read_rvb",
     "read_solutions",
     "read_star_lists",
-    "remove_leftovers",
     "rereference",
     "rvb_bands",
     "search_radius",
     "select_motions",
-    "sha256_of",
     "star_list_of_hst1pass",
     "stream_rvb",
     "tangent_plane",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from astropy.table import Table
 
-from bayesdist.data.from_table import matches_from_table
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.usual_names import ALIASES
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.reading.table import matches_from_table
+from bayesdist.data.tables.names import ALIASES
 
 __all__ = ["COLUMNS", "is_astrometrynet", "matches_from_corr"]
 
@@ -28,12 +30,10 @@ def is_astrometrynet(names: Iterable[str]) -> bool:
 
 def matches_from_corr(
     table: Table,
+    options: ReadOptions | None = None,
     *,
     source: str = "corr.fits",
-    tangent_point: tuple[float, float] | None = None,
     exposure_name: str | None = None,
-    epoch: float | str | None = None,
-    not_finite: str = "refuse",
 ) -> MatchTable:
     """MatchTable from the columns of a `corr.fits`.
 
@@ -44,11 +44,9 @@ def matches_from_corr(
     Parameters
     ----------
     table : astropy Table
-    source : str, optional
-        File, for errors.
-    tangent_point : tuple of float, optional
-        RA and Dec in degrees; by default the mean direction of the stars.
-    exposure_name, epoch, not_finite
+    options : ReadOptions, optional
+        The format fixes columns, origin and unit.
+    source, exposure_name
         As `matches_from_table`.
 
     Returns
@@ -61,13 +59,5 @@ def matches_from_corr(
         For missing columns or values.
     """
     columns = COLUMNS | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
-    return matches_from_table(
-        table,
-        columns,
-        source=source,
-        read_sigma=False,
-        tangent_point=tangent_point,
-        exposure_name=exposure_name,
-        epoch=epoch,
-        not_finite=not_finite,
-    )
+    options = replace(options or ReadOptions(), columns=columns, unit=None, sigma="by_magnitude")
+    return matches_from_table(table, options, source=source, exposure_name=exposure_name)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.starlists import StarList
+from bayesdist.data.tables.checks import check_values, one_length
 from bayesdist.errors import InputError
 
 __all__ = ["NO_STAR", "Detections", "detections_of"]
@@ -69,27 +70,12 @@ class Detections:
             object.__setattr__(self, "chip", np.ones(n, np.int64))
         if self.star is None:
             object.__setattr__(self, "star", np.full(n, NO_STAR))
-        for name in ("x", "y", "sigma", "mag", "exposure", "chip", "star"):
-            values = getattr(self, name)
-            if values is None:
-                continue
-            kind = np.float64 if name in ("x", "y", "sigma", "mag") else np.int64
-            values = np.ascontiguousarray(values, kind)
+        names = ("x", "y", "sigma", "mag", "exposure", "chip", "star")
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        arrays = one_length(given, integers=("exposure", "chip", "star"), where=self.source)
+        for name, values in arrays.items():
             object.__setattr__(self, name, values)
-            if values.shape != (n,):
-                raise InputError(
-                    f"column {name!r} has shape {values.shape}, but 'x' has {n} rows",
-                    where=self.source,
-                    do="give columns of one length",
-                )
-            good = np.isfinite(values) if name != "sigma" else (values > 0) & np.isfinite(values)
-            if not good.all():
-                bad = int(np.argmin(good))
-                raise InputError(
-                    f"value is {values[bad]:g}",
-                    where=f"{self.source}, row {bad + 1}, column {name!r}",
-                    do="correct the row or drop it",
-                )
+        check_values(arrays, place=lambda row: f"{self.source}, row {row + 1}", positive=("sigma",))
 
     def __len__(self) -> int:
         return len(self.x)

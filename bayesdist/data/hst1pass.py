@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.tables import read_lines
+from bayesdist.data.tables.files import read_lines
 from bayesdist.errors import FormatError
 
 __all__ = ["Hst1passList", "is_hst1pass", "is_matchup", "read_hst1pass", "read_matchup"]

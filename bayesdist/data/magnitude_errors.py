@@ -16,11 +16,11 @@ __all__ = ["MagnitudeErrors", "estimate", "no_magnitudes"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-_LEAST = 40  # stars in a bin
-_MOST = 25  # bins
-_FEWEST = 10  # stars in all, below which no scatter is worth the name
+_MIN_STARS_IN_BIN = 40  # stars in a bin
+_MAX_BINS = 25  # bins
+_MIN_STARS = 10  # stars in all, below which no scatter is worth the name
 _CLIP = 4.0  # sigmas beyond which a star has no part in the scatter
-_NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
+MAD_TO_SIGMA = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 _SMALL_SAMPLE = 0.31  # relative bias of the median of |z| over n stars is +0.31 / n
 _LOG_VARIANCE = 1.36  # variance of ln(scatter) times n: the median of |z| is 37 % efficient
 _TURN = 9.0  # gain in chi-square that a rise towards the bright end must bring to be believed
@@ -113,9 +113,9 @@ def estimate(
         raise InputError(
             "a magnitude or a residual is not finite", where=where, do="drop such stars"
         )
-    if mag.size < _FEWEST:
+    if mag.size < _MIN_STARS:
         raise InputError(
-            f"{mag.size} stars are too few", where=where, do=f"give {_FEWEST}, or give errors"
+            f"{mag.size} stars are too few", where=where, do=f"give {_MIN_STARS}, or give errors"
         )
     if 2 * mag.size <= n_params:
         raise InputError(
@@ -148,13 +148,13 @@ def estimate(
 def _bins(mag: Float) -> list[Int]:
     """Indices of the stars of each bin; stars of one magnitude stay together."""
     order = np.argsort(mag, kind="stable")
-    count = int(np.clip(len(mag) // _LEAST, 1, _MOST))
+    count = int(np.clip(len(mag) // _MIN_STARS_IN_BIN, 1, _MAX_BINS))
     edges = np.linspace(0, len(mag), count + 1).astype(int)[1:-1]
     edges = np.unique(np.searchsorted(mag[order], mag[order][edges], side="left"))
     parts = [part for part in np.split(order, edges) if len(part)]
     out: list[Int] = []
     for part in parts:  # ties may have left a bin too small to stand alone
-        if out and min(len(part), len(out[-1])) < min(_LEAST, len(mag) // count):
+        if out and min(len(part), len(out[-1])) < min(_MIN_STARS_IN_BIN, len(mag) // count):
             out[-1] = np.concatenate([out[-1], part])
         else:
             out.append(part)
@@ -164,13 +164,13 @@ def _bins(mag: Float) -> list[Int]:
 def _scatter(residuals: Float) -> Float:
     """Scatter (2,) of residuals (2, n), unmoved by stars far out."""
     size = np.abs(residuals)
-    scale = _NORMAL * np.median(size, axis=1)
+    scale = MAD_TO_SIGMA * np.median(size, axis=1)
     for _ in range(20):
         # one membership for both axes, as in the outlier model
         near = (size <= _CLIP * scale[:, None]).all(axis=0)
         if not near.any():
             break
-        new = _NORMAL * np.median(size[:, near], axis=1)
+        new = MAD_TO_SIGMA * np.median(size[:, near], axis=1)
         if np.allclose(new, scale, rtol=1e-12, atol=0.0):
             break
         scale = new

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.added_errors import AddedErrors
-from bayesdist.data.duplicates import first_duplicate
+from bayesdist.data.labels import merged_codes, merged_counts, merged_optional
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
-from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
-from bayesdist.data.missing import absent, counted
 from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
-from bayesdist.data.units import check_unit, conversion, unit_of, without_unit
+from bayesdist.data.tables.checks import absent, check_values, counted, one_length, refuse_half
+from bayesdist.data.tables.repeated import first_duplicate
+from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
 
 __all__ = ["MatchTable"]
@@ -185,17 +185,10 @@ class MatchTable:
             if getattr(self, name) is None:
                 default = np.arange(n) if name == "row" else np.zeros(n, np.int64)
                 object.__setattr__(self, name, default)
-        for name in self._array_names():
-            kind = np.int64 if name in _INTEGERS else np.float64
-            # contiguous and in the machine's byte order, which FITS columns are not
-            values = np.ascontiguousarray(getattr(self, name), dtype=kind)
+        given = {name: getattr(self, name) for name in self._array_names()}
+        where = ", ".join(self.sources)
+        for name, values in one_length(given, integers=_INTEGERS, where=where).items():
             object.__setattr__(self, name, values)
-            if values.shape != (n,):
-                raise InputError(
-                    f"column {name!r} has shape {values.shape}, but 'x' has {n} rows",
-                    where=", ".join(self.sources),
-                    do="give columns of one length",
-                )
         object.__setattr__(self, "n_rows", n if self.n_rows is None else int(self.n_rows))
         object.__setattr__(self, "rejected", dict(self.rejected))
 
@@ -247,20 +240,9 @@ class MatchTable:
 
     def _check_values(self) -> None:
         check_unit(self.unit, where=", ".join(self.sources))
-        if (self.sigma_u is None) != (self.sigma_v is None):
-            missing = "sigma_u" if self.sigma_u is None else "sigma_v"
-            raise InputError(
-                f"column {missing!r} is missing beside its partner",
-                where=", ".join(self.sources),
-                do="give both errors or neither",
-            )
-        if (self.u_nominal is None) != (self.v_nominal is None):
-            missing = "u_nominal" if self.u_nominal is None else "v_nominal"
-            raise InputError(
-                f"column {missing!r} is missing beside its partner",
-                where=", ".join(self.sources),
-                do="give nominal positions in both axes or in none",
-            )
+        present, where = set(self._array_names()), ", ".join(self.sources)
+        refuse_half(_SIGMAS, present, where=where, what="errors")
+        refuse_half(_NOMINAL, present, where=where, what="nominal positions")
         names_of = {**_CODES, "source": "sources"}
         for name, labels in names_of.items():
             codes = getattr(self, name)
@@ -277,21 +259,9 @@ class MatchTable:
                 where=self._where(bad, "star"),
                 do="number the reference stars from 0",
             )
-        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
-            values = getattr(self, name)
-            if values is None:
-                continue
-            good = np.isfinite(values)
-            if name in _SIGMAS:
-                good &= values > 0
-            if not good.all():
-                bad = int(np.argmin(good))
-                must = "finite and positive" if name in _SIGMAS else "finite"
-                raise InputError(
-                    f"value is {values[bad]:g}, and must be {must}",
-                    where=self._where(bad, name),
-                    do="correct the row or drop it",
-                )
+        numbers = {name: getattr(self, name) for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL)}
+        given = {name: values for name, values in numbers.items() if values is not None}
+        check_values(given, place=self._where, positive=_SIGMAS)
 
     def _check_duplicates(self) -> None:
         keys = [getattr(self, k) for k in (*_POSITIONS, *_CODES)]

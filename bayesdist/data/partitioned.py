@@ -19,15 +19,11 @@ from numpy.typing import NDArray
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.parquet_files import describe_part
 from bayesdist.data.parts import MatchPart, Whole, match_part, scan, tangent_point_of
 from bayesdist.data.pieces import PIECE, Piece, even_edges, every_kth
-from bayesdist.data.readers import (
-    check_sigma,
-    exposure_names,
-    input_files,
-    refuse_missing_errors,
-)
+from bayesdist.data.reading.formats import exposure_names, input_files
+from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
+from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 
 __all__ = ["PartPiece", "PartitionedMatches", "open_matches"]
@@ -220,7 +216,7 @@ class PartitionedMatches:
     @property
     def has_epoch(self) -> bool:
         """Whether the stars have epochs."""
-        return "epoch" in self.parts[0].found or self.parts[0].epoch is not None
+        return "epoch" in self.parts[0].found or self.parts[0].options.epoch is not None
 
     @property
     def has_mag(self) -> bool:
@@ -397,26 +393,15 @@ def _spans(group_rows: Sequence[int]) -> list[tuple[int, int]]:
     return out
 
 
-def open_matches(
-    path: PathLike | Sequence[PathLike],
-    *,
-    columns: Mapping[str, str] | None = None,
-    unit: str | None = None,
-    sigma: str | float = "columns",
-    pixel_origin: int | None = None,
-    tangent_point: tuple[float, float] | None = None,
-    epoch: float | str | None = None,
-    catalogue_epoch: float | None = None,
-    chips: Mapping[str, int] | None = None,
-) -> PartitionedMatches:
+def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> PartitionedMatches:
     """Matched star positions that stay on disk.
 
     Parameters
     ----------
     path : path-like or sequence of path-like
         Parquet: a file, a list of files, a pattern, or a folder of parts of one table.
-    columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips
-        As `read_matches`; a row with a missing value is refused.
+    **options
+        As `ReadOptions`; a row with a missing value, or one that is not finite, is refused.
 
     Returns
     -------
@@ -429,7 +414,13 @@ def open_matches(
         For all that is wrong with a file or an option, in one sentence.  All files must have the
         same quantities; one of them may be empty.
     """
-    check_sigma(sigma)
+    given = ReadOptions(**options)
+    if given.not_finite == "reject":
+        raise InputError(
+            "rows of tables on disk cannot be left out in reading",
+            where="data.not_finite",
+            do="write the table without them",
+        )
     files = input_files(path)
     for file in files:
         if file.suffix.lower() != ".parquet":
@@ -443,26 +434,18 @@ def open_matches(
     if not in_parts and len(files) > 1:
         names = exposure_names(files)
     parts = tuple(
-        match_part(
-            describe_part(file),
-            columns,
-            unit=unit,
-            read_sigma=sigma == "columns",
-            pixel_origin=pixel_origin,
-            tangent_point=tangent_point,
-            exposure_name=name,
-            epoch=epoch,
-            catalogue_epoch=catalogue_epoch,
-            chips=chips,
-        )
+        match_part(describe_part(file), given, exposure_name=name)
         for file, name in zip(files, names, strict=True)
     )
     _refuse_differences(parts)
     first = parts[0]
+    sigma = given.sigma
     refuse_missing_errors(sigma, _has_errors(first), "mag" in first.found, where=first.source)
-    if first.on_sky and tangent_point is None:
+    if first.on_sky and given.tangent_point is None:
         point = tangent_point_of(parts)
-        parts = tuple(replace(one, tangent_point=point) for one in parts)
+        parts = tuple(
+            replace(one, options=replace(one.options, tangent_point=point)) for one in parts
+        )
     errors = None if isinstance(sigma, str) else (float(sigma), float(sigma))
     return PartitionedMatches(scan(parts), parts, errors)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -11,20 +11,21 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import (
+from bayesdist.data.reading.columns import (
+    columns_read,
     match_columns,
-    needed_columns,
     nominal_columns,
     plane_unit,
     position_unit,
 )
-from bayesdist.data.duplicates import buckets_for, first_repetition
-from bayesdist.data.parquet_files import ParquetPart, RowBlock
-from bayesdist.data.quantities import Quantities
-from bayesdist.data.sky import sky_columns
-from bayesdist.data.tangent import direction_of, direction_sum
-from bayesdist.data.usual_names import origin_of
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.sky.positions import sky_columns
+from bayesdist.data.sky.tangent import direction_of, direction_sum
+from bayesdist.data.tables.checks import refuse_half
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.parquet import ParquetPart, RowBlock
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.repeated import buckets_for, first_repetition
 from bayesdist.errors import InputError
 
 __all__ = ["MatchPart", "Whole", "match_part", "scan", "tangent_point_of"]
@@ -49,10 +50,8 @@ class MatchPart:
         Of u and v.
     exposure_name : str or None
         Name of the one exposure, where there is no column of them.
-    pixel_origin : int
-    tangent_point : tuple of float or None
-    epoch, catalogue_epoch, chips
-        As `matches_from_table`.
+    options : ReadOptions
+        With the origin of the pixels, and the tangent point once it is known.
     notes : tuple of str
         What was found out about the file, as clauses.
     """
@@ -61,11 +60,7 @@ class MatchPart:
     found: Mapping[str, str]
     unit: str
     exposure_name: str | None
-    pixel_origin: int
-    tangent_point: tuple[float, float] | None
-    epoch: float | str | None = None
-    catalogue_epoch: float | None = None
-    chips: Mapping[str, int] | None = None
+    options: ReadOptions
     notes: tuple[str, ...] = ()
 
     @property
@@ -109,16 +104,10 @@ class MatchPart:
         encoded = {found[key] for key in _LABELS if key in found}
         encoded |= {found["epoch"]} & self.part.texts if "epoch" in found else set()
         columns = list(dict.fromkeys(found.values()))
+        # names of chips alone have no numbers before all are known
+        options = replace(self.options, unit=self.unit, chips=self.options.chips or {})
         for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
-            out = match_columns(
-                self._quantities(block, found),
-                unit=self.unit,
-                pixel_origin=self.pixel_origin,
-                tangent_point=self.tangent_point,
-                epoch=self.epoch,
-                catalogue_epoch=self.catalogue_epoch,
-                chips=self.chips or {},  # names alone have no numbers before all are known
-            )
+            out = match_columns(self._quantities(block, found), options)
             for key, labels in _LABELS.items():
                 if key not in found:
                     own = self.exposure_name if key == "exposure" else None
@@ -141,71 +130,28 @@ class MatchPart:
 
 def match_part(
     part: ParquetPart,
-    columns: Mapping[str, str] | None,
+    options: ReadOptions,
     *,
-    unit: str | None,
-    read_sigma: bool,
-    pixel_origin: int | None,
-    tangent_point: tuple[float, float] | None,
     exposure_name: str | None,
-    epoch: float | str | None = None,
-    catalogue_epoch: float | None = None,
-    chips: Mapping[str, int] | None = None,
 ) -> MatchPart:
     """What a file holds, by the names and units of its columns alone.
 
-    Parameters
-    ----------
-    part : ParquetPart
-    columns, unit, read_sigma, pixel_origin, tangent_point, exposure_name, epoch, catalogue_epoch
-    chips
-        As `matches_from_table`.
-
-    Returns
-    -------
-    MatchPart
-
-    Raises
-    ------
-    InputError
-        For missing columns and units.
+    Missing columns and units are refused.
     """
     source = str(part.path)
-    found = needed_columns(part.colnames, columns, source=source, read_sigma=read_sigma)
+    found, options, notes = columns_read(part.colnames, {}, options, source=source)
     found.pop("flux", None)  # magnitudes of all rows or of none: that takes all of them
-    notes: tuple[str, ...] = ()
-    if pixel_origin is None:
-        pixel_origin, why = origin_of(found["x"], part.colnames, {})
-        notes = (f"the first pixel is taken as {pixel_origin}: {why}",) if why else ()
-    if "sigma_u" in found or "sigma_v" in found:
-        for key in ("sigma_u", "sigma_v"):
-            if key not in found:
-                raise InputError(
-                    f"column {key!r} is missing beside its partner",
-                    where=source,
-                    do="give both errors or neither",
-                )
-    nominal_columns(found, source=source, tangent_point=tangent_point)
+    refuse_half(("sigma_u", "sigma_v"), found, where=source, what="errors")
+    nominal_columns(found, source=source, tangent_point=options.tangent_point)
     if "ra" in found:
-        own = plane_unit(unit, source=source)
+        own = plane_unit(options.unit, source=source)
     else:
         u, v = (
             SourceColumn(Column([], unit=part.units.get(found[key])), source, found[key])
             for key in ("u", "v")
         )
-        own = position_unit((u, v), unit)
-    return MatchPart(
-        part,
-        found,
-        own,
-        exposure_name,
-        pixel_origin,
-        tangent_point,
-        epoch,
-        catalogue_epoch,
-        chips,
-        notes,
-    )
+        own = position_unit((u, v), options.unit)
+    return MatchPart(part, found, own, exposure_name, options, notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,7 +283,7 @@ def scan(parts: Sequence[MatchPart]) -> Whole:
         filter_names=tuple(rows.numbers["filter"]),
         sources=tuple(one.source for one in parts),
         n_rows=n_rows,
-        tangent_point=parts[0].tangent_point,
+        tangent_point=parts[0].options.tangent_point,
     )
 
 

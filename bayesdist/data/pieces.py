@@ -52,13 +52,7 @@ def even_edges(n: int, most: int) -> list[int]:
 
 
 def every_kth(n_rows: int, n: int) -> int:
-    """Step between the rows of a sample of at most `n` out of `n_rows` rows.
-
-    Raises
-    ------
-    InputError
-        For a sample of less than one row.
-    """
+    """The smallest k for which every k-th of `n_rows` rows makes no more than n."""
     if n < 1:
         raise InputError(f"a sample of {n} rows is asked for", do="ask for at least one")
     return max(1, -(-n_rows // n))

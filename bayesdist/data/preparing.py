@@ -16,7 +16,8 @@ __all__ = ["centroid_errors", "neutralise_aberration", "with_centroid_errors"]
 
 Float = NDArray[np.float64]
 
-LEAST_SHARE = 0.25  # of the total scatter that is the centroid's, whatever the catalogue quotes
+# of the total scatter that is the centroid's, whatever the catalogue quotes
+MIN_CENTROID_FRACTION = 0.25
 
 
 def with_centroid_errors(table: MatchTable, errors: MagnitudeErrors) -> MatchTable:
@@ -82,7 +83,7 @@ def centroid_errors(table: MatchTable, total: MagnitudeErrors) -> MagnitudeError
                 for k in range(len(total.mag))
             ]
         )
-        left.append(np.sqrt(np.maximum(sigma**2 - known**2, (LEAST_SHARE * sigma) ** 2)))
+        left.append(np.sqrt(np.maximum(sigma**2 - known**2, (MIN_CENTROID_FRACTION * sigma) ** 2)))
     return replace(total, sigma_u=left[0], sigma_v=left[1])
 
 

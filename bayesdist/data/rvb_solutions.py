@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.data.naming import find_columns
 from bayesdist.data.rvb_files import RVB_ALIASES
 from bayesdist.data.rvb_transform import PARAMETERS, RvbTransform
-from bayesdist.data.tables import read_table
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 
 __all__ = ["SOLUTION_ALIASES", "read_solutions"]

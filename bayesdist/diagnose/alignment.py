@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.tangent import mean_direction, tangent_plane
+from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.errors import DegenerateError, InputError
 
 __all__ = ["Alignment", "PixelToSky", "alignment_residuals"]

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import poisson
 
-from bayesdist.data.frame_stars import FrameStars, pairs_in_frames
+from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.matches import MatchTable
+from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
@@ -76,17 +77,25 @@ class Field:
         step = self.positions(now, self.grid) - self.positions(before, self.grid)
         return float(np.hypot(*step.T).max())
 
+    def _paired(self, position: Float, radius: Float) -> tuple[Int, Int]:
+        """Rows of detections (n,) and reference stars (n,) that are each other's nearest."""
+        stars, others = self.detections, self.reference
+        index, partner, _ = mutual_pairs(
+            position, others.points, radius, frame=stars.frame, reference_frame=others.frame
+        )
+        return index, partner
+
     def match(self, theta: Float | None, rule: RadialLimit, number: int) -> Believed:
         """Pairs where more are found than chance gives."""
         stars, n_bins = self.detections, self.bins**2
         position = self.positions(theta, stars)
         radius = rule.at(stars.x, stars.y, self.size)
-        index, partner = pairs_in_frames(position, stars.frame, self.reference, radius)
+        index, partner = self._paired(position, radius)
         # displaced by more than the detector is distorted, detections find strangers only
         chance = np.zeros(n_bins)
         for direction in _DIRECTIONS:
             moved = position + DISPLACED * rule.corner * np.array(direction)
-            strangers, _ = pairs_in_frames(moved, stars.frame, self.reference, radius)
+            strangers, _ = self._paired(moved, radius)
             chance += np.bincount(self.code[strangers], minlength=n_bins) / len(_DIRECTIONS)
         count = np.bincount(self.code[index], minlength=n_bins)
         there = np.bincount(self.code, minlength=n_bins)

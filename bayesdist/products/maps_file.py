@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.assess import AreaMap, UncertaintyMap
 from bayesdist.assess.maps import RELATIVE
-from bayesdist.data import atomic_path
+from bayesdist.files import atomic_path
 
 __all__ = ["write_maps"]
 

@@ -15,8 +15,8 @@ from typing import Any
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.orientation import oriented
 from bayesdist.calibration.plane import Orientation
-from bayesdist.data.files import made_folder
 from bayesdist.errors import InputError
+from bayesdist.files import made_folder
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.idctab.build import build_idctab
 from bayesdist.products.formats.idctab.drift import Loss, storable

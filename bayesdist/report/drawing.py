@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from bayesdist.data.files import atomic_path, made_folder
+from bayesdist.files import atomic_path, made_folder
 from bayesdist.report.registry import Item, Plot, Registry
 from bayesdist.report.style import figure_style, plain_ticks
 

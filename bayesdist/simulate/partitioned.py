@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.pieces import even_edges
-from bayesdist.data.writing import write_partitioned
+from bayesdist.data.write import write_partitioned
 from bayesdist.simulate.matches import Truth
 from bayesdist.simulate.wise import SAMPLE_SIZES, simulate_wise
 

@@ -9,7 +9,7 @@ from astropy.table import Table
 from bayesdist.app.campaign import series
 from bayesdist.app.campaign.table_file import read_tables
 from bayesdist.data import read_exposures, read_matches
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid
 from bayesdist.infer.nodes.sums import interpolation

@@ -15,7 +15,7 @@ from bayesdist.app.campaign.soundness import frames_not_set, shear_doubts
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
 from bayesdist.data import MatchTable
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import fit_linear, load_fit
 from bayesdist.model import Chip, DistortionModel

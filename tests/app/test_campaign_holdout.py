@@ -14,7 +14,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.assess import _assess_holdout
 from bayesdist.data import read_matches
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 
 N, LATER = 14, 3  # exposures, and how many of them the release does not see

@@ -14,7 +14,7 @@ from scipy.stats import norm
 from bayesdist.app import star_files
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.data import pieces, read_matches
-from bayesdist.data.tables import parquet_units
+from bayesdist.data.tables.files import parquet_units
 from bayesdist.infer import load_fit, load_posterior
 from tests.app.support import begin_stagewise, good, snapshot, summary_of, write_job
 

@@ -9,7 +9,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from scipy import stats
 
-from bayesdist.data.campaign import match_campaign
+from bayesdist.data.matching.campaign import match_campaign
 from bayesdist.data.motions import derive_motions
 from bayesdist.data.starlists import StarCuts
 from bayesdist.errors import InputError

@@ -12,7 +12,7 @@ from bayesdist.app.cli import main
 from bayesdist.data import read_catalog
 from bayesdist.data.exposures import read_exposures
 from bayesdist.data.starlists import StarCuts, read_star_lists
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from bayesdist.errors import InputError
 from bayesdist.simulate.acs import read_acs, simulate_acs, write_acs
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.data.frame_stars import FrameStars, pairs_in_frames
+from bayesdist.data.frame_stars import FrameStars
+from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError
 from bayesdist.infer.bringup import bring_up
@@ -128,8 +129,9 @@ def test_few_pairs_in_the_corners_at_first(scene):
     """With no model, in a band of the detector's corners against its centre."""
     x, y = scene.detections.x, scene.detections.y
     radius = RULE.at(x, y, (1016.0, 1016.0))
-    index, partner = pairs_in_frames(
-        scene.detections.points, scene.detections.frame, scene.reference, radius
+    stars, others = scene.detections, scene.reference
+    index, partner, _ = mutual_pairs(
+        stars.points, others.points, radius, frame=stars.frame, reference_frame=others.frame
     )
     true = np.zeros(len(x), bool)
     true[index] = scene.partner[index] == partner
@@ -148,7 +150,7 @@ def test_the_number_of_false_pairs_is_foretold(scene, ups):
         assert abs(false - expected) < 4 * np.sqrt(expected) + expected / 3
 
 
-def test_pairs_in_frames_by_brute_force():
+def test_mutual_pairs_in_frames_by_brute_force():
     rng = np.random.default_rng(3)
     n, m = 80, 120
     stars = FrameStars(*rng.uniform(0, 20, (2, n)), np.ones(n), rng.integers(3, size=n))
@@ -158,7 +160,10 @@ def test_pairs_in_frames_by_brute_force():
     d[stars.frame[:, None] != others.frame] = np.inf
     near, back = d.argmin(axis=1), d.argmin(axis=0)
     expected = [(k, near[k]) for k in range(n) if back[near[k]] == k and d[k, near[k]] <= radius[k]]
-    index, partner = pairs_in_frames(stars.points, stars.frame, others, radius)
+    index, partner, distance = mutual_pairs(
+        stars.points, others.points, radius, frame=stars.frame, reference_frame=others.frame
+    )
+    np.testing.assert_allclose(distance, d[index, partner])
     assert len(expected) > 20
     assert sorted(zip(index, partner, strict=True)) == expected
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.config import ReleaseBlock
 from bayesdist.app.campaign.inputs import cuts_of
 from bayesdist.data import StarList
-from bayesdist.data.campaign_faults import check_campaign
+from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.infer.catalogue.catalogue_shear import one_roll_angle
 from bayesdist.model import Chip, TimeDependence

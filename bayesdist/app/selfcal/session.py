@@ -31,7 +31,7 @@ from bayesdist.assess.maps import with_local
 from bayesdist.assess.solution import Solution as Assessed
 from bayesdist.data import MagnitudeErrors, MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
-from bayesdist.data.parallax import parallax_factors
+from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.diagnose import ScoreTest
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.selfcal.misfit import dithered_misfit

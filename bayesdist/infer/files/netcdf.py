@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import FormatError
+from bayesdist.files import atomic_path
 
 if TYPE_CHECKING:
     import xarray as xr

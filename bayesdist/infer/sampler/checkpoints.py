@@ -10,8 +10,8 @@ from typing import Any
 import h5py
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 
 __all__ = ["new_hdf5", "read_arrays", "write_arrays"]
 

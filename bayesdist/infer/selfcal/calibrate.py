@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.friends import Friends, friends_of_friends
+from bayesdist.data.matching.friends import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
 from bayesdist.infer.selfcal.errors import scatter_by_magnitude
 from bayesdist.infer.selfcal.gauge import Gauge

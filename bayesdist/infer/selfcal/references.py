@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.linear_map import LEAST, LinearMap, iterated_map
+from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 
@@ -97,7 +97,7 @@ class ReferenceStars:
         distance, nearest = tree.query(moved, distance_upper_bound=radius)
         near = np.isfinite(distance)
         limit = FAR * max(float(np.median(distance[near])), CLOSE * radius) if near.any() else 0.0
-        if near.sum() > LEAST:
+        if near.sum() > MIN_PAIRS:
             near &= distance <= limit
         # of two stars the nearer one
         order = np.flatnonzero(near)[np.argsort(distance[near], kind="stable")]

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from bayesdist.data.linear_map import LinearMap
-from bayesdist.data.mutual import MutualFrames
+from bayesdist.data.matching.frames import MutualFrames
+from bayesdist.data.matching.linear_map import LinearMap
 from bayesdist.model import Chip, DistortionModel, PolynomialBasis
 
 __all__ = ["chips_side_by_side", "fitted_polynomials", "start_parameters", "undistorted"]

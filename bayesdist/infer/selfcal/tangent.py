@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.tangent import ARCSEC
+from bayesdist.data.sky.tangent import ARCSEC
 from bayesdist.model import DistortionModel
 
 __all__ = ["TangentPlane", "places_of"]

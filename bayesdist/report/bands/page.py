@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from bayesdist.data.files import atomic_path
+from bayesdist.files import atomic_path
 
 # importing them registers what the page shows
 from bayesdist.report.bands import curves, figures, findings, tables  # noqa: F401

@@ -9,10 +9,10 @@ import numpy as np
 
 from bayesdist.data import ReferenceCatalog, read_catalog
 from bayesdist.data.exposures import read_exposures, write_exposures
-from bayesdist.data.files import atomic_path, made_folder
-from bayesdist.data.parquet_write import write_columns
 from bayesdist.data.starlists import read_star_lists
+from bayesdist.data.write import write_columns
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path, made_folder
 from bayesdist.simulate.acs.campaign import AcsCampaign
 from bayesdist.simulate.acs.truth_files import read_truth, write_truth
 

@@ -16,8 +16,8 @@ from astropy.coordinates import get_body_barycentric
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from bayesdist.data.aberration import velocity_aberration
 from bayesdist.data.exposures import Exposure, ExposureLog
+from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.simulate.acs.distortion import SM4
 from bayesdist.simulate.acs.stars import CENTRE
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data import atomic_path
 from bayesdist.data.exposures import ExposureLog
-from bayesdist.data.parquet_write import write_columns
-from bayesdist.data.tables import naming_faults, read_table
+from bayesdist.data.tables.files import naming_faults, read_table
+from bayesdist.data.write import write_columns
+from bayesdist.files import atomic_path
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable
 from bayesdist.simulate.acs.pointings import AcsFrames

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.files import atomic_path, made_folder
-from bayesdist.data.parquet_write import write_columns
+from bayesdist.data.write import write_columns
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path, made_folder
 from bayesdist.simulate.wise.sets import PairChunk, WiseSet
 
 __all__ = ["write_wise_set"]

@@ -24,8 +24,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import BayesdistError, FormatError, InputError
+from bayesdist.files import atomic_path
 from bayesdist.products.formats.common.cards import card_images, header_of
 
 __all__ = ["Content", "Hdu", "hdus_of", "read_content", "read_hdus", "readable", "write_hdus"]

@@ -7,7 +7,7 @@ import os
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.data.files import atomic_path
+from bayesdist.files import atomic_path
 from bayesdist.products.formats.common.cards import header_of, keyword_of, number_card, text_card
 from bayesdist.products.formats.common.coefficients import sip_keyword, sip_powers
 from bayesdist.products.formats.sip.header import SipHeader

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.coefficients import largest_magnitude, sip_keyword
 from bayesdist.products.formats.sip.families import EDGE, families, offset_ranges

@@ -1,0 +1,1 @@
+"""Detections to reference stars: recognised by patterns, mapped, paired, judged against chance."""
