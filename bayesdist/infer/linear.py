@@ -19,6 +19,7 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import NormalEquations, least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.rank import check_coverage, require_full_rank
+from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
@@ -137,12 +138,7 @@ class LinearFit:
 
     @cached_property
     def _root(self) -> Float:
-        scale = self.sigma
-        free = np.flatnonzero(scale > 0)  # what a gauge holds has no error
-        out = np.zeros_like(self.cov)
-        inner = self.cov[np.ix_(free, free)] / np.outer(scale[free], scale[free])
-        out[np.ix_(free, free)] = np.linalg.cholesky(inner) * scale[free, None]
-        return out
+        return scaled_cholesky(self.cov)  # what a gauge holds has no error
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors from the Gaussian with this mean and covariance.

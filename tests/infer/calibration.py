@@ -9,6 +9,8 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 from tests.seeds import over
 
+from .support import draw_prior
+
 LEVELS = (0.683, 0.954)
 SIZE = (1016.0, 1016.0)
 PLACES = np.array(
@@ -69,7 +71,7 @@ def ranks_of(seed: int) -> dict[str, float]:
     n = 300
     sigma = _errors(n, rng)
     hyper = OutlierMixture().bind(float(np.median(np.concatenate(sigma))))
-    true = {k: float(v) for k, v in hyper.values(hyper.draw_prior(1, rng)[0]).items()}
+    true = {k: float(v) for k, v in hyper.values(draw_prior(hyper, 1, rng)[0]).items()}
     matches, _ = simulate_matches(
         model,
         theta,

@@ -18,7 +18,6 @@ from bayesdist.infer import (
     load_fit,
     load_posterior,
     memberships,
-    outlier_probability,
     sample,
     save_fit,
     save_posterior,
@@ -117,7 +116,7 @@ def test_xarray_opens_it(written):
         constants = tree["constant_data"]
         np.testing.assert_array_equal(constants["sigma_u"], matches.sigma_u)
         np.testing.assert_array_equal(constants["chip"], matches.chip_number)
-        p = outlier_probability(posterior, matches)
+        p = memberships(posterior, matches).outlier_probability
         np.testing.assert_array_equal(constants["outlier_probability"], p)
         assert constants.attrs["unit"] == "pix"
         assert json.loads(tree.attrs["provenance"]) == {"seed": 8, "inputs": ["a.ecsv"]}

@@ -17,15 +17,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.recoloured import Recoloured
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.transforms import Solution
 
-__all__ = ["StarCovariance", "star_covariance", "with_star_errors"]
+__all__ = ["StarCovariance", "star_covariance"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -58,24 +57,7 @@ class StarCovariance:
         return self.total - self.counted
 
 
-def with_star_errors(solution: Solution, stars: StarCovariance) -> Recoloured:
-    """A solution whose covariance and draws know that a star has one error.
-
-    Parameters
-    ----------
-    solution : Solution
-        The one that `star_covariance` was asked for.  Views are made of the result, not before.
-    stars : StarCovariance
-
-    Returns
-    -------
-    Recoloured
-    """
-    return Recoloured(solution, np.asarray(solution.cov) + stars.extra)
-
-
-# a second BLAS thread gains little here and loses much on a machine that has other work
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def star_covariance(
     solution: Solution,
     matches: MatchTable,

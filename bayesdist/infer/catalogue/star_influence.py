@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
 
 __all__ = ["StarErrors", "StarInfluence", "star_influence"]
@@ -93,7 +93,7 @@ class StarInfluence:
         return out
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def star_influence(
     fit: LinearFit, matches: MatchTable, errors: StarErrors, codes: Int
 ) -> StarInfluence:

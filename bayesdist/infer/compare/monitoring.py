@@ -20,8 +20,8 @@ from bayesdist.errors import InputError
 from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.equations.field_test import FieldTest, field_test
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.stars.mixture import OutlierMixture
@@ -290,7 +290,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
         cov=projector @ cov @ projector.T,
         released_cov=released_cov,
         taken=taken,
-        test=field_test(rest, cov, taken, norm, draws=draws / max(share, 1e-3) ** 2),
+        test=chi_square(rest, cov, without=taken, norm=norm, draws=draws / max(share, 1e-3) ** 2),
         frame=(M, d),
     )
 

@@ -22,10 +22,10 @@ from bayesdist.errors import InputError
 from bayesdist.infer.compare.positions import (
     DifferenceField,
     PositionChange,
-    chi_square_of,
     difference_field,
     largest_difference,
 )
+from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["CoefficientChange", "PeriodComparison"]
@@ -91,11 +91,6 @@ class PeriodComparison:
     def combined(self) -> Float:
         """Parameters (D,) of the model of all periods."""
         return np.einsum("pij,pj->i", self.shares, self.means)
-
-    @cached_property
-    def combined_cov(self) -> Float:
-        """Covariance (D, D) of the combined model."""
-        return _covariance(self.shares, self.covs, self.shares)
 
     def _code(self, period: str) -> int:
         if period not in self.names:
@@ -168,10 +163,10 @@ class PeriodComparison:
             difference, cov = to_monomials @ difference, to_monomials @ cov @ to_monomials.T
         return CoefficientChange(self.model.names, difference, np.sqrt(np.diag(cov)))
 
-    def joint(self, period: str, against: str | None = None) -> tuple[float, int, float]:
-        """Chi-square of all coefficients together, its degrees of freedom, and its probability."""
+    def joint(self, period: str, against: str | None = None) -> FieldTest:
+        """Chi-square of all coefficients together."""
         difference, cov = self.difference(period, against)
-        return chi_square_of(difference, cov)
+        return chi_square(difference, cov)
 
     def positions(
         self,
@@ -229,8 +224,8 @@ class PeriodComparison:
         return difference_field(self.model, *self.difference(period, against), chip, grid)
 
     @cached_property
-    def homogeneity(self) -> tuple[float, int, float]:
-        """Chi-square that all periods have one model, its degrees of freedom, its probability.
+    def homogeneity(self) -> FieldTest:
+        """Chi-square of the periods about one model for all.
 
         Of the differences of all periods but one from the combined model, with their joint
         covariance: the last one follows from them.
@@ -240,7 +235,7 @@ class PeriodComparison:
             [[_covariance(one, self.covs, other) for other in contrasts] for one in contrasts]
         )
         differences = np.concatenate([self.difference(name)[0] for name in self.names[:-1]])
-        return chi_square_of(differences, cov)
+        return chi_square(differences, cov)
 
 
 def _covariance(one: Float, covs: Float, other: Float) -> Float:

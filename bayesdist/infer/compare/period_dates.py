@@ -18,7 +18,7 @@ MOST_MJD = 2e6  # some five thousand years: calendars end not far beyond
 
 
 def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
-    """Periods of some days about Modified Julian Dates, for `period_sums`.
+    """Periods of some days about Modified Julian Dates, for `sum_by_period`.
 
     Parameters
     ----------

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from bayesdist.data import MatchTable
 from bayesdist.errors import DegenerateError, InputError
@@ -21,15 +19,15 @@ from bayesdist.infer.compare.period_changes import PeriodComparison
 from bayesdist.infer.compare.period_dates import Periods, check_periods
 from bayesdist.infer.equations.normal import NormalEquations, least_squares
 from bayesdist.infer.equations.rank import require_full_rank
+from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.shards import Matches
-from bayesdist.infer.stars.stars import Stars, prepare
+from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel
 
 __all__ = [
     "PeriodSums",
     "compare_periods",
-    "period_sums",
     "sum_by_period",
     "sums_of_stars",
 ]
@@ -109,49 +107,16 @@ def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable
     return {name: sums[name] for name in periods}
 
 
-def period_sums(
-    fit: LinearFit, matches: Matches, periods: Periods, *, radial_weight: float = 1.0
-) -> dict[str, PeriodSums]:
-    """Sums over the pairs of each period.
-
-    Parameters
-    ----------
-    fit : LinearFit
-        Of all data: its model, and its rule for leaving pairs out, which is then one for all.
-    matches : MatchTable or PartitionedMatches
-        With errors and epochs.
-    periods : mapping of str to tuple of float
-        As `sum_by_period`.
-    radial_weight : float
-        As the fit's.
-
-    Returns
-    -------
-    dict of str to PeriodSums
-
-    Raises
-    ------
-    InputError
-        As `sum_by_period`, and for a model with frames or time dependence.
-    """
-    _check_model(fit.model)
-    task = partial(_sums_of, fit=fit, radial_weight=radial_weight)
-    out: dict[str, PeriodSums] = sum_by_period(matches, periods, task)
-    return out
-
-
-def _sums_of(matches: MatchTable, *, fit: LinearFit, radial_weight: float) -> PeriodSums:
-    return sums_of_stars(prepare(fit.model, matches)[0], fit, radial_weight)
-
-
 def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:
-    """What some pairs of one period say.
+    """Sums over some pairs of one period.
 
     Parameters
     ----------
     stars : Stars
-    fit, radial_weight
-        As `period_sums`.
+    fit : LinearFit
+        Of all data: its model, and its rule for leaving pairs out, which is then one for all.
+    radial_weight : float
+        As the fit's.
 
     Returns
     -------
@@ -182,7 +147,7 @@ def compare_periods(
     Parameters
     ----------
     fit : LinearFit
-        That `period_sums` was given.
+        Of all data, as `sums_of_stars` was given.
     sums : mapping of str to PeriodSums
         Two or more periods.  Together they are the combined data set, of which `fit` need not be
         the fit: where pairs lie outside all periods it is not.
@@ -223,7 +188,7 @@ def compare_periods(
                 do="give longer periods or lower model.order",
             ) from error
         normal = arrow.dense()
-        inverse = _inverse(normal)
+        inverse = scaled_inverse(normal)
         rights.append(right)
         steps.append(inverse @ right)
         if one.squares is not None:
@@ -232,7 +197,7 @@ def compare_periods(
         else:
             covs.append(inverse)
         normals.append(normal)
-    all_inverse = _inverse(np.sum(normals, axis=0))
+    all_inverse = scaled_inverse(np.sum(normals, axis=0))
     shares = np.array([all_inverse @ normal for normal in normals])
     scale = _error_scale(sums.values(), rights, steps) if rescale else 1.0
     return PeriodComparison(
@@ -244,13 +209,6 @@ def compare_periods(
         counts=tuple(one.n for one in sums.values()),
         error_scale=scale,
     )
-
-
-def _inverse(normal: Float) -> Float:
-    """Inverse of a normal matrix, scaled to unit diagonal on the way."""
-    scale = np.sqrt(np.diag(normal))
-    unit = cho_solve(cho_factor(normal / np.outer(scale, scale)), np.eye(len(normal)))
-    return np.asarray(unit / np.outer(scale, scale))
 
 
 def _error_scale(

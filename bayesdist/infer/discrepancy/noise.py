@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.information import Information
+from bayesdist.infer.equations.scaled import scaled_inverse
 
 __all__ = ["not_narrower", "score_excess", "shrunk_ratios"]
 
@@ -57,14 +58,9 @@ def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
     Quoted errors that are too large are the user's statement: residuals cannot tell them from
     matches that were cut.
     """
-    D = len(formal)
     # a little of the formal one, so that no direction is without variance
     noise = 0.99 * noise + 0.01 * formal
-    scale = np.sqrt(np.diag(formal))
-    ratio = float(
-        np.trace(np.linalg.solve(formal / np.outer(scale, scale), noise / np.outer(scale, scale)))
-    )
-    ratio /= D
+    ratio = float(np.sum(scaled_inverse(formal) * noise)) / len(formal)
     return noise * max(1.0, 1 / ratio), ratio
 
 

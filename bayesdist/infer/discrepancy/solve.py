@@ -9,7 +9,6 @@ from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_side
@@ -23,6 +22,7 @@ from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_stars
 from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.stars.likelihood import Scores, scores_of
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
@@ -38,8 +38,7 @@ DRAWS = 2000
 POINTS = 12  # on each axis
 
 
-# a second BLAS thread gains little here and loses much on a machine that has other work
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def estimate_discrepancy(
     matches: Matches | Shards,
     solution: Solution,

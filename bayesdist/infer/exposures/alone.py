@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.transforms import (
     LinearTerms,
@@ -111,8 +111,7 @@ class ExposureSolutions:
         return self.epoch, np.array([t.values for t in some]), np.array([t.cov for t in some])
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_exposures(
     matches: MatchTable,
     model: DistortionModel,

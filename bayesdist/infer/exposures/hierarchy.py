@@ -26,12 +26,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.exposures.scatter import Scatter
 from bayesdist.infer.linear import Clip, LinearFit, fit_linear
@@ -150,7 +150,7 @@ class HierarchicalFit:
         """Posterior standard deviation of theta, shape (D,)."""
         return np.asarray(np.sqrt(np.diag(self.cov)))
 
-    @threadpool_limits.wrap(limits=1, user_api="blas")
+    @one_thread
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors (n, D): each with a tau of its own, and theta drawn with it."""
         which = np.sort(rng.integers(len(self.tau_draws), size=n))
@@ -245,8 +245,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
     return replace(model, gauge="held", held=(*gauge.shift, -gauge.rotation), origin=(0.0, 0.0))
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_hierarchical(
     matches: Matches | Shards,
     model: DistortionModel,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.density.memberships import outlier_probability, star_log_likelihood
+from bayesdist.infer.density.memberships import memberships, star_log_likelihood
 from bayesdist.infer.files import netcdf
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.sampler.convergence import Convergence, Limits
@@ -116,7 +116,7 @@ def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[n
         "sigma_v": matches.sigma_v,
         "exposure": np.asarray(matches.exposure),
         "chip": matches.chip_number,
-        "outlier_probability": outlier_probability(posterior, matches),
+        "outlier_probability": memberships(posterior, matches).outlier_probability,
         "row": matches.row,
     }
     for name in ("epoch", "mag", "colour"):

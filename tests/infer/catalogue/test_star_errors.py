@@ -13,12 +13,12 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, fit_linear
 from bayesdist.infer.catalogue import star_errors as module
-from bayesdist.infer.catalogue.star_errors import star_covariance, with_star_errors
+from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from bayesdist.infer.transforms import linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
 
-from ..small_campaign import campaign, shared_stars
+from ..small_campaign import campaign, shared_stars, with_star_errors
 from ..support import CHIP, SIZE, UNCLIPPED, columns_of, legendre_design, simulated
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -11,9 +11,9 @@ from scipy import stats
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import GaussianPriors, fit_linear
 from bayesdist.infer.exposures.alone import fit_exposures
-from bayesdist.infer.transforms import LINEAR_TERMS, in_exposure, linear_terms, reference_gauge
+from bayesdist.infer.transforms import LINEAR_TERMS, linear_terms, reference_gauge
 
-from ..small_campaign import Truth, campaign
+from ..small_campaign import Truth, campaign, seen_by
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -25,7 +25,7 @@ FREE = (
 
 def truth_of(model, theta, exposure, epoch, *labels):
     """Linear terms of one exposure, from its true parameters."""
-    view = reference_gauge(in_exposure(Truth(model, theta), exposure, epoch=epoch))
+    view = reference_gauge(seen_by(exposure, epoch, model, theta))
     return linear_terms(view).select(*labels).values
 
 
