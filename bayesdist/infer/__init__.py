@@ -6,9 +6,8 @@ from bayesdist.infer.density.memberships import Memberships, memberships
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
-from bayesdist.infer.files.fit_file import load_fit, save_fit
-from bayesdist.infer.files.posterior_file import load_posterior, save_posterior
-from bayesdist.infer.linear import LinearFit, build_model, fit_linear, residuals
+from bayesdist.infer.files import load_fit, load_posterior, save_fit, save_posterior
+from bayesdist.infer.linear import LinearFit, Rejection, build_model, fit_linear, residuals
 from bayesdist.infer.nodes import (
     TableFit,
     TablePosterior,
@@ -46,6 +45,7 @@ __all__ = [
     "OutlierMixture",
     "Posterior",
     "ReferenceGauge",
+    "Rejection",
     "SamplerInfo",
     "Shards",
     "StarCovariance",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.infer import OutlierMixture, fit_linear, sample
+from bayesdist.infer import OutlierMixture, Rejection, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 from tests.seeds import over
@@ -83,7 +83,7 @@ def ranks_of(seed: int) -> dict[str, float]:
         outlier_scale=true["s_out"],
     )
     # no rejection by absolute size: s_out from its prior may be hundreds of pixels
-    fit = fit_linear(matches, model, clip_abs=None)
+    fit = fit_linear(matches, model, rejection=Rejection(clip_abs=None))
     posterior = sample(fit, matches, seed=seed, target_ess=800)
     out = {"converged": float(posterior.convergence.converged)}
     for key, values in posterior.hyper.items():

@@ -16,6 +16,7 @@ from bayesdist.infer import (
     LinearFit,
     OutlierMixture,
     Posterior,
+    Rejection,
     SamplerInfo,
     fit_linear,
     load,
@@ -35,7 +36,7 @@ MIXTURES = {
     "uniform": (OutlierMixture("uniform", match_radius=2.0), [np.log(0.02), -3.0]),
     "none": (OutlierMixture("none"), [np.log(0.02)]),
 }
-UNCLIPPED = {"clip_chi2": np.inf, "clip_abs": None}
+UNCLIPPED = {"rejection": Rejection(np.inf, None)}
 
 
 def legendre_design(order: int, x, y, size=SIZE) -> np.ndarray:

@@ -15,6 +15,7 @@ from bayesdist.data.motions import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import pixel_shifts
 from bayesdist.infer.nodes.alternation import inside_chips, with_columns
 from bayesdist.model import corrected
@@ -187,7 +188,7 @@ def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
     numbers, left = pairs.chip_number, []
     for table in (plain, moved) if session.tables else (plain,):
         # errors are those of the centroids: beside what the tables take out, chi-square is no guide
-        fit = fit_linear(table, model, clip_chi2=np.inf, clip_abs=farthest)
+        fit = fit_linear(table, model, rejection=Rejection(np.inf, farthest))
         left.append(pixel_shifts(fit, table).shift)
     good = np.all([np.hypot(*r.T) < (farthest or np.inf) for r in left], axis=0)
     out = []

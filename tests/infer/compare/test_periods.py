@@ -9,11 +9,14 @@ from scipy.stats import kstest, ncx2
 
 from bayesdist.data import MatchTable, matches
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer import fit_linear
-from bayesdist.infer.compare.period_changes import PeriodComparison
-from bayesdist.infer.compare.period_dates import mjd_periods
+from bayesdist.infer import Rejection, fit_linear
+from bayesdist.infer.compare.period_dates import mjd_periods, sum_by_period
 from bayesdist.infer.compare.period_verdict import period_verdict
-from bayesdist.infer.compare.periods import compare_periods, sum_by_period, sums_of_stars
+from bayesdist.infer.compare.periods import (
+    PeriodComparison,
+    compare_periods,
+    sums_of_stars,
+)
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel, TimeDependence
 from tests.infer.support import CHIP, SIZE, TWO_CHIPS, UNCLIPPED, legendre_design, simulated
@@ -54,10 +57,9 @@ def combined_cov(found: PeriodComparison) -> np.ndarray:
     return (found.shares @ found.covs @ found.shares.swapaxes(1, 2)).sum(axis=0)
 
 
-def compared(table, model=MODEL, *, rescale=False, **options) -> PeriodComparison:
-    fit = fit_linear(table, model, **(UNCLIPPED | options))
-    weight = options.get("radial_weight", 1.0)
-    sums = period_sums(fit, table, PERIODS, radial_weight=weight)
+def compared(table, model=MODEL, *, rescale=False, radial_weight=1.0) -> PeriodComparison:
+    fit = fit_linear(table, model, rejection=Rejection(np.inf, None, radial_weight))
+    sums = period_sums(fit, table, PERIODS, radial_weight=radial_weight)
     return compare_periods(fit, sums, rescale=rescale)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer import GaussianPriors, fit_linear
+from bayesdist.infer import GaussianPriors, Rejection, fit_linear
 from bayesdist.infer.exposures.alone import fit_exposures
 from bayesdist.infer.transforms import LINEAR_TERMS, linear_terms, reference_gauge
 
@@ -132,7 +132,9 @@ def test_held_is_a_line_fit_to_what_the_high_orders_leave(sparse):
     """By lstsq, with the high orders turned to the roll that the fit itself found."""
     model, matches, theta = sparse
     one = matches.select(matches.exposure == 5)
-    found = fit_exposures(one, model, high_order=Truth(model, theta), clip_chi2=1e9, clip_abs=None)
+    found = fit_exposures(
+        one, model, high_order=Truth(model, theta), rejection=Rejection(1e9, None)
+    )
     known = reference_gauge(Truth(model, theta)).mean.copy()
     bare = found.views[0].model
     known[[p.i + p.j <= 1 for p in bare.parameters]] = 0.0

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, sample
+from bayesdist.infer import GaussianPriors, OutlierMixture, Rejection, fit_linear, sample
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.exposures import scatter as scatter_module
 from bayesdist.infer.exposures.alone import fit_exposures
@@ -442,7 +442,7 @@ def test_deviations_of_single_exposures_are_those_of_the_truth(some):
 def test_its_priors_are_what_sample_wants():
     """With exact errors and no outliers the posterior is the linear fit at that tau."""
     model, matches, _ = campaign(8, 4, 60, order=2, time=False)
-    found = fit_hierarchical(matches, model, clip_chi2=1e9, clip_abs=None)
+    found = fit_hierarchical(matches, model, rejection=Rejection(1e9, None))
     for kind, tau in zip(found.scatter.kinds, found.tau_draws.T, strict=True):
         k = model.names.index(f"j003.{kind}")
         assert found.priors.precision[k] == pytest.approx(1 / np.mean(tau**2))
