@@ -34,7 +34,7 @@ __all__ = ["sample"]
 Float = NDArray[np.float64]
 
 METHODS = ("exact", "certified")
-FORMAT = 2  # of the checkpoints
+FORMAT = 3  # of the checkpoints
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may give other bits
 
 
