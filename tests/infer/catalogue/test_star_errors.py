@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
-from bayesdist.infer.catalogue import star_errors as module
+from bayesdist.infer.catalogue import star_sums as module
 from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from bayesdist.infer.transforms import linear_terms, reference_gauge
