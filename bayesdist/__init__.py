@@ -40,6 +40,7 @@ _HOMES = {
         "LinearFit",
         "OutlierMixture",
         "Posterior",
+        "Rejection",
         "build_model",
         "fit_by_magnitude",
         "fit_linear",

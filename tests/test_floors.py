@@ -43,7 +43,7 @@ DOORS = {
     "dask": "infer/stars/cluster.py",
     "distributed": "infer/stars/cluster.py",
     "pyarrow": "data/",
-    "xarray": "infer/files/",
+    "xarray": "infer/files.py",
     "arviz": "infer/sampler/convergence.py",
     "matplotlib": "report/",
     "corner": "report/",

@@ -20,6 +20,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.discrepancy.storage import discrepancy_from_arrays, discrepancy_to_arrays
+from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.recoloured import with_spread
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
@@ -123,8 +124,7 @@ class RunDiscrepancy:
 
 def _least(before: Float, more: Float) -> Float:
     """What is added to a covariance, so that no direction loses more than half its variance."""
-    scale = np.sqrt(np.diag(before))
-    root = np.linalg.cholesky(before / np.outer(scale, scale)) * scale[:, None]
+    root = scaled_cholesky(before)
     white = np.linalg.solve(root, np.linalg.solve(root, more).T)
     values, vectors = np.linalg.eigh((white + white.T) / 2)
     turned = root @ vectors

@@ -30,6 +30,7 @@ from bayesdist.infer import Matches, Posterior
 from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan_dates
 from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
 from bayesdist.infer.density.memberships import count_outliers
+from bayesdist.infer.linear import Rejection
 from bayesdist.report.comparison import change_over_time, difference_vectors
 from bayesdist.report.drawing import save_figures
 
@@ -119,8 +120,7 @@ def _fitted(
     found = fit_new(
         posterior,
         matches,
-        clip_chi2=config.fit.clip_chi2,
-        clip_abs=config.fit.clip_abs,
+        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
     )
     return posterior, matches, found, ()

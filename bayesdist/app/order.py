@@ -21,6 +21,7 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.files import atomic_path
 from bayesdist.infer.compare.order import select_order
 from bayesdist.infer.compare.order_result import OrderSelection
+from bayesdist.infer.linear import Rejection
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["order"]
@@ -123,8 +124,7 @@ def _compared(session: Session, orders: Sequence[int]) -> OrderSelection:
         session.shards,
         session.model,
         orders=orders,
-        clip_chi2=config.fit.clip_chi2,
-        clip_abs=config.fit.clip_abs,
+        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
     )
 
 

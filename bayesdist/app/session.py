@@ -66,6 +66,7 @@ from bayesdist.infer import (
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
+from bayesdist.infer.linear import Rejection
 from bayesdist.model import DistortionModel
 
 Float = NDArray[np.float64]
@@ -299,9 +300,7 @@ class Session:
     def _linear(self) -> tuple[LinearFit, MagnitudeErrors | None]:
         fit = self.config.fit
         options: dict[str, Any] = {
-            "clip_chi2": fit.clip_chi2,
-            "clip_abs": fit.clip_abs,
-            "radial_weight": fit.radial_weight,
+            "rejection": Rejection(fit.clip_chi2, fit.clip_abs, fit.radial_weight),
             "priors": self.priors,
         }
         if self.config.data is not None and self.config.data.sigma == "by_magnitude":

@@ -1,15 +1,13 @@
 """From matches to knowledge: the linear fit, the outlier mixture, and its posterior."""
 
 from bayesdist.infer.catalogue.by_magnitude import fit_by_magnitude
-from bayesdist.infer.catalogue.catalogue_shear import CatalogueShear, catalogue_shear
-from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance, with_star_errors
-from bayesdist.infer.density.memberships import Memberships, memberships, outlier_probability
+from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
+from bayesdist.infer.density.memberships import Memberships, memberships
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
-from bayesdist.infer.files.fit_file import load_fit, save_fit
-from bayesdist.infer.files.posterior_file import load_posterior, save_posterior
-from bayesdist.infer.linear import LinearFit, build_model, fit_linear, residuals
+from bayesdist.infer.files import load_fit, load_posterior, save_fit, save_posterior
+from bayesdist.infer.linear import LinearFit, Rejection, build_model, fit_linear, residuals
 from bayesdist.infer.nodes import (
     TableFit,
     TablePosterior,
@@ -26,7 +24,6 @@ from bayesdist.infer.transforms import (
     LinearTerms,
     ReferenceGauge,
     View,
-    in_exposure,
     linear_terms,
     lines,
     reference_gauge,
@@ -35,7 +32,6 @@ from bayesdist.infer.transforms import (
 )
 
 __all__ = [
-    "CatalogueShear",
     "Compute",
     "Convergence",
     "ExposureSolutions",
@@ -49,6 +45,7 @@ __all__ = [
     "OutlierMixture",
     "Posterior",
     "ReferenceGauge",
+    "Rejection",
     "SamplerInfo",
     "Shards",
     "StarCovariance",
@@ -57,7 +54,6 @@ __all__ = [
     "View",
     "binned_table",
     "build_model",
-    "catalogue_shear",
     "field_table",
     "fit_by_magnitude",
     "fit_exposures",
@@ -65,14 +61,12 @@ __all__ = [
     "fit_linear",
     "fit_with_tables",
     "held_in_reference",
-    "in_exposure",
     "linear_terms",
     "lines",
     "load",
     "load_fit",
     "load_posterior",
     "memberships",
-    "outlier_probability",
     "reference_gauge",
     "residuals",
     "sample",
@@ -80,6 +74,5 @@ __all__ = [
     "save_posterior",
     "segment",
     "star_covariance",
-    "with_star_errors",
     "without_frames",
 ]

@@ -9,7 +9,6 @@ elsewhere are left out, and the polynomial's order rises as the place does.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError
 from bayesdist.infer.bringup_pairs import Field
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["BringUp", "Round", "bring_up"]
@@ -125,9 +124,7 @@ def bring_up(
     *,
     acceptance: RadialLimit,
     bins: int = 12,
-    radial_weight: float = 1.0,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
+    rejection: Rejection = DEFAULT_REJECTION,
     max_rounds: int = 30,
 ) -> BringUp:
     """Match and fit in turn until the whole detector is covered and nothing moves.
@@ -149,8 +146,8 @@ def bring_up(
         Of the first rounds.  The radius in the centre must allow for the offset there.
     bins : int
         On each axis, for the coverage.
-    radial_weight, clip_chi2, clip_abs
-        As `fit_linear`; the extra weight in the corners ends with the larger radius there.
+    rejection : Rejection
+        As of `fit_linear`; the extra weight in the corners ends with the larger radius there.
     max_rounds : int
 
     Returns
@@ -181,20 +178,15 @@ def bring_up(
     field = Field(detections, reference, model, bins)
     theta = None if start is None else np.asarray(start, float)
     rounds: list[Round] = []
-    rule, weight, order, settled = acceptance, radial_weight, min(FIRST_ORDER, model.order), False
+    rule, order, settled = acceptance, min(FIRST_ORDER, model.order), False
     while True:
         found = field.match(theta, rule, len(rounds) + 1)
         matches = field.table(found)
-        options: dict[str, Any] = {
-            "clip_chi2": clip_chi2,
-            "clip_abs": clip_abs,
-            "radial_weight": weight,
-        }
         # the last fit is that of the model itself, which refuses pairs that cover too little
         last = settled or len(rounds) + 1 >= max_rounds
         order = model.order if last else order
-        fit = fit_linear(matches, model, **options) if last else None
-        now = _partial_fit(matches, model, order, options) if fit is None else fit
+        fit = fit_linear(matches, model, rejection=rejection) if last else None
+        now = _partial_fit(matches, model, order, rejection) if fit is None else fit
         moved = field.distance(theta, _in_model(now, model))
         theta = _in_model(now, model)
         rounds.append(
@@ -219,12 +211,13 @@ def bring_up(
         grew = len(rounds) < 2 or found.coverage > rounds[-2].coverage + GROWS
         if order == model.order and not grew:
             settled = rule.corner == rule.centre and still
-            rule, weight = RadialLimit(acceptance.centre, acceptance.centre), 1.0
+            rule = RadialLimit(acceptance.centre, acceptance.centre)
+            rejection = replace(rejection, radial_weight=1.0)
         order = min(order + 1, model.order)
 
 
 def _partial_fit(
-    matches: MatchTable, model: DistortionModel, order: int, options: dict[str, Any]
+    matches: MatchTable, model: DistortionModel, order: int, rejection: Rejection
 ) -> LinearFit:
     """Fit of the part of the detector that has pairs, as if it were a detector of its own."""
     low = [max(0.0, np.floor(z.min() - 0.5)) for z in (matches.x, matches.y)]
@@ -237,7 +230,7 @@ def _partial_fit(
         (chip.reference_pixel[0] - low[0], chip.reference_pixel[1] - low[1]),
     )
     moved = replace(matches, x=matches.x - low[0], y=matches.y - low[1])
-    return fit_linear(moved, replace(model, order=order, chips=(part,)), **options)
+    return fit_linear(moved, replace(model, order=order, chips=(part,)), rejection=rejection)
 
 
 def _in_model(fit: LinearFit, model: DistortionModel) -> Float:

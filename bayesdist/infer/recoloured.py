@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.transforms import Derived, Solution
 from bayesdist.model import DistortionModel
@@ -97,9 +98,8 @@ def recolouring(before: Float, after: Float) -> Float:
         A with A before A^T = after; the identity where the two are equal, and for what is held.
     """
     free = np.flatnonzero(np.diag(before) > 0)
-    scale = np.sqrt(np.diag(before)[free])
-    unit, inner = np.outer(scale, scale), np.ix_(free, free)
-    roots = [np.linalg.cholesky(c[inner] / unit) * scale[:, None] for c in (before, after)]
+    inner = np.ix_(free, free)
+    old, new = (scaled_cholesky(cov[inner]) for cov in (before, after))
     out = np.eye(len(before))
-    out[inner] = np.linalg.solve(roots[0].T, roots[1].T).T
+    out[inner] = np.linalg.solve(old.T, new.T).T
     return out

@@ -1,4 +1,4 @@
-"""Solutions seen otherwise: in the reference gauge, in one segment, in one exposure, term by term.
+"""Solutions seen otherwise: in the reference gauge, in one segment, term by term.
 
 A view is a solution again: its draws are those of its source, transformed one by one, and its
 covariance is the source's through the exact Jacobian of that transformation at the mean.
@@ -24,7 +24,6 @@ __all__ = [
     "ReferenceGauge",
     "Solution",
     "View",
-    "in_exposure",
     "linear_terms",
     "lines",
     "reference_gauge",
@@ -222,47 +221,6 @@ def without_frames(solution: Solution) -> View:
     return _viewed(solution, _bare(solution.model), lambda theta: theta[..., :n], np.eye(n))
 
 
-def in_exposure(solution: Solution, exposure: int | str, *, epoch: float | None = None) -> View:
-    """The polynomials of all chips as one exposure saw them, its frame included.
-
-    Parameters
-    ----------
-    solution : Solution
-    exposure : int or str
-        Code or name.
-    epoch : float, optional
-        Its date, decimal years; needed by a model with time dependence.
-
-    Returns
-    -------
-    View
-        Without frames and without time dependence.
-
-    Raises
-    ------
-    InputError
-        For an unknown exposure or a missing epoch.
-    """
-    model = solution.model
-    new = replace(_bare(model), time=None)
-    groups = model.groups(
-        len(model.chips),
-        epoch=epoch if model.time is not None else None,
-        exposure=exposure,
-        chip=[chip.number for chip in model.chips],
-    )
-    order = groups.index  # the group of each chip
-
-    def transform(theta: Float) -> Float:
-        E = model.effective(theta, groups)[..., order, :, :]
-        return E.reshape(*theta.shape[:-1], new.n_params)
-
-    jacobian = np.zeros((len(model.chips), 2 * model.n_terms, model.n_params))
-    for g, (columns, d) in enumerate(model.effective_jacobian(solution.mean, groups)):
-        jacobian[groups.chip[g]][:, columns] = d.reshape(2 * model.n_terms, -1)
-    return _viewed(solution, new, transform, jacobian.reshape(new.n_params, -1))
-
-
 def segment(solution: Solution, s: int) -> View:
     """One segment of the time dependence, as a model without breaks: what one IDCTAB holds.
 
@@ -387,7 +345,7 @@ def linear_terms(
     Parameters
     ----------
     solution : Solution
-        Of which the polynomials are taken, without frames; see `in_exposure` for one exposure.
+        Of which the polynomials are taken, without frames.
     chip : int, optional
         Chip number; all chips by default, and then their names stand before the labels.
     epoch : float, optional

@@ -28,7 +28,7 @@ from bayesdist.app.stages.report import title_of
 from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
-from bayesdist.infer import load_fit, load_posterior, outlier_probability, residuals
+from bayesdist.infer import load_fit, load_posterior, memberships, residuals
 from tests.app.support import (
     SIZE,
     begin_stagewise,
@@ -186,7 +186,7 @@ def test_the_summary_counts_what_there_is(finished, posterior, matches):
     r = residuals(fit, matches)[used, 0]
     assert s["fit"]["rms_u"] == pytest.approx(np.sqrt(np.mean(r**2)))
     assert s["outliers"]["fraction"]["mean"] == pytest.approx(posterior.hyper["f"].mean())
-    flagged = outlier_probability(posterior, matches) > 0.5
+    flagged = memberships(posterior, matches).outlier_probability > 0.5
     assert s["outliers"]["n_flagged"] == posterior.n_flagged == flagged.sum()
     assert s["sampler"]["converged"] is True
 
@@ -200,7 +200,7 @@ def test_the_posterior_finds_the_truth(finished, posterior, matches):
         chi2 += ((values.mean() - getattr(finished.truth, true)) / values.std()) ** 2
     assert chi2 < 45.0
     false = finished.truth.false
-    flagged = outlier_probability(posterior, matches) > 0.5
+    flagged = memberships(posterior, matches).outlier_probability > 0.5
     assert (flagged & false).sum() > 0.7 * false.sum()  # those within 2 sigma look like true ones
     assert (flagged & ~false).sum() <= 2
 

@@ -14,7 +14,7 @@ from bayesdist.assess.wise.formal_radii import (
 )
 from bayesdist.data import MatchTable
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer import fit_linear
+from bayesdist.infer import Rejection, fit_linear
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.wise import FORMAL_RADII, RADIAL_RESIDUALS, SAMPLE_SIZES, WISE_ARRAYS
 
@@ -62,7 +62,7 @@ def thinning(X, Y):
 def test_fits_of_pairs_have_it(pairs, factor):
     """`fit_linear` with its covariance, and its sandwich where corners count for more."""
     model = DistortionModel(4, (Chip(1, "A", SIZE, (508.5, 508.5)),))
-    fit = fit_linear(pairs, model, clip_chi2=1e9, clip_abs=1e9, radial_weight=factor)
+    fit = fit_linear(pairs, model, rejection=Rejection(1e9, 1e9, factor))
     found = uncertainty_map(fit, grid=(9, 9))
     weight = corner_weight(factor)
     f = formal_radii(len(pairs), (0.1, 0.2), density=thinning, weight=weight, grid=(1017, 1017))

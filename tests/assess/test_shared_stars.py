@@ -10,9 +10,8 @@ from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.terms.field_terms import CatalogueTerm, ExposureScatter
 from bayesdist.assess.terms.fields import draw_errors
 from bayesdist.infer import fit_linear
-from bayesdist.infer.catalogue.star_errors import with_star_errors
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
-from tests.infer.small_campaign import campaign, campaign_truth, shared_stars
+from tests.infer.small_campaign import campaign, campaign_truth, shared_stars, with_star_errors
 from tests.infer.support import UNCLIPPED
 
 NUMBERS = (1, 2)

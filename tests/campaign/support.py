@@ -18,7 +18,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.data import MatchTable
-from bayesdist.infer.catalogue.star_errors import star_covariance, with_star_errors
+from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
 from bayesdist.infer.recoloured import Recoloured
@@ -27,6 +27,7 @@ from bayesdist.model import LookupTable
 from bayesdist.simulate.acs import AcsCampaign, acs_model, read_acs
 from bayesdist.simulate.acs.pointings import OWN
 from tests.app.support import good
+from tests.infer.small_campaign import with_star_errors
 
 FILTER = "F606W"
 TERMS = ("A_2", "B_3", "B_2")  # Tables 1, 2, 3

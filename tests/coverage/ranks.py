@@ -25,6 +25,7 @@ from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial import fields
 from tests.adversarial.measure import GRID, assessed
 from tests.adversarial.truth import SIGMA, Truth, mapped, order_config, pixels
+from tests.infer.support import draw_prior
 
 from .places import one_thread
 
@@ -86,7 +87,7 @@ def from_priors(seed: int) -> tuple[Truth, fields.Field]:
     polynomial = fields.distortion(rng, ORDER)
     true_map = mapped(polynomial, structure(rng))
     hyper = OutlierMixture("gaussian").bind(SIGMA)
-    drawn = {k: float(v[0]) for k, v in hyper.values(hyper.draw_prior(1, rng)).items()}
+    drawn = {k: float(v[0]) for k, v in hyper.values(draw_prior(hyper, 1, rng)).items()}
     x, y = pixels(rng, STARS)
     uv, false = true_map(x, y, None), rng.uniform(size=STARS) < drawn["f"]
     core = np.hypot(SIGMA, drawn["j"])

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import InputError
-from bayesdist.infer import fit_linear
+from bayesdist.infer import Rejection, fit_linear
 from bayesdist.model import polynomial_terms
 from bayesdist.simulate import simulate_wise, wise_solution
 from bayesdist.simulate.wise import WISE_COEFFICIENTS
@@ -233,6 +233,6 @@ def test_the_fit_finds_the_published_coefficients(pairs):
     honest = matches.with_sigma(
         np.hypot(matches.sigma_u, truth.jitter), np.hypot(matches.sigma_v, truth.jitter)
     ).select(~truth.false)
-    fit = fit_linear(honest, model, clip_chi2=np.inf, clip_abs=None)
+    fit = fit_linear(honest, model, rejection=Rejection(np.inf, None))
     d = fit.mean - theta
     assert 1e-3 < stats.chi2(30).sf(d @ np.linalg.solve(fit.cov, d)) < 1 - 1e-3

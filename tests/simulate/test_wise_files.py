@@ -14,7 +14,7 @@ from bayesdist.app.check import check
 from bayesdist.app.simulate_wise import simulate_wise_pairs
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
-from bayesdist.infer import fit_linear
+from bayesdist.infer import Rejection, fit_linear
 from bayesdist.simulate.wise import (
     RADIAL_RESIDUALS,
     RESIDUAL_SIGMAS,
@@ -168,7 +168,7 @@ def test_a_fit_finds_the_published_coefficients(tmp_path, band):
     one = wise_set(band, pairs=60_000, seed=6, false_share=0.0)
     write_wise_set(one, tmp_path)
     matches = read_matches(tmp_path / band.lower(), columns=COLUMNS | {"exposure": ""})
-    fit = fit_linear(matches, one.model, clip_chi2=1e9, clip_abs=1e9)
+    fit = fit_linear(matches, one.model, rejection=Rejection(1e9, 1e9))
     off = fit.mean - one.theta
     assert 1e-3 < stats.chi2.sf(off @ np.linalg.solve(fit.cov, off), 30) < 1 - 1e-3
     assert abs(fit.chi2 / fit.dof - 1) < 5 * np.sqrt(2 / fit.dof)

@@ -21,7 +21,7 @@ from bayesdist.assess.wise import (
     pattern_changes,
     period_table,
 )
-from bayesdist.infer import fit_linear, load
+from bayesdist.infer import Rejection, fit_linear, load
 from bayesdist.simulate.wise import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
 
 from .support import matches_of, pairs_of
@@ -39,7 +39,7 @@ def calibrated(band: str, partition: bool, bins: int = 31, pairs: int | None = N
     one = wise_set(band, pairs=pairs or PAIRS[band], seed=8, false_share=0.0, partition=partition)
     drawn = pairs_of(one)
     matches = matches_of(drawn)
-    fit = fit_linear(matches, one.model, clip_chi2=1e9, clip_abs=None)
+    fit = fit_linear(matches, one.model, rejection=Rejection(1e9, None))
     with_shards = load(one.model, matches)
     found = with_shards.sum(band_bins_of_stars, fit.mean, fit.clip, bins)
     with_shards.close()

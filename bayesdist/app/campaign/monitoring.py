@@ -15,8 +15,8 @@ from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centr
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.compare.monitoring import NewFit, fit_new
-from bayesdist.infer.compare.monitoring_stars import with_star_errors_of
+from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
+from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
 from bayesdist.model import corrected
 
@@ -133,8 +133,7 @@ def fit_exposures_of(session: CampaignSession, new: NewExposures) -> NewFit:
     found = fit_new(
         new.released,
         new.matches,
-        clip_chi2=config.fit.clip_chi2,
-        clip_abs=config.fit.clip_abs,
+        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
         scatter=dict(zip(kinds, np.sqrt((tau**2).mean(axis=0)), strict=True)),
     )

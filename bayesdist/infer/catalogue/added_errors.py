@@ -41,7 +41,7 @@ from bayesdist.infer.catalogue.by_magnitude import (
     variances_of,
 )
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.linear import NO_REJECTION, LinearFit, fit_linear
 from bayesdist.model import DistortionModel
 
 __all__ = ["ONE", "GroupedErrors", "grouped_errors"]
@@ -254,7 +254,7 @@ def _climbed(
         before, variance = variance, _maxima(quoted, square, good, code, n_groups)
         var = quoted + variance[code]
         weighted = table.with_sigma(*(np.sqrt(var / np.maximum(good, LEAST_WEIGHT))))
-        fit = fit_linear(weighted, model, clip_chi2=np.inf, clip_abs=None, priors=priors)
+        fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
         residual = residuals_of(fit, table) ** 2
         square = residual + variances_of(fit, table)
         if (np.abs(variance - before) < SETTLED * (typical + variance)).all():

@@ -9,8 +9,6 @@ back).  Rejection by a limit has no part in it: stars that go in and out of a fi
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,8 +17,8 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import LinearFit, fit_linear
-from bayesdist.infer.stars.shards import Matches
+from bayesdist.infer.linear import DEFAULT_REJECTION, NO_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.stars.shards import Compute, Matches
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
@@ -41,8 +39,9 @@ def fit_by_magnitude(
     matches: Matches,
     model: DistortionModel,
     *,
+    rejection: Rejection = DEFAULT_REJECTION,
     priors: GaussianPriors | None = None,
-    **options: Any,
+    compute: Compute | None = None,
 ) -> tuple[LinearFit, Matches, MagnitudeErrors]:
     """Fit, and errors by magnitude from its residuals, estimated together.
 
@@ -51,8 +50,9 @@ def fit_by_magnitude(
     matches : MatchTable or PartitionedMatches
         With magnitudes; errors, if there are any, are replaced.
     model : DistortionModel
+    rejection : Rejection
     priors : GaussianPriors, optional
-    **options
+    compute : Compute, optional
         As of `fit_linear`.
 
     Returns
@@ -76,21 +76,21 @@ def fit_by_magnitude(
             do="map column 'mag' or give data.sigma another value",
         )
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
-    errors = _law(matches.sample(count), model, priors, options)
+    errors = _law(matches.sample(count), model, rejection, priors)
     table = matches.with_errors_by_magnitude(errors)
-    return fit_linear(table, model, priors=priors, **options), table, errors
+    fit = fit_linear(table, model, rejection=rejection, priors=priors, compute=compute)
+    return fit, table, errors
 
 
 def _law(
     stars: MatchTable,
     model: DistortionModel,
+    rejection: Rejection,
     priors: GaussianPriors | None,
-    options: dict[str, Any],
 ) -> MagnitudeErrors:
     """Errors by magnitude of some stars."""
     assert stars.mag is not None
-    options = {name: value for name, value in options.items() if name != "compute"}
-    fit = fit_linear(stars.with_sigma(1.0, 1.0), model, priors=priors, **options)
+    fit = fit_linear(stars.with_sigma(1.0, 1.0), model, rejection=rejection, priors=priors)
     residual = residuals_of(fit, stars)
     bins = estimate(stars.mag, *residual, n_params=model.n_params)
     law = MagnitudeLaw.of(stars.mag, bins)
@@ -102,7 +102,7 @@ def _law(
         good = memberships_of(square, var, f, wide)
         weight = np.sqrt(np.maximum(good, LEAST_WEIGHT))
         weighted = stars.with_sigma(*(np.sqrt(var) / weight))
-        fit = fit_linear(weighted, model, clip_chi2=np.inf, clip_abs=None, priors=priors)
+        fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
         square = residuals_of(fit, stars) ** 2 + variances_of(fit, stars)
         bad = 1.0 - good
         f = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))

@@ -1,6 +1,6 @@
 """What the error of a single star of the catalogue has in common with a solution.
 
-With the notation of `star_errors`, an error c_s of star s moves the parameters by H^-1 G_s c_s.  So
+With the notation of `star_sums`, an error c_s of star s moves the parameters by H^-1 G_s c_s.  So
 a star that is seen again, in an exposure that was no part of the fit, has an error that the
 solution's own is correlated with: cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
 """
@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.stars.stars import prepare
 
 __all__ = ["StarErrors", "StarInfluence", "star_influence"]
 
@@ -93,7 +95,7 @@ class StarInfluence:
         return out
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def star_influence(
     fit: LinearFit, matches: MatchTable, errors: StarErrors, codes: Int
 ) -> StarInfluence:
@@ -120,21 +122,12 @@ def star_influence(
     wanted = np.isin(matches.star, codes) & fit.uses(matches)
     if not wanted.any():
         return StarInfluence(errors, codes, by)
-    table = matches.select(wanted)
-    assert table.star is not None and table.sigma_u is not None and table.sigma_v is not None
-    names = {name: k for k, name in enumerate(model.exposures)}
-    exposure = np.array([names[name] for name in table.exposure_names])[table.exposure]
-    groups = model.groups(len(table), epoch=table.epoch, exposure=exposure, chip=table.chip_number)
-    inverse = np.stack([table.sigma_u, table.sigma_v]) ** -2.0
-    levers = errors.levers(table.star, table.epoch)
-    at = np.searchsorted(codes, table.star)
-    cov = np.asarray(fit.cov, float)[:, :D]
-    jacobians = model.effective_jacobian(np.asarray(fit.mean), groups)
-    for g, rows in enumerate(groups.members()):
-        columns, d = jacobians[g]
-        phi = model.basis(model.chips[groups.chip[g]].number).evaluate(table.x[rows], table.y[rows])
-        for axis in (0, 1):
-            moved = (phi * inverse[axis, rows, None]) @ (d[axis] @ cov[columns])
-            for c, lever in enumerate(levers):
-                np.add.at(by[c, axis], at[rows], lever[rows, None] * moved)
+    stars, order = prepare(model, matches.select(wanted))
+    star = matches.star[wanted][order]
+    epoch = None if matches.epoch is None else matches.epoch[wanted][order]
+    levers = list(errors.levers(star, epoch))
+    inverse = np.stack([1 / stars.var_u, 1 / stars.var_v])
+    sums = StarSums.of(stars, np.searchsorted(codes, star), inverse, levers)
+    influence = influence_by_group(model, fit.mean, stars.groups, fit.cov, D)
+    by[: len(levers)] = sums.each(influence, 0, len(codes))
     return StarInfluence(errors, codes, by)

@@ -21,8 +21,8 @@ from scipy.stats import chi2 as chi_square
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
-from bayesdist.infer.equations.field_test import FieldTest, determined
 from bayesdist.infer.equations.normal import NormalEquations, mixture
+from bayesdist.infer.equations.scaled import FieldTest, determined
 from bayesdist.infer.stars.shards import Matches
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
@@ -273,12 +273,9 @@ def _from_then_on(change: Change, normal: Float, right: Float, free: Float) -> C
     """The change that a normal matrix and its score tell, without what frames take up."""
     root = without(change.taken, mean_squares(change.model)) @ _root(normal, free)
     white = right @ _root(normal, free)
-    test = FieldTest(
-        float(white @ white), len(white), float(chi_square.sf(white @ white, len(white)))
-    )
     return replace(
         change,
         difference=(root @ white).reshape(change.difference.shape),
         cov=root @ root.T,
-        test=test,
+        test=FieldTest.of(white),
     )

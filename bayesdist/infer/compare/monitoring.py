@@ -16,20 +16,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.infer.catalogue.star_errors import star_covariance
+from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
 from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.equations.field_test import FieldTest, field_test
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Matches, load
 from bayesdist.infer.transforms import Solution, View, without_frames
 from bayesdist.model import DistortionModel
 
-__all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model"]
+__all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
 
 Float = NDArray[np.float64]
 
@@ -140,8 +143,7 @@ def fit_new(
     matches: Matches,
     *,
     mixture: OutlierMixture | None = None,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
+    rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
     scatter: Mapping[str, float] | None = None,
 ) -> NewFit:
@@ -156,7 +158,7 @@ def fit_new(
         With errors.
     mixture : OutlierMixture, optional
         That of a released posterior by default, else Gaussian outliers.
-    clip_chi2, clip_abs
+    rejection : Rejection
         As of `fit_linear`.
     compute : Compute, optional
     scatter : mapping of str to float, optional
@@ -185,7 +187,7 @@ def fit_new(
     shards = load(model, matches, compute)
     mixture = mixture or getattr(released, "mixture", None) or OutlierMixture()
     priors = _with_scatter(_held_drift(bare, model), model, scatter or {})
-    fit = fit_linear(shards, model, clip_chi2=clip_chi2, clip_abs=clip_abs, priors=priors)
+    fit = fit_linear(shards, model, rejection=rejection, priors=priors)
     target = Target(shards, mixture, priors)
     proposal = build_proposal(target, fit)
     best, n = proposal.best, model.n_params
@@ -290,7 +292,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
         cov=projector @ cov @ projector.T,
         released_cov=released_cov,
         taken=taken,
-        test=field_test(rest, cov, taken, norm, draws=draws / max(share, 1e-3) ** 2),
+        test=chi_square(rest, cov, without=taken, norm=norm, draws=draws / max(share, 1e-3) ** 2),
         frame=(M, d),
     )
 
@@ -334,3 +336,51 @@ def _at_epoch(model: DistortionModel, epoch: float | None) -> Float:
         out[c * size : (c + 1) * size] = 0.0
         out[c * size : (c + 1) * size, columns] = d.reshape(size, -1)
     return out
+
+
+def with_star_errors_of(
+    errors: StarErrors,
+    new: NewFit,
+    matches: MatchTable,
+    released: tuple[LinearFit, MatchTable] | None = None,
+) -> NewFit:
+    """A fit of new matches that knows that a star has one error.
+
+    A star has one error in all of its new exposures, and where the release was made with the same
+    catalogue, it has moved both sides: what it moved alike is no change.
+
+    Parameters
+    ----------
+    errors : StarErrors
+        Of the catalogue, by code of the star; the quoted errors contain them.
+    new : NewFit
+    matches : MatchTable
+        Those of `new`, with codes of the stars.
+    released : tuple of LinearFit and MatchTable, optional
+        The release and its matches, where they have the same catalogue and codes.
+
+    Returns
+    -------
+    NewFit
+    """
+    n = new.model.n_polynomial
+    motion_u, motion_v = (0.0, 0.0) if errors.motion is None else errors.motion.T
+    shared = star_covariance(
+        new.fit,
+        matches,
+        *errors.position.T,
+        motion_u=motion_u,
+        motion_v=motion_v,
+        epoch0=errors.epoch,
+        frames=False,
+    )
+    out = replace(new, extra=shared.extra[:n, :n])
+    if released is None or released[1].star is None or matches.star is None:
+        return out
+    codes = np.intersect1d(released[1].star, matches.star)
+    old, now = (
+        star_influence(fit, table, errors, codes).by
+        for fit, table in (released, (new.fit, matches))
+    )
+    variances = errors.variances[: len(old), codes]
+    return replace(out, common=np.einsum("lasd,lsa,lasn->dn", old, variances, now[..., :n]))

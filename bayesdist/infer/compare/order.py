@@ -24,7 +24,7 @@ from bayesdist.infer.compare.order_sums import (
     share_sums,
     truncated,
 )
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
@@ -44,8 +44,7 @@ def select_order(
     bins: int = 31,
     regions: int = 10,
     shares: int = 100,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
+    rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
 ) -> OrderSelection:
     """Compare polynomial orders.
@@ -66,7 +65,7 @@ def select_order(
         Regions that are held out, on each axis; each is made of whole bins.
     shares : int
         Shares of the stars that are held out, one at a time.
-    clip_chi2, clip_abs
+    rejection : Rejection
         As `fit_linear`.
     compute : Compute, optional
 
@@ -86,7 +85,7 @@ def select_order(
     chosen = _checked(orders, model, bins, regions, shares)
     top = replace(model, order=chosen[-1])
     with opened(top, matches, compute) as shards:
-        fit = fit_linear(shards, top, clip_chi2=clip_chi2, clip_abs=clip_abs)
+        fit = fit_linear(shards, top, rejection=rejection)
         binned = shards.sum(bin_sums, fit.mean, fit.clip, bins)
         shared = shards.sum(share_sums, fit.mean, fit.clip, shares)
     n_terms = [(n + 1) * (n + 2) // 2 for n in chosen]

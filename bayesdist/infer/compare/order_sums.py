@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
 from bayesdist.infer.linear import Clip
-from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.stars import Stars, cell_of
 
 __all__ = ["LotSums", "bin_sums", "departures", "held_out_gain", "share_sums", "truncated"]
 
@@ -82,10 +82,7 @@ def bin_sums(stars: Stars, theta: Float, clip: Clip, bins: int) -> LotSums:
     -------
     LotSums
     """
-    ix, iy = (
-        np.clip(((z + 1) * (0.5 * bins)).astype(np.int64), 0, bins - 1) for z in (stars.X, stars.Y)
-    )
-    return _sums(stars, iy * bins + ix, bins * bins, theta, clip)
+    return _sums(stars, cell_of(stars.X, stars.Y, bins), bins * bins, theta, clip)
 
 
 def share_sums(stars: Stars, theta: Float, clip: Clip, shares: int) -> LotSums:

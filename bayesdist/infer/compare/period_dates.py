@@ -1,16 +1,19 @@
-"""Periods: when they begin and end."""
+"""Periods: when they begin and end, and sums over the matches of each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from astropy.time import Time
 
+from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.infer.stars.shards import Matches
 
-__all__ = ["Periods", "check_periods", "mjd_periods"]
+__all__ = ["Periods", "check_periods", "mjd_periods", "sum_by_period"]
 
 Periods = Mapping[str, tuple[float, float]]  # begin and end by name, decimal years
 
@@ -18,7 +21,7 @@ MOST_MJD = 2e6  # some five thousand years: calendars end not far beyond
 
 
 def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
-    """Periods of some days about Modified Julian Dates, for `period_sums`.
+    """Periods of some days about Modified Julian Dates, for `sum_by_period`.
 
     Parameters
     ----------
@@ -85,3 +88,50 @@ def check_periods(periods: Periods) -> None:
                 where="periods",
                 do="let each begin where the one before it is over, or later",
             )
+
+
+def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable], Any]) -> Any:
+    """Sum over the pairs of each period of a task: one pass over the data, piece by piece.
+
+    Parameters
+    ----------
+    matches : MatchTable or PartitionedMatches
+        With epochs.
+    periods : mapping of str to tuple of float
+        First epoch of each period, and the epoch at which it is over, in decimal years.  Pairs
+        outside all of them are not used.
+    task : callable
+        Of the pairs of a period that one piece of the data holds; what it returns adds.
+
+    Returns
+    -------
+    dict of str to what the task returns
+
+    Raises
+    ------
+    InputError
+        Without epochs, for periods that overlap, and for a period without pairs.
+    """
+    where = ", ".join(matches.sources)
+    if not matches.has_epoch:
+        raise InputError(
+            "periods need an epoch for every pair", where=where, do="map column 'epoch'"
+        )
+    check_periods(periods)
+    sums: dict[str, Any] = {}
+    for piece in matches.pieces():
+        table = piece.read()
+        assert table.epoch is not None
+        for name, (start, stop) in periods.items():
+            inside = (table.epoch >= start) & (table.epoch < stop)
+            if inside.any():
+                part = task(table.select(inside))
+                sums[name] = sums[name] + part if name in sums else part
+    for name, (start, stop) in periods.items():
+        if name not in sums:
+            raise InputError(
+                f"period {name} ({start:.8g} to {stop:.8g}) has no pairs",
+                where=where,
+                do="correct the period or leave it out",
+            )
+    return {name: sums[name] for name in periods}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bayesdist.infer.compare.period_changes import PeriodComparison
+from bayesdist.infer.compare.periods import PeriodComparison
 from bayesdist.infer.compare.positions import PositionChange
 
 __all__ = ["SIGNIFICANT", "all_below", "period_verdict"]

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.infer.equations.scaled import scaled_cholesky, scaled_inverse
 from bayesdist.infer.recoloured import Recoloured
 from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
@@ -153,13 +154,10 @@ def with_information(solution: Solution, information: Float) -> Recoloured:
             do="give that of the polynomials and their drift",
         )
     cov = np.asarray(solution.cov, float)
-    scale = np.sqrt(np.diag(cov)[:n])
-    unit = np.outer(scale, scale)
-    before = cov[:n, :n] / unit
     # (C^-1 + H)^-1 without inverting C, which may be nearly singular
-    L = np.linalg.cholesky(before)
-    inner = np.eye(n) + L.T @ (information * unit) @ L
-    after = L @ np.linalg.solve(inner, L.T)
-    follow = np.linalg.solve(before, (cov[:, :n] / scale).T).T
-    changed = cov + follow @ (after - before) @ follow.T
+    root = scaled_cholesky(cov[:n, :n])
+    inner = np.eye(n) + root.T @ information @ root
+    after = root @ np.linalg.solve(inner, root.T)
+    follow = cov[:, :n] @ scaled_inverse(cov[:n, :n])
+    changed = cov + follow @ (after - cov[:n, :n]) @ follow.T
     return Recoloured(solution, (changed + changed.T) / 2)

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import chi2 as chi_square
+from scipy.stats import chi2 as chi_square_distribution
 
+from bayesdist.infer.equations.scaled import chi_square, scaled_cholesky
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = [
     "DifferenceField",
     "PositionChange",
-    "chi_square_of",
     "difference_field",
     "largest_difference",
 ]
@@ -113,9 +112,7 @@ def largest_difference(
     -------
     PositionChange
     """
-    scale = np.sqrt(np.diag(cov))
-    root = np.linalg.cholesky(cov / np.outer(scale, scale)) * scale[:, None]
-    noise = rng.standard_normal((n_draws, len(scale))) @ root.T
+    noise = rng.standard_normal((n_draws, len(cov))) @ scaled_cholesky(cov).T
     largest, worst = np.zeros(n_draws), (-1.0, 0, (0.0, 0.0), 0.0)
     for chip in model.chips:
         x, y = (a.ravel() for a in np.meshgrid(*_axes(chip, (grid, grid))))
@@ -127,12 +124,12 @@ def largest_difference(
         size = np.hypot(*field)
         k = int(np.argmax(size))
         if size[k] > worst[0]:
-            along = np.zeros(len(scale))
+            along = np.zeros(len(cov))
             direction = field[:, k] / size[k] if size[k] > 0 else np.array([1.0, 0.0])
             along[u], along[v] = direction[0] * phi[k], direction[1] * phi[k]
             sigma = float(np.sqrt(along @ cov @ along))
             worst = (float(size[k]), chip.number, (float(x[k]), float(y[k])), sigma)
-    chi2, dof, p_field = chi_square_of(difference, cov)
+    chi2, dof, p_field = chi_square(difference, cov)
     return PositionChange(
         largest=worst[0],
         at=worst[2],
@@ -173,17 +170,10 @@ def difference_field(
         for b, other in enumerate(parts):
             joint[:, a, b] = np.einsum("nk,kl,nl->n", phi, cov[one, other], phi, optimize=True)
     z2 = np.einsum("na,na->n", field, np.linalg.solve(joint, field[..., None])[..., 0])
-    du, dv, p_value = (a.reshape(len(y), len(x)) for a in (*field.T, chi_square.sf(z2, 2)))
+    du, dv, p_value = (
+        a.reshape(len(y), len(x)) for a in (*field.T, chi_square_distribution.sf(z2, 2))
+    )
     return DifferenceField(chip, x, y, du, dv, p_value)
-
-
-def chi_square_of(difference: Float, cov: Float) -> tuple[float, int, float]:
-    """Chi-square of a vector, its degrees of freedom, and the probability of one as large."""
-    scale = np.sqrt(np.diag(cov))
-    factor = cho_factor(cov / np.outer(scale, scale))
-    scaled = difference / scale
-    value = float(scaled @ cho_solve(factor, scaled))
-    return value, len(scaled), float(chi_square.sf(value, len(scaled)))
 
 
 def _axes(chip: Chip, grid: tuple[int, int]) -> tuple[Float, Float]:

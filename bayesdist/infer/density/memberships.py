@@ -21,7 +21,6 @@ __all__ = [
     "count_outliers",
     "memberships",
     "memberships_of",
-    "outlier_probability",
     "sampled_points",
     "some_draws",
     "star_averages",
@@ -114,11 +113,6 @@ def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
     else:
         theta, h = some_draws(*sampled_points(posterior), posterior.n_stars)
     return theta, posterior.mixture.bind(posterior.reference_sigma).constants(h)
-
-
-def outlier_probability(posterior: Posterior, matches: MatchTable) -> Float:
-    """Probability (N,) that each star of a table is a false match: see `memberships`."""
-    return memberships(posterior, matches).outlier_probability
 
 
 def star_log_likelihood(posterior: Posterior, matches: MatchTable) -> Float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayesdist.infer.discrepancy.cells import CellSums
 from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.model import DistortionModel
 
 __all__ = ["GroupCells", "Information"]
@@ -152,10 +153,7 @@ class Information:
     @cached_property
     def covariance(self) -> Float:
         """Its inverse: formal where the likelihood is right."""
-        scale = 1 / np.sqrt(np.diag(self.precision))
-        inverse = np.linalg.inv(self.precision * np.outer(scale, scale))
-        inverse = inverse * np.outer(scale, scale)
-        return (inverse + inverse.T) / 2
+        return scaled_inverse(self.precision)
 
     @cached_property
     def score(self) -> Float:

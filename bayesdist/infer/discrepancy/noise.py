@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.information import Information
+from bayesdist.infer.equations.scaled import scaled_inverse
+from bayesdist.infer.stars.stars import cell_of
 
 __all__ = ["not_narrower", "score_excess", "shrunk_ratios"]
 
@@ -31,7 +33,7 @@ def score_excess(information: Information) -> Float:
     curvature = np.zeros_like(squares)
     count = np.zeros((n_chips, side * side))
     for cells in information.groups():
-        at = _cell_of(cells.X, cells.Y, side)
+        at = cell_of(cells.X, cells.Y, side)
         free = 1 - information.leverage(cells)
         for a in (0, 1):
             np.add.at(squares[cells.chip, :, a], at, cells.squares[:, a, a] / free[:, a])
@@ -57,20 +59,10 @@ def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
     Quoted errors that are too large are the user's statement: residuals cannot tell them from
     matches that were cut.
     """
-    D = len(formal)
     # a little of the formal one, so that no direction is without variance
     noise = 0.99 * noise + 0.01 * formal
-    scale = np.sqrt(np.diag(formal))
-    ratio = float(
-        np.trace(np.linalg.solve(formal / np.outer(scale, scale), noise / np.outer(scale, scale)))
-    )
-    ratio /= D
+    ratio = float(np.sum(scaled_inverse(formal) * noise)) / len(formal)
     return noise * max(1.0, 1 / ratio), ratio
-
-
-def _cell_of(X: Float, Y: Float, side: int) -> NDArray[np.int64]:
-    ix, iy = (np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (X, Y))
-    return np.asarray(iy * side + ix)
 
 
 def shrunk_ratios(top: Float, bottom: Float, n: Float) -> Float:

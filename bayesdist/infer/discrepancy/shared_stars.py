@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
 from bayesdist.infer.stars.likelihood import Scores
 from bayesdist.infer.stars.stars import Stars, prepare
@@ -36,7 +37,8 @@ class SharedStars:
     stars : Stars
     code : ndarray of int, shape (N,)
         Star of each match, in the order of `stars`.
-    curvature : ndarray, shape (N, 2, 2)
+    curvature : ndarray, shape (3, N)
+        Minus second derivatives uu, uv, vv of the log-likelihood.
     """
 
     rms: float
@@ -56,24 +58,14 @@ class SharedStars:
             Of the parameters, by their likelihood.
         """
         D = model.n_distortion  # frames follow as they are correlated
-        together = np.zeros((int(self.code.max()) + 1, D, 2))
-        alone = np.zeros((D, D))
-        stars = self.stars
-        for g, (columns, derivative) in enumerate(model.effective_jacobian(theta, stars.groups)):
-            rows = slice(stars.starts[g], stars.starts[g + 1])
-            own = columns < D
-            phi = model.basis(model.chips[stars.groups.chip[g]].number).evaluate_scaled(
-                stars.X[rows], stars.Y[rows]
-            )
-            pull = np.einsum(
-                "nk,nab,bkm->nma", phi, self.curvature[rows], derivative[:, :, own], optimize=True
-            )
-            columns = columns[own]
-            alone[np.ix_(columns, columns)] += np.einsum("nma,nla->ml", pull, pull, optimize=True)
-            np.add.at(together, (self.code[rows][:, None], columns), pull)
-        shared = np.einsum("sma,sla->ml", together, together, optimize=True)
+        uu, uv, vv = self.curvature
+        one = np.ones(len(self.code))
+        sums = StarSums.of(self.stars, self.code, np.stack([uu, vv]), [one], uv)
+        gradient = influence_by_group(model, theta, self.stars.groups, None, D)
+        alike = [np.ones((int(self.code.max()) + 1, 2))]
+        shared = sums.shared(gradient, alike)[0] - sums.independent(gradient, alike)
         by_scores = formal[:, :D]
-        extra = self.rms**2 * by_scores @ (shared - alone) @ by_scores.T
+        extra = self.rms**2 * by_scores @ shared @ by_scores.T
         return np.asarray((extra + extra.T) / 2)
 
 
@@ -126,7 +118,7 @@ def shared_stars(
         ).sum(axis=1)
     weight = np.exp(log_density - log_density.max())
     square = float(weight @ size**2 / weight.sum())
-    curvature = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2) * good[:, None, None]
+    curvature = np.stack([h_uu, h_uv, h_vv]) * good
     # the matches of a star share its error, of which one match alone would show its own part
     rest = np.mean(summed, axis=0) * (1 - 1 / np.maximum(n_matches, 1))
     repetition = float(np.average(1 + square * rest, weights=n_matches))

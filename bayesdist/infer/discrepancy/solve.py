@@ -9,7 +9,6 @@ from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_side
@@ -23,10 +22,11 @@ from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_stars
 from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.stars.likelihood import Scores, scores_of
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
-from bayesdist.infer.stars.stars import prepare
+from bayesdist.infer.stars.stars import cell_of, prepare
 from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 
@@ -38,8 +38,7 @@ DRAWS = 2000
 POINTS = 12  # on each axis
 
 
-# a second BLAS thread gains little here and loses much on a machine that has other work
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def estimate_discrepancy(
     matches: Matches | Shards,
     solution: Solution,
@@ -231,7 +230,7 @@ def _along_axes(
         for cells in source.groups():
             if cells.chip != chip:
                 continue
-            at = _rows(cells.X, cells.Y, side, row)
+            at = row[cell_of(cells.X, cells.Y, side)]
             here, M = values[at], cells.frame
             turned = np.einsum("cab,bd->cad", cells.curvature, M)
             for a in (0, 1):
@@ -243,9 +242,3 @@ def _along_axes(
     n = len(used)
     S = [B.T @ (weight[a, :n, None] * B) for a in (0, 1)]
     return S, crossed, taken, [B.T @ score[a, :n] for a in (0, 1)]
-
-
-def _rows(X: Float, Y: Float, side: int, row: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows of the chip's cells at their mean positions."""
-    ix, iy = (np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (X, Y))
-    return np.asarray(row[iy * side + ix])

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.transforms import (
     LinearTerms,
     ReferenceGauge,
@@ -111,8 +110,7 @@ class ExposureSolutions:
         return self.epoch, np.array([t.values for t in some]), np.array([t.cov for t in some])
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_exposures(
     matches: MatchTable,
     model: DistortionModel,
@@ -121,9 +119,7 @@ def fit_exposures(
     high_order: Solution | None = None,
     skip: bool = False,
     priors: GaussianPriors | None = None,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
-    radial_weight: float = 1.0,
+    rejection: Rejection = DEFAULT_REJECTION,
 ) -> ExposureSolutions:
     """Fit every exposure by itself.
 
@@ -144,7 +140,7 @@ def fit_exposures(
         Whether exposures that cannot be fitted are left out and counted; else they are an error.
     priors : GaussianPriors, optional
         On the parameters of one exposure: those of `model` without frames and time dependence.
-    clip_chi2, clip_abs, radial_weight
+    rejection : Rejection
         As of `fit_linear`.
 
     Returns
@@ -183,11 +179,6 @@ def fit_exposures(
             where="high_order",
             do="give a solution of the same order and chips",
         )
-    options: dict[str, Any] = {
-        "clip_chi2": clip_chi2,
-        "clip_abs": clip_abs,
-        "radial_weight": radial_weight,
-    }
     order = np.argsort(matches.exposure, kind="stable")
     codes, starts = np.unique(matches.exposure[order], return_index=True)
     names, epochs, fits, views, terms = [], [], [], [], []
@@ -200,9 +191,9 @@ def fit_exposures(
         try:
             _require_stars(table, alone, 3 if joint is not None else alone.n_terms)
             if joint is None:
-                fit = fit_linear(table, alone, priors=base, **options)
+                fit = fit_linear(table, alone, rejection=rejection, priors=base)
             else:
-                fit = _fit_held(table, alone, joint, epoch, chip, base, options)
+                fit = _fit_held(table, alone, joint, epoch, chip, base, rejection)
         except DegenerateError as error:
             where = f"exposure {name}" + (f", {error.where}" if error.where else "")
             if not skip:
@@ -255,7 +246,7 @@ def _fit_held(
     epoch: float,
     chip: int,
     base: GaussianPriors,
-    options: dict[str, Any],
+    rejection: Rejection,
 ) -> LinearFit:
     """The fit of one exposure with the terms above the first order held.
 
@@ -281,7 +272,8 @@ def _fit_held(
     angle = _rotation(table, model, known)
     centre, precision = base.centre.copy(), base.precision.copy()
     centre[index], precision[index] = held(angle), sigma**-2
-    fit = fit_linear(table, model, priors=GaussianPriors(centre, precision), **options)
+    priors = GaussianPriors(centre, precision)
+    fit = fit_linear(table, model, rejection=rejection, priors=priors)
     gain = fit.cov[:, index] * sigma**-2
     for _ in range(20):
         found = reference_gauge(fit, chip).gauge

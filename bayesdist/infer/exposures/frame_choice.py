@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.linear import fit_linear, residuals
+from bayesdist.infer.linear import Rejection, fit_linear, residuals
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
 
@@ -93,6 +93,6 @@ def _scatter(matches: MatchTable, model: DistortionModel) -> float:
     for _ in range(FITS):
         sigma = np.full(len(matches), max(median / MEDIAN_LENGTH, np.finfo(float).tiny))
         table = replace(matches, sigma_u=sigma, sigma_v=sigma)
-        fit = fit_linear(table, model, clip_abs=None)
+        fit = fit_linear(table, model, rejection=Rejection(clip_abs=None))
         median = float(np.median(np.hypot(*residuals(fit, table).T)))
     return median * float(np.sqrt(2 * len(matches) / (2 * len(matches) - model.n_params)))

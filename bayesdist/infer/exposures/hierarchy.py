@@ -22,19 +22,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.exposures.scatter import Scatter
-from bayesdist.infer.linear import Clip, LinearFit, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, Clip, LinearFit, Rejection, fit_linear
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.transforms import reference_gauge
 from bayesdist.model import DistortionModel
@@ -150,7 +149,7 @@ class HierarchicalFit:
         """Posterior standard deviation of theta, shape (D,)."""
         return np.asarray(np.sqrt(np.diag(self.cov)))
 
-    @threadpool_limits.wrap(limits=1, user_api="blas")
+    @one_thread
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors (n, D): each with a tau of its own, and theta drawn with it."""
         which = np.sort(rng.integers(len(self.tau_draws), size=n))
@@ -245,8 +244,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
     return replace(model, gauge="held", held=(*gauge.shift, -gauge.rotation), origin=(0.0, 0.0))
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_hierarchical(
     matches: Matches | Shards,
     model: DistortionModel,
@@ -257,8 +255,7 @@ def fit_hierarchical(
     pixel: float = 1.0,
     n_tau: int = 256,
     seed: int = 1,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
+    rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
 ) -> HierarchicalFit:
     """Fit all exposures jointly, with the scatter of their scale and shear.
@@ -285,7 +282,8 @@ def fit_hierarchical(
         Draws of tau over which results are averaged.
     seed : int
         Of these draws.
-    clip_chi2, clip_abs, compute
+    rejection : Rejection
+    compute : Compute, optional
         As of `fit_linear`.
 
     Returns
@@ -310,10 +308,9 @@ def fit_hierarchical(
     half = max(max(chip.size) for chip in model.chips) / 2
     of_gap = np.array(["shift" in name for name in kinds])
     scales = scale * np.where(of_gap, half * pixel, 1.0)
-    options: dict[str, Any] = {"clip_chi2": clip_chi2, "clip_abs": clip_abs}
     with opened(model, matches, compute) as shards:
         wide = _with_deviations(others, index, scales[kind] ** -2)
-        first = fit_linear(shards, model, priors=wide, **options)
+        first = fit_linear(shards, model, rejection=rejection, priors=wide)
         limits = (first.clip.theta, first.clip.chi2_limit, first.clip.abs_limit)
         equations = shards.sum(least_squares, first.mean, *limits)
         matrix, right = equations.assemble(model, first.mean)
@@ -333,9 +330,8 @@ def fit_hierarchical(
         scatter = scatter.loosened(outlying[member])
         tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
         precision = scatter.prior(_root_mean_square(tau_draws))
-        fit = fit_linear(
-            shards, model, priors=_with_deviations(others, index, precision), **options
-        )
+        known = _with_deviations(others, index, precision)
+        fit = fit_linear(shards, model, rejection=rejection, priors=known)
         settling = Settling.of(model, kinds, equations.groups, others.precision > 0, outlying)
     fit = replace(
         fit,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.equations.scaled import scaled_inverse, unit_diagonal
 from bayesdist.infer.transforms import Derived, Solution, reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.similarity import turned, turned_model
@@ -107,14 +108,12 @@ def with_drift_of(
     there, matrix = _in_gauge(reference, model, chip, gauge.rotation)
     k = model.n_polynomial
     cov = np.asarray(own.cov, float)
-    sigma = np.sqrt(np.diag(cov)[k:])
-    if not (sigma > 0).all():
+    if not (np.diag(cov)[k:] > 0).all():
         raise DegenerateError(
             "the solution's drift has no error", where="model.tdd", do="fit it, or give it a prior"
         )
     exact = cov if formal is None else np.asarray(without_frames(formal).cov, float)
-    scaled = exact[k:, k:] / np.outer(sigma, sigma)
-    gain = np.linalg.solve(scaled, (exact[:k, k:] / sigma).T).T / sigma
+    gain = exact[:k, k:] @ scaled_inverse(exact[k:, k:])
     drift = matrix @ np.asarray(there.mean, float)
     spread = matrix @ np.asarray(there.cov, float) @ matrix.T
     mean = np.array(own.mean, float)
@@ -165,8 +164,8 @@ def drift_priors(
     there, matrix = _in_gauge(reference, model, chip, 0.0)
     mean = matrix @ np.asarray(there.mean, float)
     cov = matrix @ np.asarray(there.cov, float) @ matrix.T
-    sigma = np.sqrt(np.diag(cov))
-    largest = float(np.linalg.eigvalsh(cov / np.outer(sigma, sigma))[-1])
+    correlation, sigma = unit_diagonal(cov)
+    largest = float(np.linalg.eigvalsh(correlation)[-1])
     names = model.names[model.n_polynomial : model.n_distortion]
     pairs = zip(mean.tolist(), (np.sqrt(largest) * sigma).tolist(), strict=True)
     return dict(zip(names, pairs, strict=True))

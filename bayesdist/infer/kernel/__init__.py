@@ -9,7 +9,6 @@ from bayesdist.infer.kernel.cache import kept_by_content
 
 with kept_by_content():
     from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
-    from bayesdist.infer.kernel.circle import circle_terms
     from bayesdist.infer.kernel.likelihood import log_likelihood
     from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
     from bayesdist.infer.kernel.moments import (
@@ -46,7 +45,6 @@ __all__ = [
     "UNIFORM",
     "Constants",
     "Moments",
-    "circle_terms",
     "eliminate_stars",
     "least_squares_moments",
     "linearised",

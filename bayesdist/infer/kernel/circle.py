@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import FAST
 
-__all__ = ["NODES", "circle_terms", "inside", "log_circle", "nodes_for", "slopes"]
+__all__ = ["NODES", "inside", "log_circle", "nodes_for", "slopes"]
 
 Float = NDArray[np.float64]
 
@@ -207,36 +207,3 @@ def slopes(du, dv, A, B, R, nodes, q, work, out):
     out[0], out[1], out[2] = log_z, u, v
     out[3], out[4], out[5] = uu - u * u, uv - u * v, vv - v * v
     out[6], out[7], out[8], out[9] = t, tu - t * u, tv - t * v, tt - t * t
-
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _each(du, dv, A, B, R, nodes, out):
-    q, work = np.empty(MOST), np.empty(MOST)
-    for s in range(len(du)):
-        slopes(du[s], dv[s], A[s], B[s], R, nodes, q, work, out[s])
-
-
-def circle_terms(du: Float, dv: Float, A: Float, B: Float, radius: float) -> Float:
-    """Logarithm of the probability that Gaussians fall in circles, and its derivatives (N, 10).
-
-    Parameters
-    ----------
-    du, dv : ndarray, shape (N,)
-        Centres of the circles, seen from those of the Gaussians.
-    A, B : ndarray, shape (N,)
-        Variances in u and v.
-    radius : float
-        Of the circles.
-
-    Returns
-    -------
-    ndarray, shape (N, 10)
-        The logarithm; its derivatives by the centre's u, v; uu, uv, vv; by a variance that is added
-        on both axes; by that variance and u, by it and v; twice by it.
-    """
-    du, dv, A, B = (
-        np.ascontiguousarray(a, float) for a in np.broadcast_arrays(*np.atleast_1d(du, dv, A, B))
-    )
-    out = np.empty((len(du), 10))
-    _each(du, dv, A, B, float(radius), NODES, out)
-    return out

@@ -19,10 +19,10 @@ from bayesdist.infer.density.proposal import GridProposal, Random
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
 from bayesdist.infer.sampler.convergence import diagnose
+from bayesdist.infer.sampler.ensembles import Whitening
 from bayesdist.infer.sampler.lookahead import Page, pilot_page
 from bayesdist.infer.sampler.move_schedule import Plan, expected_passes
 from bayesdist.infer.sampler.surrogate import Certificate, Surrogate, certify, draw_surrogate
-from bayesdist.infer.sampler.whitening import Whitening
 
 __all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
 

@@ -23,14 +23,14 @@ from bayesdist.infer.density.importance import (
 )
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.sampler.blocks import Block
+from bayesdist.infer.sampler.checkpoints import Block
 from bayesdist.infer.sampler.convergence import (
     LEAST_PER_WALKER,
     Convergence,
     Limits,
     diagnose,
 )
-from bayesdist.infer.sampler.ensembles import Ensembles
+from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
 from bayesdist.infer.sampler.lookahead import pilot_page
 from bayesdist.infer.sampler.move_schedule import (
     EFFICIENT,
@@ -45,7 +45,6 @@ from bayesdist.infer.sampler.move_schedule import (
     plan_moves,
     walkers_for,
 )
-from bayesdist.infer.sampler.whitening import Whitening
 
 __all__ = ["Chains", "Settings", "run_chains"]
 

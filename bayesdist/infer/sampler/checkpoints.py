@@ -1,23 +1,33 @@
-"""Arrays that a resumed run takes up again, in files that say to what they belong."""
+"""Arrays that a resumed run takes up again, in files that say to what they belong.
+
+The steps of a chain are kept block by block.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 
-__all__ = ["new_hdf5", "read_arrays", "write_arrays"]
+__all__ = ["Block", "Walkers", "block_path", "read_arrays", "write_arrays"]
+
+Float = NDArray[np.float64]
+
+BLOCK_ARRAYS = ("coords", "log_prob", "accepted", "log_weights")
+END_ARRAYS = ("log_q", "random_keys", "random_state")
 
 
 @contextmanager
-def new_hdf5(path: Path) -> Iterator[h5py.File]:
+def _new_hdf5(path: Path) -> Iterator[h5py.File]:
     """A file to be filled, which appears whole or not at all.
 
     It is made in memory: where a disk is full, HDF5 fails again as it closes its file, and may end
@@ -73,7 +83,80 @@ def read_arrays(
 
 def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Keep arrays by name; the file appears whole or not at all."""
-    with new_hdf5(path) as file:
+    with _new_hdf5(path) as file:
         for name, values in arrays.items():
             file[name] = values
         file.attrs["fingerprint"] = fingerprint
+
+
+@dataclass(frozen=True, eq=False)
+class Walkers:
+    """Where an ensemble stands.
+
+    Parameters
+    ----------
+    coords : ndarray, shape (walkers, D)
+        psi where proposals are drawn ahead, otherwise whitened.
+    log_prob : ndarray, shape (walkers,)
+    log_q : ndarray, shape (walkers,)
+        Log proposal density; NaN where no move needs it.
+    random : tuple
+        State of emcee's random numbers, as `numpy.random.RandomState.get_state` gives it.
+    """
+
+    coords: Float
+    log_prob: Float
+    log_q: Float
+    random: tuple
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Some steps of one ensemble.
+
+    Parameters
+    ----------
+    coords : ndarray, shape (steps kept, walkers, D)
+        In the coordinates of `Walkers`.
+    log_prob : ndarray, shape (steps kept, walkers)
+    accepted : ndarray, shape (walkers,)
+        Number of accepted moves of each walker among the steps kept.
+    log_weights : ndarray, shape (proposals,)
+        Log importance weights of proposals that were drawn ahead; NaN outside the support.
+    end : Walkers
+        After the last step.
+    """
+
+    coords: Float
+    log_prob: Float
+    accepted: Float
+    log_weights: Float
+    end: Walkers
+
+    def write(self, path: Path, mark: str) -> None:
+        """Keep a block; `mark` says to what it belongs."""
+        arrays = {name: getattr(self, name) for name in BLOCK_ARRAYS}
+        _, keys, *state = self.end.random
+        end = (self.end.log_q, keys, np.array(state))
+        write_arrays(path, mark, arrays | dict(zip(END_ARRAYS, end, strict=True)))
+
+    @classmethod
+    def read(cls, path: Path, mark: str) -> Block:
+        """Read a block back.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be read, or is marked otherwise.
+        """
+        do = "delete it and resume: its steps are run again"
+        kept = read_arrays(path, mark, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
+        log_q, keys, (position, has_gauss, gauss) = (kept.pop(name) for name in END_ARRAYS)
+        random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
+        end = Walkers(kept["coords"][-1], kept["log_prob"][-1], log_q, random)
+        return cls(**kept, end=end)
+
+
+def block_path(folder: Path, ensemble: int, end: int) -> Path:
+    """File of the block of an ensemble (from 0) that ends at a step."""
+    return folder / f"chain-{ensemble + 1}-{end:06d}.h5"

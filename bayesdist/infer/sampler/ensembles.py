@@ -28,17 +28,60 @@ from numpy.typing import NDArray
 from bayesdist.errors import InputError
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.sampler.blocks import Block, Walkers, block_path, read_block, write_block
+from bayesdist.infer.equations.arrow import ArrowFactor
+from bayesdist.infer.sampler.checkpoints import Block, Walkers, block_path
 from bayesdist.infer.sampler.lookahead import Page, draw_page
 from bayesdist.infer.sampler.move_schedule import Plan, Stretch
-from bayesdist.infer.sampler.whitening import Whitening
 
-__all__ = ["Ensembles", "replay"]
+__all__ = ["Ensembles", "Whitening", "replay"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 START_PAGES = 20  # further pages of proposals in which walkers look for a start
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Coordinates in which the posterior is close to a standard Gaussian.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (D,)
+    factor : ArrowFactor
+        Of the curvature of the distortion parameters.
+    scale : ndarray, shape (h,)
+        Standard deviations of the hyperparameters.
+    """
+
+    centre: Float
+    factor: ArrowFactor
+    scale: Float
+
+    @classmethod
+    def of(cls, target: Target, proposal: Proposal, draws: Float) -> Whitening:
+        """From the proposal's best node and hyperparameters of some draws (n, D)."""
+        n = target.n_theta
+        factor = proposal.best.factor.matrix.without_tail().factor()
+        hyper = draws[:, n:]
+        centre = np.concatenate([proposal.best.mode[:n], np.nanmean(hyper, axis=0)])
+        return cls(centre, factor, np.nanstd(hyper, axis=0))
+
+    @property
+    def n_theta(self) -> int:
+        """Number of distortion parameters."""
+        return self.factor.matrix.size
+
+    def to_psi(self, w: Float) -> Float:
+        """Sampled coordinates (n, D) from whitened ones."""
+        n = self.n_theta
+        parts = [self.factor.colour(w[:, :n]), w[:, n:] * self.scale]
+        return self.centre + np.concatenate(parts, axis=1)
+
+    def to_white(self, psi: Float) -> Float:
+        """Whitened coordinates (n, D) from sampled ones."""
+        n, shift = self.n_theta, psi - self.centre
+        return np.concatenate([self.factor.whiten(shift[:, :n]), shift[:, n:] / self.scale], axis=1)
 
 
 class _Replay:
@@ -209,7 +252,7 @@ class Ensembles:
         if self.folder is not None:
             paths = [block_path(self.folder, e, stretch.end) for e in range(len(self.seeds))]
         mark = f"{self.fingerprint} {self.plan.method} {stretch.begin}"
-        known = [read_block(p, mark) if p is not None and p.exists() else None for p in paths]
+        known = [Block.read(p, mark) if p is not None and p.exists() else None for p in paths]
         # always for all ensembles, so that the very same numbers come out when some are known
         page = None
         if self.plan.independent and any(block is None for block in known):
@@ -220,7 +263,7 @@ class Ensembles:
                 steps = stretch.end - stretch.begin
                 block = self._walk(states[e], steps) if page is None else replay(states[e], page, e)
                 if path is not None:
-                    write_block(path, mark, block)
+                    block.write(path, mark)
             out.append(block)
         return out
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError
 from bayesdist.infer.density.grid import build_proposal
@@ -18,6 +17,7 @@ from bayesdist.infer.density.memberships import count_outliers
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.sampler.certified import run_certified
@@ -34,12 +34,11 @@ __all__ = ["sample"]
 Float = NDArray[np.float64]
 
 METHODS = ("exact", "certified")
-FORMAT = 2  # of the checkpoints
+FORMAT = 3  # of the checkpoints
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may give other bits
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def sample(
     fit: LinearFit,
     matches: Matches | Shards,

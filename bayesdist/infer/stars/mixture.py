@@ -311,18 +311,3 @@ class Hyper:
                     curvature[j, j] += by_j**2 * e - by_j * (2 - by_j) * (OUTLIER_SHAPE - e)
                     curvature[[j, k], [k, j]] -= 2 * e * by_j
         return gradient, curvature
-
-    def draw_prior(self, n: int, rng: np.random.Generator) -> Float:
-        """Points (n, n_hyper) from the prior, for simulation-based calibration."""
-        columns = []
-        for name in self.mixture.hyper:
-            if name == "f":
-                f = rng.beta(*self.mixture.fraction_prior, size=n)
-                columns.append(logit(np.clip(f, 1e-300, 1 - 1e-16)))
-            elif name == "j":
-                columns.append(np.log(self._jitter_scale * np.abs(rng.standard_t(T_DOF, size=n))))
-            else:
-                unit = rng.gamma(OUTLIER_SHAPE, size=n)  # w^2 is the rate over this
-                so_far = np.column_stack(columns)
-                columns.append(0.5 * np.log(self._outlier_rate(so_far) / unit))
-        return np.column_stack(columns) if columns else np.zeros((n, 0))

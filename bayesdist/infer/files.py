@@ -1,35 +1,45 @@
-"""posterior.nc: the posterior as a netCDF tree that ArviZ and xarray open.
+"""Solutions as netCDF files, written whole or not at all, and read with one clear error.
 
-Groups: posterior, sample_stats, diagnostics; of tables in memory also observed_data, constant_data
-and, where that is not too large, log_likelihood.  What the posterior says of each star of larger
-data stands beside it, in the parts of `stars/`.
+fit.nc holds a linear fit, posterior.nc a posterior, as a tree that ArviZ and xarray open: groups
+posterior, sample_stats, diagnostics; of tables in memory also observed_data, constant_data and,
+where that is not too large, log_likelihood.  What the posterior says of each star of larger data
+stands beside it, in the parts of `stars/`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.density.memberships import outlier_probability, star_log_likelihood
-from bayesdist.infer.files import netcdf
+from bayesdist.errors import FormatError
+from bayesdist.files import atomic_path
+from bayesdist.infer.density.memberships import memberships, star_log_likelihood
+from bayesdist.infer.linear import Clip, LinearFit
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.sampler.convergence import Convergence, Limits
 from bayesdist.infer.sampler.surrogate import Certificate
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
 
-__all__ = ["load_posterior", "save_posterior"]
+if TYPE_CHECKING:
+    import xarray as xr
 
+__all__ = ["load_fit", "load_posterior", "save_fit", "save_posterior"]
+
+ENGINE: Final = "h5netcdf"
 SCHEMA = 2
-NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
+POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 MOST_STARS = 1_000_000  # whose data are repeated here
 LARGEST = 16_000_000  # bytes of log-likelihood that are kept star by star and draw by draw
+FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
 
 
 def save_posterior(
@@ -103,9 +113,9 @@ def save_posterior(
         "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
         "n_parameters": n_theta,
         "own_places": int(posterior.own_places),
-        **{name: getattr(posterior, name) for name in NUMBERS},
+        **{name: getattr(posterior, name) for name in POSTERIOR_NUMBERS},
     }
-    netcdf.write(tree, path)
+    _write(tree, path)
 
 
 def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[no-untyped-def]
@@ -116,7 +126,7 @@ def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[n
         "sigma_v": matches.sigma_v,
         "exposure": np.asarray(matches.exposure),
         "chip": matches.chip_number,
-        "outlier_probability": outlier_probability(posterior, matches),
+        "outlier_probability": memberships(posterior, matches).outlier_probability,
         "row": matches.row,
     }
     for name in ("epoch", "mag", "colour"):
@@ -150,8 +160,8 @@ def load_posterior(path: str | Path) -> Posterior:
     path = Path(path)
     if path.is_dir():
         path = path / "posterior.nc"
-    with netcdf.reading(path, "a posterior", "sample"):
-        with xr.open_datatree(path, engine=netcdf.ENGINE) as tree:
+    with _reading(path, "a posterior", "sample"):
+        with xr.open_datatree(path, engine=ENGINE) as tree:
             tree.load()
         attrs = tree.attrs
         draws, checks = tree["posterior"].to_dataset(), tree["diagnostics"].to_dataset()
@@ -197,3 +207,97 @@ def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
 
 def _plain(value: object) -> object:
     return value.item() if isinstance(value, np.generic) else value
+
+
+def save_fit(fit: LinearFit, path: str | Path) -> None:
+    """Write a linear fit; the file is replaced atomically."""
+    import xarray as xr
+
+    names = list(fit.model.names)
+    data = xr.Dataset(
+        {
+            "mean": ("parameter", fit.mean),
+            "cov": (("parameter", "parameter_2"), fit.cov),
+            "clip": ("parameter", fit.clip.theta),
+        },
+        coords={"parameter": names, "parameter_2": names},
+        attrs={
+            "creator": "bayesdist",
+            "model": json.dumps(fit.model.to_dict()),
+            "rejected": json.dumps(fit.rejected),
+            "clip_chi2_limit": fit.clip.chi2_limit,
+            "clip_abs_limit": fit.clip.abs_limit,
+            **{name: getattr(fit, name) for name in FIT_NUMBERS},
+        },
+    )
+    _write(data, path)
+
+
+def load_fit(path: str | Path) -> LinearFit:
+    """Read a linear fit back.
+
+    Raises
+    ------
+    FormatError
+        When the file is missing or is not such a file.
+    """
+    import xarray as xr
+
+    path = Path(path)
+    with _reading(path, "a fit", "fit"):
+        with xr.open_dataset(path, engine=ENGINE) as data:
+            data.load()
+        return LinearFit(
+            model=DistortionModel.from_dict(json.loads(data.attrs["model"])),
+            mean=data["mean"].values,
+            cov=data["cov"].values,
+            clip=Clip(
+                data["clip"].values,
+                float(data.attrs["clip_chi2_limit"]),
+                float(data.attrs["clip_abs_limit"]),
+            ),
+            rejected=json.loads(data.attrs["rejected"]),
+            **{name: data.attrs[name].item() for name in FIT_NUMBERS},
+        )
+
+
+def _write(data: xr.Dataset | xr.DataTree, path: str | Path) -> None:
+    """Write a dataset or a tree, replaced atomically.
+
+    The file is put together in memory: on a full disk HDF5 itself would crash when it is closed.
+    """
+    content = data.to_netcdf(engine=ENGINE)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+@contextmanager
+def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
+    """Turn whatever goes wrong while a file is read into one error.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file should be: 'a posterior', 'a fit'.
+    stage : str
+        The stage that makes it.
+
+    Raises
+    ------
+    FormatError
+    """
+    if not path.exists():
+        raise FormatError(
+            "there is no such file", where=str(path), do=f"run 'bayesdist {stage} RUN' first"
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # foreign HDF5 files are told of below
+            yield
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise FormatError(
+            f"this is not {what} that bayesdist wrote, or it is damaged",
+            where=str(path),
+            do=f"make it again with 'bayesdist {stage} RUN'",
+        ) from error
