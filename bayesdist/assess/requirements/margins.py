@@ -109,7 +109,6 @@ def check_requirements(
     n_draws: int = 2000,
     rng: np.random.Generator,
     pixel_scale: float | None = None,
-    converged: bool | None = None,
     caveats: Sequence[Caveat] = (),
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws of the position error.
@@ -152,11 +151,9 @@ def check_requirements(
     rng : numpy.random.Generator
     pixel_scale : float, optional
         Size of one pixel in mas; `pixel_scale_of` the solution by default.
-    converged : bool, optional
-        Whether the posterior may be trusted; by default what its convergence says.  If not, every
-        verdict is 'undecided'.
     caveats : sequence of Caveat
-        Other reasons why the errors may not be as stated.
+        Reasons why the errors may not be as stated, beside a posterior that is not converged: its
+        verdicts are all 'undecided'.
 
     Returns
     -------
@@ -206,7 +203,7 @@ def check_requirements(
                 error.cause, where=f"{owner.where}, {error.where}", do=error.do
             ) from None
 
-    caveats = (*_not_converged(solution, converged), *caveats)
+    caveats = (*_not_converged(solution), *caveats)
     n_effective = effective_draws(solution, n_draws)
     margins = []
     for r, case in zip(requirements, cases, strict=True):
@@ -314,12 +311,10 @@ def _of_extremes(
     return replace(worse, verdict="undecided", reason="; ".join(texts))
 
 
-def _not_converged(solution: Solution, converged: bool | None) -> tuple[Caveat, ...]:
+def _not_converged(solution: Solution) -> tuple[Caveat, ...]:
     """Why draws cannot be trusted, where they cannot."""
     convergence = getattr(solution, "convergence", None)
-    if converged is None:
-        converged = convergence is None or bool(convergence.converged)
-    if converged:
+    if convergence is None or convergence.converged:
         return ()
     reasons = "; ".join(getattr(convergence, "reasons", ()))
     text = "the posterior is not converged" + (f": {reasons}" if reasons else "")

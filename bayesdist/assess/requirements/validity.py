@@ -95,7 +95,6 @@ def horizon_of(
     epochs: ArrayLike,
     *,
     n_effective: float | None = None,
-    chip: int | None = None,
     pixel_scale: float | None = None,
 ) -> Horizon:
     """Follow a requirement through time.
@@ -114,7 +113,7 @@ def horizon_of(
         Decimal years, rising.
     n_effective : float, optional
         Independent draws that the draws are worth; their number by default.
-    chip, pixel_scale
+    pixel_scale : float, optional
         As `check_requirements`.
 
     Returns
@@ -139,7 +138,7 @@ def horizon_of(
     factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
     n = n_effective or float(errors.n_draws)
     (judged,) = judged_places(
-        replace(requirement, epoch=float(at[0]), epochs=None), model, chip=chip
+        replace(requirement, epoch=float(at[0]), epochs=None), model
     )
     cases = [replace(judged, epoch=float(epoch)) for epoch in at]
     name = requirement.statistic
