@@ -12,7 +12,7 @@ from bayesdist.app.horizon import horizons_of
 from bayesdist.app.product_terms import product_terms
 from bayesdist.app.session import Session
 from bayesdist.assess import Margin, Requirement, check_requirements, pixel_scale_of
-from bayesdist.assess.budget.detector import DetectorBudget, detector_budget
+from bayesdist.assess.budget.budget import ErrorBudget, detector_budget
 from bayesdist.assess.drawn import PositionErrors, position_errors
 from bayesdist.assess.requirements.validity import Horizon
 from bayesdist.assess.solution import Solution
@@ -59,7 +59,7 @@ def _assessment(session: Session, solution: Solution | None, n_draws: int | None
 
 def budget_of(
     session: Session, solution: Solution | None = None, n_draws: int | None = None
-) -> DetectorBudget:
+) -> ErrorBudget:
     """The budget of the session's solution with all that is known of its errors.
 
     Another solution is assessed by itself.

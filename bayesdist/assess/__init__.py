@@ -1,8 +1,8 @@
 """What a solution is worth: uncertainty maps, error budget, margins against requirements."""
 
 from bayesdist.assess.area import AreaMap, area_map
-from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget, error_budget, error_budgets
-from bayesdist.assess.budget.detector import DetectorBudget, detector_budget
+from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget, detector_budget, error_budget
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.assess.requirements.margins import Margin, Requirement, check_requirements
@@ -41,9 +41,9 @@ __all__ = [
     "BinnedResiduals",
     "BinnedSums",
     "BudgetTerm",
-    "DetectorBudget",
     "ErrorBudget",
     "ErrorFields",
+    "EvaluationDomain",
     "ExposureSums",
     "LocalTerm",
     "Margin",
@@ -65,7 +65,6 @@ __all__ = [
     "detector_budget",
     "distortion_vectors",
     "error_budget",
-    "error_budgets",
     "error_fields",
     "field_statistic",
     "flagged_by_exposure",

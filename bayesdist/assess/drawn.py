@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.domain import Judged, JudgedFields, Place, judged_fields
+from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.judged_statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.fields import MODEL, ErrorDraws, draw_errors
+from bayesdist.assess.terms.fields import MODEL, ErrorDraws, ErrorFields, draw_errors
 from bayesdist.assess.terms.given import LocalTerm, UserTerm
 from bayesdist.assess.terms.sizes import drawn_squares, resized
 from bayesdist.data.magnitude_errors import MagnitudeErrors
@@ -25,9 +25,10 @@ from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = ["CENTROID", "Judged", "Place", "PositionErrors", "position_errors"]
+__all__ = ["CENTROID", "DomainFields", "PositionErrors", "position_errors", "sigma_at"]
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 CENTROID = "centroid"
 
@@ -35,6 +36,63 @@ BLOCK = 200_000  # places times draws whose errors a thread holds at once
 SMOOTH_ORDER = 3  # of fields that stand for what may vary over the detector
 SMOOTH_DRAWS = 1000
 BEYOND = 0.5  # magnitudes by which the outermost bins may be left
+MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
+
+
+@dataclass(frozen=True, eq=False)
+class DomainFields:
+    """Error fields at the positions of a domain.
+
+    Parameters
+    ----------
+    domain : EvaluationDomain
+    fields : tuple of ErrorFields
+        One for each chip.
+    """
+
+    domain: EvaluationDomain
+    fields: tuple[ErrorFields, ...]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts that are fields, without the joint error."""
+        return tuple(name for name in self.fields[0].parts if name != MODEL)
+
+    def variance(self, part: str) -> Float:
+        """Mean square of a part at each position, (N, 2)."""
+        return np.concatenate([np.stack(f.sigma(part), axis=1) ** 2 for f in self.fields])
+
+    def values(self, part: str) -> Float:
+        """Errors (n, N, 2) of all draws."""
+        return np.concatenate([f.field(part) for f in self.fields], axis=1)
+
+    def joint(self, rows: slice, shrink: Mapping[str, float]) -> Float:
+        """The joint error (rows, N, 2) of some draws, parts of it taken off to a factor."""
+        return np.concatenate([_shrunk(f, rows, shrink) for f in self.fields], axis=1)
+
+    def factor(self, shrink: Mapping[str, float]) -> Float | float:
+        """What multiplies the joint error (N, 2) where parts shrink that cannot be taken off.
+
+        The spread of the solution shrinks at each position as the part's share in its variance
+        says.
+        """
+        held = shrink.keys() & set(self.parts)
+        if not held:
+            return 1.0
+        whole = self.variance(MODEL)
+        left = whole - sum(
+            (1.0 - shrink[name] ** 2) * np.minimum(self.variance(name), whole) for name in held
+        )
+        return np.sqrt(np.maximum(left, 0.0) / np.where(whole > 0, whole, 1.0))
+
+
+def _shrunk(fields: ErrorFields, rows: slice, shrink: Mapping[str, float]) -> Float:
+    """The joint error (rows, N, 2) of some draws with some of its parts shrunk."""
+    parts = fields.polynomials
+    joint = parts[MODEL][rows]
+    for name in shrink.keys() & parts.keys():
+        joint = joint - (1.0 - shrink[name]) * parts[name][rows]
+    return replace(fields, polynomials={MODEL: joint}).field(MODEL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +133,7 @@ class PositionErrors:
     offsets: Float
     seed: int
     squares: Float
-    _kept: dict[Judged, JudgedFields] = field(default_factory=dict, repr=False)
+    _kept: dict[EvaluationDomain, DomainFields] = field(default_factory=dict, repr=False)
 
     def varied(self) -> tuple[PositionErrors, ...]:
         """The same draws with what may vary over the field varying: smoothly, and everywhere.
@@ -129,25 +187,33 @@ class PositionErrors:
     def _sized(self) -> list[tuple[UserTerm, tuple[float, float]]]:
         return list(zip(self.terms, self.sigmas, strict=True))
 
-    def names(self, judged: Judged) -> tuple[str, ...]:
+    def at(self, domain: EvaluationDomain) -> DomainFields:
+        """Error fields at the positions of a domain."""
+        key = domain.positions
+        if key not in self._kept:
+            points = {chip: (key.x[rows], key.y[rows]) for chip, rows in key.by_chip()}
+            self._kept[key] = DomainFields(key, self.fields.at(points, epoch=key.epoch))
+        return self._kept[key]
+
+    def names(self, domain: EvaluationDomain) -> tuple[str, ...]:
         """All terms that an error is made of there."""
-        parts = self._fields(judged).parts
-        own = [CENTROID] if judged.magnitude is not None else []
+        parts = self.at(domain).parts
+        own = [CENTROID] if domain.magnitude is not None else []
         return (*parts, *(t.name for t in self.local), *(t.name for t in self.terms), *own)
 
     def statistics(
         self,
-        judged: Judged,
+        domain: EvaluationDomain,
         names: Sequence[str],
         *,
         shrink: Mapping[str, float] | None = None,
         n_draws: int | None = None,
     ) -> dict[str, Float]:
-        """Statistics of each draw's error over the places.
+        """Statistics of each draw's error over the positions.
 
         Parameters
         ----------
-        judged : Judged
+        domain : EvaluationDomain
         names : sequence of str
             Of `STATISTICS`.
         shrink : mapping of str to float, optional
@@ -162,15 +228,15 @@ class PositionErrors:
         Raises
         ------
         InputError
-            For a region that holds fewer than four points of the grid, no pair of places that near,
-            a magnitude where no errors by magnitude are known, and a missing epoch.
+            For no pair of positions that near, a magnitude where no errors by magnitude are known,
+            and a missing epoch.
         """
-        (found,) = self.course((judged,), names, shrink=shrink, n_draws=n_draws)
+        (found,) = self.course((domain,), names, shrink=shrink, n_draws=n_draws)
         return found
 
     def course(
         self,
-        cases: Sequence[Judged],
+        cases: Sequence[EvaluationDomain],
         names: Sequence[str],
         *,
         shrink: Mapping[str, float] | None = None,
@@ -180,7 +246,7 @@ class PositionErrors:
 
         Parameters
         ----------
-        cases : sequence of Judged
+        cases : sequence of EvaluationDomain
             That differ in their epochs only.
         names, shrink, n_draws
             As `statistics`.
@@ -190,47 +256,49 @@ class PositionErrors:
         tuple of dict of str to ndarray, shape (n_draws,)
             One for each case.
         """
-        judged = cases[0]
-        fields, pairs = self._fields(judged), None
-        if judged.relative:
-            pairs = fields.pairs(judged.separation, np.random.default_rng(self.seed))
+        domain = cases[0]
+        pairs = domain.pairs()
+        if pairs is not None and pairs.shape[1] > MOST_PAIRS:
+            rng = np.random.default_rng(self.seed)
+            pairs = pairs[:, rng.choice(pairs.shape[1], MOST_PAIRS, replace=False)]
         return drawn_statistics(
             [self._errors(case, shrink or {}) for case in cases],
             names,
             n_draws=n_draws or self.n_draws,
-            n_places=fields.size,
+            n_places=domain.size,
             block=BLOCK,
             seed=self.seed,
             pairs=pairs,
-            over_all=judged.relative and judged.separation is None,
+            over_all=domain.relative == "pairs" and domain.separation is None,
         )
 
-    def worst(self, judged: Judged, axis: str = "") -> Place:
+    def worst(self, domain: EvaluationDomain, axis: str = "") -> WorstPosition:
         """The place at which the error is largest; of two positions, the one farther off.
 
         Parameters
         ----------
-        judged : Judged
+        domain : EvaluationDomain
         axis : {'', 'u', 'v'}
             Of which axis; of both by default.
         """
-        drawn = self._fields(judged)
+        drawn = self.at(domain)
         variance = drawn.variance(MODEL)
-        for shared, sigma in self._added(judged, {}):
-            if not (shared and judged.relative):
+        for shared, sigma in self._added(domain, {}):
+            if not (shared and domain.relative):
                 variance = variance + sigma**2
         total = variance.sum(axis=1) if not axis else variance[:, "uv".index(axis)]
         k = int(np.argmax(total))
-        return Place(*drawn.at(k), float(np.sqrt(total[k])))
+        at = int(domain.chip[k]), float(domain.x[k]), float(domain.y[k])
+        return WorstPosition(*at, float(np.sqrt(total[k])))
 
-    def size(self, judged: Judged, name: str) -> float:
-        """Radial root mean square of one term over the places."""
-        drawn = self._fields(judged)
+    def size(self, domain: EvaluationDomain, name: str) -> float:
+        """Radial root mean square of one term over the positions."""
+        drawn = self.at(domain)
         if name in (*drawn.parts, MODEL):
             variance = drawn.variance(name)
         else:
-            others = {other: 0.0 for other in self.names(judged) if other != name}
-            variance = sum(s**2 for _, s in self._added(judged, others))
+            others = {other: 0.0 for other in self.names(domain) if other != name}
+            variance = sum(s**2 for _, s in self._added(domain, others))
         return float(np.sqrt(np.mean(variance.sum(axis=1))))
 
     def centroid_at(self, magnitude: float) -> Float:
@@ -259,9 +327,9 @@ class PositionErrors:
 
     # -- the draws --------------------------------------------------------------------------------
 
-    def _errors(self, judged: Judged, shrink: Mapping[str, float]) -> ErrorsOf:
+    def _errors(self, domain: EvaluationDomain, shrink: Mapping[str, float]) -> ErrorsOf:
         """All terms together; noise is the same at every epoch and for every what-if."""
-        fields, added = self._fields(judged), self._added(judged, shrink, spread=False)
+        fields, added = self.at(domain), self._added(domain, shrink, spread=False)
         shared, single = (
             np.sqrt(sum(s**2 for is_shared, s in added if is_shared == which))
             for which in (True, False)
@@ -269,10 +337,9 @@ class PositionErrors:
         exact = {name: s for name, s in shrink.items() if self._beside(name)}
         factor = fields.factor({k: s for k, s in shrink.items() if k not in exact})
         own = [s for _, s in added[2 + len(self.terms) :][: len(self.local)]]
-        model = self.fields.whole.solution.model
-        chip = np.array([model.chip_code(number) for number in fields.places[0]])
+        chip = domain.chip_code
         common = [
-            (self._drawn_at(term, fields), shrink.get(term.name, 1.0))
+            (_drawn_at(term, domain), shrink.get(term.name, 1.0))
             for term in self.local
             if term.drawn
         ]
@@ -290,36 +357,20 @@ class PositionErrors:
 
         return error_of
 
-    def _fields(self, judged: Judged) -> JudgedFields:
-        """Fields at the points of the region."""
-        key = replace(judged, relative=False, separation=None, magnitude=None)
-        if key not in self._kept:
-            self._kept[key] = judged_fields(self.fields, key, self.grid)
-        return self._kept[key]
-
     def _beside(self, name: str) -> bool:
         """Whether a part is drawn together with the joint error, so that it can be taken off it."""
         if name in self.fields.terms:
             return name in self.fields.added
         return self.fields.whole is self.fields.shown
 
-    def _drawn_at(self, term: LocalTerm, fields: JudgedFields) -> NDArray[np.floating]:
-        """Draws (n, N, 2) of a local term at the judged points."""
-        on_chips = [
-            term.drawn[f.chip].reshape(len(term.drawn[f.chip]), -1, 2)[:, inside]
-            for f, inside in zip(fields.fields, fields.inside, strict=True)
-        ]
-        return np.concatenate(on_chips, axis=1)
-
     def _added(
-        self, judged: Judged, shrink: Mapping[str, float], *, spread: bool = True
+        self, domain: EvaluationDomain, shrink: Mapping[str, float], *, spread: bool = True
     ) -> list[tuple[bool, Float]]:
         """Whether all places share an error, and its sigmas (N, 2), of terms that are no fields.
 
         Without `spread` those of terms that have draws of their own are zero.
         """
-        drawn = self._fields(judged)
-        N = drawn.size
+        N = domain.size
         out = [(True, np.zeros((N, 2))), (False, np.zeros((N, 2)))]
         for term, sigma in zip(self.terms, self.sigmas, strict=True):
             value = np.tile(sigma, (N, 1)) * shrink.get(term.name, 1.0)
@@ -328,15 +379,36 @@ class PositionErrors:
             if one.drawn and not spread:
                 out.append((False, np.zeros((N, 2))))
                 continue
-            on_chips = [
-                np.column_stack([s.ravel() for s in one.on(f.chip, self.grid[::-1])])[inside]
-                for f, inside in zip(drawn.fields, drawn.inside, strict=True)
-            ]
-            out.append((False, np.concatenate(on_chips) * shrink.get(one.name, 1.0)))
-        if judged.magnitude is not None:
-            at = self.centroid_at(judged.magnitude)
+            out.append((False, sigma_at(one, domain) * shrink.get(one.name, 1.0)))
+        if domain.magnitude is not None:
+            at = self.centroid_at(domain.magnitude)
             out.append((False, np.tile(at, (N, 1)) * shrink.get(CENTROID, 1.0)))
         return out
+
+
+def sigma_at(term: LocalTerm, domain: EvaluationDomain) -> Float:
+    """Standard deviations (N, 2) of a local term."""
+    chips = {chip.number: chip for chip in domain.model.chips}
+    parts = [
+        term.at(number, chips[number].size, domain.x[rows], domain.y[rows])
+        for number, rows in domain.by_chip()
+    ]
+    return np.concatenate(parts)
+
+
+def _drawn_at(term: LocalTerm, domain: EvaluationDomain) -> NDArray[np.floating]:
+    """Draws (n, N, 2) of a local term at points of its grid."""
+    chips, parts = {chip.number: chip for chip in domain.model.chips}, []
+    for number, rows in domain.by_chip():
+        drawn = term.drawn[number]
+        ix, iy = (
+            np.rint((at[rows] - 1.0) / (size - 1.0) * (n - 1)).astype(np.int64)
+            for at, size, n in zip(
+                (domain.x, domain.y), chips[number].size, drawn.shape[2:0:-1], strict=True
+            )
+        )
+        parts.append(drawn[:, iy, ix])
+    return np.concatenate(parts, axis=1)
 
 
 def position_errors(

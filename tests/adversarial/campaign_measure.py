@@ -162,9 +162,5 @@ def table_errors(session: CampaignSession, truth: CampaignTruth) -> np.ndarray:
 
 def stated_sigma(session: Session) -> np.ndarray:
     """Standard deviations (N, 2) of all terms of the budget together, over the same grid."""
-    return np.concatenate(
-        [
-            np.column_stack([chip.total_u.ravel(), chip.total_v.ravel()])
-            for chip in budget_of(session).chips
-        ]
-    )
+    total = budget_of(session).total
+    return np.column_stack([total.u, total.v])

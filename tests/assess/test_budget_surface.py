@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.budget import detector_budget, place_budget
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.drawn import position_errors
 from bayesdist.assess.terms.fields import MODEL
@@ -61,12 +60,12 @@ def test_any_place_at_any_epoch_has_its_budget(solution_of, epoch):
     x, y = np.array([1.0, 33.5, 201.0]), np.array([101.0, 7.25, 50.0])
     for chip in (1, 2):
         truth = place_budget(errors, x, y, chip=chip, epoch=epoch)
-        for term in truth.terms:
+        for term in truth.every:
             part = MODEL if term.name == "total" else term.name
             found = variance(surface, part, chip, x, y, epoch)
             np.testing.assert_allclose(found[:, 0], term.u**2, rtol=1e-7)
             np.testing.assert_allclose(found[:, 1], term.v**2, rtol=1e-7)
-        between = place_budget(errors, x, y, chip=chip, epoch=epoch, relative=True).terms[-1]
+        between = place_budget(errors, x, y, chip=chip, epoch=epoch, relative=True).total
         found = variance(surface, MODEL, chip, x[1:], y[1:], epoch, origin=(x[:1], y[:1]))
         np.testing.assert_allclose(found[:, 0], between.u**2, rtol=1e-7)
 
@@ -75,7 +74,7 @@ def test_over_the_grid_it_is_the_budget_of_the_detector(solution_of):
     solution, errors, what = drawn(solution_of, frames="shift", exposures=("a", "b", "c"))
     budget = detector_budget(solution, epoch=2012.0, rng=np.random.default_rng(2), **what)
     surface = budget_surface(errors, epoch=2012.0, years=(2002.0, 2020.0))
-    assert set(surface.parts) == {t.name for t in budget.chips[0].terms}
+    assert set(surface.parts) == {t.name for t in budget.terms}
     x, y = mesh(*grid_pixels(SIZE, GRID))
     for row in budget.rows():
         part = MODEL if row["name"] == "total" else row["name"]
@@ -97,7 +96,7 @@ def test_alignment_hardly_depends_on_the_drift(solution_of):
     """What a rotation takes up follows the drifting positions: quadratic to first order only."""
     _, errors, _ = drawn(solution_of, aligned=True)
     surface = budget_surface(errors, years=(2002.0, 2020.0))
-    truth = place_budget(errors, [10.0], [90.0], chip=1, epoch=2004.1).terms[-1]
+    truth = place_budget(errors, [10.0], [90.0], chip=1, epoch=2004.1).total
     found = variance(surface, MODEL, 1, [10.0], [90.0], 2004.1)
     assert found[0] == pytest.approx([truth.u[0] ** 2, truth.v[0] ** 2], rel=1e-3)
 

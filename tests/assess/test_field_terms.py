@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import LocalTerm, Requirement, UserTerm, check_requirements, error_fields
-from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.budget.budget import detector_budget
 from bayesdist.assess.terms.field_terms import MOTIONS, CatalogueTerm, ExposureScatter
 from bayesdist.assess.terms.fields import MODEL, draw_errors
 from bayesdist.assess.terms.parameters import LinearTerm

@@ -5,7 +5,7 @@ import pytest
 
 from bayesdist.assess import UserTerm
 from bayesdist.assess import drawn as module
-from bayesdist.assess.domain import Judged
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import position_errors
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
@@ -29,7 +29,7 @@ def errors(solution_of):
 
 
 def cases(**more):
-    return [Judged(CHIPS, epoch, "field", **more) for epoch in EPOCHS]
+    return [EvaluationDomain.of_chips(MODEL, (6, 5), epoch=epoch, **more) for epoch in EPOCHS]
 
 
 @pytest.mark.parametrize("more", [{}, {"relative": True}, {"relative": True, "separation": 30.0}])

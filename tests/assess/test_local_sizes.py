@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess.drawn import Judged, position_errors
-from bayesdist.assess.requirements.regions import WHOLE
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.drawn import position_errors
 from bayesdist.assess.terms.given import LocalTerm
 from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.infer import fit_linear
@@ -25,7 +25,8 @@ def drawn(squares: dict[int, MeanSquare], sigma: float = 1.0):
     errors = position_errors(
         fit, local=[term], grid=SHAPE, n_draws=DRAWS, rng=np.random.default_rng(1)
     )
-    return lambda names: errors.statistics(Judged(model.chips, None, WHOLE), names)
+    domain = EvaluationDomain.of_chips(model, SHAPE)
+    return lambda names: errors.statistics(domain, names)
 
 
 @pytest.mark.parametrize("error", [None, 0.1, 0.2])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm, error_budget
-from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.budget import place_budget
 from bayesdist.assess.drawn import position_errors
 from bayesdist.assess.terms.given import LocalTerm
 from bayesdist.data import MagnitudeErrors
@@ -31,7 +31,7 @@ def errors_of(solution_of, *, sigma=(0.03, 0.02), **options):
 
 
 def named(budget):
-    return {t.name: t for t in budget.terms}
+    return {t.name: t for t in budget.every}
 
 
 TERMS = [
@@ -49,13 +49,12 @@ def test_at_the_points_of_a_grid_it_is_the_budget_of_the_grid(solution_of):
         n_draws=DRAWS,
         rng=np.random.default_rng(1),
     )
-    x, y = (a.ravel() for a in np.meshgrid(whole.x, whole.y))
-    found = named(place_budget(errors, x, y, chip=1))
+    found = named(place_budget(errors, whole.x, whole.y, chip=1))
     for term in whole.terms:
-        assert found[term.name].u == pytest.approx(term.u.ravel(), rel=1e-9)
+        assert found[term.name].u == pytest.approx(term.u, rel=1e-9)
         assert found[term.name].source == term.source
-    assert found["total"].u == pytest.approx(whole.total_u.ravel(), rel=1e-9)
-    assert found["total"].v == pytest.approx(whole.total_v.ravel(), rel=1e-9)
+    assert found["total"].u == pytest.approx(whole.total.u, rel=1e-9)
+    assert found["total"].v == pytest.approx(whole.total.v, rel=1e-9)
 
 
 def test_between_two_positions_what_they_share_drops_out(solution_of):

@@ -7,8 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.budget import detector_budget, place_budget
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.drawn import position_errors
 from bayesdist.assess.terms.product_terms import PRODUCT, ProductTerm, with_product
@@ -63,12 +62,12 @@ def test_who_uses_the_file_has_both(solution):
 def test_at_a_place_it_is_the_field_and_between_two_the_difference(solution):
     errors = position_errors(solution, grid=GRID, n_draws=100, rng=np.random.default_rng(3))
     x, y = [11.0, 151.0], [20.0, 90.0]
-    single = place_budget(errors, x, y, chip=2, products=(TERM,)).terms
-    alone = place_budget(errors, x, y, chip=2).terms
+    single = place_budget(errors, x, y, chip=2, products=(TERM,)).every
+    alone = place_budget(errors, x, y, chip=2).every
     np.testing.assert_allclose(single[-2].u, [0.09, 0.05])
     np.testing.assert_allclose(single[-2].v, 0.05)
     np.testing.assert_array_equal(single[-1].u, alone[-1].u)
-    between = place_budget(errors, x, y, chip=2, relative=True, products=(TERM,)).terms
+    between = place_budget(errors, x, y, chip=2, relative=True, products=(TERM,)).every
     np.testing.assert_allclose(between[-2].u, [0.14])
     np.testing.assert_allclose(between[-2].v, 0.0)
 

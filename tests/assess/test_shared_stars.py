@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.budget.budget import detector_budget
 from bayesdist.assess.terms.field_terms import CatalogueTerm, ExposureScatter
 from bayesdist.assess.terms.fields import draw_errors
 from bayesdist.infer import fit_linear
@@ -51,7 +51,7 @@ def test_the_budget_is_the_scatter_over_catalogues():
 
     # points of the budget, and behind them stars that cover the chips evenly
     pixels = [
-        (budget.chips[0].x, budget.chips[0].y),
+        budget.chips[0].axes,
         ((np.arange(32) + 0.5) * 128, (np.arange(16) + 0.5) * 128),
     ]
     points, cover = (np.stack(np.meshgrid(*xy)).reshape(2, -1) for xy in pixels)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.budget.budget import detector_budget
 from bayesdist.assess.drawn import position_errors
 from bayesdist.assess.requirements.validity import horizon_of
 from bayesdist.model import Chip, DistortionModel, TimeDependence

@@ -12,8 +12,7 @@ import numpy as np
 from scipy.stats import norm
 
 from bayesdist.app.judging import errors_of
-from bayesdist.assess.budget.budget import TOTAL
-from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.budget import TOTAL, place_budget
 from bayesdist.assess.drawn import CENTROID, PositionErrors
 from bayesdist.assess.terms.correlated import STRUCTURE_IN_FIT
 from bayesdist.assess.terms.fields import COEFFICIENTS, MODEL, TIME_DEPENDENCE
@@ -138,7 +137,7 @@ def _said(errors: PositionErrors, x, y, epoch, mag) -> dict[str, np.ndarray]:
     for rows in _together(x.size):
         when = None if epoch is None else float(epoch[rows][0])
         place = {"chip": 1, "epoch": when, "magnitude": float(mag[rows][0])}
-        for one in place_budget(errors, x[rows], y[rows], **place).terms:
+        for one in place_budget(errors, x[rows], y[rows], **place).every:
             out.setdefault(one.name, []).append(np.column_stack([one.u, one.v]))
     said = {name: np.concatenate(parts) for name, parts in out.items()}
     said[PLACE_TOTAL] = np.sqrt(said[TOTAL] ** 2 - said[CENTROID] ** 2)

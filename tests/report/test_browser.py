@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm
-from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.budget.place import place_budget
+from bayesdist.assess.budget.budget import detector_budget, place_budget
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.drawn import position_errors
 from bayesdist.assess.terms.given import LocalTerm
@@ -181,8 +180,8 @@ def test_a_position_is_that_of_the_assessment(asked, opened, chip, x, y, epoch, 
     )
     assert slider(opened) == pytest.approx(epoch, abs=0.026)  # the slider's steps
     found = shown(opened)
-    assert [t.name for t in truth.terms if t.name not in found] == []
-    for term in truth.terms:
+    assert [t.name for t in truth.every if t.name not in found] == []
+    for term in truth.every:
         values = (term.u[0], term.v[0], term.radial[0])
         assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
 
@@ -209,11 +208,11 @@ def test_the_difference_of_two_positions_is_that_of_the_assessment(asked, opened
         products=asked.files,
     )
     found = shown(opened)
-    for term in truth.terms:
+    for term in truth.every:
         values = (term.u[0], term.v[0], term.radial[0])
         assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
     # what both positions share: the frames of this run are shifts
-    assert [t.name for t in truth.terms if t.radial[0] == 0] == [
+    assert [t.name for t in truth.every if t.radial[0] == 0] == [
         "exposure frame",
         "reference catalogue",
     ]

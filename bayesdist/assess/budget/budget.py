@@ -1,29 +1,32 @@
-"""The error budget: what the position error at each place of the detector is made of."""
+"""The error budget: what the error of each position is made of."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.drawn import CENTROID, PositionErrors, position_errors, sigma_at
 from bayesdist.assess.requirements.verdict import effective_draws
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.fields import MODEL, ErrorFields, draw_errors
+from bayesdist.assess.terms.fields import MODEL
 from bayesdist.assess.terms.given import LOCAL, MEASURED, LocalTerm, UserTerm
 from bayesdist.assess.terms.product_terms import PRODUCT, ProductTerm
 from bayesdist.assess.units import pixel_scale_of
-from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = [
+    "TOTAL",
     "BudgetTerm",
     "ErrorBudget",
-    "budget_rows",
+    "detector_budget",
     "error_budget",
-    "error_budgets",
+    "place_budget",
 ]
 
 Float = NDArray[np.float64]
@@ -43,13 +46,15 @@ class BudgetTerm:
     kind : str
         'random', 'systematic' (as the parts of the model, which all stars share), 'local' (shared
         by the stars at one place), or 'product' (of a file, known, and in no total).
-    u, v : ndarray, shape (ny, nx)
+    u, v : ndarray, shape (P,)
         Standard deviations, in the unit of the budget; of products the displacements' sizes.
     source : str
         Begins with 'measured in this run', 'given by the user' or 'published'.
     relative_error : float or None
         How well the standard deviations are known themselves, relative to their size: of draws the
         Monte-Carlo error.  None where it is not known.
+    by_chip : mapping of int to float or None
+        The same by chip number, where that differs; `relative_error` is that of the first chip.
     """
 
     name: str
@@ -58,106 +63,161 @@ class BudgetTerm:
     v: Float
     source: str
     relative_error: float | None = None
+    by_chip: Mapping[int, float | None] = field(default_factory=dict)
 
     @property
     def radial(self) -> Float:
-        """hypot(u, v), (ny, nx)."""
+        """hypot(u, v), (P,)."""
         return np.hypot(self.u, self.v)
+
+    def on(self, chip: int, rows: slice) -> BudgetTerm:
+        """The same on one chip, whose positions are some of the rows."""
+        known = self.by_chip.get(chip, self.relative_error)
+        return replace(self, u=self.u[rows], v=self.v[rows], relative_error=known, by_chip={})
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """Contributions to the position error over the detector, and their total.
+    """Contributions to the errors of positions, or of their differences to the first one.
 
     Parameters
     ----------
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        FITS 1-based pixels.
+    domain : EvaluationDomain
+        N positions; P = N, or N - 1 where errors are those of differences to the first.
     unit : str
-    chip : int
-    epoch : float or None
     terms : tuple of BudgetTerm
         Parts of the model first, then field terms, local ones, and the user's.
-    model_u, model_v : ndarray, shape (ny, nx)
+    model : BudgetTerm
         All parts of the model and the field terms jointly.  They are correlated, so this may be
         smaller than any of them.
-    total_u, total_v : ndarray, shape (ny, nx)
-        The former, the local terms and the user's in quadrature.
-    dominant : ndarray of int, shape (ny, nx)
-        Index into `terms` of the one with the largest radial error.
     n_draws : int
         Draws behind the model's parts: their relative error is about 1 / sqrt(2 n_draws).
     products : tuple of BudgetTerm
         What files differ by from the solution: in no total.
     """
 
-    x: Float
-    y: Float
+    domain: EvaluationDomain
     unit: str
-    chip: int
-    epoch: float | None
     terms: tuple[BudgetTerm, ...]
-    model_u: Float
-    model_v: Float
-    total_u: Float
-    total_v: Float
-    dominant: Int
+    model: BudgetTerm
+    total: BudgetTerm
     n_draws: int
     products: tuple[BudgetTerm, ...] = ()
 
     @property
-    def radial(self) -> Float:
-        """Total radial error hypot(total_u, total_v), (ny, nx)."""
-        return np.hypot(self.total_u, self.total_v)
+    def x(self) -> Float:
+        """FITS 1-based columns (P,)."""
+        return self.domain.x[self._kept]
 
     @property
-    def total(self) -> BudgetTerm:
-        """All terms together, as one."""
-        return BudgetTerm("total", TOTAL, self.total_u, self.total_v, TOGETHER)
+    def y(self) -> Float:
+        """FITS 1-based rows (P,)."""
+        return self.domain.y[self._kept]
+
+    @property
+    def _kept(self) -> slice:
+        return slice(1 if self.domain.relative else 0, None)
+
+    @property
+    def epoch(self) -> float | None:
+        """Decimal years."""
+        return self.domain.epoch
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the terms."""
+        return tuple(t.name for t in self.terms)
+
+    @property
+    def every(self) -> tuple[BudgetTerm, ...]:
+        """All rows: terms, products, and the total last."""
+        return (*self.terms, *self.products, self.total)
+
+    @property
+    def radial(self) -> Float:
+        """Total radial error (P,)."""
+        return self.total.radial
+
+    @property
+    def dominant(self) -> Int:
+        """Index into `terms` of the one with the largest radial error, (P,)."""
+        return np.argmax([t.radial for t in self.terms], axis=0)
+
+    @property
+    def share(self) -> Float:
+        """Fraction of the positions at which each term is the largest."""
+        dominant = self.dominant
+        return np.bincount(dominant, minlength=len(self.terms)) / dominant.size
+
+    @property
+    def chips(self) -> tuple[ErrorBudget, ...]:
+        """The budget of each chip by itself."""
+        return tuple(
+            replace(
+                self,
+                domain=self.domain.on(chip),
+                terms=tuple(t.on(chip, rows) for t in self.terms),
+                model=self.model.on(chip, rows),
+                total=self.total.on(chip, rows),
+                products=tuple(t.on(chip, rows) for t in self.products),
+            )
+            for chip, rows in self.domain.by_chip()
+        )
+
+    @property
+    def axes(self) -> tuple[Float, Float]:
+        """Columns (nx,) and rows (ny,) of the grid, of a budget over the grid of one chip."""
+        nx, ny = self.domain.grid or (self.domain.size, 1)
+        return self.x[:nx], self.y.reshape(ny, nx)[:, 0]
+
+    def on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values (N,) of a budget over the grid of one chip as a map (ny, nx)."""
+        nx, ny = self.domain.grid or (self.domain.size, 1)
+        return values.reshape(ny, nx)
 
     def rows(self) -> list[dict[str, Any]]:
         """The budget as a table: one row for each term and each product, the total last.
 
+        The total is known as well as its terms are: not where one of them was given without an
+        error.
+
         Returns
         -------
         list of dict
-            name, kind, u, v, radial (root mean squares over the grid), radial_error (how well that
-            is known; None where it is not), source.
+            name, kind, u, v, radial (root mean squares over the positions), radial_error (how well
+            that is known; None where it is not), source.
         """
-        return budget_rows([*self.terms, *self.products, self.total])
+        rows = []
+        for t in self.every:
+            mean_u, mean_v = float(np.mean(t.u**2)), float(np.mean(t.v**2))
+            radial = (mean_u + mean_v) ** 0.5
+            error = None if t.relative_error is None else t.relative_error * radial
+            rows.append(
+                {
+                    "name": t.name,
+                    "kind": t.kind,
+                    "u": mean_u**0.5,
+                    "v": mean_v**0.5,
+                    "radial": radial,
+                    "radial_error": error,
+                    "source": t.source,
+                }
+            )
+        total = rows[-1]
+        if total["radial"] > 0:
+            parts = [(r["radial"], r["radial_error"]) for r in rows[:-1] if r["kind"] != PRODUCT]
+            known = [(radial, error) for radial, error in parts if error is not None]
+            spread = sum((radial * error) ** 2 for radial, error in known) ** 0.5
+            # a term of nothing needs no error
+            whole = len(known) == sum(radial > 0 or error is not None for radial, error in parts)
+            total["radial_error"] = spread / total["radial"] if whole else None
+        return rows
 
-
-def budget_rows(terms: Sequence[BudgetTerm]) -> list[dict[str, Any]]:
-    """Rows of a budget: root mean squares of the standard deviations; the total is the last one.
-
-    The total is known as well as its terms are: not where one of them was given without an error.
-    """
-    rows = []
-    for t in terms:
-        mean_u, mean_v = float(np.mean(t.u**2)), float(np.mean(t.v**2))
-        radial = (mean_u + mean_v) ** 0.5
-        error = None if t.relative_error is None else t.relative_error * radial
-        rows.append(
-            {
-                "name": t.name,
-                "kind": t.kind,
-                "u": mean_u**0.5,
-                "v": mean_v**0.5,
-                "radial": radial,
-                "radial_error": error,
-                "source": t.source,
-            }
-        )
-    total = rows[-1]
-    if total["kind"] == TOTAL and total["radial"] > 0:
-        parts = [(r["radial"], r["radial_error"]) for r in rows[:-1] if r["kind"] != PRODUCT]
-        known = [(radial, error) for radial, error in parts if error is not None]
-        spread = sum((radial * error) ** 2 for radial, error in known) ** 0.5
-        # a term of nothing needs no error
-        whole = len(known) == sum(radial > 0 or error is not None for radial, error in parts)
-        total["radial_error"] = spread / total["radial"] if whole else None
-    return rows
+    def rows_by_chip(self) -> list[dict[str, Any]]:
+        """As `rows`, followed by those of each chip alone; column chip is 'all' or its number."""
+        alone = zip(self.domain.chips, self.chips, strict=True)
+        parts = [("all", self.rows()), *((str(chip), b.rows()) for chip, b in alone)]
+        return [{"chip": chip} | row for chip, rows in parts for row in rows]
 
 
 def error_budget(
@@ -173,7 +233,7 @@ def error_budget(
     rng: np.random.Generator,
     pixel_scale: float | None = None,
 ) -> ErrorBudget:
-    """The error budget of a solution over a grid, at an epoch.
+    """The error budget of a solution over a grid on a chip, at an epoch.
 
     The parts of the model and the field terms are combined by joint draws, for they are correlated;
     the user's terms are independent and added in quadrature.
@@ -209,25 +269,22 @@ def error_budget(
         For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
         needs a pixel scale that is not known.
     """
-    number = place_of(solution.model, epoch=epoch, chip=chip).chip.number
-    (budget,) = error_budgets(
+    return detector_budget(
         solution,
-        (number,),
         terms=terms,
         fields=fields,
         aligned=aligned,
         grid=grid,
         epoch=epoch,
+        chips=(place_of(solution.model, epoch=epoch, chip=chip).chip.number,),
         n_draws=n_draws,
         rng=rng,
         pixel_scale=pixel_scale,
     )
-    return budget
 
 
-def error_budgets(
+def detector_budget(
     solution: Solution,
-    chips: Sequence[int],
     *,
     terms: Sequence[UserTerm] = (),
     fields: Sequence[FieldTerm] = (),
@@ -236,97 +293,167 @@ def error_budgets(
     products: Sequence[ProductTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
+    chips: Sequence[int] | None = None,
     n_draws: int = 4000,
     rng: np.random.Generator,
     pixel_scale: float | None = None,
-) -> tuple[ErrorBudget, ...]:
-    """Error budgets of several chips from one set of draws: the chips share parameters.
+) -> ErrorBudget:
+    """The error budget of a solution over its chips, the same grid on each.
 
     Parameters
     ----------
     solution : LinearFit or Posterior
-    chips : sequence of int
-        Chip numbers.
     local : sequence of LocalTerm
-        Measured beside the solution, on this grid.
+        Measured beside the solution.
     products : sequence of ProductTerm
         Shown beside the others, and in no total.
+    chips : sequence of int, optional
+        Chip numbers; all by default.
     terms, fields, aligned, grid, epoch, n_draws, rng, pixel_scale
         As in `error_budget`.
 
     Returns
     -------
-    tuple of ErrorBudget
+    ErrorBudget
+        In the unit of u, v.
 
     Raises
     ------
     InputError
         As `error_budget`.
     """
-    unit = solution.model.unit
     if pixel_scale is None:
-        pixel_scale = pixel_scale_of(solution, chips[0])
-    sigmas = [t.sigma(unit, pixel_scale) for t in terms]  # refuse bad units before the work
-    grids = {
-        c: grid_pixels(place_of(solution.model, epoch=epoch, chip=c).chip.size, grid) for c in chips
-    }
-    draws = draw_errors(solution, n_draws, rng, fields=fields, aligned=aligned)
-    drawn = draws.at({c: mesh(*xy) for c, xy in grids.items()}, epoch=epoch)
+        pixel_scale = pixel_scale_of(solution, None if chips is None else chips[0])
+    domain = EvaluationDomain.of_chips(solution.model, grid, chips=chips, epoch=epoch)
+    errors = position_errors(
+        solution,
+        terms=terms,
+        fields=fields,
+        aligned=aligned,
+        local=local,
+        grid=grid,
+        n_draws=n_draws,
+        rng=rng,
+        pixel_scale=pixel_scale,
+    )
     noise = 1.0 / (2.0 * effective_draws(solution, n_draws)) ** 0.5
     sources = {t.name: t.source for t in fields}
-    return tuple(
-        replace(
-            _budget(f, *grids[f.chip], terms, sigmas, local, noise, sources),
-            products=tuple(_product(p, *grids[f.chip], f.chip, f.epoch) for p in products),
-        )
-        for f in drawn
+    return _budget(errors, domain, relative_error=noise, sources=sources, products=products)
+
+
+def place_budget(
+    errors: PositionErrors,
+    x: ArrayLike,
+    y: ArrayLike,
+    *,
+    chip: int,
+    epoch: float | None = None,
+    magnitude: float | None = None,
+    relative: bool = False,
+    relative_error: float | None = None,
+    sources: Mapping[str, str] | None = None,
+    products: Sequence[ProductTerm] = (),
+) -> ErrorBudget:
+    """The error budget of some positions, or of their differences to the first one.
+
+    Parameters
+    ----------
+    errors : PositionErrors
+    x, y : array_like, shape (N,)
+        FITS 1-based pixels; two or more for relative errors.
+    chip : int
+        Chip number.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    magnitude : float, optional
+        Of the stars: their centroids' errors are a term then.
+    relative : bool
+        Errors of the differences to the first position, in one image: what all positions share
+        drops out, and what is independent counts twice.
+    relative_error : float, optional
+        Monte-Carlo error of what is drawn.
+    sources : mapping of str to str, optional
+        Where terms come from; 'measured in this run' by default.
+    products : sequence of ProductTerm
+        Shown beside the others, and in no total.
+
+    Returns
+    -------
+    ErrorBudget
+
+    Raises
+    ------
+    InputError
+        For an unknown chip, a position off the chip, a missing epoch, a magnitude where no errors
+        by magnitude are known, and relative errors of one position.
+    """
+    model = errors.fields.whole.solution.model
+    domain = EvaluationDomain.at_pixels(
+        model, chip, x, y, epoch=epoch, magnitude=magnitude, relative=relative
+    )
+    return _budget(
+        errors, domain, relative_error=relative_error, sources=sources or {}, products=products
     )
 
 
-def _product(term: ProductTerm, x: Float, y: Float, chip: int, epoch: float | None) -> BudgetTerm:
-    u, v = np.abs(term.at(*mesh(x, y), chip, epoch)).T.reshape(2, y.size, x.size)
-    return BudgetTerm(term.name, PRODUCT, u, v, term.source, 0.0)
-
-
 def _budget(
-    fields: ErrorFields,
-    x: Float,
-    y: Float,
-    terms: Sequence[UserTerm],
-    sigmas: Sequence[tuple[float, float]],
-    local: Sequence[LocalTerm],
-    noise: float,
+    errors: PositionErrors,
+    domain: EvaluationDomain,
+    *,
+    relative_error: float | None,
     sources: Mapping[str, str],
+    products: Sequence[ProductTerm],
 ) -> ErrorBudget:
-    shape = (y.size, x.size)
-    measured = {part: tuple(s.reshape(shape) for s in fields.sigma(part)) for part in fields.parts}
-    model_u, model_v = measured.pop(MODEL)
-    entries = [
-        BudgetTerm(n, "systematic", u, v, sources.get(n, MEASURED), noise)
-        for n, (u, v) in measured.items()
+    fields, relative, N = errors.at(domain), bool(domain.relative), domain.size
+
+    def drawn(part: str) -> Float:
+        if not relative:
+            return fields.variance(part)
+        values = fields.values(part)
+        return np.asarray(np.mean((values[:, 1:] - values[:, :1]) ** 2, axis=0))
+
+    def single(sigma: Float) -> Float:
+        return sigma[1:] ** 2 + sigma[:1] ** 2 if relative else sigma**2
+
+    def term(
+        name: str, kind: str, square: Float, source: str, error: float | None = None
+    ) -> BudgetTerm:
+        return BudgetTerm(name, kind, *np.sqrt(square).T, source, error)
+
+    terms = [
+        term(name, "systematic", drawn(name), sources.get(name, MEASURED), relative_error)
+        for name in fields.parts
     ]
-    n_parts = len(entries)
-    entries += [
-        BudgetTerm(
-            t.name, LOCAL, *t.on(fields.chip, shape), t.source, t.relative_error(fields.chip)
+    model, others = drawn(MODEL), []
+    for local in errors.local:
+        square = single(sigma_at(local, domain))
+        known = {chip: local.relative_error(chip) for chip in domain.chips}
+        one = term(local.name, LOCAL, square, local.source, known[domain.chips[0]])
+        others.append(replace(one, by_chip=known))
+    for given, sigma in zip(errors.terms, errors.sigmas, strict=True):
+        square = single(np.tile(sigma, (N, 1)))
+        if given.kind != "random" and relative:
+            square = np.zeros_like(square)
+        others.append(term(given.name, given.kind, square, given.source))
+    if domain.magnitude is not None:
+        sigma = np.tile(errors.centroid_at(domain.magnitude), (N, 1))
+        others.append(term(CENTROID, "random", single(sigma), MEASURED))
+    moved = [
+        np.concatenate(
+            [p.at(domain.x[k], domain.y[k], chip, domain.epoch) for chip, k in domain.by_chip()]
         )
-        for t in local
+        for p in products
     ]
-    for t, (su, sv) in zip(terms, sigmas, strict=True):
-        entries.append(BudgetTerm(t.name, t.kind, np.full(shape, su), np.full(shape, sv), t.source))
-    others = entries[n_parts:]
-    user_u2, user_v2 = (sum(getattr(t, axis) ** 2 for t in others) for axis in "uv")
+    total = sum((np.stack([t.u, t.v], axis=1) ** 2 for t in others), model)
     return ErrorBudget(
-        x=x,
-        y=y,
-        unit=fields.unit,
-        chip=fields.chip,
-        epoch=fields.epoch,
-        terms=tuple(entries),
-        model_u=model_u,
-        model_v=model_v,
-        total_u=np.sqrt(model_u**2 + user_u2),
-        total_v=np.sqrt(model_v**2 + user_v2),
-        dominant=np.argmax([t.radial for t in entries], axis=0),
-        n_draws=fields.n_draws,
+        domain,
+        errors.unit,
+        (*terms, *others),
+        term("model", "systematic", model, MEASURED, relative_error),
+        term(TOTAL, TOTAL, total, TOGETHER),
+        errors.n_draws,
+        tuple(
+            term(p.name, PRODUCT, (m[1:] - m[:1] if relative else m) ** 2, p.source, 0.0)
+            for p, m in zip(products, moved, strict=True)
+        ),
     )

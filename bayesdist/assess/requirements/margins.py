@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.drawn import Judged, Place, PositionErrors, position_errors
+from bayesdist.assess.domain import EvaluationDomain, WorstPosition
+from bayesdist.assess.drawn import PositionErrors, position_errors
 from bayesdist.assess.requirements.remedy import Remedy, find_remedy
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import (
@@ -26,7 +27,7 @@ from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["Margin", "Requirement", "check_requirements", "judged_places"]
+__all__ = ["Margin", "Requirement", "check_requirements", "domains_of"]
 
 Float = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ class Margin:
         Independent draws that the draws are worth.
     draws : ndarray, shape (n,)
         The statistic of every draw; over a range of epochs the largest.
-    worst : Place
+    worst : WorstPosition
         Where the error is largest, at that epoch; its size in `unit`.
     rests_on : tuple of str
         What the verdict takes for granted or has measured, as clauses.
@@ -84,7 +85,7 @@ class Margin:
     epoch: float | None
     n_effective: float
     draws: Float
-    worst: Place
+    worst: WorstPosition
     remedy: Remedy | None = None
     rests_on: tuple[str, ...] = ()
 
@@ -176,7 +177,7 @@ def check_requirements(
         t.sigma(unit, pixel_scale)
     if not requirements:
         return ()
-    cases = [judged_places(r, solution.model, epoch=epoch, chip=chip) for r in requirements]
+    cases = [domains_of(r, solution.model, grid, epoch=epoch, chip=chip) for r in requirements]
     errors = position_errors(
         solution,
         terms=terms,
@@ -189,16 +190,16 @@ def check_requirements(
         rng=rng,
         pixel_scale=pixel_scale,
     )
-    wanted: dict[Judged, set[str]] = {}
+    wanted: dict[EvaluationDomain, set[str]] = {}
     for r, case in zip(requirements, cases, strict=True):
-        for judged in case:
-            wanted.setdefault(judged, set()).add(r.statistic)
+        for domain in case:
+            wanted.setdefault(domain, set()).add(r.statistic)
     ways, found = (errors, *errors.varied()), {}
-    for judged, names in wanted.items():
-        owner = next(r for r, case in zip(requirements, cases, strict=True) if judged in case)
+    for domain, names in wanted.items():
+        owner = next(r for r, case in zip(requirements, cases, strict=True) if domain in case)
         try:
-            found[judged] = [one.statistics(judged, sorted(names)) for one in ways]
-        except InputError as error:  # of its region, separation or magnitude
+            found[domain] = [one.statistics(domain, sorted(names)) for one in ways]
+        except InputError as error:  # of its separation or magnitude
             raise InputError(
                 error.cause, where=f"{owner.where}, {error.where}", do=error.do
             ) from None
@@ -212,7 +213,7 @@ def check_requirements(
             _margin(r, case, draws, way, factor, n_effective, caveats)
             for way, *draws in zip(
                 ways,
-                *([factor * one[r.statistic] for one in found[judged]] for judged in case),
+                *([factor * one[r.statistic] for one in found[domain]] for domain in case),
                 strict=True,
             )
         ]
@@ -220,31 +221,35 @@ def check_requirements(
     return tuple(margins)
 
 
-def judged_places(
+def domains_of(
     requirement: Requirement,
     model: DistortionModel,
+    grid: tuple[int, int],
     *,
     epoch: float | None = None,
     chip: int | None = None,
-) -> tuple[Judged, ...]:
+) -> tuple[EvaluationDomain, ...]:
     """Where and when a requirement is judged: one for each epoch.
 
     Parameters
     ----------
     requirement : Requirement
     model : DistortionModel
+    grid : tuple of int
+        Points on x and y of a chip.
     epoch, chip
         For a requirement that names none.
 
     Returns
     -------
-    tuple of Judged
+    tuple of EvaluationDomain
 
     Raises
     ------
     InputError
-        For an unknown chip, a missing epoch, a range of epochs where nothing depends on time, and a
-        polygon that is not said to lie on one of several chips.
+        For an unknown chip, a missing epoch, a range of epochs where nothing depends on time, a
+        polygon that is not said to lie on one of several chips, and a region that holds fewer than
+        four points of the grid.
     """
     r = requirement
     epochs: list[float | None] = [r.epoch if r.epoch is not None else epoch]
@@ -273,7 +278,20 @@ def judged_places(
             where=r.where,
             do=f"name its chip, one of {', '.join(str(c.number) for c in chips)}",
         )
-    return tuple(Judged(chips, t, r.region, r.relative, r.separation, r.magnitude) for t in epochs)
+    try:
+        first = EvaluationDomain.of_chips(
+            model,
+            grid,
+            chips=[c.number for c in chips],
+            region=r.region,
+            epoch=epochs[0],
+            magnitude=r.magnitude,
+            relative=r.relative,
+            separation=r.separation,
+        )
+    except InputError as error:  # of its region
+        raise InputError(error.cause, where=f"{r.where}, {error.where}", do=error.do) from None
+    return tuple(first.at(epoch) for epoch in epochs)
 
 
 def _chips_of(
@@ -323,7 +341,7 @@ def _not_converged(solution: Solution) -> tuple[Caveat, ...]:
 
 def _margin(
     requirement: Requirement,
-    case: Sequence[Judged],
+    case: Sequence[EvaluationDomain],
     by_epoch: Sequence[Float],
     errors: PositionErrors,
     factor: float,

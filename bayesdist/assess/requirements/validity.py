@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.assess.drawn import PositionErrors
-from bayesdist.assess.requirements.margins import judged_places
+from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.units import convert
@@ -137,10 +137,9 @@ def horizon_of(
         raise InputError("the epochs do not rise", where="epochs", do="give two or more in order")
     factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
     n = n_effective or float(errors.n_draws)
-    (judged,) = judged_places(
-        replace(requirement, epoch=float(at[0]), epochs=None), model
-    )
-    cases = [replace(judged, epoch=float(epoch)) for epoch in at]
+    here = replace(requirement, epoch=float(at[0]), epochs=None)
+    (domain,) = domains_of(here, model, errors.grid)
+    cases = [domain.at(float(epoch)) for epoch in at]
     name = requirement.statistic
     draws = factor * np.array([found[name] for found in errors.course(cases, [name])])
     met, value = np.mean(draws <= requirement.limit, axis=1), np.median(draws, axis=1)

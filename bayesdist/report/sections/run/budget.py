@@ -177,7 +177,10 @@ def budget_dominating(r: ReportInput) -> Plot:
     panels.frame()
     scalar_map(
         panels,
-        [Grid(b.x, b.y, np.searchsorted(present, b.dominant).astype(float)) for b in budget.chips],
+        [
+            Grid(*b.axes, np.searchsorted(present, b.on_grid(b.dominant)).astype(float))
+            for b in budget.chips
+        ],
         r.mosaic.names,
         norm=BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present)),
         cmap=ListedColormap(colors),
