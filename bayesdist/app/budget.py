@@ -7,15 +7,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.judging import errors_of, products_of
+from bayesdist.app.judging import errors_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
-from bayesdist.assess.requirements.verdict import effective_draws
-from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.errors import InputError
 
 __all__ = ["budget_at"]
@@ -62,7 +61,6 @@ def budget_at(
         require(session, "budget", ("fit", "sample"))
         number_of = _chip(session, chip, str(run))
         errors = errors_of(session)
-        noise = (2.0 * effective_draws(session.solution, errors.n_draws)) ** -0.5
         x, y = zip(at, *to, strict=True)
         found = place_budget(
             errors,
@@ -72,9 +70,6 @@ def budget_at(
             epoch=session.epoch if epoch is None else epoch,
             magnitude=magnitude,
             relative=bool(to),
-            relative_error=noise,
-            sources={t.name: t.source for t in session.field_terms},
-            products=products_of(session),
         )
         mas = session.config.detector.scale_mas if found.unit == "pix" else None
         return _text(found, at, mas)

@@ -203,8 +203,8 @@ class EvaluationDomain:
 
     @property
     def positions(self) -> EvaluationDomain:
-        """The positions by themselves: of any star, and not relative to each other."""
-        return replace(self, magnitude=None, relative="", separation=None)
+        """The positions by themselves, not relative to each other."""
+        return replace(self, relative="", separation=None) if self.relative else self
 
     @property
     def size(self) -> int:
@@ -225,10 +225,12 @@ class EvaluationDomain:
             start = stop
 
     @cached_property
-    def chip_code(self) -> Int:
-        """Code (N,) of the chip of each position."""
-        codes = {number: self.model.chip_code(number) for number in self.chips}
-        return np.array([codes[number] for number in self.chip.tolist()], np.int64)
+    def basis(self) -> dict[int, Float]:
+        """Basis functions (N, K) of the model at the positions on each chip, by its number."""
+        return {
+            chip: self.model.basis(chip).evaluate(self.x[rows], self.y[rows])
+            for chip, rows in self.by_chip()
+        }
 
     def pairs(self) -> Int | None:
         """Pairs of positions, shape (2, P), whose differences count; None where none do.

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import error_budget
-from bayesdist.assess.budget.budget import detector_budget
-from bayesdist.assess.terms.parameters import LinearTerm
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 
@@ -30,9 +30,9 @@ def solution_with_positions(solution_of, chips):
 def test_an_error_of_scale_or_rotation_grows_with_the_distance(solution_of, kind):
     chips = (Chip(2, "B", SIZE, (501.0, 251.0)), Chip(1, "A", SIZE, (501.0, 251.0)))
     solution = solution_with_positions(solution_of, chips)
-    term = LinearTerm("aberration", kind, 1e-5, solution)
+    term = ScaleError("aberration", kind, 1e-5, solution)
     budget = detector_budget(
-        solution, fields=[term], grid=(5, 3), n_draws=DRAWS, rng=np.random.default_rng(1)
+        solution, terms=[term], grid=(5, 3), n_draws=DRAWS, rng=np.random.default_rng(1)
     )
     for k, one in enumerate(budget.chips):
         [found] = [t for t in one.terms if t.name == "aberration"]
@@ -51,7 +51,7 @@ def test_the_error_of_a_drawn_term_is_that_of_its_draws(solution_of):
     rows = [
         error_budget(
             solution,
-            fields=[LinearTerm("aberration", "scale", 1e-5, solution, "a paper")],
+            terms=[ScaleError("aberration", "scale", 1e-5, solution, "a paper")],
             grid=(3, 3),
             n_draws=200,
             rng=np.random.default_rng(seed),
@@ -71,4 +71,4 @@ def test_the_error_of_a_drawn_term_is_that_of_its_draws(solution_of):
 def test_what_is_no_such_term_is_refused(solution_of, kind, sigma, message):
     solution = solution_with_positions(solution_of, (Chip(1, "A", SIZE, (501.0, 251.0)),))
     with pytest.raises(InputError, match=message):
-        LinearTerm("aberration", kind, sigma, solution)
+        ScaleError("aberration", kind, sigma, solution)

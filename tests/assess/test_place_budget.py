@@ -3,8 +3,9 @@ import pytest
 
 from bayesdist.assess import UserTerm, error_budget
 from bayesdist.assess.budget.budget import place_budget
-from bayesdist.assess.drawn import position_errors
-from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.given import Centroids
+from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import InputError
@@ -17,17 +18,11 @@ DRAWS = 20_000
 NOISE = 5 / np.sqrt(2 * DRAWS)
 
 
-def errors_of(solution_of, *, sigma=(0.03, 0.02), **options):
+def errors_of(solution_of, *, sigma=(0.03, 0.02), terms=()):
     """Errors of the shift and the scale of u."""
     cov = np.zeros((6, 6))
     cov[0, 0], cov[1, 1] = np.square(sigma)
-    return position_errors(
-        solution_of(MODEL, cov=cov),
-        grid=(3, 3),
-        n_draws=DRAWS,
-        rng=np.random.default_rng(1),
-        **options,
-    )
+    return error_model(solution_of(MODEL, cov=cov), terms).drawn(DRAWS, np.random.default_rng(1))
 
 
 def named(budget):
@@ -43,7 +38,7 @@ TERMS = [
 def test_at_the_points_of_a_grid_it_is_the_budget_of_the_grid(solution_of):
     errors = errors_of(solution_of, terms=TERMS)
     whole = error_budget(
-        errors.fields.whole.solution,
+        errors.solution,
         terms=TERMS,
         grid=(3, 3),
         n_draws=DRAWS,
@@ -60,7 +55,7 @@ def test_at_the_points_of_a_grid_it_is_the_budget_of_the_grid(solution_of):
 def test_between_two_positions_what_they_share_drops_out(solution_of):
     one = np.array([1])
     centroid = MagnitudeErrors(np.array([-12.0]), 0.04 * one, 0.05 * one, one, one, one)
-    errors = errors_of(solution_of, terms=TERMS, centroid=centroid)
+    errors = errors_of(solution_of, terms=[*TERMS, Centroids(centroid)])
     found = place_budget(
         errors, [1.0, 101.0, 26.0], [41.0, 41.0, 41.0], chip=1, magnitude=-12.0, relative=True
     )
@@ -80,8 +75,8 @@ def test_local_terms_are_interpolated_and_counted_twice_in_a_difference(solution
     values = np.zeros((3, 3, 2))
     values[..., 0] = [[0.0, 0.1, 0.2]]  # grows with x
     square = MeanSquare(np.array([0.02, 0.0]), np.array([0.004, 0.0]))
-    local = [LocalTerm("tables", {1: values}, squares={1: square})]
-    errors = errors_of(solution_of, sigma=(0.0, 0.0), local=local)
+    local = [LocalErrors.on_grid("tables", {1: values}, MODEL, squares={1: square})]
+    errors = errors_of(solution_of, sigma=(0.0, 0.0), terms=local)
     single = named(place_budget(errors, [26.0, 101.0], [10.0, 70.0], chip=1))
     assert single["tables"].u == pytest.approx([0.05, 0.2])
     assert single["tables"].relative_error == pytest.approx(0.1, rel=1e-4)  # hardly cut

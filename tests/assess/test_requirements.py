@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess import STATISTICS, Requirement, UserTerm, check_requirements
-from bayesdist.assess import drawn as position_errors
+from bayesdist.assess import STATISTICS, Requirement, UserTerm, check_requirements, drawn
 from bayesdist.assess.requirements.verdict import Caveat, clopper_pearson, scatter_too_small
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
@@ -258,7 +257,7 @@ def test_blocks_of_draws_do_not_change_the_margins(shifting, monkeypatch):
     req = [Requirement("r", "p90", 0.1)]
     options = dict(terms=[*SYSTEMATIC, *RANDOM], grid=(5, 5), n_draws=200)
     [whole] = margins_of(shifting(), req, **options)
-    monkeypatch.setattr(position_errors, "BLOCK", 75)
+    monkeypatch.setattr(drawn, "BLOCK", 75)
     [cut] = margins_of(shifting(), req, **options)
     np.testing.assert_allclose(cut.draws, whole.draws, rtol=1e-12)
     [other] = margins_of(shifting(), req, seed=2, **options)

@@ -119,7 +119,7 @@ def ranks(seed: int) -> dict[str, float]:
         }
         x, y = mesh(*grid_pixels(model.chips[0].size, GRID))
         error = truth.true_map(x, y, None) - model.predict(mean, x, y)
-        drawn = errors._errors(EvaluationDomain.of_chips(model, GRID), {})(slice(0, n), np.zeros(1))
+        drawn = errors.errors(EvaluationDomain.of_chips(model, GRID))(slice(0, n), np.zeros(1))
         for i, j in AT:
             k = j * GRID[0] + i
             for axis, name in enumerate("uv"):

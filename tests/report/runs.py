@@ -24,7 +24,7 @@ from bayesdist.assess import (
     star_sums,
     uncertainty_map,
 )
-from bayesdist.assess.budget.budget import detector_budget
+from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import MatchTable

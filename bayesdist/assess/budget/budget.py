@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,24 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.drawn import CENTROID, PositionErrors, position_errors, sigma_at
+from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.verdict import effective_draws
-from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.fields import MODEL
-from bayesdist.assess.terms.given import LOCAL, MEASURED, LocalTerm, UserTerm
-from bayesdist.assess.terms.product_terms import PRODUCT, ProductTerm
-from bayesdist.assess.units import pixel_scale_of
-from bayesdist.model.grid import DEFAULT_GRID
+from bayesdist.assess.terms.forms import PRODUCT
 
-__all__ = [
-    "TOTAL",
-    "BudgetTerm",
-    "ErrorBudget",
-    "detector_budget",
-    "error_budget",
-    "place_budget",
-]
+__all__ = ["TOTAL", "BudgetTerm", "ErrorBudget", "budget_of", "place_budget", "with_product"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -86,10 +73,10 @@ class ErrorBudget:
         N positions; P = N, or N - 1 where errors are those of differences to the first.
     unit : str
     terms : tuple of BudgetTerm
-        Parts of the model first, then field terms, local ones, and the user's.
-    model : BudgetTerm
-        All parts of the model and the field terms jointly.  They are correlated, so this may be
-        smaller than any of them.
+        Errors of parameters first, then local ones, and the user's.
+    total : BudgetTerm
+        All terms together.  Rows of one term are correlated, so this may be smaller than any of
+        them.
     n_draws : int
         Draws behind the model's parts: their relative error is about 1 / sqrt(2 n_draws).
     products : tuple of BudgetTerm
@@ -99,7 +86,6 @@ class ErrorBudget:
     domain: EvaluationDomain
     unit: str
     terms: tuple[BudgetTerm, ...]
-    model: BudgetTerm
     total: BudgetTerm
     n_draws: int
     products: tuple[BudgetTerm, ...] = ()
@@ -157,7 +143,6 @@ class ErrorBudget:
                 self,
                 domain=self.domain.on(chip),
                 terms=tuple(t.on(chip, rows) for t in self.terms),
-                model=self.model.on(chip, rows),
                 total=self.total.on(chip, rows),
                 products=tuple(t.on(chip, rows) for t in self.products),
             )
@@ -220,129 +205,60 @@ class ErrorBudget:
         return [{"chip": chip} | row for chip, rows in parts for row in rows]
 
 
-def error_budget(
-    solution: Solution,
-    *,
-    terms: Sequence[UserTerm] = (),
-    fields: Sequence[FieldTerm] = (),
-    aligned: bool = False,
-    grid: tuple[int, int] = DEFAULT_GRID,
-    epoch: float | None = None,
-    chip: int | None = None,
-    n_draws: int = 4000,
-    rng: np.random.Generator,
-    pixel_scale: float | None = None,
-) -> ErrorBudget:
-    """The error budget of a solution over a grid on a chip, at an epoch.
+def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:
+    """The error budget of positions, or of their differences to the first one.
 
-    The parts of the model and the field terms are combined by joint draws, for they are correlated;
-    the user's terms are independent and added in quadrature.
+    Terms are independent of each other, so that their squares add up to the total; rows of one term
+    may be correlated, and the term counts as they do together.
 
     Parameters
     ----------
-    solution : LinearFit or Posterior
-    terms : sequence of UserTerm
-    fields : sequence of FieldTerm
-        Errors that are fields over the detector, each a row of its own.
-    aligned : bool
-        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`.
-        The user's terms stay as they are given.
-    grid : tuple of int
-        Points on x and y.
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-    chip : int, optional
-        Chip number; the first chip by default.
-    n_draws : int
-    rng : numpy.random.Generator
-    pixel_scale : float, optional
-        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+    errors : DrawnErrors
+    domain : EvaluationDomain
 
     Returns
     -------
     ErrorBudget
-        In the unit of u, v.
 
     Raises
     ------
     InputError
-        For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
-        needs a pixel scale that is not known.
+        For a missing epoch, and a magnitude where no errors by magnitude are known.
     """
-    return detector_budget(
-        solution,
-        terms=terms,
-        fields=fields,
-        aligned=aligned,
-        grid=grid,
-        epoch=epoch,
-        chips=(place_of(solution.model, epoch=epoch, chip=chip).chip.number,),
-        n_draws=n_draws,
-        rng=rng,
-        pixel_scale=pixel_scale,
+    monte_carlo = (2.0 * effective_draws(errors.solution, errors.n_draws)) ** -0.5
+    fields = errors.at(domain)
+    terms: list[tuple[bool, BudgetTerm]] = []
+    products = []
+    for one in fields:
+        squares = one.squares()
+        for row in one.rows:
+            known = {c: one.relative_error(row.name, c, monte_carlo) for c in domain.chips}
+            found = BudgetTerm(
+                row.name,
+                row.kind,
+                *np.sqrt(squares[row.name]).T,
+                row.source,
+                known[domain.chips[0]],
+                known,
+            )
+            if row.kind == PRODUCT:
+                products.append(found)
+            else:
+                terms.append((not one.of_parameters(row.name), found))
+    total = sum(one.total() for one in fields)
+    return ErrorBudget(
+        domain,
+        errors.unit,
+        # errors of parameters come first, whatever else their term holds
+        tuple(t for _, t in sorted(terms, key=lambda pair: pair[0])),
+        BudgetTerm(TOTAL, TOTAL, *np.sqrt(total).T, TOGETHER),
+        errors.n_draws,
+        tuple(products),
     )
-
-
-def detector_budget(
-    solution: Solution,
-    *,
-    terms: Sequence[UserTerm] = (),
-    fields: Sequence[FieldTerm] = (),
-    aligned: bool = False,
-    local: Sequence[LocalTerm] = (),
-    products: Sequence[ProductTerm] = (),
-    grid: tuple[int, int] = DEFAULT_GRID,
-    epoch: float | None = None,
-    chips: Sequence[int] | None = None,
-    n_draws: int = 4000,
-    rng: np.random.Generator,
-    pixel_scale: float | None = None,
-) -> ErrorBudget:
-    """The error budget of a solution over its chips, the same grid on each.
-
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    local : sequence of LocalTerm
-        Measured beside the solution.
-    products : sequence of ProductTerm
-        Shown beside the others, and in no total.
-    chips : sequence of int, optional
-        Chip numbers; all by default.
-    terms, fields, aligned, grid, epoch, n_draws, rng, pixel_scale
-        As in `error_budget`.
-
-    Returns
-    -------
-    ErrorBudget
-        In the unit of u, v.
-
-    Raises
-    ------
-    InputError
-        As `error_budget`.
-    """
-    if pixel_scale is None:
-        pixel_scale = pixel_scale_of(solution, None if chips is None else chips[0])
-    domain = EvaluationDomain.of_chips(solution.model, grid, chips=chips, epoch=epoch)
-    errors = position_errors(
-        solution,
-        terms=terms,
-        fields=fields,
-        aligned=aligned,
-        local=local,
-        grid=grid,
-        n_draws=n_draws,
-        rng=rng,
-        pixel_scale=pixel_scale,
-    )
-    noise = 1.0 / (2.0 * effective_draws(solution, n_draws)) ** 0.5
-    sources = {t.name: t.source for t in fields}
-    return _budget(errors, domain, relative_error=noise, sources=sources, products=products)
 
 
 def place_budget(
-    errors: PositionErrors,
+    errors: DrawnErrors,
     x: ArrayLike,
     y: ArrayLike,
     *,
@@ -350,15 +266,12 @@ def place_budget(
     epoch: float | None = None,
     magnitude: float | None = None,
     relative: bool = False,
-    relative_error: float | None = None,
-    sources: Mapping[str, str] | None = None,
-    products: Sequence[ProductTerm] = (),
 ) -> ErrorBudget:
     """The error budget of some positions, or of their differences to the first one.
 
     Parameters
     ----------
-    errors : PositionErrors
+    errors : DrawnErrors
     x, y : array_like, shape (N,)
         FITS 1-based pixels; two or more for relative errors.
     chip : int
@@ -370,12 +283,6 @@ def place_budget(
     relative : bool
         Errors of the differences to the first position, in one image: what all positions share
         drops out, and what is independent counts twice.
-    relative_error : float, optional
-        Monte-Carlo error of what is drawn.
-    sources : mapping of str to str, optional
-        Where terms come from; 'measured in this run' by default.
-    products : sequence of ProductTerm
-        Shown beside the others, and in no total.
 
     Returns
     -------
@@ -387,73 +294,17 @@ def place_budget(
         For an unknown chip, a position off the chip, a missing epoch, a magnitude where no errors
         by magnitude are known, and relative errors of one position.
     """
-    model = errors.fields.whole.solution.model
-    domain = EvaluationDomain.at_pixels(
-        model, chip, x, y, epoch=epoch, magnitude=magnitude, relative=relative
-    )
-    return _budget(
-        errors, domain, relative_error=relative_error, sources=sources or {}, products=products
-    )
-
-
-def _budget(
-    errors: PositionErrors,
-    domain: EvaluationDomain,
-    *,
-    relative_error: float | None,
-    sources: Mapping[str, str],
-    products: Sequence[ProductTerm],
-) -> ErrorBudget:
-    fields, relative, N = errors.at(domain), bool(domain.relative), domain.size
-
-    def drawn(part: str) -> Float:
-        if not relative:
-            return fields.variance(part)
-        values = fields.values(part)
-        return np.asarray(np.mean((values[:, 1:] - values[:, :1]) ** 2, axis=0))
-
-    def single(sigma: Float) -> Float:
-        return sigma[1:] ** 2 + sigma[:1] ** 2 if relative else sigma**2
-
-    def term(
-        name: str, kind: str, square: Float, source: str, error: float | None = None
-    ) -> BudgetTerm:
-        return BudgetTerm(name, kind, *np.sqrt(square).T, source, error)
-
-    terms = [
-        term(name, "systematic", drawn(name), sources.get(name, MEASURED), relative_error)
-        for name in fields.parts
-    ]
-    model, others = drawn(MODEL), []
-    for local in errors.local:
-        square = single(sigma_at(local, domain))
-        known = {chip: local.relative_error(chip) for chip in domain.chips}
-        one = term(local.name, LOCAL, square, local.source, known[domain.chips[0]])
-        others.append(replace(one, by_chip=known))
-    for given, sigma in zip(errors.terms, errors.sigmas, strict=True):
-        square = single(np.tile(sigma, (N, 1)))
-        if given.kind != "random" and relative:
-            square = np.zeros_like(square)
-        others.append(term(given.name, given.kind, square, given.source))
-    if domain.magnitude is not None:
-        sigma = np.tile(errors.centroid_at(domain.magnitude), (N, 1))
-        others.append(term(CENTROID, "random", single(sigma), MEASURED))
-    moved = [
-        np.concatenate(
-            [p.at(domain.x[k], domain.y[k], chip, domain.epoch) for chip, k in domain.by_chip()]
-        )
-        for p in products
-    ]
-    total = sum((np.stack([t.u, t.v], axis=1) ** 2 for t in others), model)
-    return ErrorBudget(
-        domain,
-        errors.unit,
-        (*terms, *others),
-        term("model", "systematic", model, MEASURED, relative_error),
-        term(TOTAL, TOTAL, total, TOGETHER),
-        errors.n_draws,
-        tuple(
-            term(p.name, PRODUCT, (m[1:] - m[:1] if relative else m) ** 2, p.source, 0.0)
-            for p, m in zip(products, moved, strict=True)
+    return budget_of(
+        errors,
+        EvaluationDomain.at_pixels(
+            errors.solution.model, chip, x, y, epoch=epoch, magnitude=magnitude, relative=relative
         ),
     )
+
+
+def with_product(total: float, product: float) -> float:
+    """Root mean square of an error of mean zero together with a displacement that never changes.
+
+    A constant is independent of every error: the squares add up exactly.
+    """
+    return float(np.hypot(total, product))

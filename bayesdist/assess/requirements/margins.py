@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
-from bayesdist.assess.drawn import PositionErrors, position_errors
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.remedy import Remedy, find_remedy
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import (
@@ -19,10 +20,8 @@ from bayesdist.assess.requirements.verdict import (
     verdict_of,
 )
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.given import LocalTerm, UserTerm
+from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
-from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
@@ -99,11 +98,8 @@ def check_requirements(
     solution: Solution,
     requirements: Sequence[Requirement],
     *,
-    terms: Sequence[UserTerm] = (),
-    fields: Sequence[FieldTerm] = (),
+    terms: Sequence[ErrorTerm] = (),
     aligned: bool = False,
-    local: Sequence[LocalTerm] = (),
-    centroid: MagnitudeErrors | None = None,
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     chip: int | None = None,
@@ -115,11 +111,10 @@ def check_requirements(
     """Judge requirements on draws of the position error.
 
     Each draw is an error field over the grid: a draw of the solution minus its mean (all parts of
-    the model jointly, so with the correlation between positions), plus a draw of every field term
-    that is not among the solution's errors, plus for the systematic terms one Gaussian offset of
-    each axis for the whole field, plus for the random and the local terms an independent Gaussian
-    error at every grid point.  The statistic of each field gives a
-    distribution, and the fraction of draws at or under the limit is compared with the probability
+    the model jointly, so with the correlation between positions), plus a draw of every term: of a
+    systematic one of the user one Gaussian offset of each axis for the whole field, of random and
+    local ones an independent Gaussian error at every grid point.  The statistic of each field gives
+    a distribution, and the fraction of draws at or under the limit is compared with the probability
     asked for.
 
     The field is that of all chips: the same grid on each of them, so that each has the same weight.
@@ -133,15 +128,11 @@ def check_requirements(
     ----------
     solution : LinearFit or Posterior
     requirements : sequence of Requirement
-    terms : sequence of UserTerm
-    fields : sequence of FieldTerm
+    terms : sequence of ErrorTerm
+        For requirements that name a magnitude `Centroids` among them.
     aligned : bool
-        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`:
-        over all chips, also where one is judged.  The user's terms stay as they are given.
-    local : sequence of LocalTerm
-        Measured beside the solution, on this grid.
-    centroid : MagnitudeErrors, optional
-        Errors of centroids, in the unit of the solution: for requirements that name a magnitude.
+        Whether shift and rotation of the exposure are the observer's to fit, as of `ErrorModel`:
+        over all chips, also where one is judged.  Terms that are no polynomials stay as they are.
     grid : tuple of int
         Points on x and y.
     epoch : float, optional
@@ -173,28 +164,16 @@ def check_requirements(
         pixel_scale = pixel_scale_of(solution, chip)
     for r in requirements:
         convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
-    for t in terms:
-        t.sigma(unit, pixel_scale)
+    model = error_model(solution, terms, aligned=aligned, pixel_scale=pixel_scale)
     if not requirements:
         return ()
     cases = [domains_of(r, solution.model, grid, epoch=epoch, chip=chip) for r in requirements]
-    errors = position_errors(
-        solution,
-        terms=terms,
-        fields=[term for term in fields if term.without is None],
-        aligned=aligned,
-        local=local,
-        centroid=centroid,
-        grid=grid,
-        n_draws=n_draws,
-        rng=rng,
-        pixel_scale=pixel_scale,
-    )
+    errors = model.drawn(n_draws, rng)
     wanted: dict[EvaluationDomain, set[str]] = {}
     for r, case in zip(requirements, cases, strict=True):
         for domain in case:
             wanted.setdefault(domain, set()).add(r.statistic)
-    ways, found = (errors, *errors.varied()), {}
+    ways, found = (errors, *errors.treatments(grid)), {}
     for domain, names in wanted.items():
         owner = next(r for r, case in zip(requirements, cases, strict=True) if domain in case)
         try:
@@ -217,7 +196,11 @@ def check_requirements(
                 strict=True,
             )
         ]
-        margins.append(_of_extremes(extremes, [t.name for t in terms if t.varies], caveats))
+        margins.append(
+            _of_extremes(
+                extremes, [t.rows[0].name for t in terms if getattr(t, "varies", False)], caveats
+            )
+        )
     return tuple(margins)
 
 
@@ -343,7 +326,7 @@ def _margin(
     requirement: Requirement,
     case: Sequence[EvaluationDomain],
     by_epoch: Sequence[Float],
-    errors: PositionErrors,
+    errors: DrawnErrors,
     factor: float,
     n_effective: float,
     caveats: Sequence[Caveat],

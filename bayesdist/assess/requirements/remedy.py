@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.drawn import PositionErrors
+from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.requirement import Requirement
 
 __all__ = ["Remedy", "find_remedy"]
@@ -55,7 +55,7 @@ class Remedy:
 
 
 def find_remedy(
-    errors: PositionErrors, requirement: Requirement, domain: EvaluationDomain, factor: float
+    errors: DrawnErrors, requirement: Requirement, domain: EvaluationDomain, factor: float
 ) -> Remedy:
     """The term of which the least shrinking meets a requirement.
 
@@ -63,7 +63,7 @@ def find_remedy(
 
     Parameters
     ----------
-    errors : PositionErrors
+    errors : DrawnErrors
     requirement : Requirement
     domain : EvaluationDomain
         Where, and at the worst epoch.
@@ -78,12 +78,12 @@ def find_remedy(
     statistic = requirement.statistic
 
     def met(term: str, size: float) -> bool:
-        found = errors.statistics(domain, [statistic], shrink={term: size}, n_draws=n)
+        found = errors.statistics(domain, [statistic], scale={term: size}, n_draws=n)
         return bool(
             np.mean(factor * found[statistic] <= requirement.limit) >= requirement.probability
         )
 
-    sizes = {name: factor * errors.size(domain, name) for name in errors.names(domain)}
+    sizes = {name: factor * size for name, size in errors.sizes(domain).items()}
     largest = max(sizes, key=lambda name: sizes[name])
     alone = {}
     for name in sizes:

@@ -121,7 +121,7 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     good = (H[:, 0, 0] > 0) & (H[:, 1, 1] > 0)
 
     g, H = g * good[:, None], H * good[:, None, None]
-    members = sums_over(star, good, S)
+    members = sums_over(star, good.astype(float), S)
     A = sums_over(star, H, S) + data.precision
     many = np.flatnonzero(members >= FEWEST_DETECTIONS)
     mean = sums_over(star, good * data.epoch, S) / np.maximum(members, 1)

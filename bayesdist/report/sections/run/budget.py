@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.fields import Grid, scalar_map
