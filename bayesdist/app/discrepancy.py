@@ -74,11 +74,14 @@ class RunDiscrepancy:
         more = follow @ (cov - formal)[:D, :D] @ follow.T
         return with_spread(posterior, before, before + _least(before, (more + more.T) / 2))
 
-    def terms(self, *, single: bool = False) -> tuple[ErrorTerm, ...]:
-        """Terms of the error model; with the deviation of single exposures."""
+    def terms(self, *, single: bool = False, left: bool = True) -> tuple[ErrorTerm, ...]:
+        """Terms of the error model; with the deviation of single exposures, and what is left out.
+
+        The latter at a position, where no tables stand for it.
+        """
         out = list[ErrorTerm]()
         if self.found.structure:
-            out.append(StructureErrors(self.found, self.frames))
+            out.append(StructureErrors(self.found, self.frames, left))
         if self.found.linear is not None:
             out.append(Deviations(self.found, single, self.frames))
         return tuple(out)

@@ -437,7 +437,14 @@ class Session:
     def structure_sigma(self, **where: Any) -> NDArray[np.float64] | None:
         """Standard deviations (N, 2) of what the model leaves out on the grid of a chip, if any."""
         found = self.discrepancy
-        return None if found is None else found.structure_sigma(self._domain(**where))
+        if found is None or not self.structure_is_left:
+            return None
+        return found.structure_sigma(self._domain(**where))
+
+    @property
+    def structure_is_left(self) -> bool:
+        """Whether what the model leaves out at a position is an error of its own."""
+        return True
 
     def _domain(
         self, *, grid: tuple[int, int], epoch: float | None, chip: int | None = None

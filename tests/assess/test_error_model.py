@@ -121,6 +121,7 @@ def term_list():
         ),
         "structure": StructureErrors(found),
         "structure with frames": StructureErrors(found, frames=True),
+        "structure that tables hold": StructureErrors(found, left=False),
         "deviations": Deviations(found),
         "deviations of one": Deviations(found, single=True, frames=True),
         "tables": LocalErrors.on_grid(

@@ -61,3 +61,22 @@ def test_noise_has_its_size_and_belongs_to_a_place(solution_of):
     assert np.mean(square) == pytest.approx(dof, abs=5 * np.sqrt(2 * dof / n))
     # variance of chi-square 2 dof, of its estimate from n draws (2 + 12 / dof) / n relative
     assert np.var(square) == pytest.approx(2 * dof, rel=5 * np.sqrt((2 + 12 / dof) / n))
+
+
+def test_domains_of_the_same_positions_are_equal():
+    """So that requirements on the same part of the detector share what is evaluated."""
+    one, same = (EvaluationDomain.of_chips(MODEL, (6, 5), epoch=2010.0) for _ in range(2))
+    pixels = EvaluationDomain.at_pixels(MODEL, 1, [1.0, 50.0], [2.0, 80.0], epoch=2010.0)
+    others = [
+        one.at(2011.0),
+        one.on(2),
+        pixels,
+        EvaluationDomain.of_chips(MODEL, (6, 5), epoch=2010.0, relative=True),
+        EvaluationDomain.of_chips(MODEL, (6, 5), epoch=2010.0, magnitude=15.0),
+        EvaluationDomain.of_chips(MODEL, (6, 5), epoch=2010.0, region="inner 60 %"),
+    ]
+    assert one == same and len({one, same}) == 1
+    assert len({one, *others}) == 1 + len(others)
+    assert one.at(2011.0).at(2010.0) == one
+    assert [(chip, rows.stop - rows.start) for chip, rows in one.by_chip()] == [(1, 30), (2, 30)]
+    assert one.pairs() is None and others[3].pairs().shape == (2, 60 * 59 // 2)

@@ -118,6 +118,11 @@ class CampaignSession(Session):
         """Look-up tables of an earlier stage: the detector's, and those of the filter."""
         return self._kept_tables.tables
 
+    @property
+    def structure_is_left(self) -> bool:
+        """Not where the errors of tables stand for it."""
+        return not self._kept_tables.position_sigma
+
     @cached_property
     def local_terms(self) -> tuple[LocalErrors, ...]:
         """What the errors of the tables leave of the position, and what lies between nodes."""

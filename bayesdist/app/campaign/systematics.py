@@ -62,7 +62,7 @@ def systematics_of(session: CampaignSession) -> Systematics:
     if found is not None:
         before = covariance_of(session.posterior, session.fit, stars)
         solution = found.with_noise(solution, before)
-        terms += found.terms()
+        terms += found.terms(left=session.structure_is_left)
     of_solution = SolutionErrors(solution, posterior if catalogue else None, catalogue)
     scatter = ExposureVariation(
         posterior.model,

@@ -12,6 +12,7 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms import (
     LOCAL,
     MEASURED,
+    ErrorDraws,
     Functions,
     Image,
     Polynomials,
@@ -44,33 +45,31 @@ class StructureErrors:
     discrepancy : Discrepancy
     frames : bool
         Whether errors of the exposures' frames count.
+    left : bool
+        Whether what is left at a position counts; False where errors of look-up tables stand for
+        it.
     """
 
     discrepancy: Discrepancy
     frames: bool = False
+    left: bool = True
 
     @property
     def rows(self) -> tuple[Row, ...]:
         """The part in the parameters, and what is left."""
-        return Row(STRUCTURE_IN_FIT, source=SOURCE), Row(STRUCTURE, LOCAL, SOURCE)
+        in_fit = Row(STRUCTURE_IN_FIT, source=SOURCE)
+        return (in_fit, Row(STRUCTURE, LOCAL, SOURCE)) if self.left else (in_fit,)
 
-    def draw(self, n: int, rng: np.random.Generator) -> Together:
+    def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
         """The first n draws, over and over."""
-        found, (fit, left) = self.discrepancy, self.rows
-        shift = found.structure_theta
+        found, shift = self.discrepancy, self.discrepancy.structure_theta
         theta = _moved(found, shift[np.arange(n) % len(shift)], self.frames)
-        return Together(
-            (
-                Polynomials(fit, found.model, found.mean, theta, frames=self.frames),
-                Functions(
-                    left,
-                    {chip: one.coefficients for chip, one in found.structure.items()},
-                    partial(_functions, found),
-                    n,
-                ),
-            ),
-            remainder=True,
-        )
+        fit = Polynomials(self.rows[0], found.model, found.mean, theta, frames=self.frames)
+        if not self.left:
+            return fit
+        coefficients = {chip: one.coefficients for chip, one in found.structure.items()}
+        left = Functions(self.rows[1], coefficients, partial(_functions, found), n)
+        return Together((fit, left), remainder=True)
 
     def sigma(self, domain: EvaluationDomain) -> Float:
         """Standard deviations (N, 2) of what is left, over all draws."""
