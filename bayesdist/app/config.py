@@ -27,9 +27,10 @@ from bayesdist.app.selfcal.config import GaugeBlock, SelfcalBlock
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
-from bayesdist.assess.terms.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
-from bayesdist.assess.terms.given import GIVEN, said_by_user
-from bayesdist.assess.terms.parameters import LINEAR_KINDS, LinearTerm
+from bayesdist.assess.terms.forms import GIVEN
+from bayesdist.assess.terms.given import said_by_user
+from bayesdist.assess.terms.parameters import LINEAR_KINDS, ScaleError
+from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.data.tables.units import length_advice
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
@@ -680,10 +681,10 @@ class Config(Section):
             if b.sigma_u is not None and b.sigma_v is not None
         )
 
-    def linear_terms(self, solution: Solution) -> tuple[LinearTerm, ...]:
+    def linear_terms(self, solution: Solution) -> tuple[ScaleError, ...]:
         """The user's terms of the error budget that grow with the distance from the middle."""
         return tuple(
-            LinearTerm(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
+            ScaleError(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
             for b in self.budget
             if b.sigma is not None
         )

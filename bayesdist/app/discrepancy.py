@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.fingerprint import fingerprint_of
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.centroid import without
-from bayesdist.assess.terms.correlated import DeviationsTerm, StructureInFit, structure_term
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.assess.terms.correlated import Deviations, StructureErrors
+from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
@@ -75,25 +75,23 @@ class RunDiscrepancy:
         more = follow @ (cov - formal)[:D, :D] @ follow.T
         return with_spread(posterior, before, before + _least(before, (more + more.T) / 2))
 
-    def fields(self, *, single: bool = False) -> tuple[FieldTerm, ...]:
-        """Errors of parameters, as terms of the budget; with the deviation of single exposures."""
-        terms: list[FieldTerm] = []
-        if self.found.structure:
-            terms.append(StructureInFit(self.found, self.frames))
-        if self.found.linear is not None:
-            terms.append(DeviationsTerm(self.found, single, self.frames))
-        return tuple(terms)
+    def terms(self, *, single: bool = False, left: bool = True) -> tuple[ErrorTerm, ...]:
+        """Terms of the error model; with the deviation of single exposures, and what is left out.
 
-    def structure(self, grid: tuple[int, int], epoch: float | None) -> LocalTerm | None:
-        """What is left out at a position; None where nothing is."""
+        The latter at a position, where no tables stand for it.
+        """
+        out = list[ErrorTerm]()
+        if self.found.structure:
+            out.append(StructureErrors(self.found, self.frames, left))
+        if self.found.linear is not None:
+            out.append(Deviations(self.found, single, self.frames))
+        return tuple(out)
+
+    def structure_sigma(self, domain: EvaluationDomain) -> Float | None:
+        """Standard deviations (N, 2) of what is left out; None where nothing is."""
         if not self.found.structure:
             return None
-        return structure_term(self.found, grid, epoch, frames=self.frames)
-
-    def local(self, grid: tuple[int, int], epoch: float | None) -> tuple[LocalTerm, ...]:
-        """The same, as terms of the budget."""
-        term = self.structure(grid, epoch)
-        return () if term is None else (term,)
+        return StructureErrors(self.found, self.frames).sigma(domain)
 
     @property
     def structure_rms(self) -> float | None:

@@ -1,15 +1,17 @@
 """What a solution is worth: uncertainty maps, error budget, margins against requirements."""
 
 from bayesdist.assess.area import AreaMap, area_map
-from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget, error_budget, error_budgets
-from bayesdist.assess.budget.detector import DetectorBudget, detector_budget
+from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget
+from bayesdist.assess.budget.detector import detector_budget, error_budget
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.error_model import ErrorModel, error_model
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.assess.requirements.margins import Margin, Requirement, check_requirements
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.statistics import STATISTICS, field_statistic
-from bayesdist.assess.terms.fields import ErrorFields, error_fields
-from bayesdist.assess.terms.given import TERM_KINDS, LocalTerm, UserTerm
+from bayesdist.assess.terms.given import TERM_KINDS, UserTerm
+from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.units import UNITS, convert, pixel_scale_of
 from bayesdist.assess.vectors import VectorMap, distortion_vectors
 from bayesdist.diagnose.alignment import Alignment, alignment_residuals
@@ -41,11 +43,11 @@ __all__ = [
     "BinnedResiduals",
     "BinnedSums",
     "BudgetTerm",
-    "DetectorBudget",
     "ErrorBudget",
-    "ErrorFields",
+    "ErrorModel",
+    "EvaluationDomain",
     "ExposureSums",
-    "LocalTerm",
+    "LocalErrors",
     "Margin",
     "Misfit",
     "Requirement",
@@ -65,8 +67,7 @@ __all__ = [
     "detector_budget",
     "distortion_vectors",
     "error_budget",
-    "error_budgets",
-    "error_fields",
+    "error_model",
     "field_statistic",
     "flagged_by_exposure",
     "grid_pixels",

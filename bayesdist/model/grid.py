@@ -7,7 +7,14 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["DEFAULT_GRID", "grid_pixels", "mesh", "outline_pixels", "position_of_largest"]
+__all__ = [
+    "DEFAULT_GRID",
+    "cell_index",
+    "grid_pixels",
+    "mesh",
+    "outline_pixels",
+    "position_of_largest",
+]
 
 Float = NDArray[np.float64]
 
@@ -49,6 +56,27 @@ def mesh(x: Float, y: Float) -> tuple[Float, Float]:
     """Pixel of every grid point, (ny * nx,) each, in the order of a flattened [iy, ix] array."""
     X, Y = np.meshgrid(x, y)
     return X.ravel(), Y.ravel()
+
+
+def cell_index(X: Float, Y: Float, bins: tuple[int, int]) -> NDArray[np.int64]:
+    """Cell of each place, (N,), counted along x first.
+
+    Parameters
+    ----------
+    X, Y : ndarray, shape (N,)
+        From -1 to 1 over the chip; what lies beyond is in the outermost cells.
+    bins : tuple of int
+        Cells on x and y.
+
+    Returns
+    -------
+    ndarray of int, shape (N,)
+    """
+    ix, iy = (
+        np.clip(((z + 1) * (0.5 * n)).astype(np.int64), 0, n - 1)
+        for z, n in zip((X, Y), bins, strict=True)
+    )
+    return np.asarray(iy * bins[0] + ix, np.int64)
 
 
 def outline_pixels(size: tuple[float, float]) -> tuple[Float, Float]:

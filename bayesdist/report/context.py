@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         UncertaintyMap,
         VectorMap,
     )
-    from bayesdist.assess.budget.detector import DetectorBudget
+    from bayesdist.assess.budget.budget import ErrorBudget
     from bayesdist.assess.budget.surface import BudgetSurface
     from bayesdist.assess.periods import TimeVariation
     from bayesdist.assess.requirements.validity import Horizon
@@ -232,7 +232,7 @@ class ReportInput:
         Legendre coefficients and all other parameters; columns name, chip, axis, i, j, value,
         sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit.  Those of the
         posterior may be missing or masked.
-    budget : DetectorBudget or None
+    budget : ErrorBudget or None
     surface : BudgetSurface or None
         The same budget at every position and epoch, for the page to compute from.
     margins : tuple of Margin
@@ -272,7 +272,7 @@ class ReportInput:
     posterior: Posterior | None
     chips: tuple[ChipResults, ...]
     coefficients: Table
-    budget: DetectorBudget | None = None
+    budget: ErrorBudget | None = None
     surface: BudgetSurface | None = None
     margins: tuple[Margin, ...] = ()
     horizons: tuple[Horizon, ...] = ()

@@ -103,8 +103,8 @@ def actual_error(session: Session, truth: Truth, rng: np.random.Generator) -> np
 
 def stated_sigma(session: Session) -> np.ndarray:
     """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid."""
-    (chip,) = budget_of(session).chips
-    return np.column_stack([chip.total_u.ravel(), chip.total_v.ravel()])
+    total = budget_of(session).total
+    return np.column_stack([total.u, total.v])
 
 
 def carried(truth: Truth | CampaignTruth, folder: Path, seed: int) -> Session:

@@ -18,6 +18,7 @@ from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.release import _require_alike
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
@@ -126,7 +127,10 @@ def test_the_error_of_the_held_tables_stays_in_the_budget(sessions):
             *(np.linspace(1, n, m) for n, m in zip(chip.size, (33, 17), strict=True))
         )
         held = held_sigma(other.tables, x.ravel(), y.ravel(), chip=chip.number)
-        sigma = term.sigma[chip.number].reshape(-1, 2)
+        domain = EvaluationDomain.of_chips(
+            other.posterior.model, (33, 17), chips=(chip.number,), epoch=other.epoch
+        )
+        sigma = term.sigma(domain)
         # a pixel is 1 px of (u, v) but for some per cent of scale
         assert (sigma > 0.9 * held).all() and (held > 0).all()
 
@@ -273,7 +277,7 @@ def test_stwcs_sees_our_model_and_the_true_sky(
         D = model.jacobian(turned.mean, x, y, epoch=epoch, chip=chip)
         D = D - model.jacobian(turned.mean, 2048.0, 1024.0, **middle)
         variance = 1e6 * np.einsum("nap,pq,naq->n", D, turned.cov, D, optimize=True)
-        tables = 50.0**2 * (term.sigma[chip] ** 2).sum(axis=2).mean()
+        tables = 50.0**2 * (term.tables[chip].values ** 2).sum(axis=0).mean()
         unresolved = 50.0**2 * (beyond_nodes(truth.tables, chip, filter) ** 2).sum(axis=1).mean()
         stated = np.sqrt(variance.mean() + tables + unresolved)
         assert 0.4 * stated < np.sqrt((away**2).mean()) < 1.4 * stated

@@ -15,8 +15,8 @@ from bayesdist.app.campaign.systematics import (
     catalogue_terms,
     with_shared_stars,
 )
-from bayesdist.assess.terms.field_terms import CATALOGUE as POSITIONS
-from bayesdist.assess.terms.field_terms import MOTIONS
+from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
+from bayesdist.assess.terms.parameters import MOTIONS
 from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.infer import Posterior, Rejection, fit_linear
 from bayesdist.infer.stars.mixture import OutlierMixture

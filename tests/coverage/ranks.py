@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesdist.app.judging import errors_of, margins_of
 from bayesdist.assess import Requirement
-from bayesdist.assess.drawn import Judged
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.infer import OutlierMixture
 from bayesdist.infer.discrepancy import DiscrepancyPriors
@@ -120,7 +120,7 @@ def ranks(seed: int) -> dict[str, float]:
         }
         x, y = mesh(*grid_pixels(model.chips[0].size, GRID))
         error = truth.true_map(x, y, None) - model.predict(mean, x, y)
-        drawn = errors._errors(Judged(model.chips, None, "whole"), {})(slice(0, n), np.zeros(1))
+        drawn = errors.errors(EvaluationDomain.of_chips(model, GRID))(slice(0, n), np.zeros(1))
         for i, j in AT:
             k = j * GRID[0] + i
             for axis, name in enumerate("uv"):

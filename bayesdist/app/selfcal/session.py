@@ -396,7 +396,7 @@ class SelfcalSession(Session):
         if found is not None:
             S = gauge_free_matrix(self.model, self.solution.mean, self.gauge.null)
             relative = replace(found.moved(S), frames=False)  # of the detector alone
-            local = relative.structure(where["grid"], where.get("epoch"))
+            local = relative.structure_sigma(self._domain(**where))
         return with_local(uncertainty_map(self.relative, **where), local)
 
     @property

@@ -5,7 +5,6 @@ from bayesdist.assess.wise.bands import (
     WISE_ARCSEC,
     BandBins,
     band_bins,
-    band_bins_of_stars,
 )
 from bayesdist.assess.wise.changes import PatternChange, pattern_changes
 from bayesdist.assess.wise.contradictions import contradictions_across, contradictions_within
@@ -43,7 +42,6 @@ __all__ = [
     "StatisticsRow",
     "StatisticsTable",
     "band_bins",
-    "band_bins_of_stars",
     "band_to_band_table",
     "bin_row",
     "contradictions_across",

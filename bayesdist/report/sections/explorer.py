@@ -10,11 +10,9 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from bayesdist.assess.budget.surface import BudgetSurface, SurfaceProduct
-from bayesdist.assess.drawn import CENTROID
-from bayesdist.assess.terms.fields import MODEL
-from bayesdist.assess.terms.given import LOCAL, MEASURED
-from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.assess.budget.surface import JOINT, BudgetSurface, GridRow
+from bayesdist.assess.terms.forms import MEASURED, Row
+from bayesdist.assess.terms.given import CENTROID
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numbers import ladder
@@ -36,17 +34,13 @@ def budget_data(r: ReportInput) -> dict[str, Any]:
     s = r.surface
     assert s is not None
     nodes = s.spans[0].nodes
-    parts = [
-        {"name": name, "kind": "systematic", "source": s.sources.get(name, MEASURED)}
-        for name in s.parts
-    ]
     return _common(r) | {
         "terms": list(s.model.basis(s.model.chips[0].number).terms),
         "grid": list(s.grid),
         "epoch": s.epoch,
         "years": [nodes[0], s.spans[-1].nodes[-1]] if nodes else None,
-        "parts": parts,
-        "joint": MODEL,
+        "parts": [_row(row) for row in s.parts],
+        "joint": JOINT,
         "spans": [
             {
                 "nodes": list(span.nodes),
@@ -58,21 +52,16 @@ def budget_data(r: ReportInput) -> dict[str, Any]:
             for span in s.spans
         ],
         "local": [
-            {
-                "name": t.name,
-                "kind": LOCAL,
-                "source": t.source,
+            _row(t.row)
+            | {
                 "sigma": {
-                    str(chip): [_short(v[..., axis], MAP_DIGITS) for axis in (0, 1)]
-                    for chip, v in t.sigma.items()
+                    str(chip): [_short(v[0, :, axis], MAP_DIGITS) for axis in (0, 1)]
+                    for chip, v in t.values[0].items()
                 },
             }
             for t in s.local
         ],
-        "given": [
-            {"name": t.name, "kind": t.kind, "source": t.source, "sigma": list(sigma)}
-            for t, sigma in zip(s.terms, s.sigmas, strict=True)
-        ],
+        "given": [_row(row) | {"sigma": sigma.tolist()} for row, sigma in s.constant],
         "centroid": _centroid(s),
         "products": [_product(term) for term in s.products],
         "cycle": list(CYCLE),
@@ -134,16 +123,20 @@ def _triangles(moments: Float) -> list[list[list[float | None]]]:
     return [[_short(v, MOMENT_DIGITS) for v in node] for node in values]
 
 
-def _product(term: SurfaceProduct) -> dict[str, Any]:
+def _row(row: Row) -> dict[str, Any]:
+    return {"name": row.name, "kind": row.kind, "source": row.source}
+
+
+def _product(term: GridRow) -> dict[str, Any]:
     """Displacements on the grid, by span, chip, node and axis."""
     spans = [
         {
             str(chip): [[_short(one[:, axis], MAP_DIGITS) for axis in (0, 1)] for one in nodes]
             for chip, nodes in shifts.items()
         }
-        for shifts in term.shifts
+        for shifts in term.values
     ]
-    return {"name": term.name, "kind": PRODUCT, "source": term.source, "spans": spans}
+    return _row(term.row) | {"spans": spans}
 
 
 def _short(values: Float, digits: int) -> list[float | None]:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.fields import Grid, scalar_map
@@ -177,7 +177,10 @@ def budget_dominating(r: ReportInput) -> Plot:
     panels.frame()
     scalar_map(
         panels,
-        [Grid(b.x, b.y, np.searchsorted(present, b.dominant).astype(float)) for b in budget.chips],
+        [
+            Grid(*b.axes, np.searchsorted(present, b.on_grid(b.dominant)).astype(float))
+            for b in budget.chips
+        ],
         r.mosaic.names,
         norm=BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present)),
         cmap=ListedColormap(colors),
