@@ -20,7 +20,7 @@ ROOT = Path(bayesdist.__file__).parent
 
 # Packages on one floor do not see each other; each may import what lies on the floors before.
 FLOORS = (
-    ("errors",),
+    ("errors", "lazy"),
     ("data", "model"),
     ("infer", "simulate"),
     ("calibration",),

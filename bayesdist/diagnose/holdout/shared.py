@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.rows import Rows
 

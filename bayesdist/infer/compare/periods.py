@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.period_changes import PeriodComparison
 from bayesdist.infer.compare.period_dates import Periods, check_periods
