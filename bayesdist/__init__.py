@@ -50,8 +50,8 @@ _HOMES = {
         "sample",
         "save_posterior",
     ),
-    "bayesdist.simulate": (
-        "simulate_matches",
+    "bayesdist.simulate": ("simulate_matches", "simulate_partitioned"),
+    "bayesdist.missions.wise.simulate": (
         "simulate_wise",
         "simulate_wise_partitioned",
         "wise_solution",

@@ -302,16 +302,16 @@ def _seed(text: str) -> int:
 
 
 def _demo(options: argparse.Namespace) -> None:
-    from bayesdist.app.demo import demo
+    from bayesdist.missions.wise.demo import demo
 
     print(demo(options.output, force=options.force, command=options.line))
 
 
 def _run(options: argparse.Namespace) -> None:
-    from bayesdist.app.demo import results_text
     from bayesdist.app.run import run
     from bayesdist.app.rundir import RunDirectory
     from bayesdist.app.session import Session
+    from bayesdist.app.summary_text import results_text
 
     path = run(
         options.config,
@@ -338,7 +338,7 @@ def _release(options: argparse.Namespace) -> None:
 
 
 def _bands(options: argparse.Namespace) -> None:
-    from bayesdist.app.bands.command import bands_of_runs
+    from bayesdist.missions.wise.bands.command import bands_of_runs
 
     text = bands_of_runs(
         options.runs,
@@ -425,7 +425,7 @@ def _apply(options: argparse.Namespace) -> None:
 
 
 def _pam(options: argparse.Namespace) -> None:
-    from bayesdist.app.pam import write_area_maps
+    from bayesdist.missions.acs.pam import write_area_maps
 
     names = ("chip", "filter", "epoch", "scale", "image", "force")
     chosen = {name: getattr(options, name) for name in names}
@@ -433,7 +433,7 @@ def _pam(options: argparse.Namespace) -> None:
 
 
 def _handbook(options: argparse.Namespace) -> None:
-    from bayesdist.app.handbook import handbook
+    from bayesdist.missions.acs.handbook import handbook
 
     names = ("filter", "epoch", "scale", "detector", "magnification")
     chosen = {name: getattr(options, name) for name in names}
@@ -464,7 +464,7 @@ def _monitor(options: argparse.Namespace) -> None:
 
 
 def _rotate(options: argparse.Namespace) -> None:
-    from bayesdist.app.rotate import rotate
+    from bayesdist.missions.wise.rotate import rotate
 
     text = rotate(
         options.file,
@@ -477,25 +477,25 @@ def _rotate(options: argparse.Namespace) -> None:
 
 
 def _rvb_transform(options: argparse.Namespace) -> None:
-    from bayesdist.app.rvb_commands import transform_files
+    from bayesdist.missions.wise.rvb import transform_files
 
     print(transform_files(options))
 
 
 def _rvb_rereference(options: argparse.Namespace) -> None:
-    from bayesdist.app.rvb_commands import rereference_files
+    from bayesdist.missions.wise.rvb import rereference_files
 
     print(rereference_files(options))
 
 
 def _simulate_acs(options: argparse.Namespace) -> None:
-    from bayesdist.app.simulate import simulate_campaign
+    from bayesdist.missions.acs.simulated_campaign import simulate_campaign
 
     print(simulate_campaign(options))
 
 
 def _simulate_wise(options: argparse.Namespace) -> None:
-    from bayesdist.app.simulate_wise import simulate_wise_pairs
+    from bayesdist.missions.wise.simulated_pairs import simulate_wise_pairs
 
     print(simulate_wise_pairs(options))
 

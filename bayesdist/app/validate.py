@@ -9,7 +9,6 @@ from typing import Any
 
 from bayesdist.app.config import load_requirements
 from bayesdist.app.dates import idle_dates
-from bayesdist.app.demo import margins_text
 from bayesdist.app.horizon import write_horizons
 from bayesdist.app.judging import assessed_horizons, margins_of
 from bayesdist.app.margins import margin_rows, write_margins
@@ -17,6 +16,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
+from bayesdist.app.summary_text import margins_text
 from bayesdist.assess import Margin, Requirement
 from bayesdist.errors import InputError
 

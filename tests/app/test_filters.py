@@ -25,13 +25,13 @@ from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.series import Series
 from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, without_frames
+from bayesdist.missions.acs.simulate import acs_solution, making, read_acs, simulate_acs
 from bayesdist.model import LookupTable, TimeDependence, corrected
 from bayesdist.products import (
     read_d2im,
     read_idctab,
     read_lookup_file,
 )
-from bayesdist.simulate.acs import acs_solution, making, read_acs, simulate_acs
 from tests.app.support import cli, good, one_sentence, snapshot
 from tests.infer.small_campaign import Truth
 from tests.products.acs_offline import Pointing, to_sky

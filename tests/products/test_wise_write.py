@@ -15,6 +15,7 @@ from numpy.polynomial import polynomial
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear
+from bayesdist.missions.wise.simulate import WISE_COEFFICIENTS, wise_set, wise_solution
 from bayesdist.products import (
     describe,
     lint_wise_band,
@@ -25,8 +26,6 @@ from bayesdist.products import (
     write_sip,
     write_wise_meta,
 )
-from bayesdist.simulate import wise_solution
-from bayesdist.simulate.wise import WISE_COEFFICIENTS, wise_set
 from tests.app.support import begin_stagewise, cli, good, one_sentence, summary_of, write_config
 
 from .support import astropy_wcs, random_pixels, some_solution

@@ -22,7 +22,7 @@ from bayesdist.assess.wise import (
     period_table,
 )
 from bayesdist.infer import fit_linear, load
-from bayesdist.simulate.wise import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
+from bayesdist.missions.wise.simulate import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
 
 from .support import matches_of, pairs_of
 

@@ -1,0 +1,168 @@
+"""`bayesdist simulate wise`: pairs of WISE and 2MASS, and how to calibrate them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.app.screen import table_text
+from bayesdist.data.files import atomic_path
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.demo import simulation_config, write_simulation
+from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
+from bayesdist.missions.wise.simulate.stand_in import STAND_IN_TURN, write_stand_in
+
+__all__ = ["simulate_wise_pairs"]
+
+WISE_CONFIG = """\
+# Calibrates WISE {band} from simulated pairs: bayesdist run THIS -o {run}
+# {truth} holds what they were made from
+[data]
+matches = "{folder}"
+format = "rvb"
+band = "{band}"
+columns = {{exposure = ""}}    # without the frames: one distortion serves all
+
+[detector]
+name = "{band}"
+size = [{columns:.0f}, {rows:.0f}]
+scale_mas = {scale_mas:.1f}
+
+[model]
+order = 4
+reference_pixel = [{centre[0]}, {centre[1]}]
+
+[fit]
+clip_abs = 3.0               # pixels: the match circle in the corners
+
+[assess]
+grid = [33, 33]
+
+[[budget]]
+name = "reference catalogue"
+kind = "random"
+sigma_u = 0.0                # the simulation's is exact; of 2MASS state yours
+sigma_v = 0.0
+source = "simulation"
+
+[[requirement]]
+name = "worst corner"
+statistic = "max"
+limit = 0.05
+unit = "pix"
+
+[products]
+sip = {{inverse_order = 5, linear = "sip"}}
+"""
+
+
+def simulate_wise_pairs(options: argparse.Namespace) -> str:
+    """Full sets in Parquet, or one small table where its options are given.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Of the command line: output, force, seed; bands, pairs (None: those of section 4 of WSDC
+        D-T033), false_share, partition_pattern; or stars, band, fraction (None: not asked for).
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For options that cannot be used, and a folder in use.
+    """
+    if options.stars is None and options.band is None and options.fraction is None:
+        return _sets(options)
+    return _small_table(
+        options,
+        6000 if options.stars is None else options.stars,
+        options.band or "W2",
+        0.03 if options.fraction is None else options.fraction,
+    )
+
+
+def _small_table(options: argparse.Namespace, stars: int, band: str, fraction: float) -> str:
+    if stars < 1 or not 0 <= fraction < 1:
+        raise InputError(
+            "a simulation needs stars, and true matches among them",
+            do="give --stars 1 or more and --fraction in [0, 1)",
+        )
+    folder = Path(options.output)
+    if (folder / "config.toml").exists() and not options.force:
+        raise InputError(
+            "the folder holds a configuration", where=str(folder), do="replace it by --force"
+        )
+    rng = np.random.default_rng(options.seed)
+    matches, truth = simulate_wise(stars, band=band, fraction=fraction, rng=rng)
+    write_simulation(folder, matches, truth, simulation_config(band))
+    return (
+        f"{len(matches)} pairs, {int(truth.false.sum())} of them false: {folder / 'stars.ecsv'}\n"
+        f"calibrate them:  bayesdist run {folder / 'config.toml'} -o {folder / 'run'}"
+    )
+
+
+def _sets(options: argparse.Namespace) -> str:
+    folder = Path(options.output)
+    if len(set(options.bands)) < len(options.bands):
+        raise InputError("a band is named twice", where="--bands", do="name each once")
+    sets = [
+        wise_set(
+            band,
+            pairs=options.pairs,
+            seed=options.seed,
+            false_share=options.false_share,
+            partition=options.partition_pattern,
+        )
+        for band in options.bands
+    ]
+    names = [one.band.lower() for one in sets]
+    used = [name for name in ("config.toml", *names) if (folder / name).exists()]
+    if used and not options.force:
+        raise InputError(
+            f"the folder holds {used[0]} already", where=str(folder), do="replace it by --force"
+        )
+    rows: list[dict[str, object]] = []
+    lines = []
+    for one, name in zip(sets, names, strict=True):
+        n_false = write_wise_set(one, folder, threads=os.cpu_count() or 1, force=options.force)
+        with atomic_path(folder / f"{name}.toml") as temporary:
+            temporary.write_text(_wise_config(one), encoding="utf-8")
+        blocks = 0 if one.pattern is None else one.pattern.blocks
+        rows.append(
+            {
+                "band": one.band,
+                "pairs": one.pairs,
+                "false": n_false,
+                "partition": f"{blocks} x {blocks}" if blocks else "none",
+            }
+        )
+        lines.append(f"bayesdist run {folder / f'{name}.toml'} -o {folder / f'run_{name}'}")
+    write_stand_in(folder / "optical_w2.hdr")
+    runs = " ".join(str(folder / f"run_{name}") for name in names)
+    compare = (
+        f"compare them:\n  bayesdist bands {runs} -o {folder / 'bands'} "
+        f"--optical {folder / 'optical_w2.hdr'} --turn {STAND_IN_TURN}"
+    )
+    return f"{table_text(rows)}\n\ncalibrate them:\n  " + "\n  ".join([*lines, compare])
+
+
+def _wise_config(one: WiseSet) -> str:
+    name = one.band.lower()
+    array = one.array
+    return WISE_CONFIG.format(
+        band=one.band,
+        folder=name,
+        run=f"run_{name}",
+        truth=f"truth/{name}.ecsv",
+        columns=array.size[0],
+        rows=array.size[1],
+        centre=array.centre,
+        scale_mas=1000.0 * array.scale,
+    )
