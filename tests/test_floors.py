@@ -21,6 +21,7 @@ ROOT = Path(bayesdist.__file__).parent
 # Packages on one floor do not see each other; each may import what lies on the floors before.
 FLOORS = (
     ("errors", "lazy"),
+    ("mission",),
     ("data", "model"),
     ("infer", "simulate"),
     ("calibration",),
@@ -99,8 +100,6 @@ def imports_of(name: str, *, at_import_time: bool = False) -> set[str]:
 def floor(name: str) -> str:
     """'infer' of bayesdist.infer.sampler.ensembles; '' of bayesdist itself and of __main__."""
     parts = name.split(".")
-    if name == "bayesdist.app.cli":  # it still names the commands of missions
-        return ""
     return "" if len(parts) == 1 or parts[1] == "__main__" else parts[1]
 
 

@@ -1,4 +1,4 @@
-"""`bayesdist validate`: the margins of a run against requirements of their own file."""
+"""`bayesdist requirements`: the margins of a run against requirements of their own file."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
     """
     asked = load_requirements(requirements)
     with closing(session_of(RunDirectory.open(run))) as session:
-        require(session, "validate", ("fit", "sample"))
+        require(session, "requirements", ("fit", "sample"))
         with _named_after(requirements, asked):
             margins = margins_of(session, asked)
             horizons = assessed_horizons(session, asked)
@@ -64,7 +64,7 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
     lines = [*_lines(margins), *(one.sentence for one in horizons)]
     lines += [f"WARNING: {text}" for text in warnings if text]
     if outdated:
-        lines.append(f"{report} shows earlier margins; renew it by 'bayesdist report {run}'")
+        lines.append(f"{report} shows earlier margins; renew it by 'bayesdist stage report {run}'")
     return "\n".join(lines), all(m.verdict == "met" for m in margins)
 
 

@@ -147,8 +147,8 @@ def test_each_period_has_its_table_and_both_are_the_model(run):
 def test_a_stage_can_be_run_again(run):
     of_these_stages = ("matching", "tables", "scatter", "fit")
     before = {key: summary_of(run)[key] for key in of_these_stages}
-    good("match", run, "-q")
-    good("fit", run, "-q")
+    good("stage", "match", run, "-q")
+    good("stage", "fit", run, "-q")
     assert {key: summary_of(run)[key] for key in of_these_stages} == before
 
 

@@ -51,10 +51,8 @@ INPUTS = ("catalog.parquet", "exposures.ecsv", "start_idc.fits", "lists", "run_f
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("filters") / "acs"
-    good(
-        *("simulate", "acs", "-o", folder, "--exposures", 14, "--other", 8, "--stars", 6000),
-        *("--filters", "F606W,F814W", "--seed", 5, "-q"),
-    )
+    options = ("--exposures", 14, "--secondary-exposures", 8, "--stars", 6000, "--seed", 5, "-q")
+    good("simulate", "acs", "-o", folder, "--filters", "F606W,F814W", *options)
     return folder
 
 
@@ -74,7 +72,7 @@ def calibrated(run, text: str, *stages: str):
     run.mkdir()
     (run / "config.toml").write_text(text, encoding="utf-8")
     for stage in stages:
-        good(stage, run, "-q")
+        good("stage", stage, run, "-q")
     return run
 
 
@@ -377,8 +375,8 @@ def test_a_run_that_has_not_converged(runs, tmp_path, monkeypatch):
         return replace(posterior, convergence=poor)
 
     monkeypatch.setattr(bayesdist.app.session, "load_posterior", doubtful)
-    refused(tmp_path, runs["F606W"], words=["R-hat 1.3", "--force"])
-    good("release", runs["F606W"], "-o", tmp_path / "out", "--force", "-q")
+    refused(tmp_path, runs["F606W"], words=["R-hat 1.3", "--allow-unconverged"])
+    good("release", runs["F606W"], "-o", tmp_path / "out", "--allow-unconverged", "-q")
     for path in sorted((tmp_path / "out").glob("*.fits")):
         header = read_lookup_file(path).header if "d2i" in path.name else read_idctab(path).header
         assert "NOT CONVERGED" in " ".join(map(str, header["HISTORY"]))

@@ -35,3 +35,16 @@ def test_a_room_loads_nothing_before_it_is_asked(name):
     code = f"import sys, bayesdist.{name}; print([m for m in {heavy!r} if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+def test_help_loads_nothing_heavy():
+    heavy = ("numpy", "numba", "scipy", "astropy", "matplotlib", "pydantic")
+    code = f"""
+import sys
+from bayesdist.app.cli import main
+assert main(["--help"]) == main(["run", "--help"]) == 0
+print([m for m in {heavy!r} if m in sys.modules], file=sys.stderr)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stderr.strip() == "[]"
+    assert "Exit codes: 0 good, 1 bad input, 2 usage" in run.stdout

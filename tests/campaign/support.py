@@ -154,7 +154,7 @@ def _simulate(setting: Setting, seed: int, folder: Path) -> None:
             stack.enter_context(mock.patch(making + "filter_tables", lambda *_: ()))
         stack.enter_context(mock.patch(f"{simulate}.pointings.OWN", setting.own))
         options = ["--exposures", setting.exposures, "--stars", setting.stars, "--seed", seed]
-        options += ["--smooth"] if setting.pattern == "none" else []
+        options += ["--no-tables"] if setting.pattern == "none" else []
         good("simulate", "acs", "-o", folder, *options, "-q")
     config = folder / f"campaign_{FILTER.lower()}.toml"
     text = config.read_text(encoding="utf-8")

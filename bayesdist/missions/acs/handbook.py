@@ -1,4 +1,4 @@
-"""`bayesdist handbook`: what section 4.1 of the ACS handbook shows, of any calibration."""
+"""`bayesdist hst handbook`: what section 4.1 of the ACS handbook shows, of any calibration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`bayesdist pam`: pixel area maps of a calibration."""
+"""`bayesdist hst pam`: pixel area maps of a calibration."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -89,13 +89,40 @@ segment = 1
 """
 
 
-def simulate_campaign(options: argparse.Namespace) -> str:
+def simulate_campaign(
+    output: str | Path,
+    *,
+    seed: int = 1,
+    force: bool = False,
+    exposures: int = 110,
+    stars: int = 53_900,
+    filters: Sequence[str] = (REFERENCE,),
+    secondary_exposures: int = 15,
+    false: float = 0.05,
+    outlying: float = 0.0,
+    cte: bool = False,
+    no_tables: bool = False,
+) -> str:
     """Simulate, and write into a folder.
 
     Parameters
     ----------
-    options : argparse.Namespace
-        Of the command line.
+    output : path
+        Folder.
+    seed : int
+    force : bool
+        Replace a campaign that is there.
+    exposures, stars : int
+        In the first filter, and of the catalogue.
+    filters : sequence of str
+    secondary_exposures : int
+        Of each further filter.
+    false, outlying : float
+        Fractions of detections that are none, and of outlying exposures.
+    cte : bool
+        Trailed charge moves the stars.
+    no_tables : bool
+        A distortion without look-up tables.
 
     Returns
     -------
@@ -107,25 +134,25 @@ def simulate_campaign(options: argparse.Namespace) -> str:
     InputError
         For options that cannot be used, and a folder in use.
     """
-    folder = Path(options.output)
-    if (folder / "lists").exists() and not options.force:
+    folder = Path(output)
+    if (folder / "lists").exists() and not force:
         raise InputError(
             "the folder holds a campaign", where=str(folder), do="replace it by --force"
         )
     with progress_bar("exposures") as progress:
         campaign = simulate_acs(
-            seed=options.seed,
-            n_exposures=options.exposures,
-            n_stars=options.stars,
-            filters=tuple(name.strip() for name in options.filters.split(",")),
-            n_other=options.other,
-            fine_scale=not options.smooth,
-            cte=options.cte,
-            outlying=options.outlying,
-            false=options.false,
+            seed=seed,
+            n_exposures=exposures,
+            n_stars=stars,
+            filters=tuple(filters),
+            n_other=secondary_exposures,
+            fine_scale=not no_tables,
+            cte=cte,
+            outlying=outlying,
+            false=false,
             progress=progress,
         )
-    write_acs(campaign, folder, force=options.force)
+    write_acs(campaign, folder, force=force)
     write_idctab(_stale(), folder / START)
     filters = campaign.log.filters
     first = REFERENCE if REFERENCE in filters else filters[0]

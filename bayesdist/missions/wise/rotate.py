@@ -1,4 +1,4 @@
-"""`bayesdist rotate`: a product in rotated or mirrored pixels."""
+"""`bayesdist wise rotate`: a product in rotated or mirrored pixels."""
 
 from __future__ import annotations
 

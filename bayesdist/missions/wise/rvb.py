@@ -1,9 +1,8 @@
-"""`bayesdist rvb`: RvB pairs with their reference positions transformed, frame by frame or all."""
+"""`bayesdist wise rvb`: RvB pairs with transformed reference positions, frame by frame or all."""
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import radians
 from pathlib import Path
@@ -25,14 +24,35 @@ from bayesdist.errors import InputError
 __all__ = ["rereference_files", "transform_files"]
 
 
-def transform_files(options: argparse.Namespace) -> str:
+def transform_files(
+    files: Sequence[str | Path],
+    output: str | Path,
+    *,
+    band: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    dx: float = 0.0,
+    dy: float = 0.0,
+    rotation: float = 0.0,
+    scale_x: float = 0.0,
+    scale_y: float = 0.0,
+) -> str:
     """Pairs with all reference positions moved by one linear transformation.
 
     Parameters
     ----------
-    options : argparse.Namespace
-        Of the command line: files, output, band, column; dx, dy, rotation in degrees, scale_x,
-        scale_y.
+    files : sequence of path
+    output : path
+        New folder.
+    band : str, optional
+        Needed where the files hold several.
+    columns : mapping of str to str, optional
+        As `stream_rvb`.
+    dx, dy : float
+        Pixels.
+    rotation : float
+        Degrees, from x towards y.
+    scale_x, scale_y : float
+        Relative to one.
 
     Returns
     -------
@@ -44,27 +64,39 @@ def transform_files(options: argparse.Namespace) -> str:
     InputError
         For no transformation, and as `stream_rvb`, `transformed` and `write_rvb`.
     """
-    transform = RvbTransform(
-        options.dx, options.dy, radians(options.rotation), options.scale_x, options.scale_y
-    )
+    transform = RvbTransform(dx, dy, radians(rotation), scale_x, scale_y)
     if transform == RvbTransform():
         raise InputError(
             "no transformation is asked for",
-            where="bayesdist rvb transform",
+            where="bayesdist wise rvb transform",
             do="give --dx, --dy, --rotation, --scale-x or --scale-y",
         )
-    band = _band(options)
+    columns = columns or {}
+    band = _band(files, band, columns)
     transform = replace(transform, centre=_centre(band))
-    return _written(options, band, lambda matches: transformed(matches, transform))
+    return _written(files, output, band, columns, lambda matches: transformed(matches, transform))
 
 
-def rereference_files(options: argparse.Namespace) -> str:
+def rereference_files(
+    files: Sequence[str | Path],
+    output: str | Path,
+    *,
+    free: str | Path,
+    fixed: str | Path,
+    band: str | None = None,
+    columns: Mapping[str, str] | None = None,
+) -> str:
     """Pairs brought from the frame solutions that they were made with to others.
 
     Parameters
     ----------
-    options : argparse.Namespace
-        Of the command line: files, output, band, column; free, fixed (tables of solutions).
+    files : sequence of path
+    output : path
+        New folder.
+    free, fixed : path
+        Tables of solutions: those of the pairs, and those that they are brought to.
+    band, columns
+        As of `transform_files`.
 
     Returns
     -------
@@ -76,27 +108,14 @@ def rereference_files(options: argparse.Namespace) -> str:
     InputError
         As `stream_rvb`, `read_solutions`, `rereference` and `write_rvb`.
     """
-    band = _band(options)
-    free, fixed = (
-        read_solutions(path, centre=_centre(band)) for path in (options.free, options.fixed)
-    )
-    return _written(options, band, lambda matches: rereference(matches, free, fixed))
+    columns = columns or {}
+    band = _band(files, band, columns)
+    old, new = (read_solutions(path, centre=_centre(band)) for path in (free, fixed))
+    return _written(files, output, band, columns, lambda matches: rereference(matches, old, new))
 
 
-def _columns(options: argparse.Namespace) -> dict[str, str]:
-    out = {}
-    for text in options.column:
-        key, equals, name = text.partition("=")
-        if not equals:
-            raise InputError(
-                f"{text!r} names no column", where="--column", do="give KEY=NAME, as in u=U2MASS"
-            )
-        out[key] = name
-    return out
-
-
-def _band(options: argparse.Namespace) -> str:
-    return chosen_band(open_rvb_files(options.files, _columns(options)), options.band)
+def _band(files: Sequence[str | Path], band: str | None, columns: Mapping[str, str]) -> str:
+    return chosen_band(open_rvb_files(files, columns), band)
 
 
 def _centre(band: str) -> tuple[float, float]:
@@ -105,20 +124,23 @@ def _centre(band: str) -> tuple[float, float]:
 
 
 def _written(
-    options: argparse.Namespace, band: str, move: Callable[[MatchTable], MatchTable]
+    files: Sequence[str | Path],
+    output: str | Path,
+    band: str,
+    columns: Mapping[str, str],
+    move: Callable[[MatchTable], MatchTable],
 ) -> str:
-    output = Path(options.output).resolve()
-    for path in map(Path, options.files):
-        if path.is_dir() and output.is_relative_to(path.resolve()):
+    for path in map(Path, files):
+        if path.is_dir() and Path(output).resolve().is_relative_to(path.resolve()):
             raise InputError(
                 "lies inside the folder of its input",
-                where=options.output,
+                where=str(output),
                 do="choose a folder outside of it",
             )
 
     def moved() -> Iterator[RvbPairs]:
-        for pairs in stream_rvb(options.files, band=band, columns=_columns(options)):
+        for pairs in stream_rvb(files, band=band, columns=columns):
             yield replace(pairs, matches=move(pairs.matches))
 
-    n = write_rvb(moved(), options.output)
-    return f"{options.output}: {n} pairs of {band}; calibrate them with data.format = 'rvb'"
+    n = write_rvb(moved(), output)
+    return f"{output}: {n} pairs of {band}; calibrate them with data.format = 'rvb'"

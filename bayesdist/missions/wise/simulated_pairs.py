@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from bayesdist.missions.wise.demo import simulation_config, write_simulation
 from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
 from bayesdist.missions.wise.simulate.stand_in import STAND_IN_TURN, write_stand_in
 
-__all__ = ["simulate_wise_pairs"]
+__all__ = ["simulate_sets", "simulate_table"]
 
 WISE_CONFIG = """\
 # Calibrates WISE {band} from simulated pairs: bayesdist run THIS -o {run}
@@ -59,14 +59,28 @@ sip = {{inverse_order = 5, linear = "sip"}}
 """
 
 
-def simulate_wise_pairs(options: argparse.Namespace) -> str:
-    """Full sets in Parquet, or one small table where its options are given.
+def simulate_table(
+    output: str | Path,
+    *,
+    stars: int = 6000,
+    band: str = "W2",
+    fraction: float = 0.03,
+    seed: int = 1,
+    force: bool = False,
+) -> str:
+    """One small table of one band, and how to calibrate it.
 
     Parameters
     ----------
-    options : argparse.Namespace
-        Of the command line: output, force, seed; bands, pairs (None: those of section 4 of WSDC
-        D-T033), false_share, partition_pattern; or stars, band, fraction (None: not asked for).
+    output : path
+        Folder.
+    stars : int
+    band : str
+    fraction : float
+        Of false matches.
+    seed : int
+    force : bool
+        Replace a configuration that is there.
 
     Returns
     -------
@@ -78,28 +92,17 @@ def simulate_wise_pairs(options: argparse.Namespace) -> str:
     InputError
         For options that cannot be used, and a folder in use.
     """
-    if options.stars is None and options.band is None and options.fraction is None:
-        return _sets(options)
-    return _small_table(
-        options,
-        6000 if options.stars is None else options.stars,
-        options.band or "W2",
-        0.03 if options.fraction is None else options.fraction,
-    )
-
-
-def _small_table(options: argparse.Namespace, stars: int, band: str, fraction: float) -> str:
     if stars < 1 or not 0 <= fraction < 1:
         raise InputError(
             "a simulation needs stars, and true matches among them",
             do="give --stars 1 or more and --fraction in [0, 1)",
         )
-    folder = Path(options.output)
-    if (folder / "config.toml").exists() and not options.force:
+    folder = Path(output)
+    if (folder / "config.toml").exists() and not force:
         raise InputError(
             "the folder holds a configuration", where=str(folder), do="replace it by --force"
         )
-    rng = np.random.default_rng(options.seed)
+    rng = np.random.default_rng(seed)
     matches, truth = simulate_wise(stars, band=band, fraction=fraction, rng=rng)
     write_simulation(folder, matches, truth, simulation_config(band))
     return (
@@ -108,30 +111,66 @@ def _small_table(options: argparse.Namespace, stars: int, band: str, fraction: f
     )
 
 
-def _sets(options: argparse.Namespace) -> str:
-    folder = Path(options.output)
-    if len(set(options.bands)) < len(options.bands):
+def simulate_sets(
+    output: str | Path,
+    *,
+    bands: Sequence[str] = ("W1", "W2", "W3", "W4"),
+    pairs: int | None = None,
+    false_share: float = 0.03,
+    partition_pattern: bool = False,
+    seed: int = 1,
+    force: bool = False,
+) -> str:
+    """Full sets of bands in Parquet, and how to calibrate them.
+
+    Parameters
+    ----------
+    output : path
+        Folder.
+    bands : sequence of str
+    pairs : int, optional
+        Of each band; by default those of section 4 of WSDC D-T033.
+    false_share : float
+        Fraction of false matches.
+    partition_pattern : bool
+        Blocks in the residuals.
+    seed : int
+    force : bool
+        Replace sets that are there.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For options that cannot be used, and a folder in use.
+    """
+    folder = Path(output)
+    if len(set(bands)) < len(bands):
         raise InputError("a band is named twice", where="--bands", do="name each once")
     sets = [
         wise_set(
             band,
-            pairs=options.pairs,
-            seed=options.seed,
-            false_share=options.false_share,
-            partition=options.partition_pattern,
+            pairs=pairs,
+            seed=seed,
+            false_share=false_share,
+            partition=partition_pattern,
         )
-        for band in options.bands
+        for band in bands
     ]
     names = [one.band.lower() for one in sets]
     used = [name for name in ("config.toml", *names) if (folder / name).exists()]
-    if used and not options.force:
+    if used and not force:
         raise InputError(
             f"the folder holds {used[0]} already", where=str(folder), do="replace it by --force"
         )
     rows: list[dict[str, object]] = []
     lines = []
     for one, name in zip(sets, names, strict=True):
-        n_false = write_wise_set(one, folder, threads=os.cpu_count() or 1, force=options.force)
+        n_false = write_wise_set(one, folder, threads=os.cpu_count() or 1, force=force)
         with atomic_path(folder / f"{name}.toml") as temporary:
             temporary.write_text(_wise_config(one), encoding="utf-8")
         blocks = 0 if one.pattern is None else one.pattern.blocks
@@ -147,8 +186,8 @@ def _sets(options: argparse.Namespace) -> str:
     write_stand_in(folder / "optical_w2.hdr")
     runs = " ".join(str(folder / f"run_{name}") for name in names)
     compare = (
-        f"compare them:\n  bayesdist bands {runs} -o {folder / 'bands'} "
-        f"--optical {folder / 'optical_w2.hdr'} --turn {STAND_IN_TURN}"
+        f"compare them:\n  bayesdist wise bands {runs} -o {folder / 'bands'} "
+        f"--optical {folder / 'optical_w2.hdr'} --rotation {STAND_IN_TURN}"
     )
     return f"{table_text(rows)}\n\ncalibrate them:\n  " + "\n  ".join([*lines, compare])
 

@@ -106,7 +106,16 @@ def test_nothing_is_replaced_unasked_and_nothing_old_stays(tmp_path):
 
 def test_the_command(tmp_path, capsys):
     arguments = ["simulate", "acs", "-o", str(tmp_path / "sim"), "--exposures", "3", "-q"]
-    arguments += ["--stars", "400", "--filters", "F606W,F814W", "--other", "2", "--seed", "7"]
+    arguments += [
+        "--stars",
+        "400",
+        "--filters",
+        "F606W,F814W",
+        "--secondary-exposures",
+        "2",
+        "--seed",
+        "7",
+    ]
     assert main(arguments) == 0
     out = capsys.readouterr()
     assert re.search(r"F606W +3 ", out.out) and re.search(r"F814W +2 ", out.out) and not out.err
@@ -116,7 +125,7 @@ def test_the_command(tmp_path, capsys):
     equal(read_acs(tmp_path / "sim").catalog, expected.catalog, ("u", "v"))
     assert main(arguments) == 1
     assert "--force" in capsys.readouterr().err
-    assert main([*arguments, "--force", "--cte", "--smooth"]) == 0
+    assert main([*arguments, "--force", "--cte", "--no-tables"]) == 0
     settings = read_acs(tmp_path / "sim").truth.settings
     assert settings["cte"] and not settings["fine_scale"]
     assert main(["simulate", "acs", "-o", str(tmp_path / "no"), "--filters", "F606"]) == 1

@@ -1,4 +1,4 @@
-"""`bayesdist bands` on small sets of two bands, against what is computed here from their files."""
+"""`bayesdist wise bands` on small sets of two bands, against what is computed from their files."""
 
 from __future__ import annotations
 
@@ -68,8 +68,10 @@ class Compared:
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory) -> Compared:
     folder = tmp_path_factory.mktemp("bands")
-    said = good("simulate", "wise", "-o", folder / "set", "--pairs", PAIRS, "--bands", *BANDS)
-    assert f"--optical {folder / 'set' / 'optical_w2.hdr'} --turn 270" in said.out
+    said = good(
+        "simulate", "wise", "-o", folder / "set", "--pairs", PAIRS, "--bands", ",".join(BANDS)
+    )
+    assert f"--optical {folder / 'set' / 'optical_w2.hdr'} --rotation 270" in said.out
     for band in BANDS:
         name = band.lower()
         text = (folder / "set" / f"{name}.toml").read_text(encoding="utf-8")
@@ -79,11 +81,11 @@ def compared(tmp_path_factory) -> Compared:
         run.mkdir()
         (run / "config.toml").write_text(text, encoding="utf-8")
         for stage in ("fit", "sample"):  # what comes after is not needed
-            good(stage, run)
+            good("stage", stage, run)
     optical = folder / "set" / "optical_w2.hdr"
     runs = [folder / "run_w4", folder / "run_w1"]  # the tables put them in order
-    options = ["--bins", BINS, "--optical", optical, "--turn", 270]
-    return Compared(folder, good("bands", *runs, "-o", folder / "bands", *options))
+    options = ["--bins", BINS, "--optical", optical, "--rotation", 270]
+    return Compared(folder, good("wise", "bands", *runs, "-o", folder / "bands", *options))
 
 
 def residuals(compared: Compared, band: str) -> tuple[np.ndarray, ...]:
@@ -263,7 +265,9 @@ def test_an_optical_model_of_another_field_is_refused(compared, tmp_path):
     header.totextfile(tmp_path / "camera.hdr")
     options = ["--bins", BINS, "--optical", tmp_path / "camera.hdr"]
     words = ["camera.hdr", "0.847 arcmin", "W1 sees 46.6", "own field"]
-    refused(tmp_path, "bands", compared.run("W1"), "-o", tmp_path / "out", *options, words=words)
+    refused(
+        tmp_path, "wise", "bands", compared.run("W1"), "-o", tmp_path / "out", *options, words=words
+    )
 
 
 def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):
@@ -272,8 +276,8 @@ def test_a_run_that_has_not_converged_is_said_on_top(compared, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.toml").write_text(text, encoding="utf-8")
     for stage in ("fit", "sample"):
-        cli(stage, tmp_path / "run")
-    result = good("bands", tmp_path / "run", "-o", tmp_path / "out", "--bins", BINS)
+        cli("stage", stage, tmp_path / "run")
+    result = good("wise", "bands", tmp_path / "run", "-o", tmp_path / "out", "--bins", BINS)
     assert "WARNING: W4 has not converged" in result.out
     page = (tmp_path / "out" / "bands.html").read_text(encoding="utf-8")
     assert page.index("NOT CONVERGED: W4") < page.index("Overview")
@@ -288,14 +292,14 @@ def test_a_run_that_is_not_finished_is_refused(compared, tmp_path):
     record = json.loads((tmp_path / "run" / "run.json").read_text(encoding="utf-8"))
     del record["stages"]["sample"]
     (tmp_path / "run" / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    words = ["needs stage 'sample'", "bayesdist sample"]
-    refused(tmp_path, "bands", tmp_path / "run", "-o", tmp_path / "out", words=words)
+    words = ["needs stage 'sample'", "bayesdist stage sample"]
+    refused(tmp_path, "wise", "bands", tmp_path / "run", "-o", tmp_path / "out", words=words)
 
 
 def test_two_runs_of_one_band_are_refused(compared, tmp_path):
     run = compared.run("W1")
     words = ["is of band W1", "one run for each band"]
-    refused(tmp_path, "bands", run, run, "-o", tmp_path / "out", words=words)
+    refused(tmp_path, "wise", "bands", run, run, "-o", tmp_path / "out", words=words)
 
 
 @pytest.mark.parametrize(
@@ -303,19 +307,21 @@ def test_two_runs_of_one_band_are_refused(compared, tmp_path):
     [
         (["--optical", "nowhere.hdr"], ["nowhere.hdr", "there is no such file"]),
         (["--optical", "README.md"], ["README.md"]),
-        (["--optical", "a.hdr", "b.hdr"], ["2 optical models", "1 runs"]),
+        (["--optical", "a.hdr,b.hdr"], ["2 optical models", "1 runs"]),
         (["--bins", "5"], ["--bins", "give 6 or more"]),
     ],
 )
 def test_options_that_cannot_be_used_are_refused(compared, tmp_path, monkeypatch, options, words):
     monkeypatch.chdir(REPOSITORY)
     run = compared.run("W1")
-    refused(tmp_path, "bands", run, "-o", tmp_path / "out", *options, words=words)
+    refused(tmp_path, "wise", "bands", run, "-o", tmp_path / "out", *options, words=words)
 
 
 def test_a_folder_in_use_is_refused(compared):
     words = ["holds other files", "never overwritten"]
-    refused(compared.output, "bands", compared.run("W1"), "-o", compared.output, words=words)
+    refused(
+        compared.output, "wise", "bands", compared.run("W1"), "-o", compared.output, words=words
+    )
 
 
 def test_stars_that_are_not_those_of_the_run_are_refused(tmp_path):
@@ -324,14 +330,14 @@ def test_stars_that_are_not_those_of_the_run_are_refused(tmp_path):
     stars = config.parent / "stars.ecsv"
     stars.write_text(stars.read_text(encoding="utf-8") + "\n", encoding="utf-8")
     words = ["stars.ecsv", "changed since the run began"]
-    refused(tmp_path, "bands", run, "-o", tmp_path / "out", words=words)
+    refused(tmp_path, "wise", "bands", run, "-o", tmp_path / "out", words=words)
 
 
 def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
     detector = {"name": "blue", "size": SIZE, "scale_mas": 50.0}
     config = write_job(tmp_path / "in", detector=detector)
     begin_stagewise(tmp_path / "run", config, "fit", "sample")
-    good("bands", tmp_path / "run", "-o", tmp_path / "out", "--bins", 6)
+    good("wise", "bands", tmp_path / "run", "-o", tmp_path / "out", "--bins", 6)
     page = (tmp_path / "out" / "bands.html").read_text(encoding="utf-8")
     text = re.sub(r'src="data:[^"]*"', "", page)
     for word in ("printed", "WISE", "W1", "frameset", "5-1"):
@@ -344,7 +350,7 @@ def test_a_missing_scale_is_refused(tmp_path):
     config = write_job(tmp_path / "in", detector={"name": "blue", "size": SIZE})
     run = begin_stagewise(tmp_path / "run", config, "fit", "sample")
     words = ["size of a pixel", "detector.scale_mas"]
-    refused(tmp_path, "bands", run, "-o", tmp_path / "out", words=words)
+    refused(tmp_path, "wise", "bands", run, "-o", tmp_path / "out", words=words)
 
 
 def test_several_chips_are_refused(tmp_path):
@@ -361,4 +367,12 @@ def test_several_chips_are_refused(tmp_path):
     settings = {"detector": {"name": "D", "scale_mas": 50.0}, "model": {"order": 2}}
     config = write_job(tmp_path / "in", table, chip=blocks, **settings)
     run = begin_stagewise(tmp_path / "run", config, "fit", "sample")
-    refused(tmp_path, "bands", run, "-o", tmp_path / "out", words=["has 2 chips", "one chip each"])
+    refused(
+        tmp_path,
+        "wise",
+        "bands",
+        run,
+        "-o",
+        tmp_path / "out",
+        words=["has 2 chips", "one chip each"],
+    )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -25,7 +23,7 @@ from bayesdist.missions.wise.simulate import (
     write_wise_set,
 )
 from bayesdist.missions.wise.simulate.interlopers import match_radius
-from bayesdist.missions.wise.simulated_pairs import simulate_wise_pairs
+from bayesdist.missions.wise.simulated_pairs import simulate_sets
 
 COLUMNS = {"sigma_u": "sigma", "sigma_v": "sigma", "exposure": "frame"}
 
@@ -227,22 +225,20 @@ def test_the_pattern_is_written(tmp_path, many):
     assert at == pytest.approx(row["offset"][0] - smooth, abs=1e-12)
 
 
-def options(folder, **changes):
+def simulated(folder, **changes):
     values = {
-        "output": str(folder),
         "bands": ["W1", "W4"],
         "pairs": 2000,
         "seed": 1,
         "false_share": 0.03,
         "partition_pattern": True,
         "force": False,
-        **dict.fromkeys(("stars", "band", "fraction")),
     }
-    return argparse.Namespace(**values | changes)
+    return simulate_sets(folder, **values | changes)
 
 
 def test_the_command_writes_jobs_that_check_accepts(tmp_path):
-    text = simulate_wise_pairs(options(tmp_path))
+    text = simulated(tmp_path)
     assert "bayesdist run" in text and "5 x 5" in text and "none" in text
     for name in ("w1", "w4"):
         assert "30 of 30" in check(tmp_path / f"{name}.toml")
@@ -250,33 +246,33 @@ def test_the_command_writes_jobs_that_check_accepts(tmp_path):
 
 def test_what_cannot_be_simulated_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no band 'W9'.*W1"):
-        simulate_wise_pairs(options(tmp_path, bands=["W9"]))
+        simulated(tmp_path, bands=["W9"])
     with pytest.raises(InputError, match="named twice"):
-        simulate_wise_pairs(options(tmp_path, bands=["W1", "W1"]))
+        simulated(tmp_path, bands=["W1", "W1"])
     with pytest.raises(InputError, match="pairs is 0"):
-        simulate_wise_pairs(options(tmp_path, pairs=0))
+        simulated(tmp_path, pairs=0)
     for share in (-0.1, 1.0, np.nan):
         with pytest.raises(InputError, match="share of false matches"):
-            simulate_wise_pairs(options(tmp_path, false_share=share))
+            simulated(tmp_path, false_share=share)
     assert not list(tmp_path.iterdir())
-    simulate_wise_pairs(options(tmp_path, bands=["W4"]))
+    simulated(tmp_path, bands=["W4"])
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*")}
     with pytest.raises(InputError, match=r"holds w4 already.*--force"):  # before W1 is begun
-        simulate_wise_pairs(options(tmp_path))
+        simulated(tmp_path)
     with pytest.raises(InputError, match="holds Parquet files already"):
         write_wise_set(wise_set("W4", pairs=10), tmp_path)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*")} == before
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be made"):
-        simulate_wise_pairs(options(tmp_path / "file"))
+        simulated(tmp_path / "file")
 
 
 def test_force_leaves_nothing_of_the_set_before(tmp_path, monkeypatch):
     monkeypatch.setattr(sets, "CHUNK", 500)
     new = {"pairs": 900, "partition_pattern": False}
-    simulate_wise_pairs(options(tmp_path / "a"))
-    simulate_wise_pairs(options(tmp_path / "a", force=True, **new))
-    simulate_wise_pairs(options(tmp_path / "b", **new))
+    simulated(tmp_path / "a")
+    simulated(tmp_path / "a", force=True, **new)
+    simulated(tmp_path / "b", **new)
     a, b = (
         {p.relative_to(d): p.read_bytes() for p in d.rglob("*.*")}
         for d in map(tmp_path.joinpath, "ab")

@@ -1,1 +1,1 @@
-"""`bayesdist bands`: tables and diagrams of several bands beside each other."""
+"""`bayesdist wise bands`: tables and diagrams of several bands beside each other."""

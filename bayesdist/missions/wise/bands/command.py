@@ -36,7 +36,7 @@ def bands_of_runs(
     *,
     bins: int = 31,
     optical: Sequence[str | Path] = (),
-    turn: float = 0.0,
+    rotation: float = 0.0,
     published: bool = True,
     command: str = "",
 ) -> str:
@@ -52,7 +52,7 @@ def bands_of_runs(
         Of residuals, on each axis.
     optical : sequence of path
         SIP headers or WISE meta-data of an optical model: one, or one for each run.
-    turn : float
+    rotation : float
         Degrees by which that is turned, from x towards y.
     published : bool
         Whether WISE's bands have the values of WSDC D-T033 beside them.
@@ -84,7 +84,7 @@ def bands_of_runs(
         inputs = measure_bands(
             bands,
             bins=bins,
-            optical=optical_models(optical, turn, named),
+            optical=optical_models(optical, rotation, named),
             published=published,
             provenance={"command": command, **versions()},
         )
