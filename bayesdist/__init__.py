@@ -8,8 +8,9 @@ Everything public is here and is loaded when it is first used::
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from bayesdist.lazy import lazy_name
 
 __version__ = "0.1.0"
 
@@ -50,8 +51,8 @@ _HOMES = {
         "sample",
         "save_posterior",
     ),
-    "bayesdist.simulate": (
-        "simulate_matches",
+    "bayesdist.simulate": ("simulate_matches", "simulate_partitioned"),
+    "bayesdist.missions.wise.simulate": (
         "simulate_wise",
         "simulate_wise_partitioned",
         "wise_solution",
@@ -82,19 +83,16 @@ _HOMES = {
     ),
     "bayesdist.app.run": ("run",),
 }
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
-__all__ = ["__version__", *sorted(_HOME_OF)]
+__all__ = ["__version__", *sorted(name for names in _HOMES.values() for name in names)]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME_OF:
-        return getattr(import_module(_HOME_OF[name]), name)
-    raise AttributeError(f"module 'bayesdist' has no attribute {name!r}")
+    return lazy_name(__name__, _HOMES, name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME_OF})
+    return sorted({*globals(), *__all__})
 
 
 if TYPE_CHECKING:

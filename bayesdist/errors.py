@@ -14,6 +14,7 @@ __all__ = [
     "InputError",
     "NotConvergedError",
     "NotSettledError",
+    "RenamedError",
 ]
 
 
@@ -74,3 +75,17 @@ class NotConvergedError(BayesdistError):
     """The sampler did not reach its targets and ``--strict`` was given."""
 
     exit_code = 3
+
+
+class RenamedError(BayesdistError):
+    """A command under a name that it no longer has.
+
+    Parameters
+    ----------
+    old, new : str
+    """
+
+    exit_code = 2
+
+    def __init__(self, old: str, new: str) -> None:
+        super().__init__(f"the command {old!r} is {new!r} now", do=f"say 'bayesdist {new}'")

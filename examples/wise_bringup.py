@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.infer.bringup import bring_up
-from bayesdist.simulate.bringup import optical_model, simulate_unpaired
+from bayesdist.missions.wise.simulate.bringup import optical_model, simulate_unpaired
 
 STARTS = {
     "from nothing": None,

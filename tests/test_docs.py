@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import ast
 import json
 import os
@@ -13,12 +12,13 @@ import typing
 from importlib import import_module
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from pydantic import BaseModel
 
 import bayesdist as bd
-from bayesdist.app.cli import _parser
+from bayesdist.app.cli import bayesdist as root
 from bayesdist.app.config import Config
 
 from .docs_blocks import DOCS, blocks, run_page
@@ -216,26 +216,28 @@ def _values(annotation: object) -> set[object]:
     return {value for part in parts for value in _values(part)}
 
 
-def _commands(parser: argparse.ArgumentParser, path: str = "bayesdist"):
-    """Each command with its parser, those with a second word by both."""
-    subs = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
-    if not subs:
-        yield path, parser
-    for sub in subs:
-        for name, inner in sub.choices.items():
-            yield from _commands(inner, f"{path} {name}")
+def _commands(group: click.Group, path: str = ""):
+    """Each command by its words, those in groups of groups too."""
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        words = f"{path} {name}".strip()
+        if isinstance(command, click.Group):
+            yield from _commands(command, words)
+        else:
+            yield words, command
 
 
 def test_every_command_is_documented_with_its_options():
     text = (DOCS / "commands.md").read_text(encoding="utf-8")
     everywhere = "\n".join(p.read_text(encoding="utf-8") for p in DOCS.glob("*.md"))
-    for path, parser in _commands(_parser()):
-        name = path.removeprefix("bayesdist ")
-        assert re.search(rf"bayesdist (?:[\w]+ \| )*{name}\b", text), path
-        for action in parser._actions:
-            option = max(action.option_strings, key=len, default="")
-            if option not in ("", "--help", "--quiet", "--output"):
-                assert option in everywhere, f"{path} {option}"
+    for words, command in _commands(root):
+        assert f"bayesdist {words} " in text, words
+        assert command.help, words
+        for option in (one for one in command.params if isinstance(one, click.Option)):
+            name = max(option.opts, key=len)
+            if name not in ("--quiet", "--output"):
+                assert name in everywhere, f"{words} {name}"
 
 
 def test_the_reference_names_all_that_is_public():

@@ -1,4 +1,4 @@
-"""`bayesdist order`: which polynomial order do the data of a configuration ask for?"""
+"""`bayesdist select-order`: which polynomial order do the data of a configuration ask for?"""
 
 from __future__ import annotations
 

@@ -6,106 +6,68 @@ been checked.  What outgrows the memory is Parquet: `open_matches` leaves it on 
 `PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such files.
 """
 
-from bayesdist.data.catalog import ReferenceCatalog, catalog_from_table, read_catalog
-from bayesdist.data.exposure_log import Exposure, ExposureLog
-from bayesdist.data.exposures import read_exposures, write_exposures
-from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
-from bayesdist.data.magnitude_errors import MagnitudeErrors
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.matching.campaign import CampaignMatches, match_campaign
-from bayesdist.data.matching.linear_map import LinearMap
-from bayesdist.data.matching.reports import ExposureReport
-from bayesdist.data.matching.search_radius import SearchRadius, search_radius
-from bayesdist.data.matching.similarity import find_similarity, pattern_index
-from bayesdist.data.matching.table import Matching, match_table, match_to_catalog
-from bayesdist.data.motions import (
-    MotionErrorLine,
-    derive_motions,
-    motion_error_line,
-    select_motions,
-)
-from bayesdist.data.partitioned import PartitionedMatches, open_matches
-from bayesdist.data.pieces import PIECE, Piece
-from bayesdist.data.preparing import centroid_errors, neutralise_aberration, with_centroid_errors
-from bayesdist.data.reading.formats import FORMATS, input_files
-from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.reading.read import read_matches
-from bayesdist.data.reading.table import matches_from_table
-from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
-from bayesdist.data.rvb_accept import RadialLimit
-from bayesdist.data.rvb_linear import fit_transform, linear_moments
-from bayesdist.data.rvb_pairs import RvbPairs
-from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
-from bayesdist.data.rvb_solutions import read_solutions
-from bayesdist.data.rvb_transform import RvbTransform, rereference, transformed
-from bayesdist.data.rvb_write import write_rvb
-from bayesdist.data.sky.earth import velocity_aberration
-from bayesdist.data.sky.tangent import mean_direction, tangent_plane
-from bayesdist.data.starlists import StarCuts, StarList, read_star_lists, star_list_of_hst1pass
-from bayesdist.data.tables.units import UNITS
-from bayesdist.data.write import write_partitioned
+from __future__ import annotations
 
-__all__ = [
-    "FORMATS",
-    "PIECE",
-    "UNITS",
-    "CampaignMatches",
-    "Exposure",
-    "ExposureLog",
-    "ExposureReport",
-    "Hst1passList",
-    "LinearMap",
-    "MagnitudeErrors",
-    "MatchTable",
-    "Matching",
-    "MotionErrorLine",
-    "PartitionedMatches",
-    "Piece",
-    "RadialLimit",
-    "ReadOptions",
-    "ReferenceCatalog",
-    "RvbPairs",
-    "RvbSelection",
-    "RvbTransform",
-    "SearchRadius",
-    "SelectedPairs",
-    "StarCuts",
-    "StarList",
-    "catalog_from_table",
-    "centroid_errors",
-    "derive_motions",
-    "find_similarity",
-    "fit_transform",
-    "input_files",
-    "linear_moments",
-    "match_campaign",
-    "match_table",
-    "match_to_catalog",
-    "matches_from_table",
-    "mean_direction",
-    "motion_error_line",
-    "neutralise_aberration",
-    "open_matches",
-    "pattern_index",
-    "read_catalog",
-    "read_exposures",
-    "read_hst1pass",
-    "read_matches",
-    "read_matchup",
-    "read_rvb",
-    "read_solutions",
-    "read_star_lists",
-    "rereference",
-    "rvb_bands",
-    "search_radius",
-    "select_motions",
-    "star_list_of_hst1pass",
-    "stream_rvb",
-    "tangent_plane",
-    "transformed",
-    "velocity_aberration",
-    "with_centroid_errors",
-    "write_exposures",
-    "write_partitioned",
-    "write_rvb",
-]
+from typing import Any
+
+from bayesdist.lazy import lazy_name
+
+_HOMES = {
+    "bayesdist.data.catalog": ("ReferenceCatalog", "catalog_from_table", "read_catalog"),
+    "bayesdist.data.exposure_log": ("Exposure", "ExposureLog"),
+    "bayesdist.data.exposures": ("read_exposures", "write_exposures"),
+    "bayesdist.data.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
+    "bayesdist.data.magnitude_errors": ("MagnitudeErrors"),
+    "bayesdist.data.matches": ("MatchTable"),
+    "bayesdist.data.matching.campaign": ("CampaignMatches", "match_campaign"),
+    "bayesdist.data.matching.linear_map": ("LinearMap"),
+    "bayesdist.data.matching.reports": ("ExposureReport"),
+    "bayesdist.data.matching.search_radius": ("SearchRadius", "search_radius"),
+    "bayesdist.data.matching.similarity": ("find_similarity", "pattern_index"),
+    "bayesdist.data.matching.table": ("Matching", "match_table", "match_to_catalog"),
+    "bayesdist.data.motions": (
+        "MotionErrorLine",
+        "derive_motions",
+        "motion_error_line",
+        "select_motions",
+    ),
+    "bayesdist.data.partitioned": ("PartitionedMatches", "open_matches"),
+    "bayesdist.data.pieces": ("PIECE", "Piece"),
+    "bayesdist.data.preparing": (
+        "centroid_errors",
+        "neutralise_aberration",
+        "with_centroid_errors",
+    ),
+    "bayesdist.data.reading.formats": ("FORMATS", "input_files"),
+    "bayesdist.data.reading.options": ("ReadOptions"),
+    "bayesdist.data.reading.read": ("read_matches"),
+    "bayesdist.data.reading.table": ("matches_from_table"),
+    "bayesdist.data.rvb": ("read_rvb", "rvb_bands", "stream_rvb"),
+    "bayesdist.data.rvb_accept": ("RadialLimit"),
+    "bayesdist.data.rvb_linear": ("fit_transform", "linear_moments"),
+    "bayesdist.data.rvb_pairs": ("RvbPairs"),
+    "bayesdist.data.rvb_select": ("RvbSelection", "SelectedPairs"),
+    "bayesdist.data.rvb_solutions": ("read_solutions"),
+    "bayesdist.data.rvb_transform": ("RvbTransform", "rereference", "transformed"),
+    "bayesdist.data.rvb_write": ("write_rvb"),
+    "bayesdist.data.sky.earth": ("velocity_aberration"),
+    "bayesdist.data.sky.tangent": ("mean_direction", "tangent_plane"),
+    "bayesdist.data.starlists": (
+        "StarCuts",
+        "StarList",
+        "read_star_lists",
+        "star_list_of_hst1pass",
+    ),
+    "bayesdist.data.tables.units": ("UNITS"),
+    "bayesdist.data.write": ("write_partitioned"),
+}
+
+__all__ = sorted(name for names in _HOMES.values() for name in names)
+
+
+def __getattr__(name: str) -> Any:
+    return lazy_name(__name__, _HOMES, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -26,13 +26,13 @@ from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.series import Series
 from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, without_frames
+from bayesdist.missions.acs.simulate import acs_solution, making, read_acs, simulate_acs
 from bayesdist.model import LookupTable, TimeDependence, corrected
 from bayesdist.products import (
     read_d2im,
     read_idctab,
     read_lookup_file,
 )
-from bayesdist.simulate.acs import acs_solution, making, read_acs, simulate_acs
 from tests.app.support import cli, good, one_sentence, snapshot
 from tests.infer.small_campaign import Truth
 from tests.products.acs_offline import Pointing, to_sky
@@ -52,10 +52,8 @@ INPUTS = ("catalog.parquet", "exposures.ecsv", "start_idc.fits", "lists", "run_f
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("filters") / "acs"
-    good(
-        *("simulate", "acs", "-o", folder, "--exposures", 14, "--other", 8, "--stars", 6000),
-        *("--filters", "F606W,F814W", "--seed", 5, "-q"),
-    )
+    options = ("--exposures", 14, "--secondary-exposures", 8, "--stars", 6000, "--seed", 5, "-q")
+    good("simulate", "acs", "-o", folder, "--filters", "F606W,F814W", *options)
     return folder
 
 
@@ -75,7 +73,7 @@ def calibrated(run, text: str, *stages: str):
     run.mkdir()
     (run / "config.toml").write_text(text, encoding="utf-8")
     for stage in stages:
-        good(stage, run, "-q")
+        good("stage", stage, run, "-q")
     return run
 
 
@@ -381,8 +379,8 @@ def test_a_run_that_has_not_converged(runs, tmp_path, monkeypatch):
         return replace(posterior, convergence=poor)
 
     monkeypatch.setattr(bayesdist.app.session, "load_posterior", doubtful)
-    refused(tmp_path, runs["F606W"], words=["R-hat 1.3", "--force"])
-    good("release", runs["F606W"], "-o", tmp_path / "out", "--force", "-q")
+    refused(tmp_path, runs["F606W"], words=["R-hat 1.3", "--allow-unconverged"])
+    good("release", runs["F606W"], "-o", tmp_path / "out", "--allow-unconverged", "-q")
     for path in sorted((tmp_path / "out").glob("*.fits")):
         header = read_lookup_file(path).header if "d2i" in path.name else read_idctab(path).header
         assert "NOT CONVERGED" in " ".join(map(str, header["HISTORY"]))

@@ -136,8 +136,8 @@ def test_subarrays_by_number_and_by_image(idctab, tmp_path):
         good("apply", idctab, table, "-o", tmp_path / f"{name}.csv", *options)
         found[name] = Table.read(tmp_path / f"{name}.csv", format="ascii.csv")["x_out"][0]
     assert len({round(v, 9) for v in found.values()}) == 1
-    good("pam", idctab, "-o", tmp_path / "pam.fits", "--image", tmp_path / "flt.fits")
-    good("pam", idctab, "-o", tmp_path / "all.fits")
+    good("hst", "pam", idctab, "-o", tmp_path / "pam.fits", "--image", tmp_path / "flt.fits")
+    good("hst", "pam", idctab, "-o", tmp_path / "all.fits")
     with fits.open(tmp_path / "pam.fits") as part, fits.open(tmp_path / "all.fits") as whole:
         assert whole[1].header["CCDCHIP"] == 2  # the reference chip first, as in exposures
         assert_allclose(part[0].data, whole["SCI", 1].data[50:114, 100:228], rtol=1e-6)
@@ -145,7 +145,7 @@ def test_subarrays_by_number_and_by_image(idctab, tmp_path):
 
 
 def test_area_maps_say_how_well_they_are_known(idctab, tmp_path):
-    result = good("pam", idctab, "-o", tmp_path / "one.fits", "--chip", 1)
+    result = good("hst", "pam", idctab, "-o", tmp_path / "one.fits", "--chip", 1)
     assert "mmag at worst" in result.out and "SCALE" in result.out
     c = idctab_calibration(read_idctab(idctab)).in_frame()[1]
     by_x, by_y = (c.coefficients @ g[0] for g in c.basis.gradient([30.0], [200.0]))
@@ -154,7 +154,7 @@ def test_area_maps_say_how_well_they_are_known(idctab, tmp_path):
 
 
 def test_figures_and_numbers_of_a_table(idctab, tmp_path):
-    result = good("handbook", idctab, "-o", tmp_path / "book")
+    result = good("hst", "handbook", idctab, "-o", tmp_path / "book")
     assert {p.name for p in (tmp_path / "book").iterdir()} == {
         "non_linear.png", "pixel_area.png", "numbers.ecsv"
     }  # fmt: skip
@@ -165,19 +165,22 @@ def test_figures_and_numbers_of_a_table(idctab, tmp_path):
 
 def test_a_run_is_shown_with_its_residuals(idctab, tmp_path):
     run = begin_stagewise(tmp_path / "run", write_job(tmp_path / "job"), "fit")
-    result = good("handbook", run, "-o", tmp_path / "book", "--detector", "hrc")
+    result = good("hst", "handbook", run, "-o", tmp_path / "book", "--detector", "hrc")
     assert (tmp_path / "book" / "residuals.png").is_file() and "4.9" in result.out
     # a product beside the run is shown without them: its unit may be another one
     table = run / "made_idc.fits"
     table.write_bytes(idctab.read_bytes())
-    assert "no residuals, which only runs have" in good("handbook", table, "-o", tmp_path / "p").out
+    assert (
+        "no residuals, which only runs have"
+        in good("hst", "handbook", table, "-o", tmp_path / "p").out
+    )
     table.unlink()
     # without the matches all else is shown
     for path in (tmp_path / "job").glob("*.ecsv"):
         path.unlink()
-    result = good("handbook", run, "-o", tmp_path / "again")
+    result = good("hst", "handbook", run, "-o", tmp_path / "again")
     assert "no residuals: " in result.out and not (tmp_path / "again" / "residuals.png").exists()
-    good("pam", run, "-o", tmp_path / "pam.fits")
+    good("hst", "pam", run, "-o", tmp_path / "pam.fits")
     assert fits.getdata(tmp_path / "pam.fits").shape == (800, 1000)
 
 
@@ -202,15 +205,15 @@ def test_a_run_is_shown_with_its_residuals(idctab, tmp_path):
         (("apply", "I", "B", "-o", "o.ecsv"), ["column 'x_out' already"]),
         (("apply", "I", "B", "-o", "o.ecsv", "--inverse", "--columns", "x_out", "y",
           "--method", "polynomial", "--order", "11"), ["order of the inverse is 11"]),
-        (("pam", "I", "-o", "pam.txt"), ["extension '.txt'"]),
-        (("pam", "I", "-o", "S.fits"), ["exists", "--force"]),
-        (("pam", "I", "-o", "pam.fits", "--chip", "9"), ["no chip 9"]),
-        (("pam", "I", "-o", "pam.fits", "--image", "I"), ["no extension SCI"]),
-        (("pam", "S", "-o", "pam.fits"), ["of no kind that is understood"]),
-        (("handbook", "I", "-o", "full"), ["full"]),
-        (("handbook", "I", "-o", "new", "--detector", "UVIS"), ["no detector 'UVIS'"]),
-        (("handbook", "I", "-o", "new", "--magnification", "0"), ["magnification is 0"]),
-        (("handbook", "T", "-o", "new"), ["T_idc.fits"]),
+        (("hst", "pam", "I", "-o", "pam.txt"), ["extension '.txt'"]),
+        (("hst", "pam", "I", "-o", "S.fits"), ["exists", "--force"]),
+        (("hst", "pam", "I", "-o", "pam.fits", "--chip", "9"), ["no chip 9"]),
+        (("hst", "pam", "I", "-o", "pam.fits", "--image", "I"), ["no extension SCI"]),
+        (("hst", "pam", "S", "-o", "pam.fits"), ["of no kind that is understood"]),
+        (("hst", "handbook", "I", "-o", "full"), ["full"]),
+        (("hst", "handbook", "I", "-o", "new", "--detector", "UVIS"), ["no detector 'UVIS'"]),
+        (("hst", "handbook", "I", "-o", "new", "--magnification", "0"), ["magnification is 0"]),
+        (("hst", "handbook", "T", "-o", "new"), ["T_idc.fits"]),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_sentence(idctab, stars, tmp_path, monkeypatch, arguments, words):

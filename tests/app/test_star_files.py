@@ -120,6 +120,6 @@ def test_the_stage_writes_them_again(finished, tmp_path):
     path = begin_stagewise(tmp_path / "run", finished.config, "fit", "sample")
     before = snapshot(path / "stars")
     shutil.rmtree(path / "stars")
-    good("sample", path)
+    good("stage", "sample", path)
     assert snapshot(path / "stars") == before
     assert summary_of(path)["outliers"]["n_flagged"] > 0

@@ -11,32 +11,35 @@ from scipy.stats import chi2, kstest
 from bayesdist.assess import residual_statistics
 from bayesdist.assess.wise import (
     STATISTICS,
-    TABLE_5_1,
-    TABLE_5_2,
-    TABLE_5_3,
-    TABLE_C_1,
     BinValues,
     band_bins,
     band_to_band_table,
     bin_row,
-    contradictions_across,
-    contradictions_within,
     fitting_table,
     multiframe_table,
-    noise_of_bins,
     pair_row,
     pair_statistics,
     pattern_changes,
     period_table,
-    printed_rows,
 )
-from bayesdist.assess.wise.histograms import band_sums
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
 from bayesdist.infer.linear import Clip
 from bayesdist.infer.stars.shards import LocalShards
-from bayesdist.simulate import simulate_wise
-from bayesdist.simulate.wise import SAMPLE_SIZES
+from bayesdist.missions.wise.assess.contradictions import (
+    contradictions_across,
+    contradictions_within,
+)
+from bayesdist.missions.wise.assess.histograms import band_sums
+from bayesdist.missions.wise.assess.published import (
+    TABLE_5_1,
+    TABLE_5_2,
+    TABLE_5_3,
+    TABLE_C_1,
+    noise_of_bins,
+    printed_rows,
+)
+from bayesdist.missions.wise.simulate import SAMPLE_SIZES, simulate_wise
 
 SIZE = (60.0, 60.0)
 

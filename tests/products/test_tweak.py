@@ -16,9 +16,9 @@ import pytest
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.diagnose.alignment import Alignment, PixelToSky, alignment_residuals
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products.release import Period, write_release
-from bayesdist.simulate.acs.tables import detector_tables, filter_tables
 
 from .acs_offline import Pointing, plane_matrix
 from .acs_offline import corrected as corrected_by_stwcs

@@ -13,6 +13,7 @@ from lxml import html as lxml_html
 from bayesdist.app.campaign.report import held_parameters
 from bayesdist.assess import Misfit
 from bayesdist.infer import GaussianPriors, fit_linear
+from bayesdist.missions.acs.simulate.distortion import DRIFT
 from bayesdist.model import Chip, TimeDependence
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
@@ -22,7 +23,6 @@ from bayesdist.report.sections.campaign.published import LINES, published_lines
 from bayesdist.report.sections.campaign.terms import course_of, line_error
 from bayesdist.report.sections.run.coefficients import coefficient_tables
 from bayesdist.report.sections.run.fit import fit_tables
-from bayesdist.simulate.acs.distortion import DRIFT
 
 from . import campaigns
 from .plots import drawings_of, plot_of, plots_of, tables_of

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.data import MatchTable
 from bayesdist.infer import Rejection, fit_linear, sample
-from bayesdist.simulate.wise import WISE_BANDS, PairChunk, WiseSet, wise_set
+from bayesdist.missions.wise.simulate import WISE_BANDS, PairChunk, WiseSet, wise_set
 
 CLIP_ABS = 3.0  # pixels: the match circle in the corners
 

@@ -20,9 +20,9 @@ from bayesdist.assess.wise import (
     pattern_changes,
     period_table,
 )
-from bayesdist.assess.wise.histograms import band_sums
 from bayesdist.infer import Rejection, fit_linear, load
-from bayesdist.simulate.wise import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
+from bayesdist.missions.wise.assess.histograms import band_sums
+from bayesdist.missions.wise.simulate import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
 
 from .support import matches_of, pairs_of
 

@@ -154,7 +154,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
             raise InputError(
                 "is a configuration, whose star lists would have to be matched first",
                 where=str(new),
-                do="give the folder of its 'bayesdist run', or of 'bayesdist match'",
+                do="give the folder of its 'bayesdist run', or of 'bayesdist stage match'",
             )
         if not new.exists():
             raise InputError("there is no such file", where=str(new), do="check the name")

@@ -93,7 +93,7 @@ def _inputs(session: Session) -> ReportInput:
         coefficients=coefficient_table(fit, session.solution),
         budget=budget_of(session),
         surface=_surface(session),
-        # the requirements that were judged last, be it by `assess` or by `validate`
+        # the requirements that were judged last, be it by `assess` or by `requirements`
         margins=margins_of(session, judged),
         horizons=kept_horizons(run / "horizon.ecsv", judged),
         products=products,

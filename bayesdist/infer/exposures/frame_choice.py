@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.linear import Rejection, fit_linear, residuals
 from bayesdist.model import DistortionModel

@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from bayesdist.data import MatchTable, PartitionedMatches
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.partitioned import PartitionedMatches
 from bayesdist.data.pieces import Piece
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.scratch import Store

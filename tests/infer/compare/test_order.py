@@ -15,8 +15,9 @@ from bayesdist.infer import Rejection, fit_linear
 from bayesdist.infer.compare.order import select_order
 from bayesdist.infer.compare.order_sums import bin_sums, departures, held_out_gain, share_sums
 from bayesdist.infer.stars.stars import prepare
+from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.simulate import simulate_matches, wise_solution
+from bayesdist.simulate import simulate_matches
 
 from ..support import CHIP, SIZE, TWO_CHIPS, UNCLIPPED, legendre_design, simulated, truth_of
 

@@ -23,7 +23,6 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
 
 __all__ = [
     "Coefficients",
@@ -144,6 +143,8 @@ def largest_magnitude(
     sampled = float(values.max())
     if sampled == 0.0:
         return 0.0
+    from scipy.optimize import minimize  # here, as a file that is only read needs it not
+
     centre, half = (low + high) / 2, (high - low) / 2
     half[half == 0] = 1.0
     dx, dy = polynomial.polyder(c, axis=0), polynomial.polyder(c, axis=1)

@@ -9,9 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy import stats
-from scipy.optimize import brentq, minimize_scalar
-from scipy.special import betaln
 
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
@@ -208,6 +205,9 @@ class _Closure:
         for _ in range(_STEPS):  # with one slope: a distortion is nearly linear in its coefficients
             value -= (d @ rest[mask]) / (d @ d)
             rest = components(value)
+        from scipy import stats  # here, as few files need it, and all would wait for it
+        from scipy.special import betaln
+
         dof = int(mask.sum()) - 1
         inside, outside = (float(r @ r) + r.size * _ROUNDING**2 for r in (rest[mask], rest[~mask]))
         score = betaln(0.5, dof / 2) - dof / 2 * np.log(inside)
@@ -257,6 +257,8 @@ class StatedMaxima:
             changed = base + (centre + z * half - printed) * monomial
             return float(np.abs(changed).max()) - limit
 
+        from scipy.optimize import minimize_scalar
+
         # the largest |p| is a convex function of each coefficient
         lowest, highest = self._limits(prefix)
         bottom = float(minimize_scalar(beyond, bounds=(-1, 1), args=(0.0,), method="bounded").x)
@@ -287,6 +289,8 @@ def _crossing(
         return start
     if beyond(end, limit) <= 0:
         return end
+    from scipy.optimize import brentq
+
     return float(brentq(beyond, start, end, args=(limit,)))
 
 
