@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy import stats
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose import ScoreTest, score_tests
@@ -149,3 +150,16 @@ def scenes_of_null() -> Iterator[tuple[str, Scene]]:
     yield "nothing left", Scene(60, 1, "shift", 20)
     yield "mostly false", Scene(600, 2, fraction=0.4, mixture=True)
     yield "many chips", Scene(1500, 1, "shift", 3, MANY_CHIPS)
+
+
+def assert_no_smaller_than_chance(test: str, p: np.ndarray) -> None:
+    """Of p-values (n,) no more are below 0.5, 0.1 and 0.01 than chance makes."""
+    for level in (0.5, 0.1, 0.01):
+        beyond = int((p < level).sum())
+        # of some hundred comparisons none, but for a liberal one
+        assert stats.binom.sf(beyond - 1, len(p), level) > 1e-5, (test, level, beyond, len(p))
+
+
+def assert_even(test: str, p: np.ndarray) -> None:
+    """The mean of p-values (n,) is one half within its scatter."""
+    assert abs(p.mean() - 0.5) < 0.06 + 1.2 / np.sqrt(len(p)), (test, p.mean(), len(p))

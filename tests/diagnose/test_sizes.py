@@ -11,7 +11,14 @@ from bayesdist.diagnose.score.result import corrected
 
 from .. import seeds
 from ..infer.support import columns_of, truth_of
-from .support import SIGMA, Scene, by_name, scenes_of_null
+from .support import (
+    SIGMA,
+    Scene,
+    assert_even,
+    assert_no_smaller_than_chance,
+    by_name,
+    scenes_of_null,
+)
 from .test_results import outcome
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -41,13 +48,10 @@ def test_probabilities_are_even_and_alarms_are_rare(full):
                 pooled.setdefault(f"{scene}: {test}", []).append(p)
     for test, values in pooled.items():
         p = np.array(values)
-        for level in (0.5, 0.1, 0.01):
-            beyond = int((p < level).sum())
-            # of some hundred comparisons none, but for a liberal one
-            assert stats.binom.sf(beyond - 1, len(p), level) > 1e-5, (test, level, beyond, len(p))
+        assert_no_smaller_than_chance(test, p)
         if ":" not in test and test not in CONSERVATIVE:
             # even, not only rare: at 25 stars and 15 parameters a bit less
-            assert abs(p.mean() - 0.5) < 0.06 + 1.2 / np.sqrt(len(p)), (test, p.mean(), len(p))
+            assert_even(test, p)
             beyond = int((p < 0.1).sum())
             assert stats.binom.cdf(beyond, len(p), 0.07) > 1e-3, (test, beyond, len(p))
     alarms = sum(alarm for _, alarm in found)

@@ -14,7 +14,7 @@ from bayesdist.model import TimeDependence
 
 from .. import seeds
 from .dated import DRIFT, Dated
-from .support import student, unequal
+from .support import assert_even, assert_no_smaller_than_chance, student, unequal
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -123,11 +123,8 @@ def test_probabilities_are_even(full):
             if full:
                 pooled.setdefault(f"{scene}: {test}", []).append(p)
     for test, values in pooled.items():
-        p = np.array(values)
-        for level in (0.5, 0.1, 0.01):
-            beyond = int((p < level).sum())
-            assert stats.binom.sf(beyond - 1, len(p), level) > 1e-5, (test, level, beyond, len(p))
-        assert abs(p.mean() - 0.5) < 0.06 + 1.2 / np.sqrt(len(p)), (test, p.mean(), len(p))
+        assert_no_smaller_than_chance(test, np.array(values))
+        assert_even(test, np.array(values))
 
 
 def is_found(name: str, seed: int) -> bool:
