@@ -289,7 +289,7 @@ def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
     """
     if not path.exists():
         raise FormatError(
-            "there is no such file", where=str(path), do=f"run 'bayesdist {stage} RUN' first"
+            "there is no such file", where=str(path), do=f"run 'bayesdist stage {stage} RUN' first"
         )
     try:
         with warnings.catch_warnings():
@@ -299,5 +299,5 @@ def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
         raise FormatError(
             f"this is not {what} that bayesdist wrote, or it is damaged",
             where=str(path),
-            do=f"make it again with 'bayesdist {stage} RUN'",
+            do=f"make it again with 'bayesdist stage {stage} RUN'",
         ) from error
