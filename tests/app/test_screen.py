@@ -48,3 +48,21 @@ print([m for m in {heavy!r} if m in sys.modules], file=sys.stderr)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stderr.strip() == "[]"
     assert "Exit codes: 0 good, 1 bad input, 2 usage" in run.stdout
+
+
+def test_a_file_is_inspected_without_what_only_other_files_need(tmp_path):
+    path = tmp_path / "sip.hdr"
+    path.write_text(
+        "CTYPE1  = 'RA---TAN-SIP'\nCTYPE2  = 'DEC--TAN-SIP'\nCRPIX1  = 512\nCRPIX2  = 512\n"
+        "CRVAL1  = 10\nCRVAL2  = 20\nA_ORDER = 2\nB_ORDER = 2\nA_2_0   = 1E-6\nB_0_2   = 1E-6\n"
+    )
+    heavy = ("numba", "scipy.optimize", "scipy.stats", "astropy.table", "matplotlib", "xarray")
+    code = f"""
+import sys
+from bayesdist.products.registry import open_document
+document = open_document({str(path)!r})
+assert document.format.key == "sip" and document.lint() is not None
+print([m for m in {heavy!r} if m in sys.modules])
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"

@@ -16,12 +16,11 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
-from bayesdist.products.formats.sip.build import build_sip
 from bayesdist.products.formats.sip.calibration import sip_calibration
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
-from bayesdist.products.formats.wcs import describe_wcs
+from bayesdist.products.formats.wcs.format import describe as describe_wcs
 
 __all__ = ["FORMAT", "Settings"]
 
@@ -50,6 +49,8 @@ def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
     """A header for each chip."""
+    from bayesdist.products.formats.sip.build import build_sip  # no file that is read needs it
+
     notes = [*calibration.notes, *([calibration.plane.note] if calibration.plane.note else [])]
     out = []
     for number in calibration.numbers:

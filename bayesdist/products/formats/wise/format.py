@@ -16,7 +16,6 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
-from bayesdist.products.formats.sip.build import build_sip
 from bayesdist.products.formats.sip.header import SIP_ORDERS
 from bayesdist.products.formats.wise.build import wise_text
 from bayesdist.products.formats.wise.lint import lint_wise_band
@@ -82,6 +81,8 @@ def _calibration(named: tuple[str, Bands], name: str, choice: Choice) -> Calibra
 
 def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
     """As WISE has it: all linear terms in A and B, and an inverse of the same order."""
+    from bayesdist.products.formats.sip.build import build_sip  # no file that is read needs it
+
     band = _band(calibration.detector)
     if band is None:
         raise InputError(

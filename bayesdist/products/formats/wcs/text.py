@@ -13,28 +13,22 @@ from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
 from bayesdist.products.formats.common.content import Content, Hdu
-from bayesdist.products.formats.common.document import Format, finding_lines
+from bayesdist.products.formats.common.document import finding_lines
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import image_size, parsed
 from bayesdist.products.formats.sip.text import coefficient_lines, sip_lines
-from bayesdist.products.formats.wcs_sky import Words, first_line, pv_keywords, sky_words
+from bayesdist.products.formats.wcs.format import holds_wcs
+from bayesdist.products.formats.wcs.sky import Words, first_line, pv_keywords, sky_words
 
-__all__ = ["FORMAT", "describe_wcs"]
+__all__ = ["describe_wcs"]
 
 _WCS = re.compile(
     r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|LTV)\d+[A-Z]?$|(CD|PC|PV|PS|LTM)\d+_\d+[A-Z]?$|"
     r"(A|B|AP|BP)_(ORDER|\d_\d)$|(CPDIS|CPERR|D2IMDIS|D2IMERR)\d$|(DP|DQ|D2IM)\d$|(LON|LAT)POLE"
 )
-# Without one of these nothing ties pixels to a world.
-_NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
 
 _TABLE_HDUS = ("D2IMARR", "WCSDVARR")
 _TABLES = ("CPDIS1", "CPDIS2", "D2IMDIS1", "D2IMDIS2", "AXISCORR")
-
-
-def _holds_wcs(header: fits.Header) -> bool:
-    """Whether a header ties its pixels to a world."""
-    return any(_NEEDED.match(keyword) for keyword in header)
 
 
 def _wcs_cards(header: fits.Header) -> tuple[tuple[str, str], ...]:
@@ -54,11 +48,11 @@ def describe_wcs(file: Content) -> list[str]:
         For SIP keywords that are missing or no numbers.
     """
     shown: dict[tuple[tuple[str, str], ...], list[Hdu]] = {}
-    several = sum(_holds_wcs(hdu.header) for hdu in file.hdus) > 1
+    several = sum(holds_wcs(hdu.header) for hdu in file.hdus) > 1
     for hdu in file.hdus:
         # what places the nodes of a table is told with the image that uses it
         aside = several and hdu.label.partition(",")[0] in _TABLE_HDUS
-        if _holds_wcs(hdu.header) and not aside:
+        if holds_wcs(hdu.header) and not aside:
             shown.setdefault((*_wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
     groups = list(shown.values())
     if len(file.hdus) == 1:
@@ -204,12 +198,3 @@ def _axes(wcs: WCS, header: fits.Header, key: str, *, above: bool) -> list[str]:
 
 def _with_unit(value: float, unit: object) -> str:
     return f"{value:.10g} {unit}".strip()
-
-
-def _parse(content: Content) -> Content | None:
-    return content if any(_holds_wcs(hdu.header) for hdu in content.hdus) else None
-
-
-FORMAT = Format(
-    "wcs", "a FITS file or text file of cards with WCS keywords", 4, _parse, describe_wcs
-)
