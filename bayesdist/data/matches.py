@@ -1,4 +1,4 @@
-"""MatchTable: detector pixels beside reference positions, one row for each matched star."""
+"""MatchTable: detector pixels with reference positions, one row for each matched star."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class MatchTable:
 
     @classmethod
     def of_distinct_rows(cls, **columns: Any) -> MatchTable:
-        """A table of rows that are known to differ.
+        """Table of rows that are known to differ, made without a search for repeated rows.
 
         All is as in the constructor, but repeated rows are not looked for.
 
@@ -173,7 +173,7 @@ class MatchTable:
         return MatchTable.of_distinct_rows(**columns) if distinct else MatchTable(**columns)
 
     def _complete(self) -> None:
-        """Give what was left out its default, and every array its type."""
+        """Fill in the defaults, and give every array its type."""
         self._without_units()
         self._without_masks()
         n = np.size(self.x)
@@ -193,7 +193,7 @@ class MatchTable:
         object.__setattr__(self, "rejected", dict(self.rejected))
 
     def _without_units(self) -> None:
-        """Numbers in place of quantities."""
+        """Replace quantities by numbers in `unit`."""
         units = dict.fromkeys(("x", "y"), "pix") | dict.fromkeys(_MOTIONS, f"{self.unit} / yr")
         units |= {"epoch": "yr", "mag": "mag", "colour": "mag"}
         for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
@@ -205,7 +205,7 @@ class MatchTable:
             object.__setattr__(self, name, factor * without_unit(getattr(self, name)))
 
     def _without_masks(self) -> None:
-        """Rows with a masked value are left out and counted."""
+        """Leave out rows with a masked value, and count them."""
         names = list(self._array_names())
         masked = [name for name in names if hasattr(getattr(self, name), "mask")]
         n, shapes = np.size(self.x), {np.shape(getattr(self, name)) for name in names}
@@ -281,22 +281,22 @@ class MatchTable:
 
     @property
     def has_sigma(self) -> bool:
-        """Whether the stars have errors."""
+        """True where the stars have errors."""
         return self.sigma_u is not None
 
     @property
     def has_epoch(self) -> bool:
-        """Whether the stars have epochs."""
+        """True where the stars have epochs."""
         return self.epoch is not None
 
     @property
     def has_mag(self) -> bool:
-        """Whether the stars have magnitudes."""
+        """True where the stars have magnitudes."""
         return self.mag is not None
 
     @property
     def has_nominal(self) -> bool:
-        """Whether the stars have nominal positions."""
+        """True where the stars have nominal positions."""
         return self.u_nominal is not None
 
     @property
@@ -310,7 +310,7 @@ class MatchTable:
         return np.asarray(self.chip_numbers, np.int64)[self.chip]
 
     def select(self, which: ArrayLike, *, reason: str | None = None) -> MatchTable:
-        """Some of the stars.
+        """Stars by mask or indices.
 
         Parameters
         ----------
@@ -379,7 +379,7 @@ class MatchTable:
         return self if k == 1 else self.select(np.arange(0, len(self), k))
 
     def with_sigma(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MatchTable:
-        """The same stars with other errors.
+        """These stars with other errors.
 
         Parameters
         ----------
@@ -397,7 +397,7 @@ class MatchTable:
         )
 
     def with_errors_times(self, factor: float) -> MatchTable:
-        """The same stars with all errors multiplied by a factor.
+        """These stars with all errors multiplied by a factor.
 
         Parameters
         ----------
@@ -412,7 +412,7 @@ class MatchTable:
         return self.with_sigma(factor * self.sigma_u, factor * self.sigma_v)
 
     def with_added_errors(self, added: AddedErrors) -> MatchTable:
-        """The same stars with errors added in quadrature.
+        """These stars with errors added in quadrature.
 
         Parameters
         ----------
@@ -427,7 +427,7 @@ class MatchTable:
         return self.with_sigma(*added.beside(self, self.sigma_u, self.sigma_v))
 
     def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> MatchTable:
-        """The same stars with errors by magnitude.
+        """These stars with errors by magnitude.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Which files a path names, of which format they are, and which exposures they stand for."""
+"""Files that a path names, their formats, and the exposures they stand for."""
 
 from __future__ import annotations
 

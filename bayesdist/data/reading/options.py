@@ -1,4 +1,4 @@
-"""What the user says of the columns of a table, checked once."""
+"""Options for the columns of a table, checked once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ReadOptions:
     ----------
     columns : mapping of str to str, optional
         Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag flux
-        colour star u_nominal v_nominal, and beside ra and dec sigma_ra sigma_dec pm_ra pm_dec
+        colour star u_nominal v_nominal, and with ra and dec sigma_ra sigma_dec pm_ra pm_dec
         sigma_pm_ra sigma_pm_dec corr_ra corr_dec parallax sigma_parallax catalogue_epoch.  What is
         not named is looked for under its usual names (`ALIASES`), in any case of letters; an empty
         name leaves a quantity out.  With ra and dec, u and v are the tangent plane in arcsec.
