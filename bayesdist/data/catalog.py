@@ -145,7 +145,7 @@ class ReferenceCatalog:
         return replace(self, **{k: factor * values for k, values in known.items()}, unit=unit)
 
     def at(self, epoch: float) -> ReferenceCatalog:
-        """The catalogue as it is at another epoch.
+        """Catalogue at another epoch.
 
             u(t) = u + pm (t - t0),   sigma(t)^2 = sigma^2 + sigma_pm^2 (t - t0)^2
 

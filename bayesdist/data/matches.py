@@ -168,7 +168,7 @@ class MatchTable:
         return table
 
     def _with(self, *, distinct: bool = True, **changes: Any) -> MatchTable:
-        """The table with other columns."""
+        """Table with other columns."""
         columns = {one.name: getattr(self, one.name) for one in fields(self)} | changes
         return MatchTable.of_distinct_rows(**columns) if distinct else MatchTable(**columns)
 
@@ -343,7 +343,7 @@ class MatchTable:
         return self._with(distinct=distinct, **picked, rejected=rejected)
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The rows in consecutive pieces of about equal size.
+        """Rows in consecutive pieces of about equal size.
 
         Returns
         -------
@@ -448,7 +448,7 @@ class MatchTable:
 
     @staticmethod
     def concatenate(tables: Sequence[MatchTable]) -> MatchTable:
-        """All stars of several tables, in their order.
+        """Stars of several tables, in their order.
 
         Exposures, chips, filters and files of equal name become one.  Stars keep their codes, which
         must belong to one catalogue; the codes are left out when one of the tables has none.

@@ -187,7 +187,7 @@ class PartitionedMatches:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was found out about the files, as clauses."""
+        """Clauses on properties of the files."""
         return tuple(dict.fromkeys(note for part in self.parts for note in part.notes))
 
     @property
@@ -211,7 +211,7 @@ class PartitionedMatches:
         return "u_nominal" in self.parts[0].found
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The rows in consecutive pieces.
+        """Rows in consecutive pieces.
 
         Row groups, and files, are joined up to `PIECE` rows; larger ones are split evenly.
 

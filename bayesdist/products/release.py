@@ -32,7 +32,7 @@ Filter = str | tuple[str, ...]
 
 @dataclass(frozen=True)
 class Period:
-    """The years that one IDCTAB serves.
+    """Years that one IDCTAB serves.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Period:
 
 @dataclass(frozen=True)
 class Release:
-    """What was written.
+    """Files that were written, and drifts that they do not hold.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How exposures were matched: a report of each, and what is wrong or odd about all of them."""
+"""Reports on the matching of exposures, and warnings on all of them."""
 
 from __future__ import annotations
 

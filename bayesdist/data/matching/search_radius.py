@@ -35,7 +35,7 @@ class SearchRadius:
     radius: Float
 
     def __call__(self, rho: Float) -> Float:
-        """The radius at distances from the centre."""
+        """Radius at distances from the centre."""
         return np.interp(rho, self.rho, self.radius)
 
 

@@ -1,4 +1,4 @@
-"""An IDCTAB from solutions, with the sigmas and the covariance of all it holds."""
+"""An IDCTAB from solutions, with the sigmas and the covariance of all its numbers."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def build_idctab(
     inverse: bool = False,
     history: Sequence[str] = (),
 ) -> IdcTab:
-    """As `idctab_from_solution`, of a calibration or of one for each filter."""
+    """IDCTAB of a calibration, or of one for each filter; arguments of `idctab_from_solution`."""
     entries = _entries(calibration, filters, instrument)
     first = entries[0][0]
     model = first.model
@@ -217,7 +217,7 @@ def _entries(
     filters: Sequence[str] | Sequence[Sequence[str]] | None,
     instrument: str,
 ) -> list[tuple[Calibration, tuple[tuple[str, ...], ...]]]:
-    """Each calibration with the filter combinations of its rows; () for rows of all filters."""
+    """Calibrations, each with the filter combinations of its rows; () for rows of all filters."""
     where = "products.idctab.filters"
     named: list[tuple[tuple[str, ...], Calibration]]
     if isinstance(calibration, Mapping):
@@ -289,7 +289,7 @@ def _mean_scale(fitted: Sequence[ChipNumbers]) -> float:
 def _check_alike(
     calibration: Calibration, first: Calibration, combination: tuple[str, ...]
 ) -> None:
-    """A file has one order, one set of chips and one drift."""
+    """Refuse calibrations of different orders, chips or drifts: a file has one of each."""
     where = f"filters {' '.join(combination)}"
     a, b = calibration.model, first.model
     if a.order != b.order or a.chips != b.chips:

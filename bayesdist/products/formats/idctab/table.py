@@ -46,7 +46,7 @@ _ANY_CHIP = -999  # stwcs lets such a row serve every chip
 
 @dataclass(frozen=True, eq=False)
 class IdcTab:
-    """An IDCTAB file: all its HDUs, and what they mean.
+    """IDCTAB file: all its HDUs, and their meaning.
 
     Parameters
     ----------
@@ -95,12 +95,12 @@ class IdcTab:
 
     @property
     def header(self) -> fits.Header:
-        """The primary header; a new one at each call."""
+        """Primary header; a new one at each call."""
         return self.hdus[0].header
 
     @property
     def rows(self) -> NDArray[np.void]:
-        """The coefficient table as a structured array."""
+        """Coefficient table as a structured array."""
         return self.hdus[1].rows
 
     @property
@@ -110,7 +110,7 @@ class IdcTab:
 
     @property
     def prefixes(self) -> tuple[str, str]:
-        """What coefficient columns begin with: CX, CY, or A, B in very old files."""
+        """First letters of coefficient columns: CX, CY, or A, B in very old files."""
         return ("CX", "CY") if "CX10" in self.columns else ("A", "B")
 
     @cached_property
@@ -135,7 +135,7 @@ class IdcTab:
 
     @property
     def is_acs_wfc(self) -> bool:
-        """Whether stwcs looks for time-dependent terms."""
+        """True where stwcs looks for time-dependent terms."""
         return self.instrument == "ACS" and self.detector == "WFC"
 
     @cached_property
@@ -149,7 +149,7 @@ class IdcTab:
 
     @property
     def tdd_scheme(self) -> str:
-        """As `drift.scheme_of`; 'none' for detectors other than ACS/WFC."""
+        """Scheme of the drift, see `drift.scheme_of`; 'none' for detectors other than ACS/WFC."""
         return scheme_of(self.tdd) if self.is_acs_wfc else "none"
 
     @property
@@ -388,7 +388,7 @@ def _filters(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _fits(asked: tuple[str, ...], row: tuple[str, ...]) -> bool:
-    """Whether a row's filters are those asked for; a table without filter columns serves all."""
+    """True where a row's filters are those asked for; a table without filter columns serves all."""
     if not row:
         return True
     if len(asked) == len(row):

@@ -92,7 +92,7 @@ def write_d2im(
 def read_d2im(
     path: str | os.PathLike[str], *, first: Sequence[float] | None = None
 ) -> tuple[LookupTable, ...]:
-    """The detector's tables of a D2IMFILE.
+    """Detector's tables of a D2IMFILE.
 
     Parameters
     ----------

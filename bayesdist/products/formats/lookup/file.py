@@ -39,7 +39,7 @@ _FILTERS = ("FILTER1", "FILTER2", "FILTER")
 
 @dataclass(frozen=True, eq=False)
 class LookupFile:
-    """A D2IMFILE or NPOLFILE: all its HDUs, and what they mean.
+    """D2IMFILE or NPOLFILE: all its HDUs, and their meaning.
 
     Parameters
     ----------
@@ -67,12 +67,12 @@ class LookupFile:
 
     @cached_property
     def header(self) -> fits.Header:
-        """The primary header."""
+        """Primary header."""
         return self.hdus[0].header
 
     @property
     def kind(self) -> str:
-        """'npol' for a file that says so or names a filter, else 'd2im'."""
+        """'npol' for a file that states it or names a filter, else 'd2im'."""
         filetype = str(self.header.get("FILETYPE", "")).upper()
         if "D2I" in filetype:
             return "d2im"
@@ -95,12 +95,12 @@ class LookupFile:
 
     @cached_property
     def planes(self) -> tuple[Plane, ...]:
-        """The extensions DX and DY, in the order of the file."""
+        """Extensions DX and DY, in the order of the file."""
         return self._planes(AXES)
 
     @cached_property
     def sigma_planes(self) -> tuple[Plane, ...]:
-        """The extensions SIGMA_DX and SIGMA_DY."""
+        """Extensions SIGMA_DX and SIGMA_DY."""
         return self._planes(tuple(_SIGMA + a for a in AXES))
 
     def _planes(self, names: tuple[str, ...]) -> tuple[Plane, ...]:
@@ -118,7 +118,7 @@ class LookupFile:
         return tuple(dict.fromkeys(p.chip for p in self.planes))
 
     def pair(self, chip: int) -> tuple[Plane, Plane]:
-        """The extensions DX and DY of a chip.
+        """Extensions DX and DY of a chip.
 
         Raises
         ------
@@ -232,12 +232,7 @@ def write_lookup_file(file: LookupFile, path: str | os.PathLike[str]) -> None:
 
 
 def check_kind(file: LookupFile, kind: str) -> None:
-    """Refuse a file of the other kind.
-
-    Raises
-    ------
-    FormatError
-    """
+    """Refuse (FormatError) a file of the other kind."""
     if file.kind != kind:
         names = {"d2im": "a D2IMFILE", "npol": "an NPOLFILE"}
         raise FormatError(

@@ -1,4 +1,4 @@
-"""A SIP header from a solution: forward terms with their sigmas, and an inverse that is checked."""
+"""SIP header from a solution: forward terms with their sigmas, and an inverse that is checked."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def build_sip(
     origin: tuple[float, float] | None = None,
     notes: Sequence[str] = (),
 ) -> SipHeader:
-    """As `sip_from_solution`, of a calibration: on the sky where its plane is."""
+    """SIP header of a calibration, on the sky where its plane is; as `sip_from_solution`."""
     if linear not in ("cd", "sip"):
         raise InputError(
             f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
@@ -270,7 +270,7 @@ def _origin(poly: Monomials, unit: str) -> tuple[float, float]:
 def _relative_to_identity(
     poly: Monomials, pixel: float, origin: tuple[float, float]
 ) -> tuple[Float, Float]:
-    """The whole model in pixels from the origin, less u = x and v = y, and its sigmas."""
+    """Model in pixels from the origin, less u = x and v = y, and its sigmas."""
     terms = poly.values / pixel
     for axis, power in enumerate(((1, 0), (0, 1))):
         terms[axis, poly.index(0, 0)] -= origin[axis] / pixel
@@ -285,7 +285,7 @@ def _cards(
     unit: str,
     scale_arcsec: float | None,
 ) -> tuple[str, ...]:
-    """What the fields of a SipHeader do not say."""
+    """Cards of values that are no fields of a SipHeader."""
     what = {
         "cd": "CD holds the linear terms; A and B begin at order 2.",
         "sip": "CD is a pure scale; A and B hold constant and linear terms.",
@@ -311,7 +311,7 @@ def _cards(
 def _sky_cards(
     tangent_point: tuple[float, float] | None, crval: tuple[float, float] | None
 ) -> tuple[str, ...]:
-    """What CRVAL rests on."""
+    """Cards on the origin of CRVAL."""
     if tangent_point is None:
         if crval is not None:
             return ()

@@ -1,4 +1,4 @@
-"""Checks of a SIP header against what astropy.wcs, stwcs and gwcs make of it."""
+"""Checks of a SIP header against the behaviour of astropy.wcs, stwcs and gwcs."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
 
 
 def _accused(sip: SipHeader, size: tuple[int, int], closure: float) -> Iterator[Finding]:
-    """The coefficient that is wrong, where its right value alone makes A, B and AP, BP agree."""
+    """Coefficient that is wrong, where its right value alone makes A, B and AP, BP agree."""
     suspects = implied_values(sip, size)
     first = suspects[0]
     left = worst_closure(with_coefficient(sip, first.keyword, first.value), size)

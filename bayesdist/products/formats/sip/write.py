@@ -1,4 +1,4 @@
-"""Writing of SIP headers: what was read stays card by card, and numbers keep all their digits."""
+"""Writing of SIP headers: cards that were read stay, and numbers keep all their digits."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
 
 def sip_text(sip: SipHeader) -> str:
-    """The header as text, one card a line."""
+    """Header as text, one card a line."""
     return "\n".join(_cards(sip)) + "\n"
 
 
 def sip_header(sip: SipHeader) -> fits.Header:
-    """The whole header, as astropy.wcs.WCS takes it.
+    """Whole header, as astropy.wcs.WCS takes it.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def sip_header(sip: SipHeader) -> fits.Header:
 
 
 def _cards(sip: SipHeader) -> list[str]:
-    """All cards: those that were read stay as they are unless a field says otherwise."""
+    """Cards: those that were read stay as they are unless a field differs."""
     header = header_of(sip.cards)
     stated = _keywords(sip)
     drop = {
@@ -111,7 +111,7 @@ def _cards(sip: SipHeader) -> list[str]:
 
 
 def _keywords(sip: SipHeader) -> dict[str, tuple[float | int | str, str]]:
-    """Every keyword that a field stands for, with value and comment, in the usual order."""
+    """Keywords that the fields stand for, with value and comment, in the usual order."""
     out: dict[str, tuple[float | int | str, str]] = {}
     for axis in (1, 2):
         out[f"CTYPE{axis}"] = sip.ctype[axis - 1], "tangent plane with SIP"
