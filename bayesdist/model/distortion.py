@@ -47,7 +47,7 @@ class DistortionModel(ParameterLayout):
     the time-dependent terms of each chip), then one *local* block for each exposure but the first.
 
     Polynomials and frames are determined only together: what all frames have in common is a change
-    of the polynomials.  The *gauge* says how the two are told apart.
+    of the polynomials.  The *gauge* separates the two.
 
     - "first": the frame of the first exposure is the identity.  The polynomials are those of that
       exposure, with its shift, roll angle, scale and shear.
@@ -296,7 +296,7 @@ class DistortionModel(ParameterLayout):
         return 1.0 if self.unit == "pix" else self.linear_scale(theta, chip)
 
     def linear_scale(self, theta: ArrayLike, chip: int | None = None) -> float:
-        """Size of a pixel in what u and v are counted in, also where that is called pixels.
+        """Size of a pixel in the unit that u and v are counted in, even if that is called pixels.
 
         Parameters
         ----------
@@ -324,13 +324,13 @@ class DistortionModel(ParameterLayout):
         return theta
 
     def to_dict(self) -> dict[str, Any]:
-        """The structure as JSON-able data, for files."""
+        """Structure as JSON-able data, for files."""
         values = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
         return json.loads(json.dumps(values, default=_plain))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> DistortionModel:
-        """The model that `to_dict` described.
+        """Model that `to_dict` described.
 
         Raises
         ------
@@ -357,5 +357,5 @@ class DistortionModel(ParameterLayout):
 
 
 def _plain(value: Any) -> Any:
-    """A dataclass as a dict, and a number of numpy as one of Python."""
+    """Dataclass as a dict, and a number of numpy as one of Python."""
     return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value.item()
