@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 Terms = Mapping[tuple[int, int], float]
 Forward = Callable[[Float, Float], tuple[Float, Float]]
 
-# Points of each axis: of the fits, and of the check of what they leave.
+# Points of each axis: of the fits, and of the check of their closure.
 FIT_NODES, CHECK_NODES = 65, 257
 
 

@@ -62,7 +62,7 @@ class ReferenceCatalog:
     parallax, sigma_parallax : ndarray, optional
         In `unit`, of a catalogue with a tangent point; 0 where it is not known.
     notes : tuple of str
-        What was done to the file's stars, as clauses.
+        Treatment of the file's stars, as clauses.
 
     Raises
     ------
@@ -261,7 +261,7 @@ _NAME_PAIRS = (("u", "v"), ("ra", "dec"), *_PAIRS)
 _ALSO = {"sigma_ra": "sigma_u", "sigma_dec": "sigma_v", "pm_ra": "pm_u", "pm_dec": "pm_v"}
 _ALSO |= {"sigma_pm_ra": "sigma_pm_u", "sigma_pm_dec": "sigma_pm_v", "catalogue_epoch": "epoch"}
 _MOTIONS = frozenset(("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"))
-_SPARED = frozenset(_PARALLAX)  # which a star may lack: it then has none that counts
+_SPARED = frozenset(_PARALLAX)  # a star may lack these: they are 0 then
 
 
 def read_catalog(
@@ -324,7 +324,7 @@ def catalog_from_table(
     source : str, optional
         File, for errors.
     unit : str, optional
-        Unit of u and v where the table does not say.  Errors and motions without a unit are in that
+        Unit of u and v where the table has none.  Errors and motions without a unit are in that
         of u and v, per year; with ra and dec they must have one, in the file or by their names
         (those of the Gaia archive and of VizieR).
     epoch : float, optional
@@ -417,7 +417,7 @@ def catalog_from_table(
 
 
 def _identities(column: SourceColumn) -> Int:
-    """Codes of the stars, refused where one stands twice."""
+    """Codes of the stars; a repeated one is refused."""
     star = column.integers()
     unique, first = np.unique(star, return_index=True)
     if len(unique) < len(star):

@@ -23,7 +23,7 @@ NO_STAR = -1
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Raw positions of all exposures, arrays of length N unless said otherwise.
+    """Raw positions of all exposures, arrays of length N unless stated otherwise.
 
     Refused are no detections, unequal lengths, values that are not finite, and errors that are not
     positive.

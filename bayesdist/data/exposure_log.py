@@ -85,7 +85,7 @@ class ExposureLog:
     Raises
     ------
     InputError
-        For no exposures, or one that stands twice.
+        For no exposures, or a repeated one.
     """
 
     exposures: tuple[Exposure, ...]

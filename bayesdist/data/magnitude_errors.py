@@ -18,7 +18,7 @@ Int = NDArray[np.int64]
 
 _MIN_STARS_IN_BIN = 40
 _MAX_BINS = 25
-_MIN_STARS = 10  # stars in all, below which the scatter says nothing
+_MIN_STARS = 10  # stars in all, below which the scatter is unknown
 _CLIP = 4.0  # sigmas beyond which a star has no part in the scatter
 MAD_TO_SIGMA = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 _SMALL_SAMPLE = 0.31  # relative bias of the median of |z| over n stars is +0.31 / n

@@ -79,16 +79,16 @@ class MatchTable:
         RA and Dec in degrees of the plane that u, v lie on, where they were made from sky
         positions.
     u_nominal, v_nominal : ndarray, optional
-        Where an earlier solution put the star, in `unit`: both or neither.  The match was looked
+        Position by an earlier solution, in `unit`: both or neither.  The match was looked
         for within a circle about it.
     pm_u, pm_v, sigma_pm_u, sigma_pm_v : ndarray, optional
         Proper motion of the reference star in `unit` per year, and its standard errors, where the
-        catalogue gives them: both axes or neither.  u and v hold it already, if `notes` say that
-        they were moved.
+        catalogue gives them: both axes or neither.  u and v include it already where `notes` state
+        that they were moved.
     chip_names : tuple of str
         Names of the chips of `chip_numbers`, where the file has names in place of numbers.
     notes : tuple of str
-        What was done in reading, as clauses.
+        Treatment in reading, as clauses.
 
     Raises
     ------
@@ -327,13 +327,13 @@ class MatchTable:
         Raises
         ------
         InputError
-            When no star is left, or when an index stands twice.
+            When no star is left, or when an index is repeated.
         """
         which = np.asarray(which)
         if not which.size:  # an empty list has no integer type of its own
             which = which.astype(np.int64)
         index = np.arange(len(self))[which]
-        # rows of one table differ: only an index that stands twice repeats one
+        # rows of one table differ: only a repeated index repeats one
         distinct = which.dtype == bool or len(np.unique(index)) == len(index)
         picked = {name: getattr(self, name)[index] for name in self._array_names()}
         rejected = dict(self.rejected)
@@ -363,7 +363,7 @@ class MatchTable:
         Parameters
         ----------
         n : int
-            How many rows the sample may have; k is as small as this allows.
+            Largest number of rows of the sample; k is as small as this allows.
 
         Returns
         -------

@@ -1,7 +1,7 @@
 """Matches that stay on disk: Parquet files, streamed in pieces.
 
 A scan in the memory of one block finds what must be known of all rows: the names of exposures,
-chips and filters, the tangent point, and that no row is wrong or stands twice.
+chips and filters, the tangent point, and that no row is wrong or repeated.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _shared(whole: Whole, n_rows: int) -> dict[str, Any]:
 class PartitionedMatches:
     """Matched stars on disk, as `open_matches` finds them.
 
-    It offers what a MatchTable does but the columns, which are read piece by piece.
+    It offers all of a MatchTable but the columns, which are read piece by piece.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class PartitionedMatches:
     factor : float
         On all errors.
     added : tuple of AddedErrors
-        Beside what the factor makes of them.
+        In quadrature, after the factor.
 
     Attributes
     ----------
@@ -250,7 +250,7 @@ class PartitionedMatches:
         Parameters
         ----------
         n : int
-            How many rows the sample may have; k is as small as this allows.
+            Largest number of rows of the sample; k is as small as this allows.
 
         Returns
         -------
@@ -383,7 +383,7 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Partiti
     Returns
     -------
     PartitionedMatches
-        Its pieces hold what `read_matches` gives for these rows.
+        Its pieces are equal to `read_matches` of these rows.
 
     Raises
     ------

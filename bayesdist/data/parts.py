@@ -1,4 +1,4 @@
-"""Parquet files of matches as parts of one whole: what each holds, and what they share."""
+"""Parquet files of matches as parts of one whole: their content, and their common attributes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class MatchPart:
     unit: str  # of u and v
     exposure_name: str | None  # of the one exposure, where there is no column
     options: ReadOptions  # with pixel origin, and tangent point once known
-    notes: tuple[str, ...] = ()  # what was found out about the file, as clauses
+    notes: tuple[str, ...] = ()  # findings on the file, as clauses
 
     @property
     def source(self) -> str:
@@ -124,7 +124,7 @@ def match_part(
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """Names, unit and tangent point that all parts share."""
+    """Names, unit and tangent point common to all parts."""
 
     unit: str
     exposure_names: tuple[str, ...]
@@ -199,7 +199,7 @@ class _Scan:
 
 
 def scan(parts: Sequence[MatchPart]) -> Whole:
-    """Names that all parts share, from a scan of all rows; any wrong or repeated row is refused.
+    """Names common to all parts, from a scan of all rows; any wrong or repeated row is refused.
 
     The parts have the same quantities and unit, and a tangent point if they need one.
     """

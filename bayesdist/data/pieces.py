@@ -1,4 +1,4 @@
-"""Pieces of a table of matches: what is read, sent to a worker and worked on at a time."""
+"""Pieces of a table of matches: units of reading, of transfer to a worker and of computing."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def neutralise_aberration(
 ) -> MatchTable:
     """Matches with catalogue positions as an aberration-free scale gives them.
 
-    A true offset on the sky is VAFACTOR times what the aberration-free scale of the detector gives,
+    A true offset on the sky is VAFACTOR times that by the aberration-free scale of the detector,
     so that offsets from an origin, and their errors, are divided by it.  Another origin shifts all
     stars of an exposure alike.
 

@@ -41,7 +41,7 @@ class Groups:
         return len(self.chip)
 
     def same(self, other: Groups) -> bool:
-        """True where the groups are equal, whoever their members are."""
+        """True where the groups are equal, apart from their members."""
         return all(
             np.array_equal(getattr(self, name), getattr(other, name))
             for name in ("chip", "exposure", "epoch")
@@ -94,7 +94,7 @@ def merge_groups(a: Groups, b: Groups) -> tuple[Groups, Int, Int]:
     groups : Groups
         Without members.
     of_a, of_b : ndarray of int
-        Where the groups of `a` and of `b` stand in it.
+        Indices of the groups of `a` and of `b` in it.
     """
     union = group_by(
         np.concatenate([a.chip, b.chip]),

@@ -112,8 +112,8 @@ class Words:
     false: str  # name of false rows
     chooser: str  # name of the rejection; sampling rejects nothing
     fit: str  # name of the fit before sampling
-    holder: str  # what holds parameters that the data do not constrain
-    taken: str = ""  # clause on what makes residuals smaller than errors; else empty
+    holder: str  # name of the constraint on parameters that the data do not constrain
+    taken: str = ""  # clause on why residuals are smaller than errors; else empty
 
 
 MATCHED = Words(

@@ -182,7 +182,7 @@ def ladder(unit: str) -> tuple[tuple[float, str], ...]:
 def with_mas(value: float, unit: str, scale_mas: float | None, digits: int = 3) -> str:
     """Length with its unit, and in mas where the size of a pixel is known.
 
-    As in ``"0.00930 pix (25.6 mas)"``; a dash where the value is not finite.
+    An example is ``"0.00930 pix (25.6 mas)"``; a dash where the value is not finite.
     """
     if not np.isfinite(value):
         return MISSING

@@ -22,7 +22,7 @@ class Plot:
 
     figure: Figure
     title: str
-    text: str  # what to see
+    text: str  # explanation
     alt: str  # text alternative to the picture
 
 

@@ -9,7 +9,7 @@ from pathlib import PurePath
 
 __all__ = ["MAX_ROWS", "Level", "TextTable", "further", "listing", "short_paths"]
 
-_FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room beside it
+_FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room next to it
 MAX_ROWS = 60  # of frames and exposures; hundreds of them belong in the files
 
 

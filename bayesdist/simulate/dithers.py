@@ -227,7 +227,7 @@ def pixels_of(
         dy = (by_x[:, 0] * miss[:, 1] - by_x[:, 1] * miss[:, 0]) / det
         x[near] += dx
         y[near] += dy
-        # a polynomial says nothing far from the detector
+        # a polynomial is meaningless far from the detector
         inside = (np.abs(x[near] - nx / 2) < (0.5 + OUTSIDE) * nx) & (
             np.abs(y[near] - ny / 2) < (0.5 + OUTSIDE) * ny
         )

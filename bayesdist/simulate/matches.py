@@ -34,7 +34,7 @@ class Truth:
     outlier_scale : float
         Standard deviation of false matches on each axis, or the radius of the match circle.
     false : ndarray of bool, shape (N,)
-        Which rows are false matches.
+        True for false matches.
     """
 
     model: DistortionModel
@@ -145,7 +145,7 @@ def _positions(
     """Positions (N, 2) at which stars (N,) are seen."""
     n = len(x)
     # in steps that stay in the cache, 15 times faster at a million stars; small tables in one, for
-    # the order in which BLAS adds depends on the length, and a seed is to give what it always gave
+    # the order in which BLAS adds depends on the length, and a seed must go on giving its numbers
     step = n if n <= _AT_ONCE else _STEP
     out = np.empty((n, 2))
     for a in range(0, n, step):

@@ -72,7 +72,7 @@ class CampaignMatches:
     mirrored: bool = False
 
     def warnings(self, log: ExposureLog) -> list[str]:
-        """Sentences on what is wrong or odd about the matching, as `match_warnings`."""
+        """Warnings of `match_warnings` on the matching."""
         return match_warnings(self.reports, self.left_out, log)
 
     def summary(self) -> Table:
@@ -127,18 +127,18 @@ def match_campaign(
         Known distortion: ``start(x, y, chip, epoch) -> (N, 2)`` from raw pixels and chip numbers to
         a plane in the catalogue's unit, any rotation and origin; all chips on one plane.
     cuts : StarCuts, optional
-        Which detections may be matched; by default all.  Those that the cuts leave out still help
+        Cuts on detections to be matched; by default none.  Those that the cuts leave out still help
         to recognise the field.
     radius : float, optional
         Search radius; by default it is taken from the scatter of the pairs, ring by ring around the
         middle of the detector (`search_radius`), below that where chance takes over.
     mirrored : sequence of bool, optional
-        Whether the catalogue is taken with the sign of u changed; of several, those that follow are
+        True to take the catalogue with the sign of u changed; of several, those that follow are
         tried where the first matches no exposure.  East of a sky with north up is to the left: a
         detector that is read out as the sky is seen has the parity that is opposite to (u, v) of a
         tangent plane.
     skip : bool, optional
-        Whether exposures that do not match, or lose all their detections to the cuts, are left out
+        True to leave out exposures that do not match, or lose all their detections to the cuts,
         and counted.  More than a fifth of them, or the first two, are an error all the same.
 
     Returns

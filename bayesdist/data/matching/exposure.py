@@ -36,11 +36,11 @@ Bool = NDArray[np.bool_]
 _ASTRAY_FRACTION = 0.2  # of the matched fraction of the best chip: a chip below lies elsewhere
 _MIN_DETECTIONS_ON_CHIP = 20  # detections of a chip for that comparison
 _CHANCE_RATE = 0.1  # chance matches of a detection within the largest radius that is looked at
-_DISPLACEMENT = 10.0  # radii by which detections are displaced to see what chance gives
+_DISPLACEMENT = 10.0  # radii by which detections are displaced to count chance matches
 _BRIGHT_STARS = 2000  # stars of the first linear map, and of the last check
 _MARGIN = 0.1  # of the field, around it
 _MAX_ROUNDS = 12  # of a cubic for each chip, and then the radius that follows
-_MIN_UNPAIRED = 100  # unpaired detections that say where such detections lie
+_MIN_UNPAIRED = 100  # unpaired detections that sample where such detections lie
 _MAX_FALSE_FRACTION = 0.1  # of the pairs by chance: more, and the field is not understood
 _GROWTH_FACTOR = 1.01  # of the pairs, while the cubic is still reaching out
 _MAG_PERCENTILES = (1.0, 99.0)  # percentiles of magnitude that count as the range of a list
@@ -185,8 +185,8 @@ def _settled(
 ) -> _Pairs | None:
     """Pairs after a cubic for each chip; None where there are none but by chance.
 
-    While the cubic brings in more pairs the radius stays at its largest; then it shrinks to what
-    the pairs need, unless it is fixed, and the cubic is fitted once more.
+    While the cubic brings in more pairs the radius stays at its largest; then it shrinks to that
+    which the pairs need, unless it is fixed, and the cubic is fitted once more.
     """
     allowed = SearchRadius(np.zeros(1), np.array([largest]))
     chance = min(chance_rate(start, tree, largest, _DISPLACEMENT * largest), 0.99)

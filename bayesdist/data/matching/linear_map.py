@@ -106,7 +106,7 @@ def robust_fit(
 
     `fit` gives for pairs by mask (N,) the solution and the distances (N,) of all from it, or None
     where they do not determine it.  None, too, where fewer than `least` pairs are given.  `slack`
-    is what rounding makes of a distance of 0; no pair beyond `reach` is used.
+    is the rounding error of a distance of 0; no pair beyond `reach` is used.
     """
     found, use = None, np.ones(n, bool)
     for _ in range(rounds):

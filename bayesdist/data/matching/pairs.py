@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_MAX_PROBES = 20_000  # displaced detections that say what chance gives
+_MAX_PROBES = 20_000  # displaced detections that sample chance matches
 _DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)
 
 
@@ -63,7 +63,7 @@ def mutual_pairs(
 
     `radius` is one, or the largest distance of the partner of each point (N,); `tree` is of
     `reference`, where it is at hand; of `frame` (N,) and `reference_frame` (M,) only points of
-    equal number are paired.  No index stands twice.
+    equal number are paired.  No index is repeated.
     """
     reach = float(np.max(radius))
     if frame is not None and reference_frame is not None:
@@ -87,9 +87,9 @@ def mutual_pairs(
 def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float) -> float:
     """Fraction of points (N, 2) that find a neighbour where none belongs: when all are displaced.
 
-    Unlike a formula with a mean density this knows of gradients and clusters.  `radius`, one or
-    (N,), is the largest distance of a neighbour, `step` the displacement in eight directions: so
-    large that true pairs are out of reach.
+    Unlike a formula with a mean density this takes account of gradients and clusters.  `radius`,
+    one or (N,), is the largest distance of a neighbour, `step` the displacement in eight
+    directions: so large that true pairs are out of reach.
     """
     every = -(-len(points) * len(_DIRECTIONS) // _MAX_PROBES)
     sample = points[::every]

@@ -33,7 +33,7 @@ _MIN_EXPOSURES = 5  # exposures among which one can be called odd
 _ODD_SIGMAS = 5.0  # of the other exposures
 _MIN_COMPLETENESS_STEP = 0.15  # of completeness, at least
 _MIN_FALSE_STEP = 0.05  # of the matches, at least
-_MIN_SCALE_STEP = 2e-5  # at least: less is what telescopes breathe
+_MIN_SCALE_STEP = 2e-5  # at least: telescopes breathe less
 _MAX_NAMED = 5  # exposures in a sentence
 
 
@@ -68,7 +68,7 @@ class ExposureReport:
         From the start's positions to the catalogue, degrees anticlockwise, in [0, 360).
     scale : float
     offset : tuple of float
-        Where the middle of the detections comes to lie, in the catalogue's unit.
+        Position of the middle of the detections, in the catalogue's unit.
     radius : tuple of float
         Smallest and largest search radius over the detector.
     rms : float
@@ -191,12 +191,12 @@ def refuse_astray(reports: Sequence[ExposureReport], catalog: ReferenceCatalog) 
 def match_warnings(
     reports: Sequence[ExposureReport], left_out: Mapping[str, str], log: ExposureLog
 ) -> list[str]:
-    """Clauses on exposures that were left out, that lack a chip, or that are unlike the others.
+    """Clauses on exposures that were left out, that lack a chip, or that are outliers.
 
-    An exposure is unlike the others when its completeness is far below theirs, when far more of its
-    matches are expected to be false, or when its scale, free of aberration (where the log has
-    VAFACTOR), differs: five robust standard deviations of all exposures, and no less than 0.15,
-    0.05 and 2e-5.
+    An exposure is an outlier when its completeness is far below that of the others, when far more
+    of its matches are expected to be false, or when its scale, free of aberration (where the log
+    has VAFACTOR), differs: by five robust standard deviations of all exposures, and no less than
+    0.15, 0.05 and 2e-5.
     """
     out = []
     if left_out:

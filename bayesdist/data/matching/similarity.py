@@ -37,8 +37,8 @@ Complex = NDArray[np.complex128]
 _MIN_STARS_TRIED = 60  # stars of the shallowest try
 _STARS_OF_FIRST_LEVEL = 400  # each further one has three times as many
 _LEVEL_FACTOR = 3
-_TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: what is left of a distortion
-_DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of what the mean density suggests
+_TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: remainder of a distortion
+_DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of the number by the mean density
 _STARS_CHECKED = 1000  # stars that a candidate is checked with
 _CHANCE_SIGMAS = 8.0  # by which its coincidences must beat chance
 _MIN_AGREEING = 6  # stars that agree
@@ -155,7 +155,7 @@ def find_similarity(
     Parameters
     ----------
     points : array_like, shape (N, 2)
-        Positions; what is left of a distortion may displace them by several pixels, as long as it
+        Positions; the remainder of a distortion may displace them by several pixels, as long as it
         changes local scales by less than about a per cent.
     reference : PatternIndex
     mag : array_like, shape (N,), optional
@@ -163,7 +163,7 @@ def find_similarity(
     scale : tuple of float, optional
         Smallest and largest scale.
     mirrored : bool, optional
-        Whether to look for the mirror image.
+        True to search for the mirror image.
     source, reference_name : str, optional
         For the error.
 
@@ -195,7 +195,7 @@ def find_similarity(
     if mirrored:
         stars = np.conj(stars)
     area = hull_of(xy)[1] * scale[0] * scale[1]
-    best = (0, 0.0)  # coincidences of the best candidate, and what chance gives
+    best = (0, 0.0)  # coincidences of the best candidate, and those by chance
     for tolerance, level, size in _tries(len(stars), mag is not None, reference, area):
         bright = stars[:size]
         for candidate in candidates(bright, level, tolerance, scale):
@@ -281,7 +281,7 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
             continue
         scale = ratio * found.scale
         as_it_is = abs(scale - 1.0) < _SCALE_TOLERANCE
-        if as_it_is and not mirrored:  # then neither scale nor image is what is wrong
+        if as_it_is and not mirrored:  # then neither scale nor image is wrong
             continue
         sigmas = (found.found - found.expected) / np.sqrt(found.expected)
         if sigmas <= best:

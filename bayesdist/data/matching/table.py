@@ -32,7 +32,7 @@ class Matching:
     Parameters
     ----------
     index, catalog_index : ndarray of int, shape (n_pairs,)
-        Rows of the detections and of the catalogue; no row stands twice.
+        Rows of the detections and of the catalogue; no row is repeated.
     transformation : LinearMap
         From the given positions to the catalogue's.
     radius : float

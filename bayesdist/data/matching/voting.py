@@ -18,7 +18,7 @@ _PATCHES = (400, 100, 25)  # detections of a patch in the middle that vote when 
 _PAIRS = 1_000_000  # differences of a patch at most
 _SURE = -8.0  # log10 of chance at which no further vote is held
 _WIDTHS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a bin, in mean distances between stars
-_RING = 5  # half-width in bins of the surroundings that say what chance gives
+_RING = 5  # half-width in bins of the surroundings that count chance pairs
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ Float = NDArray[np.float64]
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
     """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or else the option.
 
-    Refused where both say nothing, where they contradict each other, or where the columns do.
+    Refused where both are missing, where they contradict each other, or where the columns do.
     """
     if unit is not None:
         check_unit(unit, where="unit")
@@ -76,7 +76,7 @@ def is_on_sky(
 ) -> bool:
     """True where ra, dec are the reference positions, not u, v; refused when the user names both.
 
-    `found` is the column of each quantity, `columns` what the user names.
+    `found` is the column of each quantity, `columns` those that the user names.
     """
     named = {key for key, column in (columns or {}).items() if column}
     plane, sky = named & {"u", "v"}, named & {"ra", "dec"}
@@ -225,7 +225,7 @@ def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None
 
 
 def plane_unit(unit: str | None, *, source: str) -> str:
-    """Unit of u and v that come from the sky; an option that says another is refused."""
+    """Unit of u and v that come from the sky; another one by option is refused."""
     if unit not in (None, "arcsec"):
         raise InputError(
             f"unit is {unit}, but sky positions come to the tangent plane in arcsec",

@@ -3,7 +3,7 @@
     VAFACTOR = sqrt(1 - b^2) / (1 - n . b),    b = velocity / c
 
 Towards the apex of the motion the stars crowd together: a true offset on the sky is VAFACTOR times
-what a scale free of aberration gives for the pixels (Cox & Gilliland 2002, HST Calibration
+the offset by a scale free of aberration for the pixels (Cox & Gilliland 2002, HST Calibration
 Workshop).  Aberration is conformal, so the factor is the same in all directions.
 """
 

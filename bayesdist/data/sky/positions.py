@@ -43,7 +43,7 @@ class ReferenceSky:
     sigma: Float | None  # (2, N), per axis along east and north, arcsec
     motion: Float | None  # (2, N), to east (with cos(dec)) and north, arcsec/yr
     sigma_motion: Float | None  # (2, N), errors of the motions
-    notes: tuple[str, ...]  # what was done, as clauses
+    notes: tuple[str, ...]  # treatment of the positions, as clauses
 
 
 def sky_columns(quantities: Quantities) -> tuple[Float, Float]:

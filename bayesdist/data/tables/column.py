@@ -144,7 +144,7 @@ class SourceColumn:
     def _parsed(
         self, texts: NDArray[Any], parse: Callable[[str], Any], wanted: str
     ) -> NDArray[Any]:
-        """Each text parsed; the first that is not what is wanted ends it."""
+        """Parsed texts; the first one that cannot be parsed is refused."""
         out = []
         for index, text in enumerate(texts):
             try:

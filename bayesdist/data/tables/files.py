@@ -45,7 +45,7 @@ def reading(path: Path) -> Iterator[None]:
     do without.
     """
     with naming_faults(path), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # units are judged later, column by column
+        warnings.simplefilter("ignore")  # units are checked later, column by column
         warnings.filterwarnings("error", message=".*truncated.*")
         yield
 
@@ -78,7 +78,7 @@ def naming_faults(path: Path, where: str = "") -> Iterator[None]:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text file, with their ends; what cannot be read or is no text is refused."""
+    """Lines of a text file, with their ends; a file that is unreadable or no text is refused."""
     with reading(path), path.open(encoding="utf-8", newline="") as stream:
         return stream.readlines()
 

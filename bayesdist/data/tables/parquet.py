@@ -139,7 +139,7 @@ class ParquetPart:
         with _opened(self.path, self.texts & set(encoded)) as stored:
             if _group_rows(stored) != self.group_rows or _names(stored) != self.colnames:
                 raise self._changed()
-            # only next() is guarded: what the consumer raises is not the file's fault
+            # only next() is guarded: exceptions of the consumer are not the file's fault
             decoded = stored.iter_batches(_BATCH, row_groups=groups, columns=list(columns))
             while True:
                 try:
@@ -208,7 +208,7 @@ def describe_part(path: Path) -> ParquetPart:
 
 @contextmanager
 def _opened(path: Path, as_codes: Collection[str] = ()) -> Iterator[pyarrow.parquet.ParquetFile]:
-    """Open file of which only what is being decoded is held in memory."""
+    """Open file of which only the part being decoded is held in memory."""
     import pyarrow.parquet
 
     with naming_faults(path):

@@ -1,4 +1,4 @@
-"""Rows that stand twice in a table, whether it is held in memory or streams by.
+"""Repeated rows of a table that is held in memory or streamed.
 
 Rows are hashed to one integer each, so that ten million of them need one sort, not one for each
 key; only rows whose hashes meet are compared in full.  Of a table that streams by, the hashes are
@@ -127,7 +127,7 @@ def _joined(pieces: Iterable[UInt]) -> Iterator[UInt]:
 
 
 def _repeated(hashed: UInt) -> UInt:
-    """Hashes that stand more than once; the array is sorted in place."""
+    """Hashes that occur more than once; the array is sorted in place."""
     hashed.sort()
     twice = hashed[1:][hashed[1:] == hashed[:-1]]
     return np.unique(twice)

@@ -63,7 +63,7 @@ def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
 
 
 def conversion(unit: apu.UnitBase, to: str, *, where: str) -> float:
-    """Factor that brings values of `unit` to `to`; an error where they measure different things."""
+    """Factor from values of `unit` to those of `to`; units of different quantities are refused."""
     try:
         return float(unit.to(apu.Unit(to)))
     except apu.UnitConversionError:

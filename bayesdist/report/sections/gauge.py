@@ -1,6 +1,6 @@
 """The gauge of coefficients and errors, in plain words.
 
-What all frames have in common is a change of the polynomials: shift and rotation of a solution mean
+A change common to all frames is a change of the polynomials: shift and rotation of a solution mean
 nothing before their zero is defined.
 """
 

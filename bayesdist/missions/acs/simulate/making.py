@@ -52,7 +52,7 @@ def simulate_acs(
     Parameters
     ----------
     folder : path-like, optional
-        Where to write it, as `write_acs`.
+        Folder to write it to, as `write_acs`.
     seed : int, optional
     n_exposures : int, optional
         In F606W.

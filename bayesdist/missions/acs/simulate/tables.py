@@ -31,7 +31,7 @@ DETECTOR_LENGTH = 200.0
 COLUMNS = 4096 / 60  # "every 68th column": 60 equal strips of the mask
 COLUMN_AMPLITUDE = 0.1  # of the longest vector
 
-# Figures 12, 13, 11; F814W is not shown, and is given what the text says filters reach
+# Figures 12, 13, 11; F814W is not shown, and has the largest value for filters in the text
 FILTER_LONGEST = {"F435W": 0.062, "F475W": 0.08, "F606W": 0.032, "F814W": 0.05}
 FILTER_LENGTH = 150.0  # "spatially coherent over ~150 pixels", Section 4.3.2
 

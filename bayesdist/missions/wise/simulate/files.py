@@ -36,7 +36,7 @@ def write_wise_set(
     one : WiseSet
     folder : path-like
         ``w1/part-00000.parquet`` and so on hold the pairs, with columns x, y, u, v, sigma, mag,
-        colour, epoch, frame, band; ``truth/w1/`` of each pair whether it is false, in the same
+        colour, epoch, frame, band; ``truth/w1/`` of each pair True if it is false, in the same
         files and rows; ``truth/w1.ecsv`` the distortion; ``truth/w1_pattern.ecsv`` the partition
         pattern, where there is one.
     threads : int, optional

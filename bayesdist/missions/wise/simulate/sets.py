@@ -49,7 +49,7 @@ class PairChunk:
     sigma : ndarray, shape (N,)
         Quoted error on each axis, WISE's and 2MASS's together, in pixels.
     false : ndarray of bool, shape (N,)
-        Which pairs are false matches: the truth, which a calibration does not know.
+        True for false matches: the truth, which a calibration does not know.
     """
 
     x: Float

@@ -176,7 +176,7 @@ def readable(where: str) -> Iterator[None]:
     """Turn any exception of a library on a damaged file into a FormatError that names the file."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of cards that are not ours to judge
+            warnings.simplefilter("ignore")  # of other programs' cards
             yield
     except BayesdistError:
         raise

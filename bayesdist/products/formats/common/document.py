@@ -86,7 +86,7 @@ class Choice:
         Of an IDCTAB, where names of both wheels may be joined by a comma; the band of WISE
         meta-data, as in "W2".
     size : tuple of float, optional
-        Columns and rows, for a header that does not say.
+        Columns and rows, for a header that lacks them.
     """
 
     filter: str | None = None
@@ -140,13 +140,13 @@ class Format:
     rank : int
         Formats are tried in this order: the most special first.
     parse : callable
-        From a `Content` to what the file holds; None for a file of another kind.
+        From a `Content` to the parsed file; None for a file of another kind.
     describe : callable
-        From what `parse` gave to lines of text, findings excluded.
+        From the parsed file to lines of text, findings excluded.
     lint : callable, optional
-        From what `parse` gave to findings; of a format without checks there are none.
+        From the parsed file to findings; of a format without checks there are none.
     calibration : callable, optional
-        From what `parse` gave, the file's name and a `Choice` to a `Calibration`.
+        From the parsed file, its name and a `Choice` to a `Calibration`.
     settings : type of FormatSettings, optional
         Of a format that can be built.
     build : callable, optional
@@ -173,7 +173,7 @@ class Document:
     name : str
     format : Format
     holds : object
-        What the format's `parse` gave.
+        Parsed file, by the format's `parse`.
     """
 
     name: str

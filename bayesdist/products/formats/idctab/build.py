@@ -54,7 +54,7 @@ def idctab_from_solution(
 ) -> IdcTab:
     """IDCTAB of all chips of a solution, or of several filters with a solution each.
 
-    Frames of exposures are left out: in gauge 'first' the file holds what the first exposure saw.
+    Frames of exposures are left out: in gauge 'first' the file holds that of the first exposure.
     Everything is divided by `vafactor`, since stwcs multiplies the sky by that of each exposure.
     The constant of each chip goes to its V2REF and V3REF (and is noted in BDU0_c, BDV0_c), since
     stwcs never uses CX00 and CY00.  A file for ACS/WFC always has TDD_DATE and TDD_CTB1, TDD_CTB2,
@@ -91,16 +91,17 @@ def idctab_from_solution(
     chips : sequence of int, optional
         Chip numbers; all by default.
     inverse : bool
-        Whether to add INVERSE rows; their closure is stated as BDCLOS_c.
+        True to add INVERSE rows; their closure is stated as BDCLOS_c.
     history : sequence of str
         Lines for HISTORY.
 
     Returns
     -------
     IdcTab
-        In doubles, with HDUs SIGMA and COVAR (see `bayesdist.products.idctab`).  COVAR names the
-        filters where there are several solutions.  Solutions turned by the same orientation
-        (`bayesdist.calibration.orientation`) share its error, which stands between their blocks.
+        In doubles, with HDUs SIGMA and COVAR (see `bayesdist.products.formats.idctab.table`).
+        COVAR names the filters where there are several solutions.  Solutions turned by the same
+        orientation (`bayesdist.calibration.orientation`) have its error in common, as covariance
+        between their blocks.
 
     Raises
     ------

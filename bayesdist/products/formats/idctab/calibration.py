@@ -181,7 +181,7 @@ def _numbers_of_row(tab: IdcTab, row: int, chip: int) -> dict[str, int]:
     mine = np.flatnonzero(entries["DETCHIP"].astype(int) == chip)
     own = [c for c in FILTER_COLUMNS if c in (entries.dtype.names or ())]
     if own:
-        # numbers stand once for all filters that share them: found again by their values
+        # numbers stand once for all filters with them: identified by their values
         sets = {tuple(str(entries[c][k]).strip() for c in own) for k in mine}
         of_set = [
             [int(k) for k in mine if tuple(str(entries[c][k]).strip() for c in own) == one]
@@ -190,7 +190,7 @@ def _numbers_of_row(tab: IdcTab, row: int, chip: int) -> dict[str, int]:
         same = [s for s in of_set if _is_of_row(tab, row, listed, s)]
         if not same:
             return {}
-        # all filters share the drift, which stands with the first one
+        # the drift is common to all filters, and stands with the first one
         rates = [k for k in mine if listed[k].startswith("TDD")]
         mine = np.array([*rates, *same[0]])
     return {listed[k]: int(k) for k in mine}

@@ -53,7 +53,7 @@ class IdcTab:
     hdus : tuple of Hdu
         All HDUs; the first table is HDU 1.
     name : str
-        What to call the file in errors.
+        Name of the file in errors.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class IdcTab:
                     do="add it, or lower NORDER",
                 )
 
-    # -- what the file holds ---------------------------------------------------------------------
+    # -- content -----------------------------------------------------------------------------------
 
     @property
     def header(self) -> fits.Header:
@@ -413,7 +413,7 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
     InputError
         When the file cannot be read.
     FormatError
-        When it is no FITS file, is truncated, or lacks what an IDCTAB must have.
+        When it is no FITS file, is truncated, or lacks a part that an IDCTAB must have.
     """
     return IdcTab(read_hdus(path), str(path))
 

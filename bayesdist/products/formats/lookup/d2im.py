@@ -60,7 +60,7 @@ def write_d2im(
     Returns
     -------
     LookupFile
-        What was written: single precision, as these files are.
+        Written file: single precision, as these files are.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def read_d2im(
     ----------
     path : path-like
     first : sequence of float, optional
-        Pixel (x, y) of the first node, against what the file says: for files without CRPIX and
+        Pixel (x, y) of the first node, in place of the file's own: for files without CRPIX and
         CRVAL, which older programs registered at pixel 1 and astropy.wcs since 6.1 at pixel 64.
 
     Returns

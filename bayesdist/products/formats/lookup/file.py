@@ -1,6 +1,6 @@
 """D2IMFILE and NPOLFILE: look-up tables of the distortion, as stwcs and astropy.wcs read them.
 
-Image extensions DX and DY for each chip, told apart by CCDCHIP.  Node k (from 1) of axis a lies at
+Image extensions DX and DY for each chip, identified by CCDCHIP.  Node k (from 1) of axis a lies at
 pixel CRVALa + (k - CRPIXa) CDELTa; a file without CRPIX and CRVAL has both 0, which puts the first
 node at pixel CDELT (astropy 6.1 and later; before, at pixel 1).
 
@@ -46,7 +46,7 @@ class LookupFile:
     hdus : tuple of Hdu
         All HDUs.
     name : str
-        What to call the file in errors.
+        Name of the file in errors.
 
     Raises
     ------
@@ -123,7 +123,7 @@ class LookupFile:
         Raises
         ------
         FormatError
-            When one is missing or stands twice, or when the two are no common grid.
+            When one is missing or repeated, or when the two have no common grid.
         """
         x, y = (self._one(chip, axis) for axis in AXES)
         if x.nodes.shape != y.nodes.shape or x.first != y.first or x.step != y.step:
@@ -173,7 +173,7 @@ class LookupFile:
         filter : str
             As in `LookupTable`.
         first : sequence of float, optional
-            Pixel (x, y) of the first node, against what the file says.
+            Pixel (x, y) of the first node, in place of the file's own.
 
         Returns
         -------
@@ -182,7 +182,7 @@ class LookupFile:
         Raises
         ------
         FormatError
-            As `pair`, and for what `LookupTable` refuses.
+            As `pair`, and for values that `LookupTable` refuses.
         """
         x, _ = self.pair(chip)
         place = x.first if first is None else (float(first[0]), float(first[1]))

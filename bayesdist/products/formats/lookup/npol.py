@@ -75,7 +75,7 @@ def write_npol(
     Returns
     -------
     LookupFile
-        What was written: single precision, as these files are.  Keyword BDNPLERR of its primary
+        Written file: single precision, as these files are.  Keyword BDNPLERR of its primary
         header is the largest difference in mas, over all chips, between the polynomial at the
         shifted pixel and the polynomial plus the stored table: at the nodes, halfway between them
         and at the edges of the detector.

@@ -65,7 +65,7 @@ def sip_from_solution(
     crval : tuple of float, optional
         Sky position that the header states, degrees.  With `tangent_point` that of the reference
         pixel by default, and CRPIX is the pixel of any other one that is given; where the solution
-        has no such pixel, A_0_0 and B_0_0 are what they must be.  Without `tangent_point` it is
+        has no such pixel, A_0_0 and B_0_0 follow.  Without `tangent_point` it is
         written as it is, (0, 0) by default.
     tangent_point : tuple of float, optional
         Sky position of (u, v) = (0, 0), degrees: `MatchTable.tangent_point`.  The polynomial is
@@ -163,7 +163,7 @@ def build_sip(
     kept = [k for k, (i, j) in enumerate(poly.terms) if linear == "sip" or i + j >= 2]
     if sky is not None:
         offset = sky.offset
-        if linear == "cd" and poly.constant.any():  # no pixel has CRVAL: only A and B can say so
+        if linear == "cd" and poly.constant.any():  # no pixel has CRVAL: only A and B can state it
             kept.insert(0, poly.index(0, 0))
             notes = (*notes, "No pixel of the solution has CRVAL: A_0_0 and B_0_0 hold the rest.")
     a, b = ({poly.terms[k]: float(terms[axis, k]) for k in kept} for axis in (0, 1))

@@ -30,7 +30,7 @@ __all__ = ["Implied", "StatedMaxima", "implied_values", "with_error"]
 Float = NDArray[np.float64]
 Frozen = Any  # a distribution of scipy.stats with its parameters
 
-# Odds of a further, independent fault, for what a suspect leaves unexplained.
+# Odds of a further, independent fault, for values that a suspect leaves unexplained.
 _SECOND_FAULT = 1e-2
 # Components of a closure are known to this; pixels.
 _ROUNDING = 1e-12
@@ -53,13 +53,13 @@ class Implied:
     printed : float
         Its value in the header.
     value, sigma : float
-        Mean and standard deviation of what the others imply.
+        Mean and standard deviation of the implied value.
     interval : tuple of float
         That holds 95 % of the probability.
     probability : float
         That this coefficient is the wrong one, if exactly one is and any might be.
     sources : tuple of str
-        What the value agrees with: the other pair of polynomials, and A_DMAX or B_DMAX.
+        Sources that the value agrees with: the other pair of polynomials, and A_DMAX or B_DMAX.
     """
 
     keyword: str
@@ -86,14 +86,14 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
     even and one for odd total degree.  An inverse that was fitted to pairs of stars is biased by
     their position errors towards where stars are denser, which for a centred field is an odd
     function.  With a scale-free prior of both variances, the coefficient has a Student t
-    distribution.  A_DMAX or B_DMAX cuts out of it what its printed digits allow.
+    distribution.  A_DMAX or B_DMAX restricts it to the values that its printed digits allow.
 
     Parameters
     ----------
     sip : SipHeader
         With an inverse.
     size : tuple of int, optional
-        Columns and rows of the detector; by default what the header says.
+        Columns and rows of the detector; by default those of the header.
 
     Returns
     -------

@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 CD_KEYWORDS = ("CD1_1", "CD1_2", "CD2_1", "CD2_2")
-# What stands for a CD matrix in other headers.
+# Keywords in place of a CD matrix in other headers.
 LINEAR_KEYWORDS = (
     *("PC1_1", "PC1_2", "PC2_1", "PC2_2"),
     *("CDELT1", "CDELT2", "CROTA1", "CROTA2"),

@@ -22,7 +22,7 @@ _STRUCTURE = (
 )
 # Keywords that only a field of the header stands for: without the field they go.
 _OWNED = ("AP_ORDER", "BP_ORDER", "A_DMAX", "B_DMAX", "BDCLOS", "BDU0", "BDV0", "BDUNIT")
-# What readers assume for a keyword that is not there.
+# Values that readers assume for missing keywords.
 _DEFAULTS: dict[str, float | str] = {
     **dict.fromkeys(("CRVAL1", "CRVAL2", *CD_KEYWORDS), 0.0),
     **dict.fromkeys(("CTYPE1", "CTYPE2", "BDUNIT"), ""),
@@ -34,8 +34,8 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
     A path that ends in .fits gives a FITS file without data, whose structural keywords are its own
     (the image size goes to IMAGEW and IMAGEH); any other path a text file with one card a line,
-    which ``astropy.io.fits.Header.fromtextfile`` reads.  What `read_sip` read is written back card
-    by card.
+    which ``astropy.io.fits.Header.fromtextfile`` reads.  A header that was read is written back
+    card by card.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def sip_header(sip: SipHeader) -> fits.Header:
     Returns
     -------
     astropy.io.fits.Header
-        The cards that were read, with what the fields say otherwise.
+        The cards that were read, except where fields differ.
     """
     return header_of(_cards(sip))
 

@@ -46,7 +46,7 @@ def write_wise_meta(
     path : path-like
     bands : mapping of int to SipHeader
         By the number of the band.  CD is a pure scale and the reference pixel the middle of the
-        array, as ``sip_from_solution(..., linear="sip")`` has it: the file says nothing of either.
+        array, as ``sip_from_solution(..., linear="sip")`` has it: the file states neither.
     skew : mapping of int to float, optional
         SKEW of each band, radians; zero by default.
 

@@ -29,7 +29,7 @@ __all__ = ["lint_wise_band"]
 
 _NUMBER = re.compile(r"([+-]?)([0-9]+)\.([0-9]+)([EeDd][+-]?[0-9]+)")
 _MONOMIAL = re.compile(r"coefficient of (\S+)")
-# Farther from what is implied a number is taken as excluded.
+# Farther from the implied value a number counts as excluded.
 _ALLOWED_SIGMAS = 4.0
 
 
@@ -43,7 +43,7 @@ def lint_wise_band(band: WiseBand) -> tuple[Finding, ...]:
     Returns
     -------
     tuple of Finding
-        Those of `lint_sip`, and of the text itself: coefficients that are missing, numbers with
+        Findings of `lint_sip`, and on the text itself: coefficients that are missing, numbers with
         another count of digits than the rest, comments that name another monomial than the keyword.
     """
     # a finding on parity would be on the nominal CD, which is not in the file

@@ -29,7 +29,7 @@ __all__ = [
 _ENTRY = re.compile(r"\S*distort_(?:skew|(?:a|b|ap|bp)_)\S*")
 _ENTRY_LINE = re.compile(r"\S*distort_(\S+)\s+(\d+)\s+(\S+)\s+([ir])\s+(\S+)\s*(.*)")
 _KEYWORD = re.compile(r"SKEW|[AB]P?_(?:ORDER|\d_\d)|[AB]_DMAX")
-# What `write_wise_meta` says in comment lines, which other readers pass over.
+# Entries of `write_wise_meta` in comment lines, which other readers skip.
 _ASIDE = re.compile(r"\\\s+(\d+)\s+([AB]E_\d_\d|BDCLOS)\s+r\s+(\S+).*")
 # Columns and rows of the arrays, and arcseconds in a pixel: those of W4 are twice as wide.
 ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
@@ -43,7 +43,7 @@ class WiseBand:
     ----------
     band : int
     sip : SipHeader
-        The reference pixel is the middle of the array.  The file says nothing of the sky: CRVAL is
+        The reference pixel is the middle of the array.  The file has no sky position: CRVAL is
         zero, and CD has the nominal scale.
     skew : float
         Of the CD matrix, radians.

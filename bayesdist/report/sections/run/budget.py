@@ -82,7 +82,7 @@ def budget_table(r: ReportInput) -> TextTable:
         heads,
         tuple(out),
         words=tuple(range(len(heads) - 4)),
-        leading=len(r.budget.rows()),  # those of all chips together
+        leading=len(r.budget.rows()),  # rows of all chips together
         stacked=(heads.index("Radial"),),
         note="The parts of the model are correlated and enter the total jointly, by draws;"
         " independent terms are added in quadrature. The total therefore need not be the root of"
@@ -111,7 +111,7 @@ def _of_products(rows: Sequence[Mapping[str, Any]]) -> str:
 def budget_terms(r: ReportInput) -> Plot:
     """Bars of each term's radial rms over the detector, with its two axes marked.
 
-    Each of up to three chips has a panel beside that of the whole detector.
+    Each of up to three chips has a panel next to that of the whole detector.
     """
     budget = r.budget
     assert budget is not None

@@ -135,7 +135,7 @@ def _parameter_table(
         "ESS",
     )
     columns = (*heads, *(("Unit",) if with_unit else ()))
-    # where an interval is that of the sd and convergence was judged as a whole, paper does without
+    # where an interval is that of the sd and convergence was tested as a whole, paper omits them
     on_paper = tuple(k for k, name in enumerate(columns) if name not in _ON_SCREEN)
     return TextTable(caption, columns, tuple(out), words=(0, len(heads)), on_paper=on_paper)
 

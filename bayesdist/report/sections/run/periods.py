@@ -183,7 +183,7 @@ def _patterns(found: TimeVariation, r: ReportInput) -> TextTable:
 def period_differences(r: ReportInput) -> Plot:
     """Map of the latest model minus the earliest one.
 
-    Vectors that noise would make as long at their place in more than 5 of 100 cases are pale.
+    Vectors that noise would make as long at their position in more than 5 % of cases are pale.
     """
     found = r.periods
     assert found is not None
