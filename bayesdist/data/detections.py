@@ -25,8 +25,9 @@ NO_STAR = -1
 class Detections:
     """Raw positions of all exposures, arrays of length N unless stated otherwise.
 
-    Refused are no detections, unequal lengths, values that are not finite, and errors that are not
-    positive.
+    `star` groups the detections of one star by its code, with `NO_STAR` where it is not known;
+    `chip` is 1 by default.  Refused are no detections, unequal lengths, values that are not finite,
+    and errors that are not positive.
     """
 
     x: Float  # FITS 1-based pixels of the chip

@@ -138,8 +138,8 @@ def match_campaign(
         detector that is read out as the sky is seen has the parity that is opposite to (u, v) of a
         tangent plane.
     skip : bool, optional
-        True to leave out exposures that do not match, or lose all their detections to the cuts,
-        and counted.  More than a fifth of them, or the first two, are an error all the same.
+        True to leave out, and count, exposures that do not match or lose all their detections to
+        the cuts.  More than a fifth of them, or the first two, are an error all the same.
 
     Returns
     -------

@@ -62,11 +62,12 @@ def best_similarity(points: Float, reference: Float) -> LinearMap:
 def iterated_map(
     points: Float, reference: Float, tree: cKDTree, start: LinearMap, reach: float, radius: float
 ) -> LinearMap | None:
-    """Linear map fitted in rounds: the radius shrinks from `reach`, the area grows from the origin.
+    """Linear map fitted in rounds: pairs within `reach` at first, within `radius` at last.
 
-    Far from where the offset was found a small rotation displaces stars by more than their
-    distances, so the map is fitted near that position first.  `tree` is of `reference` (M, 2).
-    None where too few pairs are left, or they lie on a line.
+    The area grows from the start's origin meanwhile: far from where the offset was found a small
+    rotation displaces stars by more than their distances, so the map is fitted near that position
+    first.  `tree` is of `reference` (M, 2).  None where too few pairs are left, or they lie on a
+    line.
     """
     outwards = np.argsort(((points - start.origin) ** 2).sum(axis=1))
     current, size, reach = start, _FIRST_SAMPLE, max(reach, radius)

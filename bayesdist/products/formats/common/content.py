@@ -116,13 +116,13 @@ class Content:
 
     @cached_property
     def hdus(self) -> tuple[Hdu, ...]:
-        """HDUs as far as they can be found, or one of the cards of a text file."""
+        """HDUs as far as they can be found, or one HDU of the cards of a text file."""
         if self.is_fits:
             return tuple(_walked(self.raw))
         if not _CARD.match(self.text):
             return ()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of cards that are not ours to judge
+            warnings.simplefilter("ignore")  # of other programs' cards
             sep = "\n" if "\n" in self.text.strip() else ""
             header = fits.Header.fromstring(self.text, sep=sep)
             state = "whole" if "NAXIS" not in header else "none"

@@ -54,7 +54,7 @@ def idctab_from_solution(
 ) -> IdcTab:
     """IDCTAB of all chips of a solution, or of several filters with a solution each.
 
-    Frames of exposures are left out: in gauge 'first' the file holds that of the first exposure.
+    Frames of exposures are left out: in gauge 'first' the polynomials are the first exposure's.
     Everything is divided by `vafactor`, since stwcs multiplies the sky by that of each exposure.
     The constant of each chip goes to its V2REF and V3REF (and is noted in BDU0_c, BDV0_c), since
     stwcs never uses CX00 and CY00.  A file for ACS/WFC always has TDD_DATE and TDD_CTB1, TDD_CTB2,

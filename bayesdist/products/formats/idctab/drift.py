@@ -106,10 +106,10 @@ def storable(
     """Segment of a calibration with the drift that an IDCTAB can store, and the drifts left out.
 
     The calibration has an angular unit and the axes of the IDCTAB (see `calibration.orientation`);
-    `years` are the first and last date for which the file is meant, `limit_mas` bounds the sum of
-    all terms of a chip that may be left out.  With `like`, the calibration whose drift the file
-    will hold, this one gives its coefficients at the reference date, and the difference of the
-    drifts counts as left out.
+    `years` are the first and last date for which the file is meant, `segment` counts from 0,
+    `limit_mas` bounds the sum of all terms of a chip that may be left out.  With `like`, the
+    calibration whose drift the file will hold, this one gives its coefficients at the reference
+    date, and the difference of the drifts counts as left out.
 
     InputError when more than `limit_mas` would be left out, for a unit of pixels, years that do not
     rise, no such segment, or a solution that does not depend on time, or from another date, where
