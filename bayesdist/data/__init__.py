@@ -1,9 +1,10 @@
-"""What comes in: matched positions, reference catalogues, and how these are matched.
+"""Input: matched positions, reference catalogues, and the matching of star lists with catalogues.
 
-`read_matches` is the way in, `read_rvb` that of WISE's pairs.  Behind them each kind of file has a
+`read_matches` reads any known kind of file, `read_rvb` WISE's pairs.  Each kind of file has a
 module of its own, and all of them end in a `MatchTable`, where units, errors and row numbers have
-been checked.  What outgrows the memory is Parquet: `open_matches` leaves it on disk and gives
-`PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such files.
+been checked.  Tables that are larger than the memory are Parquet: `open_matches` leaves them on
+disk and gives `PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such
+files.
 """
 
 from __future__ import annotations

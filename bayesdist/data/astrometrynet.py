@@ -1,4 +1,4 @@
-"""Correspondences of astrometry.net (`corr.fits`): detections beside index stars."""
+"""Correspondences of astrometry.net (`corr.fits`): detections with their index stars."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bayesdist.data.tables.names import ALIASES
 
 __all__ = ["COLUMNS", "is_astrometrynet", "matches_from_corr"]
 
-# the other quantities are left out: 'mag' there is one of the index, if it is there at all
+# the other quantities are left out: 'mag', if there is one, is the index star's
 COLUMNS = dict.fromkeys(ALIASES, "") | {
     "x": "field_x",
     "y": "field_y",
@@ -24,7 +24,7 @@ COLUMNS = dict.fromkeys(ALIASES, "") | {
 
 
 def is_astrometrynet(names: Iterable[str]) -> bool:
-    """Whether a table with these columns is a `corr.fits`."""
+    """True for a table with the columns of a `corr.fits`."""
     return {"field_x", "field_y", "index_ra", "index_dec"} <= set(names)
 
 
@@ -35,28 +35,12 @@ def matches_from_corr(
     source: str = "corr.fits",
     exposure_name: str | None = None,
 ) -> MatchTable:
-    """MatchTable from the columns of a `corr.fits`.
+    """MatchTable from the columns of a `corr.fits`; missing columns or values are refused.
 
-    field_x and field_y are FITS 1-based pixels; index_ra and index_dec come to the tangent plane in
-    seconds of arc.  Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive.
-    There are no errors.
-
-    Parameters
-    ----------
-    table : astropy Table
-    options : ReadOptions, optional
-        The format fixes columns, origin and unit.
-    source, exposure_name
-        As `matches_from_table`.
-
-    Returns
-    -------
-    MatchTable
-
-    Raises
-    ------
-    InputError
-        For missing columns or values.
+    field_x and field_y are FITS 1-based pixels; index_ra and index_dec are projected to the tangent
+    plane in seconds of arc.  Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are
+    positive.  There are no errors.  The format fixes columns, origin and unit, so that `options`
+    must not.
     """
     columns = COLUMNS | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
     options = replace(options or ReadOptions(), columns=columns, unit=None, sigma="by_magnitude")

@@ -62,7 +62,7 @@ class ReferenceCatalog:
     parallax, sigma_parallax : ndarray, optional
         In `unit`, of a catalogue with a tangent point; 0 where it is not known.
     notes : tuple of str
-        What was done to the file's stars, as clauses.
+        Treatment of the file's stars, as clauses.
 
     Raises
     ------
@@ -128,7 +128,7 @@ class ReferenceCatalog:
         return len(self.u)
 
     def select(self, which: NDArray[Any]) -> ReferenceCatalog:
-        """Some of the stars, by mask or indices."""
+        """Stars by mask or indices."""
         arrays = {
             name: getattr(self, name)[which]
             for name in ("u", "v", "mag", *(n for pair in _PAIRS for n in pair), *_PARALLAX)
@@ -139,13 +139,13 @@ class ReferenceCatalog:
         return replace(self, **arrays, star=self.star[which])
 
     def rescaled(self, factor: float, unit: str) -> ReferenceCatalog:
-        """The same in another unit, of which the present one is `factor`."""
+        """Catalogue in another unit, of which the present one is `factor`."""
         lengths = ("u", "v", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
         known = {k: getattr(self, k) for k in lengths if getattr(self, k) is not None}
         return replace(self, **{k: factor * values for k, values in known.items()}, unit=unit)
 
     def at(self, epoch: float) -> ReferenceCatalog:
-        """The catalogue as it is at another epoch.
+        """Catalogue at another epoch.
 
             u(t) = u + pm (t - t0),   sigma(t)^2 = sigma^2 + sigma_pm^2 (t - t0)^2
 
@@ -189,7 +189,7 @@ class ReferenceCatalog:
         )
 
     def as_seen(self, epoch: float) -> ReferenceCatalog:
-        """The catalogue as the Earth sees it: that of `at`, displaced by the parallaxes.
+        """Catalogue as seen from the Earth: that of `at`, displaced by the parallaxes.
 
         Parameters
         ----------
@@ -209,7 +209,7 @@ class ReferenceCatalog:
         then = self.at(epoch)
         if self.parallax is None or self.tangent_point is None:
             return then
-        # those of the middle of the field stand for all of it
+        # factors of the middle of the field serve all of it
         east, north = parallax_factors(epoch, *self.tangent_point)[0]
         sigmas = {}
         if self.sigma_parallax is not None and then.sigma_u is not None:
@@ -228,7 +228,7 @@ class ReferenceCatalog:
         )
 
     def mirrored(self) -> ReferenceCatalog:
-        """The same with the sign of u changed, by which it leaves the tangent plane's own axes."""
+        """Catalogue with the sign of u changed, which takes it off the tangent plane's own axes."""
         return replace(
             self,
             u=-self.u,
@@ -261,7 +261,7 @@ _NAME_PAIRS = (("u", "v"), ("ra", "dec"), *_PAIRS)
 _ALSO = {"sigma_ra": "sigma_u", "sigma_dec": "sigma_v", "pm_ra": "pm_u", "pm_dec": "pm_v"}
 _ALSO |= {"sigma_pm_ra": "sigma_pm_u", "sigma_pm_dec": "sigma_pm_v", "catalogue_epoch": "epoch"}
 _MOTIONS = frozenset(("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"))
-_SPARED = frozenset(_PARALLAX)  # which a star may lack: it then has none that counts
+_SPARED = frozenset(_PARALLAX)  # a star may lack these: they are 0 then
 
 
 def read_catalog(
@@ -324,8 +324,8 @@ def catalog_from_table(
     source : str, optional
         File, for errors.
     unit : str, optional
-        Unit of u and v where the table does not say.  Errors and motions without a unit are in that
-        of u and v, per year; beside ra and dec they must have one, in the file or by their names
+        Unit of u and v where the table has none.  Errors and motions without a unit are in that
+        of u and v, per year; with ra and dec they must have one, in the file or by their names
         (those of the Gaia archive and of VizieR).
     epoch : float, optional
         Decimal year, where the table has no such column.
@@ -417,7 +417,7 @@ def catalog_from_table(
 
 
 def _identities(column: SourceColumn) -> Int:
-    """Codes of the stars, of which none stands twice."""
+    """Codes of the stars; a repeated one is refused."""
     star = column.integers()
     unique, first = np.unique(star, return_index=True)
     if len(unique) < len(star):

@@ -1,4 +1,4 @@
-"""Detections of stars on many exposures, where nobody knows the stars' positions."""
+"""Detections of stars on many exposures, where the positions of the stars are not known."""
 
 from __future__ import annotations
 
@@ -23,42 +23,21 @@ NO_STAR = -1
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Raw positions of all exposures, arrays of length N unless said otherwise.
+    """Raw positions of all exposures, arrays of length N unless stated otherwise.
 
-    Parameters
-    ----------
-    x, y : ndarray
-        FITS 1-based pixels of the chip.
-    exposure : ndarray of int
-        Codes, from 0.
-    exposure_names : tuple of str, length E
-    chip : ndarray of int, optional
-        Chip numbers; 1 by default.
-    epoch : ndarray, shape (E,), optional
-        Decimal years.
-    sigma : ndarray, optional
-        Error of x and of y, pixels.
-    mag : ndarray, optional
-        Instrumental magnitudes.
-    star : ndarray of int, optional
-        Which detections are of one star; `NO_STAR` where it is not known.
-    source : str
-
-    Raises
-    ------
-    InputError
-        For no detections, unequal lengths, values that are not finite, or errors that are not
-        positive.
+    `star` groups the detections of one star by its code, with `NO_STAR` where it is not known;
+    `chip` is 1 by default.  Refused are no detections, unequal lengths, values that are not finite,
+    and errors that are not positive.
     """
 
-    x: Float
+    x: Float  # FITS 1-based pixels of the chip
     y: Float
-    exposure: Int
+    exposure: Int  # codes, from 0
     exposure_names: tuple[str, ...]
     chip: Int = None  # type: ignore[assignment]
-    epoch: Float | None = None
-    sigma: Float | None = None
-    mag: Float | None = None
+    epoch: Float | None = None  # (E,), decimal years
+    sigma: Float | None = None  # error of x and of y, pixels
+    mag: Float | None = None  # instrumental
     star: Int = None  # type: ignore[assignment]
     source: str = "detections"
 
@@ -82,11 +61,11 @@ class Detections:
 
     @property
     def n_stars(self) -> int:
-        """One more than the largest star code."""
+        """Largest star code plus one."""
         return int(self.star.max()) + 1
 
     def select(self, which: NDArray[Any]) -> Detections:
-        """Some of the detections, by mask or indices; the exposures stay."""
+        """Detections by mask or indices; the exposures stay."""
         names = ("x", "y", "exposure", "chip", "sigma", "mag", "star")
         return replace(
             self, **{k: getattr(self, k)[which] for k in names if getattr(self, k) is not None}
@@ -99,20 +78,9 @@ def detections_of(
     epoch: Sequence[float] | None = None,
     sigma: float | None = None,
 ) -> Detections:
-    """All detections of star lists, one list for each exposure.
+    """Detections of star lists, one for each exposure, with epochs (years) and one error (pixels).
 
-    Parameters
-    ----------
-    lists : sequence of StarList
-    epoch : sequence of float, optional
-        Decimal year of each.
-    sigma : float, optional
-        Error of all positions, pixels.
-
-    Raises
-    ------
-    InputError
-        As `Detections`, and for lists of which only some have magnitudes.
+    Refused where only some of the lists have magnitudes.
     """
     with_mag = [one.mag is not None for one in lists]
     if any(with_mag) and not all(with_mag):

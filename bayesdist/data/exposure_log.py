@@ -1,4 +1,4 @@
-"""What is known of each exposure beside its stars: epoch, filter, aberration, roll, target."""
+"""Each exposure's epoch, filter, aberration, roll and target."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class ExposureLog:
     Raises
     ------
     InputError
-        For no exposures, or one that stands twice.
+        For no exposures, or a repeated one.
     """
 
     exposures: tuple[Exposure, ...]
@@ -116,13 +116,7 @@ class ExposureLog:
         return name in self._by_name
 
     def __getitem__(self, name: str) -> Exposure:
-        """The exposure of a name.
-
-        Raises
-        ------
-        InputError
-            When there is none.
-        """
+        """The exposure of a name; InputError where there is none."""
         try:
             return self._by_name[name]
         except KeyError:
@@ -219,7 +213,7 @@ class ExposureLog:
         return np.array([np.nan if value is None else value for value in found], float)
 
     def with_aberration(self) -> ExposureLog:
-        """The same log with VAFACTOR computed where it is missing.
+        """Log with VAFACTOR computed where it is missing.
 
         Only the motion of the Earth counts; the orbit of HST adds up to 2.5e-5.
 

@@ -101,7 +101,7 @@ def read_exposures(
 
 
 def _missing(values: Any) -> NDArray[np.bool_]:
-    """Which values of a column are masked or not a number."""
+    """Boolean mask of the values of a column that are masked or NaN."""
     mask = np.array(np.broadcast_to(getattr(values, "mask", False), len(values)))
     if values.dtype.kind == "f":
         mask |= np.isnan(np.ma.filled(np.ma.asarray(values), np.nan))

@@ -20,25 +20,14 @@ Int = NDArray[np.int64]
 class FrameStars:
     """Stars of many frames: detections on the detector, or reference stars in each frame's system.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (N,)
-        Detections: FITS 1-based pixels.  Reference stars: undistorted position in the frame.
-    sigma : ndarray, shape (N,)
-        Standard error on each axis, in the unit of the undistorted positions.
-    frame : ndarray of int, shape (N,)
-        Which frame; only stars of equal number are paired.
-
-    Raises
-    ------
-    InputError
-        For no stars, unequal lengths, values that are not finite, or errors that are not positive.
+    Refused are no stars, unequal lengths, values that are not finite, and errors that are not
+    positive.
     """
 
-    x: Float
+    x: Float  # (N,): FITS 1-based pixels, or undistorted positions in the frame
     y: Float
-    sigma: Float
-    frame: Int
+    sigma: Float  # (N,), per axis, in the unit of the undistorted positions
+    frame: Int  # (N,): only stars of equal number are paired
 
     def __post_init__(self) -> None:
         given = {name: getattr(self, name) for name in ("x", "y", "sigma", "frame")}

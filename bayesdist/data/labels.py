@@ -19,9 +19,9 @@ Int = NDArray[np.int64]
 def merged_codes(
     codes: Sequence[Int], labels: Sequence[tuple[Any, ...]], *, ordered: bool = False
 ) -> tuple[Int, tuple[Any, ...]]:
-    """One numbering for codes with labels of their own.
+    """One numbering for codes with labels of their own: the joined codes, and the labels.
 
-    Labels stand in the order of their first appearance, or sorted; the codes are joined.
+    Labels stand in the order of their first appearance, or sorted.
     """
     every: list[Any] = list(dict.fromkeys(label for own in labels for label in own))
     if ordered:
@@ -46,7 +46,7 @@ def merged_counts(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
 def merged_optional(
     name: str, arrays: Sequence[Float | None], sources: Sequence[str]
 ) -> Float | None:
-    """A column that all tables have, joined; None where none has it, an error where some have."""
+    """Joined column that all tables have; None where none has it; refused where only some have."""
     present = [a for a in arrays if a is not None]
     if not present:
         return None

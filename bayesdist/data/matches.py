@@ -1,4 +1,4 @@
-"""MatchTable: detector pixels beside reference positions, one row for each matched star."""
+"""MatchTable: detector pixels with reference positions, one row for each matched star."""
 
 from __future__ import annotations
 
@@ -79,16 +79,16 @@ class MatchTable:
         RA and Dec in degrees of the plane that u, v lie on, where they were made from sky
         positions.
     u_nominal, v_nominal : ndarray, optional
-        Where an earlier solution put the star, in `unit`: both or neither.  The match was looked
+        Position by an earlier solution, in `unit`: both or neither.  The match was looked
         for within a circle about it.
     pm_u, pm_v, sigma_pm_u, sigma_pm_v : ndarray, optional
         Proper motion of the reference star in `unit` per year, and its standard errors, where the
-        catalogue gives them: both axes or neither.  u and v hold it already, if `notes` say that
-        they were moved.
+        catalogue gives them: both axes or neither.  u and v include it already where `notes` state
+        that they were moved.
     chip_names : tuple of str
         Names of the chips of `chip_numbers`, where the file has names in place of numbers.
     notes : tuple of str
-        What was done in reading, as clauses.
+        Treatment in reading, as clauses.
 
     Raises
     ------
@@ -136,7 +136,7 @@ class MatchTable:
 
     @classmethod
     def of_distinct_rows(cls, **columns: Any) -> MatchTable:
-        """A table of rows that are known to differ.
+        """Table of rows that are known to differ, made without a search for repeated rows.
 
         All is as in the constructor, but repeated rows are not looked for.
 
@@ -168,12 +168,12 @@ class MatchTable:
         return table
 
     def _with(self, *, distinct: bool = True, **changes: Any) -> MatchTable:
-        """The table with other columns."""
+        """Table with other columns."""
         columns = {one.name: getattr(self, one.name) for one in fields(self)} | changes
         return MatchTable.of_distinct_rows(**columns) if distinct else MatchTable(**columns)
 
     def _complete(self) -> None:
-        """Give what was left out its default, and every array its type."""
+        """Fill in the defaults, and give every array its type."""
         self._without_units()
         self._without_masks()
         n = np.size(self.x)
@@ -193,7 +193,7 @@ class MatchTable:
         object.__setattr__(self, "rejected", dict(self.rejected))
 
     def _without_units(self) -> None:
-        """Numbers in place of quantities."""
+        """Replace quantities by numbers in `unit`."""
         units = dict.fromkeys(("x", "y"), "pix") | dict.fromkeys(_MOTIONS, f"{self.unit} / yr")
         units |= {"epoch": "yr", "mag": "mag", "colour": "mag"}
         for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
@@ -205,7 +205,7 @@ class MatchTable:
             object.__setattr__(self, name, factor * without_unit(getattr(self, name)))
 
     def _without_masks(self) -> None:
-        """Rows with a masked value are left out and counted."""
+        """Leave out rows with a masked value, and count them."""
         names = list(self._array_names())
         masked = [name for name in names if hasattr(getattr(self, name), "mask")]
         n, shapes = np.size(self.x), {np.shape(getattr(self, name)) for name in names}
@@ -281,22 +281,22 @@ class MatchTable:
 
     @property
     def has_sigma(self) -> bool:
-        """Whether the stars have errors."""
+        """True where the stars have errors."""
         return self.sigma_u is not None
 
     @property
     def has_epoch(self) -> bool:
-        """Whether the stars have epochs."""
+        """True where the stars have epochs."""
         return self.epoch is not None
 
     @property
     def has_mag(self) -> bool:
-        """Whether the stars have magnitudes."""
+        """True where the stars have magnitudes."""
         return self.mag is not None
 
     @property
     def has_nominal(self) -> bool:
-        """Whether the stars have nominal positions."""
+        """True where the stars have nominal positions."""
         return self.u_nominal is not None
 
     @property
@@ -310,7 +310,7 @@ class MatchTable:
         return np.asarray(self.chip_numbers, np.int64)[self.chip]
 
     def select(self, which: ArrayLike, *, reason: str | None = None) -> MatchTable:
-        """Some of the stars.
+        """Stars by mask or indices.
 
         Parameters
         ----------
@@ -327,13 +327,13 @@ class MatchTable:
         Raises
         ------
         InputError
-            When no star is left, or when an index stands twice.
+            When no star is left, or when an index is repeated.
         """
         which = np.asarray(which)
         if not which.size:  # an empty list has no integer type of its own
             which = which.astype(np.int64)
         index = np.arange(len(self))[which]
-        # rows of one table differ: only an index that stands twice repeats one
+        # rows of one table differ: only a repeated index repeats one
         distinct = which.dtype == bool or len(np.unique(index)) == len(index)
         picked = {name: getattr(self, name)[index] for name in self._array_names()}
         rejected = dict(self.rejected)
@@ -343,7 +343,7 @@ class MatchTable:
         return self._with(distinct=distinct, **picked, rejected=rejected)
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The rows in consecutive pieces of about equal size.
+        """Rows in consecutive pieces of about equal size.
 
         Returns
         -------
@@ -363,7 +363,7 @@ class MatchTable:
         Parameters
         ----------
         n : int
-            How many rows the sample may have; k is as small as this allows.
+            Largest number of rows of the sample; k is as small as this allows.
 
         Returns
         -------
@@ -379,7 +379,7 @@ class MatchTable:
         return self if k == 1 else self.select(np.arange(0, len(self), k))
 
     def with_sigma(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MatchTable:
-        """The same stars with other errors.
+        """These stars with other errors.
 
         Parameters
         ----------
@@ -397,7 +397,7 @@ class MatchTable:
         )
 
     def with_errors_times(self, factor: float) -> MatchTable:
-        """The same stars with all errors multiplied by a factor.
+        """These stars with all errors multiplied by a factor.
 
         Parameters
         ----------
@@ -412,7 +412,7 @@ class MatchTable:
         return self.with_sigma(factor * self.sigma_u, factor * self.sigma_v)
 
     def with_added_errors(self, added: AddedErrors) -> MatchTable:
-        """The same stars with errors added in quadrature.
+        """These stars with errors added in quadrature.
 
         Parameters
         ----------
@@ -427,7 +427,7 @@ class MatchTable:
         return self.with_sigma(*added.beside(self, self.sigma_u, self.sigma_v))
 
     def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> MatchTable:
-        """The same stars with errors by magnitude.
+        """These stars with errors by magnitude.
 
         Parameters
         ----------
@@ -448,7 +448,7 @@ class MatchTable:
 
     @staticmethod
     def concatenate(tables: Sequence[MatchTable]) -> MatchTable:
-        """All stars of several tables, in their order.
+        """Stars of several tables, in their order.
 
         Exposures, chips, filters and files of equal name become one.  Stars keep their codes, which
         must belong to one catalogue; the codes are left out when one of the tables has none.

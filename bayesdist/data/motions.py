@@ -24,10 +24,10 @@ Float = NDArray[np.float64]
 Line: TypeAlias = "float | Callable[[Float], ArrayLike]"
 
 _STARS_IN_BIN = 200  # stars of a bin in magnitude
-_MAX_BINS = 40  # bins
+_MAX_BINS = 40
 # above the median, in the logarithm: 0.6 % of a log-normal distribution
 _MAX_SCATTERS_ABOVE = 2.5
-_MIN_SCATTER = 0.05  # of ln(sigma): errors all alike are no reason to reject the next
+_MIN_SCATTER = 0.05  # of ln(sigma): among errors all alike a slightly larger one stays
 
 
 def derive_motions(
@@ -190,7 +190,7 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
 
 
 def select_motions(catalog: ReferenceCatalog, max_sigma: Line | None = None) -> ReferenceCatalog:
-    """The stars with well measured proper motions (the red line of the report's Figure 3).
+    """Stars with well measured proper motions (the red line of the report's Figure 3).
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Matches that stay on disk: Parquet files, gone through piece by piece.
+"""Matches that stay on disk: Parquet files, streamed in pieces.
 
-What must be known of the whole is found by a scan, in the memory of one block: the names of
-exposures, chips and filters, the tangent point, and that no row is wrong or stands twice.
+A scan in the memory of one block finds what must be known of all rows: the names of exposures,
+chips and filters, the tangent point, and that no row is wrong or repeated.
 """
 
 from __future__ import annotations
@@ -41,45 +41,22 @@ _ARRAYS = (
 
 @dataclass(frozen=True, eq=False)
 class PartPiece:
-    """Some consecutive rows of partitioned matches.
-
-    Parameters
-    ----------
-    whole : Whole
-    parts : tuple of MatchPart
-        The files that the rows lie in.
-    segments : tuple of (int, int, int)
-        For each of them its code, the first row, and the row after the last.
-    errors : MagnitudeErrors or tuple of float, optional
-        Errors in place of those in the files.
-    factor : float
-        On all errors.
-    added : tuple of AddedErrors
-        Beside what the factor makes of them.
-    """
+    """Consecutive rows of partitioned matches."""
 
     whole: Whole
-    parts: tuple[MatchPart, ...]
-    segments: tuple[Segment, ...]
-    errors: Errors | None = None
-    factor: float = 1.0
-    added: tuple[AddedErrors, ...] = ()
+    parts: tuple[MatchPart, ...]  # files of the rows
+    segments: tuple[Segment, ...]  # for each file its code, the first row, the row after the last
+    errors: Errors | None = None  # in place of those in the files
+    factor: float = 1.0  # on all errors
+    added: tuple[AddedErrors, ...] = ()  # in quadrature, after the factor
 
     def __len__(self) -> int:
         return sum(stop - start for _, start, stop in self.segments)
 
     def read(self) -> MatchTable:
-        """The rows.
+        """Rows, with codes and sources by the names of the whole.
 
-        Returns
-        -------
-        MatchTable
-            Codes and sources refer to the names of the whole.
-
-        Raises
-        ------
-        InputError
-            When a file is damaged, gone, or not what it was when it was opened.
+        InputError when a file is damaged, gone, or not what it was when it was opened.
         """
         read = [self._segment(*both) for both in zip(self.parts, self.segments, strict=True)]
         arrays = {name: [one[name] for one in read] for name in read[0]}
@@ -114,7 +91,7 @@ class PartPiece:
 
 
 def _shared(whole: Whole, n_rows: int) -> dict[str, Any]:
-    """What a table of some rows has from the whole."""
+    """Attributes that a table of some rows takes from the whole."""
     names = ("unit", "exposure_names", "chip_numbers", "filter_names", "sources", "tangent_point")
     return {name: getattr(whole, name) for name in names} | {"n_rows": n_rows}
 
@@ -123,7 +100,7 @@ def _shared(whole: Whole, n_rows: int) -> dict[str, Any]:
 class PartitionedMatches:
     """Matched stars on disk, as `open_matches` finds them.
 
-    It offers what a MatchTable does but the columns, which are read piece by piece.
+    It offers all of a MatchTable but the columns, which are read piece by piece.
 
     Parameters
     ----------
@@ -136,7 +113,7 @@ class PartitionedMatches:
     factor : float
         On all errors.
     added : tuple of AddedErrors
-        Beside what the factor makes of them.
+        In quadrature, after the factor.
 
     Attributes
     ----------
@@ -210,31 +187,31 @@ class PartitionedMatches:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was found out about the files, as clauses."""
+        """Clauses on properties of the files."""
         return tuple(dict.fromkeys(note for part in self.parts for note in part.notes))
 
     @property
     def has_epoch(self) -> bool:
-        """Whether the stars have epochs."""
+        """True where the stars have epochs."""
         return "epoch" in self.parts[0].found or self.parts[0].options.epoch is not None
 
     @property
     def has_mag(self) -> bool:
-        """Whether the stars have magnitudes."""
+        """True where the stars have magnitudes."""
         return "mag" in self.parts[0].found
 
     @property
     def has_sigma(self) -> bool:
-        """Whether the stars have errors."""
+        """True where the stars have errors."""
         return self.errors is not None or _has_errors(self.parts[0])
 
     @property
     def has_nominal(self) -> bool:
-        """Whether the stars have nominal positions."""
+        """True where the stars have nominal positions."""
         return "u_nominal" in self.parts[0].found
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The rows in consecutive pieces.
+        """Rows in consecutive pieces.
 
         Row groups, and files, are joined up to `PIECE` rows; larger ones are split evenly.
 
@@ -273,7 +250,7 @@ class PartitionedMatches:
         Parameters
         ----------
         n : int
-            How many rows the sample may have; k is as small as this allows.
+            Largest number of rows of the sample; k is as small as this allows.
 
         Returns
         -------
@@ -301,7 +278,7 @@ class PartitionedMatches:
         return MatchTable.of_distinct_rows(**joined, **counts, **_shared(self.whole, self.n_rows))
 
     def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> PartitionedMatches:
-        """The same stars with errors by magnitude.
+        """These stars with errors by magnitude.
 
         Parameters
         ----------
@@ -320,7 +297,7 @@ class PartitionedMatches:
         return replace(self, errors=errors, factor=1.0, added=())
 
     def with_errors_times(self, factor: float) -> PartitionedMatches:
-        """The same stars with all errors multiplied by a factor.
+        """These stars with all errors multiplied by a factor.
 
         Parameters
         ----------
@@ -334,7 +311,7 @@ class PartitionedMatches:
         return replace(self, factor=factor * self.factor, added=added)
 
     def with_added_errors(self, added: AddedErrors) -> PartitionedMatches:
-        """The same stars with errors added in quadrature.
+        """These stars with errors added in quadrature.
 
         Parameters
         ----------
@@ -347,7 +324,7 @@ class PartitionedMatches:
         return replace(self, added=(*self.added, added))
 
     def with_sigma(self, sigma_u: float, sigma_v: float) -> PartitionedMatches:
-        """The same stars with other errors.
+        """These stars with other errors.
 
         Parameters
         ----------
@@ -406,7 +383,7 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Partiti
     Returns
     -------
     PartitionedMatches
-        Its pieces hold what `read_matches` gives for these rows.
+        Its pieces are equal to `read_matches` of these rows.
 
     Raises
     ------

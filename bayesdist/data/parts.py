@@ -1,4 +1,4 @@
-"""Parquet files of matches as parts of one whole: what each holds, and what they share."""
+"""Parquet files of matches as parts of one whole: their content, and their common attributes."""
 
 from __future__ import annotations
 
@@ -32,36 +32,21 @@ __all__ = ["MatchPart", "Whole", "match_part", "scan", "tangent_point_of"]
 
 Int = NDArray[np.int64]
 
-_BLOCK = 2**18  # rows looked at together in a scan
+_BLOCK = 2**18  # rows scanned together
 _LABELS = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
 _DEFAULTS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
 
 
 @dataclass(frozen=True, eq=False)
 class MatchPart:
-    """A Parquet file of matches, and how it is read.
-
-    Parameters
-    ----------
-    part : ParquetPart
-    found : mapping of str to str
-        Column of each quantity.
-    unit : str
-        Of u and v.
-    exposure_name : str or None
-        Name of the one exposure, where there is no column of them.
-    options : ReadOptions
-        With the origin of the pixels, and the tangent point once it is known.
-    notes : tuple of str
-        What was found out about the file, as clauses.
-    """
+    """Parquet file of matches, and how it is read."""
 
     part: ParquetPart
-    found: Mapping[str, str]
-    unit: str
-    exposure_name: str | None
-    options: ReadOptions
-    notes: tuple[str, ...] = ()
+    found: Mapping[str, str]  # column of each quantity
+    unit: str  # of u and v
+    exposure_name: str | None  # of the one exposure, where there is no column
+    options: ReadOptions  # with pixel origin, and tangent point once known
+    notes: tuple[str, ...] = ()  # findings on the file, as clauses
 
     @property
     def source(self) -> str:
@@ -70,7 +55,7 @@ class MatchPart:
 
     @property
     def on_sky(self) -> bool:
-        """Whether the reference positions are ra and dec."""
+        """True where the reference positions are ra and dec."""
         return "ra" in self.found
 
     def blocks(
@@ -83,28 +68,14 @@ class MatchPart:
     ) -> Iterator[dict[str, Any]]:
         """Arguments of MatchTable for rows `start` to `stop`, at most `size` rows at a time.
 
-        Parameters
-        ----------
-        start, stop, size
-            As `ParquetPart.blocks`.
-        without : sequence of str
-            Quantities to leave out.
-
-        Yields
-        ------
-        dict
-            As `match_columns` gives it, with codes into labels of the block's own.
-
-        Raises
-        ------
-        InputError
-            For what is wrong with a row, naming its row group.
+        As `match_columns`, without the quantities of `without`, with codes into labels of the
+        block's own.  InputError names the row group of a wrong row.
         """
         found = {key: name for key, name in self.found.items() if key not in without}
         encoded = {found[key] for key in _LABELS if key in found}
         encoded |= {found["epoch"]} & self.part.texts if "epoch" in found else set()
         columns = list(dict.fromkeys(found.values()))
-        # names of chips alone have no numbers before all are known
+        # names of chips get numbers once all are known
         options = replace(self.options, unit=self.unit, chips=self.options.chips or {})
         for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
             out = match_columns(self._quantities(block, found), options)
@@ -134,10 +105,7 @@ def match_part(
     *,
     exposure_name: str | None,
 ) -> MatchPart:
-    """What a file holds, by the names and units of its columns alone.
-
-    Missing columns and units are refused.
-    """
+    """Layout of a file, by the names and units of its columns alone; missing ones are refused."""
     source = str(part.path)
     found, options, notes = columns_read(part.colnames, {}, options, source=source)
     found.pop("flux", None)  # magnitudes of all rows or of none: that takes all of them
@@ -156,17 +124,7 @@ def match_part(
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """What all parts share.
-
-    Parameters
-    ----------
-    unit : str
-    exposure_names, filter_names : tuple of str
-    chip_numbers : tuple of int
-    sources : tuple of str
-    n_rows : int
-    tangent_point : tuple of float or None
-    """
+    """Names, unit and tangent point common to all parts."""
 
     unit: str
     exposure_names: tuple[str, ...]
@@ -179,10 +137,7 @@ class Whole:
     def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
         """Codes of a block's exposures, chips or filters among those of the whole.
 
-        Raises
-        ------
-        InputError
-            For a label that was not there when the parts were scanned.
+        InputError for a label that was not there when the parts were scanned.
         """
         known = self._numbers[key]
         try:
@@ -220,10 +175,9 @@ def tangent_point_of(parts: Sequence[MatchPart]) -> tuple[float, float]:
 
 @dataclass(eq=False)
 class _Scan:
-    """The parts batch by batch, as `first_repetition` goes through them.
+    """Parts batch by batch, as `first_repetition` takes them.
 
-    All columns are read, so that whatever is wrong with a row comes out, and labels are numbered as
-    they appear.
+    All columns are read, so that any wrong row is found, and labels are numbered as they appear.
     """
 
     parts: Sequence[MatchPart]
@@ -245,21 +199,9 @@ class _Scan:
 
 
 def scan(parts: Sequence[MatchPart]) -> Whole:
-    """Go through all rows: labels are collected, and whatever is wrong is found.
+    """Names common to all parts, from a scan of all rows; any wrong or repeated row is refused.
 
-    Parameters
-    ----------
-    parts : sequence of MatchPart
-        With the same quantities and unit, and with a tangent point if they need one.
-
-    Returns
-    -------
-    Whole
-
-    Raises
-    ------
-    InputError
-        For what is wrong with a row, for a row that stands twice, for a damaged file.
+    The parts have the same quantities and unit, and a tangent point if they need one.
     """
     n_rows = sum(one.part.n_rows for one in parts)
     if n_rows == 0:

@@ -1,4 +1,4 @@
-"""Star lists: the raw detections of an exposure, and which of them are good enough to match."""
+"""Star lists: raw detections of an exposure, and the cuts that select those to be matched."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class StarList:
         return tuple(np.unique(self.chip).tolist())
 
     def select(self, which: NDArray[Any]) -> StarList:
-        """Some of the detections, by mask or indices."""
+        """Detections by mask or indices."""
         names = ("x", "y", "chip", "mag", "q", "row")
         return replace(
             self, **{k: getattr(self, k)[which] for k in names if getattr(self, k) is not None}
@@ -108,7 +108,7 @@ class StarList:
 
 @dataclass(frozen=True)
 class StarCuts:
-    """Which detections are good enough to be matched.
+    """Cuts that select the detections to be matched.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ class StarCuts:
             )
 
     def passed(self, stars: StarList) -> tuple[Bool, dict[str, int]]:
-        """Which detections pass, and why the others do not.
+        """Mask of the detections that pass, and counts of the others by reason.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ def read_star_lists(
     *,
     chip: int | None = None,
 ) -> tuple[StarList, ...]:
-    """Read raw detections.
+    """Raw detections of exposures, read from files.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def read_star_lists(
 def _of_table(
     table: Table, columns: Mapping[str, str] | None, source: str, name: str, chip: int | None
 ) -> list[StarList]:
-    """The exposures of a table."""
+    """Star lists of the exposures of a table."""
     found = find_columns(table.colnames, columns, _LIST_ALIASES, source=source)
     for key in ("x", "y"):
         if key not in found:
@@ -278,14 +278,14 @@ def _of_table(
 
 
 def _mean(years: Float | None, rows: Any) -> float | None:
-    """Date of an exposure, of which every detection has it."""
+    """Mean epoch of an exposure's rows; None without epochs."""
     return None if years is None else float(years[rows].mean())
 
 
 def star_list_of_hst1pass(
     found: Hst1passList, *, exposure: str | None = None, chip: int = 1
 ) -> StarList:
-    """The raw detections of a list of hst1pass.
+    """Raw detections of a list of hst1pass.
 
     Parameters
     ----------

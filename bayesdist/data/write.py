@@ -39,7 +39,7 @@ def write_partitioned(
     *,
     rows_per_group: int = PIECE,
 ) -> list[Path]:
-    """Tables of matches as a folder of Parquet files, parts of one table.
+    """Write tables of matches as a folder of Parquet files, parts of one table.
 
     Only one of the tables need be in memory at a time.  Reading the folder gives the same numbers
     bit for bit.  Not written are the rows and files that the stars come from, what was rejected,
@@ -144,21 +144,9 @@ def write_columns(
     columns: Mapping[str, NDArray[Any] | Labelled],
     units: Mapping[str, str],
 ) -> None:
-    """Write a Parquet file, with units in the metadata of its fields.
+    """Write a Parquet file, with units in the metadata of its fields; replaced atomically.
 
-    Parameters
-    ----------
-    path : path-like
-        Replaced atomically.
-    columns : mapping of str to ndarray, shape (N,)
-        Or codes and the labels that they stand for, kept as a dictionary.
-    units : mapping of str to str
-        Of the columns that have one.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
+    `columns` are arrays (N,), or codes and the labels that they stand for, stored as a dictionary.
     """
     import pyarrow
 

@@ -1,4 +1,4 @@
-"""The distortion model: structure without values, and what it predicts.
+"""Distortion model: structure without values, and its predictions.
 
 For a star on chip c in exposure e at epoch t, at FITS pixel (x, y):
 
@@ -41,20 +41,20 @@ NO_EXPOSURE = -1  # code of the polynomial itself where it is no exposure's
 
 @dataclass(frozen=True)
 class DistortionModel(ParameterLayout):
-    """Structure of a distortion solution: what is fitted, not its values.
+    """Structure of a distortion solution, without its values.
 
     theta holds first the *global* parameters (Legendre coefficients of each chip and axis, then
     the time-dependent terms of each chip), then one *local* block for each exposure but the first.
 
     Polynomials and frames are determined only together: what all frames have in common is a change
-    of the polynomials.  The *gauge* says how the two are told apart.
+    of the polynomials.  The *gauge* separates the two.
 
     - "first": the frame of the first exposure is the identity.  The polynomials are those of that
       exposure, with its shift, roll angle, scale and shear.
     - "held": the first exposure's shift and rotation are held at given values, exactly: they are no
       parameters.  Its scale and shear are parameters like those of all others, and stand at the end
       of the global ones.  Then scale and shear are *deviations* from polynomials that belong to no
-      exposure, and need a prior that says that they scatter about zero; without it they are
+      exposure, and need a prior by which they scatter about zero; without it they are
       degenerate with the linear terms, and `fit_linear` says so.  Held at the first exposure's roll
       and zero point, the polynomials lie along the detector's axes, and so do the shears.
 
@@ -79,7 +79,7 @@ class DistortionModel(ParameterLayout):
     held : tuple of float
         With 'held': shift_u, shift_v (unit of u, v) and rotation (radians) of the first exposure.
     chip_deviations : bool
-        Whether every chip but the first one has linear deviations of its own in each exposure.
+        True where every chip but the first one has linear deviations of its own in each exposure.
         Needs gauge 'held': they have to scatter about zero as the others do.  Scale and shear of a
         frame then act on each chip about its own reference pixel, so that the distance between the
         chips, a lever of thousands of pixels, does not pass for a measurement of their scale.
@@ -296,7 +296,7 @@ class DistortionModel(ParameterLayout):
         return 1.0 if self.unit == "pix" else self.linear_scale(theta, chip)
 
     def linear_scale(self, theta: ArrayLike, chip: int | None = None) -> float:
-        """Size of a pixel in what u and v are counted in, also where that is called pixels.
+        """Size of a pixel in the unit that u and v are counted in, even if that is called pixels.
 
         Parameters
         ----------
@@ -324,13 +324,13 @@ class DistortionModel(ParameterLayout):
         return theta
 
     def to_dict(self) -> dict[str, Any]:
-        """The structure as JSON-able data, for files."""
+        """Structure as JSON-able data, for files."""
         values = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
         return json.loads(json.dumps(values, default=_plain))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> DistortionModel:
-        """The model that `to_dict` described.
+        """Model that `to_dict` described.
 
         Raises
         ------
@@ -357,5 +357,5 @@ class DistortionModel(ParameterLayout):
 
 
 def _plain(value: Any) -> Any:
-    """A dataclass as a dict, and a number of numpy as one of Python."""
+    """Dataclass as a dict, and a number of numpy as one of Python."""
     return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value.item()

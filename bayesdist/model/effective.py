@@ -1,7 +1,7 @@
 """Effective coefficients: a chip of an exposure at an epoch as one polynomial of the pixels.
 
-The maps theta -> effective coefficients and its derivative are all that fits, samplers and
-predictions need to know of a model.
+Fits, samplers and predictions use a model through the map from theta to effective coefficients, and
+its derivative, alone.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def frame_of(layout: ParameterLayout, theta: ArrayLike, exposure: int) -> tuple[
 
 
 def _frame_parameters(layout: ParameterLayout, theta: Float, exposure: int) -> tuple[str, Float]:
-    """Kind of an exposure's frame and all its parameters (..., q), held ones included."""
+    """Kind of an exposure's frame, and all its parameters (..., q), held ones included."""
     if not layout.has_frame(exposure):
         return "none", theta[..., :0]
     names = frame_names(layout.frames)
@@ -121,7 +121,7 @@ def effective_coefficients(layout: ParameterLayout, theta: ArrayLike, groups: Gr
 def effective_derivatives(
     layout: ParameterLayout, theta: ArrayLike, groups: Groups
 ) -> list[tuple[Int, Float]]:
-    """Their derivatives by theta, as `DistortionModel.effective_jacobian`."""
+    """Derivatives of effective coefficients by theta, as `DistortionModel.effective_jacobian`."""
     theta = np.asarray(theta, float)
     K, o = layout.n_terms, np.asarray(layout.origin)
     poly = polynomials(layout, theta, groups.chip, groups.epoch)
@@ -134,7 +134,7 @@ def effective_derivatives(
         values = theta[block][own]
         L, d = chip_matrix(values) if own.stop else (np.zeros((2, 2)), np.zeros(2))
 
-        # by the polynomial's coefficients, then by what moves these
+        # by the polynomial's coefficients, then by the parameters of the drift
         columns = [np.r_[slice(2 * K * chip, 2 * K * (chip + 1))]]
         direct = np.einsum("ab,kl->akbl", M, np.eye(K))
         if own.stop:

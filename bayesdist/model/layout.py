@@ -1,4 +1,4 @@
-"""The structure of a distortion model, and the only parameter layout."""
+"""Structure of a distortion model, and the only parameter layout."""
 
 from __future__ import annotations
 
@@ -45,35 +45,21 @@ class Chip:
 
 @dataclass(frozen=True)
 class Parameter:
-    """What one entry of theta is.
-
-    Parameters
-    ----------
-    name, unit : str
-    kind : str
-        'polynomial', 'tdd' or 'frame'.
-    chip : int or None
-        Chip number; of a frame's parameter that is a chip's own deviation.
-    axis : str or None
-        'u' or 'v'.
-    i, j : int or None
-        Degree in x and y: of the Legendre product ('polynomial') or of the monomial ('tdd').
-    exposure : str or None
-    """
+    """Description of one entry of theta."""
 
     name: str
     unit: str
-    kind: str
-    chip: int | None = None
-    axis: str | None = None
-    i: int | None = None
-    j: int | None = None
+    kind: str  # 'polynomial', 'tdd' or 'frame'
+    chip: int | None = None  # number; of a frame's parameter: a chip's own deviation
+    axis: str | None = None  # 'u' or 'v'
+    i: int | None = None  # degree in x, Legendre ('polynomial') or monomial ('tdd')
+    j: int | None = None  # degree in y
     exposure: str | None = None
 
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """The fields of `DistortionModel`, which describes them, and the order of its parameters."""
+    """Fields of `DistortionModel`, which describes them, and the order of its parameters."""
 
     order: int
     chips: tuple[Chip, ...]
@@ -161,7 +147,7 @@ class ParameterLayout:
 
     @property
     def summary(self) -> str:
-        """What it is, in a few words."""
+        """Summary in a few words."""
         names = ", ".join(chip.name or str(chip.number) for chip in self.chips[:4])
         chips = f"{len(self.chips)} chip{'s' if len(self.chips) > 1 else ''}"
         more = ", ..." if len(self.chips) > 4 else ""
@@ -281,22 +267,22 @@ class ParameterLayout:
         return self.bases[0 if chip is None else self.chip_code(chip)]
 
     def coefficient_slice(self, chip: int | None, axis: int) -> slice:
-        """Where theta holds the Legendre coefficients of a chip (by number) and axis (0 u, 1 v)."""
+        """Slice of theta with the Legendre coefficients of a chip (number) and axis (0 u, 1 v)."""
         code = 0 if chip is None else self.chip_code(chip)
         start = (2 * code + axis) * self.n_terms
         return slice(start, start + self.n_terms)
 
     def tdd_slice(self, chip: int | None = None) -> slice:
-        """Where theta holds the time-dependent parameters of a chip (by number)."""
+        """Slice of theta with the time-dependent parameters of a chip (by number)."""
         return self.drift_slice(0 if chip is None else self.chip_code(chip))
 
     def drift_slice(self, chip_code: int) -> slice:
-        """Where theta holds the time-dependent parameters of a chip (by code)."""
+        """Slice of theta with the time-dependent parameters of a chip (by code)."""
         start = self.n_polynomial + chip_code * self.n_tdd
         return slice(start, start + self.n_tdd)
 
     def frame_slice(self, exposure: int) -> slice:
-        """Where theta holds the `free_frame_names` of an exposure (by code)."""
+        """Slice of theta with the `free_frame_names` of an exposure (by code)."""
         if not self.free_frame_names(exposure):
             return slice(0, 0)
         if exposure == 0:
@@ -306,7 +292,7 @@ class ParameterLayout:
 
     @property
     def local_blocks(self) -> tuple[slice, ...]:
-        """The local blocks of theta, one for each exposure but the first."""
+        """Local blocks of theta, one for each exposure but the first."""
         if not self.n_frame:
             return ()
         return tuple(self.frame_slice(e) for e in range(1, len(self.exposures)))
@@ -316,7 +302,7 @@ class ParameterLayout:
         return self.n_frame > 0 and (exposure > 0 or (exposure == 0 and self.gauge == "held"))
 
     def own_slice(self, chip_code: int, exposure: int) -> slice:
-        """Where `frame_slice` of an exposure holds a chip's own deviations (by codes), if any."""
+        """Slice of `frame_slice` of an exposure with a chip's own deviations (by codes), if any."""
         if not (self.chip_deviations and chip_code > 0 and self.has_frame(exposure)):
             return slice(0, 0)
         n, q = len(self.free_frame_names(exposure)) - len(self._own_names), len(CHIP_DEVIATIONS)
@@ -324,7 +310,7 @@ class ParameterLayout:
 
     @cached_property
     def drift_columns(self) -> tuple[tuple[Float, ...], Int]:
-        """For each chip, the Legendre coefficients (n terms, K) of each drifting monomial; axes."""
+        """Legendre coefficients (n terms, K) of each drifting monomial, for each chip; and axes."""
         if self.time is None:
             return tuple(np.zeros((0, self.n_terms)) for _ in self.chips), np.zeros(0, np.int64)
         columns = []

@@ -1,7 +1,7 @@
 """Diagrams of a whole detector, its chips as one array: as Figures 4.1 to 4.5 of the ACS handbook.
 
-They stand as pipelines have them, x to the right and y up; two of the handbook's are rotated by
-180 degrees.
+They are oriented as in pipelines, x to the right and y up; two of the handbook's are rotated by 180
+degrees.
 """
 
 from __future__ import annotations
@@ -39,20 +39,9 @@ _VECTORS, _POINTS = 21, 65
 def non_linear_figure(
     detector: WholeDetector, title: str = "", *, magnification: float | None = None
 ) -> Figure:
-    """What the best linear map of the detector leaves, as vectors.
+    """Figure of the residuals from the best linear map of the detector, as vectors in its pixels.
 
-    Parameters
-    ----------
-    detector : WholeDetector
-    title : str
-        What it is of.
-    magnification : float, optional
-        How much longer than the axes' pixels the vectors are; a round number by default.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Vectors along the detector's axes, in its pixels.
+    `magnification` is the length of the vectors over the axes' pixels, by default a round number.
     """
     found, sizes, chips = detector_numbers(detector), _sizes(detector), []
     for n, size in sizes.items():
@@ -83,18 +72,7 @@ def non_linear_figure(
 
 
 def area_figure(detector: WholeDetector, title: str = "") -> Figure:
-    """Pixel area over that at the centre of the detector, as contours.
-
-    Parameters
-    ----------
-    detector : WholeDetector
-    title : str
-        What it is of.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Figure of the pixel area over that at the centre of the detector, as contours."""
     sizes = _sizes(detector)
     grids = []
     for n, size in sizes.items():
@@ -120,22 +98,10 @@ def residual_figure(
     unit: str,
     title: str = "",
 ) -> Figure:
-    """Mean residuals of a fit in cells of the detector, as vectors.
+    """Figure of the mean residuals of a fit in cells of the detector, as vectors.
 
-    Parameters
-    ----------
-    detector : WholeDetector
-    binned : mapping of int to BinnedResiduals
-        By chip number; along the axes of (u, v).
-    unit : str
-        Of the residuals.
-    title : str
-        What it is of.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Cells whose mean lies within two of its standard errors from zero are light.
+    `binned` is by chip number, along the axes of (u, v).  Cells whose mean is within two of its
+    standard errors from zero are light.
     """
     chips = [Arrows.of_cells(b) for b in binned.values()]
     length = np.concatenate([one.length for one in chips])

@@ -1,4 +1,4 @@
-"""Data sets of known truth that need not fit into memory."""
+"""Simulated matches that need not fit into memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bayesdist.simulate.matches import Truth
 
 __all__ = ["simulate_partitioned"]
 
-CHUNK = 1_000_000  # pairs in memory at a time
+CHUNK = 1_000_000  # matches in memory at a time
 
 
 def simulate_partitioned(

@@ -1,1 +1,1 @@
-"""Detections to reference stars: recognised by patterns, mapped, paired, judged against chance."""
+"""Star lists matched with a catalogue: patterns, linear maps, nearest neighbours, and chance."""

@@ -1,9 +1,9 @@
-"""A campaign: the star lists of many exposures matched with one catalogue, without trusting a WCS.
+"""Star lists of the exposures of a campaign matched with one catalogue, without trusting a WCS.
 
 Known distortion brings the raw positions to a plane; triangles of bright stars find rotation and
-shift; a linear map is iterated while the search radius shrinks; a cubic for each chip takes up what
-the known distortion has left.  The pairs are mutual nearest neighbours within a radius that they
-themselves suggest.  Transformations serve the pairing alone: what comes out are raw pixels beside
+shift; a linear map is iterated while the search radius shrinks; a cubic for each chip fits what the
+known distortion has left.  Matches are mutual nearest neighbours within a radius that follows from
+their own distances.  Transformations serve the matching alone: the results are raw pixels with
 catalogue positions (ACS ISR 2015-06, Section 4.1).
 """
 
@@ -51,19 +51,19 @@ _LEFT_OUT = "exposure left out"
 
 @dataclass(frozen=True, eq=False)
 class CampaignMatches:
-    """The matches of a campaign.
+    """Matches of a campaign.
 
     Parameters
     ----------
     table : MatchTable
-        Raw pixels beside catalogue positions at the epoch of each exposure; `sigma_u`, `sigma_v`
+        Raw pixels with catalogue positions at the epoch of each exposure; `sigma_u`, `sigma_v`
         are those of the catalogue there, without the centroid's error.
     reports : tuple of ExposureReport
         In the order of the lists.
     left_out : dict of str to str
         Exposures that did not match, and why.
     mirrored : bool
-        Whether u has the sign that is opposite to the catalogue's.
+        True where u has the sign that is opposite to the catalogue's.
     """
 
     table: MatchTable
@@ -72,11 +72,11 @@ class CampaignMatches:
     mirrored: bool = False
 
     def warnings(self, log: ExposureLog) -> list[str]:
-        """What a reader has to know of the matching, as `match_warnings`."""
+        """Warnings of `match_warnings` on the matching."""
         return match_warnings(self.reports, self.left_out, log)
 
     def summary(self) -> Table:
-        """The reports as a table, a row for each exposure; chips and reasons are columns."""
+        """Reports as a table, a row for each exposure; chips and reasons are columns."""
         chips = sorted({chip for one in self.reports for chip in one.per_chip})
         reasons = list(dict.fromkeys(reason for one in self.reports for reason in one.rejected))
         rows: dict[str, list[Any]] = {}
@@ -127,19 +127,19 @@ def match_campaign(
         Known distortion: ``start(x, y, chip, epoch) -> (N, 2)`` from raw pixels and chip numbers to
         a plane in the catalogue's unit, any rotation and origin; all chips on one plane.
     cuts : StarCuts, optional
-        Which detections may be matched; by default all.  Those that the cuts leave out still help
+        Cuts on detections to be matched; by default none.  Those that the cuts leave out still help
         to recognise the field.
     radius : float, optional
         Search radius; by default it is taken from the scatter of the pairs, ring by ring around the
         middle of the detector (`search_radius`), below that where chance takes over.
     mirrored : sequence of bool, optional
-        Whether the catalogue is taken with the sign of u changed; of several, those that follow are
+        True to take the catalogue with the sign of u changed; of several, those that follow are
         tried where the first matches no exposure.  East of a sky with north up is to the left: a
         detector that is read out as the sky is seen has the parity that is opposite to (u, v) of a
         tangent plane.
     skip : bool, optional
-        Whether exposures that do not match, or lose all their detections to the cuts, are left out
-        and counted.  More than a fifth of them, or the first two, are an error all the same.
+        True to leave out, and count, exposures that do not match or lose all their detections to
+        the cuts.  More than a fifth of them, or the first two, are an error all the same.
 
     Returns
     -------
@@ -203,7 +203,7 @@ def match_campaign(
 
 
 class _View:
-    """A catalogue in one of its parities, at any epoch."""
+    """Catalogue in one of its parities, at any epoch."""
 
     def __init__(self, catalog: ReferenceCatalog, mirrored: bool, mean_epoch: float) -> None:
         self.mirrored = mirrored
@@ -211,7 +211,7 @@ class _View:
         self._last: tuple[float, ReferenceCatalog] | None = None
 
     def at(self, epoch: float) -> ReferenceCatalog:
-        """As it is seen at an epoch."""
+        """Catalogue as seen at an epoch."""
         if self._last is None or self._last[0] != epoch:
             then = self._catalog if self._catalog.pm_u is None else self._catalog.as_seen(epoch)
             self._last = epoch, then.mirrored() if self.mirrored else then
@@ -229,7 +229,7 @@ def _matched(
     views: Sequence[_View],
     epoch: float,
 ) -> tuple[ExposureMatch, _View]:
-    """The match with the first of these views that gives one; else the error of the first view."""
+    """Match with the first of these views that gives one; else the error of the first view."""
     errors = []
     for view in views:
         try:
@@ -261,7 +261,7 @@ def _table(
     catalog: ReferenceCatalog,
     found: Sequence[ExposureMatch],
 ) -> MatchTable:
-    """All matches, with the columns that every list has."""
+    """Table of all matches, with the columns that every list has."""
     reports = [one.report for one in found]
     sizes = [len(match.index) for match in found]
 

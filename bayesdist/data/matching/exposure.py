@@ -33,14 +33,14 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_ASTRAY_FRACTION = 0.2  # of the matched share of the best chip: a chip below lies elsewhere
-_MIN_DETECTIONS_ON_CHIP = 20  # detections of a chip, of which that can be said
+_ASTRAY_FRACTION = 0.2  # of the matched fraction of the best chip: a chip below lies elsewhere
+_MIN_DETECTIONS_ON_CHIP = 20  # detections of a chip for that comparison
 _CHANCE_RATE = 0.1  # chance matches of a detection within the largest radius that is looked at
-_DISPLACEMENT = 10.0  # radii by which detections are displaced to see what chance gives
+_DISPLACEMENT = 10.0  # radii by which detections are displaced to count chance matches
 _BRIGHT_STARS = 2000  # stars of the first linear map, and of the last check
 _MARGIN = 0.1  # of the field, around it
 _MAX_ROUNDS = 12  # of a cubic for each chip, and then the radius that follows
-_MIN_UNPAIRED = 100  # unpaired detections that say where such detections lie
+_MIN_UNPAIRED = 100  # unpaired detections that sample where such detections lie
 _MAX_FALSE_FRACTION = 0.1  # of the pairs by chance: more, and the field is not understood
 _GROWTH_FACTOR = 1.01  # of the pairs, while the cubic is still reaching out
 _MAG_PERCENTILES = (1.0, 99.0)  # percentiles of magnitude that count as the range of a list
@@ -48,25 +48,14 @@ _MAG_PERCENTILES = (1.0, 99.0)  # percentiles of magnitude that count as the ran
 
 @dataclass(frozen=True, eq=False)
 class ExposureMatch:
-    """Pairs of an exposure.
-
-    Parameters
-    ----------
-    report : ExposureReport
-    index, catalog_index : ndarray of int, shape (n,)
-        Rows of the list and of the catalogue.
-    u, v : ndarray, shape (n,)
-        Of the catalogue.
-    sigma : tuple of ndarray, shape (n,), or None
-        Errors of the catalogue.
-    """
+    """Matches of an exposure: rows of list and catalogue, and catalogue positions (n,)."""
 
     report: ExposureReport
     index: Int
     catalog_index: Int
     u: Float
     v: Float
-    sigma: tuple[Float, Float] | None
+    sigma: tuple[Float, Float] | None  # errors of the catalogue positions (n,)
 
 
 def match_exposure(
@@ -82,37 +71,12 @@ def match_exposure(
     radius: float | None,
     source: str,
 ) -> ExposureMatch:
-    """Match an exposure.
+    """Matches of the detections of an exposure with the catalogue at its epoch.
 
-    Parameters
-    ----------
-    stars : StarList
-    good : ndarray of bool, shape (N,)
-        Which detections may be matched.
-    plane : ndarray, shape (N, 2)
-        Their positions after the known distortion.
-    catalog : ReferenceCatalog
-        At the epoch of the exposure.
-    patterns : PatternIndex
-        Of the catalogue, at an epoch not far from it.
-    exposure : Exposure
-    chips : sequence of int
-        Those of the campaign.
-    rejected : mapping of str to int
-        Detections that are not good, by reason.
-    radius : float or None
-        As `match_campaign`.
-    source : str
-        For errors.
-
-    Returns
-    -------
-    ExposureMatch
-
-    Raises
-    ------
-    InputError
-        When the field is not that of the catalogue.
+    `good` (N,) masks the detections that may be matched, `plane` (N, 2) holds their positions after
+    the known distortion, `patterns` those of the catalogue at an epoch not far from this, `chips`
+    those of the campaign, `rejected` the detections that are not good, by reason; `radius` is as
+    for `match_campaign`.  InputError when the field is not that of the catalogue.
     """
     rows = np.flatnonzero(good)
     points, chip = plane[rows], stars.chip[rows]
@@ -200,7 +164,7 @@ def _astray(asked: Mapping[int, int], matched: Mapping[int, int]) -> tuple[int, 
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs, where all detections have come to lie, and how far pairs may be apart."""
+    """Pairs, the positions of all detections after the maps, and the largest distance of a pair."""
 
     moved: Float
     allowed: SearchRadius
@@ -221,8 +185,8 @@ def _settled(
 ) -> _Pairs | None:
     """Pairs after a cubic for each chip; None where there are none but by chance.
 
-    While the cubic brings in more pairs the radius stays at its largest; then it shrinks to what
-    the pairs need, unless it is fixed, and the cubic is fitted once more.
+    While the cubic brings in more pairs the radius stays at its largest; then it shrinks to that
+    which the pairs need, unless it is fixed, and the cubic is fitted once more.
     """
     allowed = SearchRadius(np.zeros(1), np.array([largest]))
     chance = min(chance_rate(start, tree, largest, _DISPLACEMENT * largest), 0.99)
@@ -259,7 +223,7 @@ def _settled(
 def _false_rate(pairs: _Pairs, rho: Float, reference: Float, step: float) -> float:
     """Probability that a detection without counterpart finds a star that is still free.
 
-    Those that stayed alone lie where such detections lie; where they are few, all are asked.
+    Unpaired detections show where such detections lie; where they are few, all detections are used.
     """
     free = np.ones(len(reference), bool)
     free[pairs.partner] = False
@@ -329,7 +293,7 @@ def _around(points: Float, catalog: ReferenceCatalog) -> Int:
 def _range(
     stars: StarList, rows: Int, index: Int, catalog: ReferenceCatalog, partner: Int
 ) -> tuple[float | None, Bool]:
-    """Zero point, and the catalogue stars within the magnitudes of the detections."""
+    """Zero point, and a mask of the catalogue stars within the magnitudes of the detections."""
     if stars.mag is None or catalog.mag is None:
         return None, np.ones(len(catalog), bool)
     zero_point = float(np.median(catalog.mag[partner] - stars.mag[rows][index]))
@@ -338,7 +302,7 @@ def _range(
 
 
 def _footprint(moved: Float, chip: Int, reference: Float) -> Bool:
-    """Reference stars inside the hull of any chip's detections."""
+    """Boolean mask of the reference stars inside the hull of any chip's detections."""
     covered = np.zeros(len(reference), bool)
     for number in np.unique(chip):
         covered |= inside_hull(reference, hull_of(moved[chip == number])[0])

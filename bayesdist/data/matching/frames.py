@@ -1,8 +1,8 @@
 """Exposures of one field brought onto the first of them, without a catalogue.
 
-Each exposure is recognised by the patterns of its bright stars among the stars of those that have
-been brought on already; what it sees beyond them is added, so that exposures that do not reach the
-first one follow by way of others.
+Each exposure is recognised by the patterns of its bright stars among the stars of the exposures
+that have been brought on already; its other stars are added to these, so that exposures that do not
+reach the first one follow by way of others.
 """
 
 from __future__ import annotations
@@ -24,27 +24,20 @@ Float = NDArray[np.float64]
 
 BRIGHT_STARS = 3000  # stars of an exposure that are used
 WIDE, NARROW = 0.3, 0.1  # of the spacing: reach of the linear map, first and last
-MAX_COMMON_FRACTION = 0.5  # share of equal positions above which two exposures are one
+MAX_COMMON_FRACTION = 0.5  # fraction of equal positions above which two exposures are one
 SCALES = (0.97, 1.03)
 
 
 @dataclass(frozen=True, eq=False)
 class MutualFrames:
-    """Where exposures lie.
+    """Linear maps of exposures: position on the first one's plane = matrix @ position + shift."""
 
-    Parameters
-    ----------
-    matrices : ndarray, shape (E, 2, 2)
-    shifts : ndarray, shape (E, 2)
-        Plane of the first exposure = matrix @ own plane + shift.
-    """
-
-    matrices: Float
-    shifts: Float
+    matrices: Float  # (E, 2, 2)
+    shifts: Float  # (E, 2)
 
     @property
     def rotations(self) -> Float:
-        """Of the similarities nearest to the matrices, radians (E,)."""
+        """Rotations (E,) of the similarities nearest to the matrices, radians."""
         M = self.matrices
         return np.asarray(np.arctan2(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1]))
 
@@ -56,23 +49,11 @@ def mutual_frames(
     *,
     source: str = "star lists",
 ) -> MutualFrames:
-    """Bring all exposures onto the first.
+    """Maps of all exposures onto the first.
 
-    Parameters
-    ----------
-    planes : sequence of ndarray, shape (N_e, 2)
-        Positions of each exposure after the known distortion.
-    mags : sequence of ndarray, optional
-        With them the bright stars are used.
-    names : sequence of str
-        Of the exposures.
-    source : str
-        For errors.
-
-    Raises
-    ------
-    InputError
-        Naming the groups of exposures that have no stars in common.
+    `planes` (N_e, 2) are the positions of each exposure after the known distortion; with `mags`
+    only the bright stars are used.  InputError names the groups of exposures that have no stars in
+    common.
     """
     groups = _groups(planes, mags)
     if len(groups) > 1:
@@ -95,20 +76,7 @@ def mutual_frames(
 def refuse_duplicates(
     pixels: Sequence[Float], names: Sequence[str], *, source: str = "star lists"
 ) -> None:
-    """Refuse an exposure that stands in the lists twice under two names.
-
-    Parameters
-    ----------
-    pixels : sequence of ndarray, shape (N_e, 2)
-        Raw positions.
-    names : sequence of str
-    source : str
-
-    Raises
-    ------
-    InputError
-        Naming the two.
-    """
+    """Refuse an exposure listed twice under two names; `pixels` (N_e, 2) are raw positions."""
     rows = [{tuple(row) for row in np.round(one, 6).tolist()} for one in pixels]
     for b in range(len(rows)):
         for a in range(b):
@@ -121,7 +89,7 @@ def refuse_duplicates(
 
 
 def _groups(planes: Sequence[Float], mags: Sequence[Float] | None) -> list[dict[int, LinearMap]]:
-    """Exposures that hang together, each with its map onto the first of its group."""
+    """Groups of exposures that are connected, each with the maps onto the first of its group."""
     bright = [_brightest(planes[e], None if mags is None else mags[e]) for e in range(len(planes))]
     left, out = list(range(len(planes))), list[dict[int, LinearMap]]()
     while left:

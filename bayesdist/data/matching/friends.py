@@ -17,61 +17,32 @@ __all__ = ["Friends", "friends_of_friends"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-FINE = 16  # cells in a linking length: detections of one cell are friends without being asked
+FINE = 16  # cells in a linking length: detections of one cell are friends without a comparison
 MAX_EXTENT = 3.0  # linking lengths that a group may span: a longer one is a chain of stars
 
 
 @dataclass(frozen=True, eq=False)
 class Friends:
-    """Stars that were found.
+    """Stars that were found among detections (N,)."""
 
-    Parameters
-    ----------
-    star : ndarray of int, shape (N,)
-        Codes from 0; `NO_STAR` for detections that were dropped.
-    n_stars : int
-    n_alone : int
-        Stars that one exposure alone has seen.
-    n_doubled : int
-        Groups with several detections of one exposure: the one nearest to the group's middle was
-        kept.
-    n_dropped : int
-        Detections that were dropped for that.
-    n_chains : int
-        Groups that were given up, as they span several stars.
-    """
-
-    star: Int
+    star: Int  # (N,) codes from 0; `NO_STAR` for detections that were dropped
     n_stars: int
-    n_alone: int
-    n_doubled: int
-    n_dropped: int
-    n_chains: int
+    n_alone: int  # stars on a single exposure
+    n_doubled: int  # groups with several detections of one exposure: the nearest to the mean stays
+    n_dropped: int  # detections that were dropped for that
+    n_chains: int  # groups that were given up, as they span several stars
 
     @property
     def n_ambiguous(self) -> int:
-        """Groups of which it is not clear what they are."""
+        """Groups that may not be one star."""
         return self.n_doubled + self.n_chains
 
 
 def friends_of_friends(places: Float, exposure: Int, length: float) -> Friends:
-    """Group detections that are connected by steps no longer than a linking length.
+    """Groups of detections (N, 2) that are connected by steps no longer than a linking length.
 
     Distances are exact to a sixteenth of the length: positions are rounded to cells, so that the
-    many detections of one star are a few points.
-
-    Parameters
-    ----------
-    places : ndarray, shape (N, 2)
-        On the common plane.
-    exposure : ndarray of int, shape (N,)
-    length : float
-        In the unit of `places`.
-
-    Returns
-    -------
-    Friends
-        Codes rise with the first detection of the star.
+    many detections of one star are a few points.  Codes rise with the first detection of the star.
     """
     cell = np.floor(places / (length / FINE)).astype(np.int64)
     cell -= cell.min(axis=0)
@@ -98,7 +69,7 @@ def friends_of_friends(places: Float, exposure: Int, length: float) -> Friends:
 
 
 def _without_chains(places: Float, group: Int, most: float) -> tuple[Int, int, int]:
-    """Groups (N,) with those left out that span more than is allowed; their number and size."""
+    """Groups (N,) without those that span too much, their number, and that of their detections."""
     n = int(group.max()) + 1
     span = np.zeros(n)
     for axis in range(2):
@@ -112,7 +83,7 @@ def _without_chains(places: Float, group: Int, most: float) -> tuple[Int, int, i
 
 
 def _one_of_each(places: Float, exposure: Int, group: Int) -> tuple[Int, int]:
-    """At most one detection of each exposure in a group: the nearest to the group's mean."""
+    """Groups (N,) with one detection an exposure, nearest to the mean; number that had several."""
     good = np.flatnonzero(group != NO_STAR)
     if not len(good):
         return group, 0

@@ -26,13 +26,13 @@ Solution = TypeVar("Solution")
 MAX_SAMPLE = 20_000  # detections that the iterations use
 _FIRST_SAMPLE = 150  # detections of the first round
 _MAX_ROUNDS = 25
-MIN_PAIRS = 6  # that a linear map needs to be more than its own fit
+MIN_PAIRS = 6  # pairs: with fewer, a linear map fits their noise
 _CLIP = 3.0  # times the median distance: 3.5 sigma of a circular normal
 
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """p -> matrix (p - origin) + origin + shift.
+    """Linear map p -> matrix (p - origin) + origin + shift.
 
     Parameters
     ----------
@@ -51,13 +51,7 @@ class LinearMap:
 
 
 def best_similarity(points: Float, reference: Float) -> LinearMap:
-    """Rotation, scale and shift by least squares, about the mean of the points.
-
-    Parameters
-    ----------
-    points, reference : ndarray, shape (N, 2)
-        Pairs; the points not all in one place.
-    """
+    """Rotation, scale and shift by least squares of pairs (N, 2), about the mean of the points."""
     origin, there = points.mean(axis=0), reference.mean(axis=0)
     p, q = (points - origin) @ [1, 1j], (reference - there) @ [1, 1j]
     turn = np.vdot(p, q) / np.vdot(p, p).real
@@ -68,25 +62,12 @@ def best_similarity(points: Float, reference: Float) -> LinearMap:
 def iterated_map(
     points: Float, reference: Float, tree: cKDTree, start: LinearMap, reach: float, radius: float
 ) -> LinearMap | None:
-    """Linear map fitted in rounds; the radius shrinks while the area grows from the start's origin.
+    """Linear map fitted in rounds: pairs within `reach` at first, within `radius` at last.
 
-    Far from where the offset was found a small rotation displaces stars by more than their
-    distances, so the map is fitted near that place first.
-
-    Parameters
-    ----------
-    points : ndarray, shape (N, 2)
-    reference : ndarray, shape (M, 2)
-    tree : cKDTree
-        Of `reference`.
-    start : LinearMap
-    reach, radius : float
-        Largest distance of a pair in the first round and in the last.
-
-    Returns
-    -------
-    LinearMap or None
-        None where too few pairs are left, or they lie on a line.
+    The area grows from the start's origin meanwhile: far from where the offset was found a small
+    rotation displaces stars by more than their distances, so the map is fitted near that position
+    first.  `tree` is of `reference` (M, 2).  None where too few pairs are left, or they lie on a
+    line.
     """
     outwards = np.argsort(((points - start.origin) ** 2).sum(axis=1))
     current, size, reach = start, _FIRST_SAMPLE, max(reach, radius)
@@ -106,7 +87,7 @@ def iterated_map(
 
 
 class RobustFit(NamedTuple, Generic[Solution]):
-    """A fit, the distances of all pairs from it (N,), and which lie near (N,)."""
+    """A fit, the distances of all pairs from it (N,), and a mask of those near it (N,)."""
 
     solution: Solution
     away: Float
@@ -126,7 +107,7 @@ def robust_fit(
 
     `fit` gives for pairs by mask (N,) the solution and the distances (N,) of all from it, or None
     where they do not determine it.  None, too, where fewer than `least` pairs are given.  `slack`
-    is what rounding makes of a distance of 0; no pair beyond `reach` is used.
+    is the rounding error of a distance of 0; no pair beyond `reach` is used.
     """
     found, use = None, np.ones(n, bool)
     for _ in range(rounds):

@@ -14,14 +14,14 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_MAX_PROBES = 20_000  # displaced detections that say what chance gives
+_MAX_PROBES = 20_000  # displaced detections that sample chance matches
 _DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)
 
 
 def hull_of(points: Float) -> tuple[Float, float]:
-    """Half-planes a x + b y + c <= 0 around points (N, 2) as rows (K, 3), and the area in them.
+    """Half-planes a x + b y + c <= 0 around points (N, 2) as rows (K, 3), and the area inside.
 
-    Of points without a hull their box, and no area is less than the smallest number.
+    Points without a hull have their box; the area is positive in any case.
     """
     try:
         hull = ConvexHull(points)
@@ -37,7 +37,7 @@ def hull_of(points: Float) -> tuple[Float, float]:
 
 
 def inside_hull(points: Float, equations: Float) -> Bool:
-    """Which points (N, 2) lie inside a hull."""
+    """Boolean mask of the points (N, 2) inside a hull."""
     inside = np.ones(len(points), bool)
     for a, b, c in equations:
         inside &= points @ np.array([a, b]) + c <= 0
@@ -45,7 +45,7 @@ def inside_hull(points: Float, equations: Float) -> Bool:
 
 
 def overlap(points: Float, reference: Float) -> tuple[int, float]:
-    """Reference stars in the hull of the points (at least 1), and its area."""
+    """Number of reference stars in the hull of the points (at least 1), and its area."""
     equations, area = hull_of(points)
     return max(int(inside_hull(reference, equations).sum()), 1), area
 
@@ -59,24 +59,11 @@ def mutual_pairs(
     frame: Int | None = None,
     reference_frame: Int | None = None,
 ) -> tuple[Int, Int, Float]:
-    """Pairs that are each other's nearest within a radius.
+    """Indices of pairs that are each other's nearest within a radius, and their distances.
 
-    Parameters
-    ----------
-    points : ndarray, shape (N, 2)
-    reference : ndarray, shape (M, 2)
-    radius : float or ndarray, shape (N,)
-        One for all, or the largest distance of the partner of each point.
-    tree : cKDTree, optional
-        Of `reference`, where it is there already.
-    frame, reference_frame : ndarray of int, shape (N,) and (M,), optional
-        Only points of equal number are paired.
-
-    Returns
-    -------
-    index, reference_index : ndarray of int
-        No index stands twice.
-    distance : ndarray
+    `radius` is one, or the largest distance of the partner of each point (N,); `tree` is of
+    `reference`, where it is at hand; of `frame` (N,) and `reference_frame` (M,) only points of
+    equal number are paired.  No index is repeated.
     """
     reach = float(np.max(radius))
     if frame is not None and reference_frame is not None:
@@ -100,9 +87,9 @@ def mutual_pairs(
 def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float) -> float:
     """Fraction of points (N, 2) that find a neighbour where none belongs: when all are displaced.
 
-    Unlike a formula with a mean density this knows of gradients and clusters.  `radius`, one or
-    (N,), is the largest distance of a neighbour, `step` the displacement in eight directions: so
-    large that true pairs are out of reach.
+    Unlike a formula with a mean density this takes account of gradients and clusters.  `radius`,
+    one or (N,), is the largest distance of a neighbour, `step` the displacement in eight
+    directions: so large that true pairs are out of reach.
     """
     every = -(-len(points) * len(_DIRECTIONS) // _MAX_PROBES)
     sample = points[::every]
@@ -116,7 +103,7 @@ def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float
 
 
 def beats_chance(points: Float, reference: Float, tree: cKDTree, distance: Float) -> bool:
-    """Whether true pairs are there: displaced detections must find far fewer neighbours.
+    """True where there are true pairs: displaced detections find far fewer neighbours.
 
     Two dense clusters laid over each other give many pairs, but as many when one is moved a little.
     `distance` is that of the pairs that were found, `tree` that of the reference positions.

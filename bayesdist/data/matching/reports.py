@@ -1,4 +1,4 @@
-"""How exposures were matched: a report of each, and what is wrong or odd about all of them."""
+"""Reports on the matching of exposures, and warnings on all of them."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ Float = NDArray[np.float64]
 
 _MAX_FRACTION_LEFT_OUT = 0.2  # of the exposures: beyond, the campaign itself is wrong
 _MAX_FAILURES_AT_FIRST = 2  # exposures that fail before any has matched
-_MIN_EXPOSURES = 5  # exposures, of which one can be called odd
+_MIN_EXPOSURES = 5  # exposures among which one can be called odd
 _ODD_SIGMAS = 5.0  # of the other exposures
 _MIN_COMPLETENESS_STEP = 0.15  # of completeness, at least
 _MIN_FALSE_STEP = 0.05  # of the matches, at least
-_MIN_SCALE_STEP = 2e-5  # at least: less is what telescopes breathe
+_MIN_SCALE_STEP = 2e-5  # at least: telescopes breathe less
 _MAX_NAMED = 5  # exposures in a sentence
 
 
 @dataclass(frozen=True)
 class ExposureReport:
-    """How an exposure was matched.
+    """Report of the matching of an exposure.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class ExposureReport:
         From the start's positions to the catalogue, degrees anticlockwise, in [0, 360).
     scale : float
     offset : tuple of float
-        Where the middle of the detections comes to lie, in the catalogue's unit.
+        Position of the middle of the detections, in the catalogue's unit.
     radius : tuple of float
         Smallest and largest search radius over the detector.
     rms : float
@@ -102,19 +102,10 @@ class ExposureReport:
 
 
 def check_campaign(lists: Sequence[StarList], log: ExposureLog, catalog: ReferenceCatalog) -> None:
-    """Refuse lists, log and catalogue that do not go together; nothing is matched.
+    """Refuse lists, log and catalogue that do not fit together; nothing is matched.
 
-    Parameters
-    ----------
-    lists : sequence of StarList
-    log : ExposureLog
-    catalog : ReferenceCatalog
-
-    Raises
-    ------
-    InputError
-        For no lists, an exposure that is not in the log or stands in two lists, errors of 0, and
-        proper motions without an epoch.
+    InputError for no lists, an exposure that is not in the log or stands in two lists, errors of 0,
+    and proper motions without an epoch.
     """
     if not lists:
         raise InputError("there are no star lists to match", do="give at least one")
@@ -147,7 +138,7 @@ def check_campaign(lists: Sequence[StarList], log: ExposureLog, catalog: Referen
 
 
 def all_cut(stars: StarList, rejected: Mapping[str, int], where: str) -> InputError:
-    """The error of a list of which the cuts leave nothing, with the counts of each cut."""
+    """Error of a list of which the cuts leave nothing, with the counts of each cut."""
     counts = ", ".join(f"{count} {reason}" for reason, count in rejected.items())
     return InputError(
         f"the cuts leave none of {len(stars)} detections ({counts})",
@@ -157,17 +148,17 @@ def all_cut(stars: StarList, rejected: Mapping[str, int], where: str) -> InputEr
 
 
 def too_many(failed: int, matched: int, n: int) -> bool:
-    """Whether so many exposures failed that the campaign itself is wrong."""
+    """True where so many exposures failed that the campaign itself is wrong."""
     return failed > _MAX_FRACTION_LEFT_OUT * n or (not matched and failed >= _MAX_FAILURES_AT_FIRST)
 
 
 def failure(
     failed: Mapping[str, InputError], reason: str, n: int, tried: Sequence[bool] = (False,)
 ) -> InputError:
-    """The first failure, with what is known of the others.
+    """First failure as an error, with what is known of the others.
 
-    `failed` is by exposure, `reason` that of `mismatch_reason`, and `tried` says whether the
-    catalogue was taken mirrored.
+    `failed` is by exposure, `reason` that of `mismatch_reason`; `tried` has True for each parity in
+    which the catalogue was taken mirrored.
     """
     first = next(iter(failed.values()))
     cause, do = first.cause, first.do
@@ -200,24 +191,12 @@ def refuse_astray(reports: Sequence[ExposureReport], catalog: ReferenceCatalog) 
 def match_warnings(
     reports: Sequence[ExposureReport], left_out: Mapping[str, str], log: ExposureLog
 ) -> list[str]:
-    """Exposures that were left out, that lack a chip, or that are unlike the others.
+    """Clauses on exposures that were left out, that lack a chip, or that are outliers.
 
-    An exposure is unlike the others when its completeness lies far below theirs, when far more of
-    its matches are expected to be false, or when its scale, free of aberration, is another: five
-    robust standard deviations of all exposures, and no less than 0.15, 0.05 and 2e-5.
-
-    Parameters
-    ----------
-    reports : sequence of ExposureReport
-    left_out : mapping of str to str
-        Exposures that did not match, and why.
-    log : ExposureLog
-        With VAFACTOR, where the scales are to be compared.
-
-    Returns
-    -------
-    list of str
-        Clauses that name the exposures.
+    An exposure is an outlier when its completeness is far below that of the others, when far more
+    of its matches are expected to be false, or when its scale, free of aberration (where the log
+    has VAFACTOR), differs: by five robust standard deviations of all exposures, and no less than
+    0.15, 0.05 and 2e-5.
     """
     out = []
     if left_out:

@@ -1,4 +1,4 @@
-"""How far from its reference star a detection may lie: by what the pairs themselves show.
+"""Largest distance of a detection from its reference star, found from the distances themselves.
 
 Where a distortion is known less well, usually in the corners, pairs need a larger search radius
 than in the middle; a radius that is large everywhere takes in false matches (the WISE distortion
@@ -17,7 +17,7 @@ __all__ = ["SearchRadius", "search_radius"]
 
 Float = NDArray[np.float64]
 
-_MIN_PAIRS_IN_RING = 100  # pairs of a ring at least
+_MIN_PAIRS_IN_RING = 100
 _MAX_RINGS = 8
 _TRUE_PAIRS_WITHIN = 0.98  # of the true pairs, within half the radius
 _MARGIN = 2.0
@@ -35,7 +35,7 @@ class SearchRadius:
     radius: Float
 
     def __call__(self, rho: Float) -> Float:
-        """The radius at distances from the centre."""
+        """Radius at distances from the centre."""
         return np.interp(rho, self.rho, self.radius)
 
 

@@ -1,9 +1,9 @@
-"""The similarity between two lists of stars, found without any hint: by the shapes of triangles.
+"""Similarity between two lists of stars, found without a start value by the shapes of triangles.
 
 Triangles of bright neighbours are looked up in a k-d tree of those of the reference list.  Each two
 of equal shape vote for one rotation, scale and shift; true ones agree, chance spreads its votes
-over the whole space.  The winner is believed when it brings far more stars together than the same
-stars find when they are displaced.
+over the whole space.  The winner is believed when it brings far more stars together than the stars
+find when they are displaced.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ Complex = NDArray[np.complex128]
 _MIN_STARS_TRIED = 60  # stars of the shallowest try
 _STARS_OF_FIRST_LEVEL = 400  # each further one has three times as many
 _LEVEL_FACTOR = 3
-_TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: what is left of a distortion
-_DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of what the mean density suggests
+_TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: remainder of a distortion
+_DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of the number by the mean density
 _STARS_CHECKED = 1000  # stars that a candidate is checked with
 _CHANCE_SIGMAS = 8.0  # by which its coincidences must beat chance
 _MIN_AGREEING = 6  # stars that agree
@@ -47,9 +47,9 @@ _MIN_AGREEING = 6  # stars that agree
 _RATIOS = (20.0, 50.0, 1000.0, 3600.0, 72_000.0, 3.6e6)
 _RATIO_TOLERANCE = 1.1  # of such a ratio; pixels have other sizes, too
 _WIDE_SCALE = 1.4  # a scale that is only badly known
-_SCALE_TOLERANCE = 0.03  # what the matching allows for
+_SCALE_TOLERANCE = 0.03  # that the matching allows
 _STARS_FOR_EACH_AGREEING = 5.0  # stars that have a neighbour, for each whose triangles agree
-_CLEAR_SIGMAS = 16.0  # standard deviations of chance: of many tries one may well have half of it
+_CLEAR_SIGMAS = 16.0  # standard deviations of chance: of many tries one may well reach half of it
 MIRRORED = "its mirror image"
 
 
@@ -57,35 +57,21 @@ MIRRORED = "its mirror image"
 class Similarity:
     """Rotation, scale and shift from one list to another.
 
-        w = scale exp(i rotation) (z or its mirror image - origin) + target,    z = x + i y
-
-    Parameters
-    ----------
-    rotation : float
-        Degrees, anticlockwise, in [0, 360).
-    scale : float
-    mirrored : bool
-        Whether the y axis is turned over first.
-    origin, target : ndarray, shape (2,)
-        A point in the middle of the list, and where it comes to lie.
-    coincidences : int
-        Stars whose triangles agree.
-    found, expected : float
-        Bright stars that have a neighbour after the transformation, and how many chance gives.
+    w = scale exp(i rotation) (z or its mirror image - origin) + target,    z = x + i y
     """
 
-    rotation: float
+    rotation: float  # degrees anticlockwise, in [0, 360)
     scale: float
-    mirrored: bool
-    origin: Float
-    target: Float
-    coincidences: int
-    found: int
-    expected: float
+    mirrored: bool  # True where the y axis is reversed first
+    origin: Float  # (2,), a point in the middle of the list
+    target: Float  # (2,), its position on the other list
+    coincidences: int  # stars whose triangles agree
+    found: int  # bright stars with a neighbour after the transformation
+    expected: float  # as many by chance
 
     @property
     def map(self) -> LinearMap:
-        """As a linear map."""
+        """Linear map that is equal to this."""
         a = np.radians(self.rotation)
         matrix = self.scale * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
         if self.mirrored:
@@ -99,24 +85,15 @@ class Similarity:
 
 @dataclass(frozen=True, eq=False)
 class PatternIndex:
-    """A reference list, ready to be searched any number of times; made by `pattern_index`.
-
-    Parameters
-    ----------
-    positions : ndarray, shape (M, 2)
-    levels : tuple
-        The brightest stars in growing number; their triangles are made when they are asked for.
-    area : float
-        Of the hull of all.
-    """
+    """Reference list (M, 2), ready to be searched any number of times; made by `pattern_index`."""
 
     positions: Float
-    levels: tuple[Level, ...]
-    area: float
+    levels: tuple[Level, ...]  # the brightest stars in growing number, with triangles
+    area: float  # of the hull of all
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of the positions."""
+        """k-d tree of the positions."""
         return cKDTree(self.positions)
 
     @cached_property
@@ -126,7 +103,7 @@ class PatternIndex:
 
 
 def pattern_index(positions: ArrayLike, mag: ArrayLike | None = None) -> PatternIndex:
-    """Prepare a reference list.
+    """Reference list prepared for `find_similarity`.
 
     Parameters
     ----------
@@ -173,12 +150,12 @@ def find_similarity(
     source: str = "detections",
     reference_name: str = "reference list",
 ) -> Similarity:
-    """The similarity that brings a list of stars onto a reference list.
+    """Similarity that brings a list of stars onto a reference list.
 
     Parameters
     ----------
     points : array_like, shape (N, 2)
-        Positions; what is left of a distortion may displace them by several pixels, as long as it
+        Positions; the remainder of a distortion may displace them by several pixels, as long as it
         changes local scales by less than about a per cent.
     reference : PatternIndex
     mag : array_like, shape (N,), optional
@@ -186,7 +163,7 @@ def find_similarity(
     scale : tuple of float, optional
         Smallest and largest scale.
     mirrored : bool, optional
-        Whether to look for the mirror image.
+        True to search for the mirror image.
     source, reference_name : str, optional
         For the error.
 
@@ -218,7 +195,7 @@ def find_similarity(
     if mirrored:
         stars = np.conj(stars)
     area = hull_of(xy)[1] * scale[0] * scale[1]
-    best = (0, 0.0)  # coincidences of the best candidate, and what chance gives
+    best = (0, 0.0)  # coincidences of the best candidate, and those by chance
     for tolerance, level, size in _tries(len(stars), mag is not None, reference, area):
         bright = stars[:size]
         for candidate in candidates(bright, level, tolerance, scale):
@@ -268,7 +245,7 @@ def _tries(
 
 
 def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> tuple[int, float]:
-    """Stars that have a reference star near them, and how many have one by chance."""
+    """Numbers of stars that have a reference star near them, and that have one by chance."""
     sample = stars[:: -(-len(stars) // _STARS_CHECKED)]
     moved = candidate.turn * sample + candidate.target
     points = np.stack([moved.real, moved.imag], axis=-1)
@@ -279,10 +256,7 @@ def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> t
 
 
 def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) -> str:
-    """The scale or mirror image by which a list (N, 2) would match a reference list, as a clause.
-
-    Empty when nothing helps.
-    """
+    """Clause on the scale or mirror image by which a list (N, 2) would match; else empty."""
     ratios = [factor for one in _RATIOS for factor in (one, 1.0 / one)]
     tries = [
         (1.0, _WIDE_SCALE, False),
@@ -302,12 +276,12 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
             )
         except InputError:
             continue
-        # shrunk onto a crowded place any list finds neighbours; but few of its triangles agree
+        # shrunk onto a crowded region any list finds neighbours; but few of its triangles agree
         if _STARS_FOR_EACH_AGREEING * found.coincidences < found.found:
             continue
         scale = ratio * found.scale
         as_it_is = abs(scale - 1.0) < _SCALE_TOLERANCE
-        if as_it_is and not mirrored:  # then neither scale nor image is what is wrong
+        if as_it_is and not mirrored:  # then neither scale nor image is wrong
             continue
         sigmas = (found.found - found.expected) / np.sqrt(found.expected)
         if sigmas <= best:

@@ -1,4 +1,4 @@
-"""What a known distortion has left over, as a cubic of each chip: for the pairing alone."""
+"""Remainder of a known distortion as a cubic of each chip, for the matching alone."""
 
 from __future__ import annotations
 
@@ -18,21 +18,17 @@ Int = NDArray[np.int64]
 
 _ORDER = 3
 _POWERS = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]
-_MIN_PAIRS_ON_CHIP = 20 * len(_POWERS)  # pairs of a chip; with fewer, what is fitted is their noise
-_MAX_PAIRS_FITTED = 4000  # that a fit uses: beyond, their noise has no part in it any more
+_MIN_PAIRS_ON_CHIP = 20 * len(_POWERS)  # pairs of a chip; with fewer, their noise is fitted
+_MAX_PAIRS_FITTED = 4000  # pairs in a fit: with more, their noise does not matter any more
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothMap:
-    """A displacement by chip and position; none for chips with too few pairs.
+    """Displacement by chip and position; none for chips with too few pairs."""
 
-    `low` and `high` bound the positions; `coefficients` (10, 2) of each chip are those of products
-    of Legendre polynomials.
-    """
-
-    low: Float
-    high: Float
-    coefficients: dict[int, Float]
+    low: Float  # (2,), smallest position
+    high: Float  # (2,), largest position
+    coefficients: dict[int, Float]  # (10, 2) of each chip, of products of Legendre polynomials
 
     def __call__(self, points: Float, chip: Int) -> Float:
         """Displacements (N, 2) at points (N, 2)."""
@@ -44,7 +40,7 @@ class SmoothMap:
 
 
 def smooth_map(points: Float, chip: Int, residual: Float, index: Int) -> SmoothMap:
-    """Cubics through the residuals of pairs, chip by chip, with those far off left out.
+    """Cubics through the residuals of pairs, chip by chip, without those far off.
 
     `points` (N, 2) and `chip` (N,) are of all detections, `residual` (n, 2) is what must be added
     to those of `index` (n,).

@@ -1,4 +1,4 @@
-"""Detections to reference stars, when positions agree up to a shift, a small rotation and scale."""
+"""Matches of detections that agree with a catalogue up to a shift, a small rotation and a scale."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """Pairs, and how they were found.
+    """Pairs of detections and reference stars, and how they were found.
 
     Parameters
     ----------
     index, catalog_index : ndarray of int, shape (n_pairs,)
-        Rows of the detections and of the catalogue; no row stands twice.
+        Rows of the detections and of the catalogue; no row is repeated.
     transformation : LinearMap
         From the given positions to the catalogue's.
     radius : float
@@ -66,7 +66,7 @@ def match_to_catalog(
     max_offset: float | None = None,
     source: str = "detections",
 ) -> Matching:
-    """Match detections one to one with reference stars.
+    """Matches of detections with reference stars, one to one.
 
     The offset is voted for by the differences of bright pairs; a linear transformation is then
     iterated while the radius shrinks; the pairs are mutual nearest neighbours inside the final
@@ -127,7 +127,7 @@ def match_to_catalog(
     tree = cKDTree(reference)
     middle = np.median(vote.voters, axis=0)
     first = LinearMap(np.eye(2), vote.offset, middle)
-    # until a nearest neighbour is the right one, only those that voted are asked
+    # until a nearest neighbour is the right one, only those that voted are used
     reach = 0.25 * mean_spacing(reference)
     rough = iterated_map(vote.voters, vote.voted, cKDTree(vote.voted), first, vote.width, reach)
     if rough is None:
@@ -165,7 +165,7 @@ def match_table(
     radius: float | None = None,
     max_offset: float | None = None,
 ) -> MatchTable:
-    """Put a catalogue's positions in the place of approximate ones, exposure by exposure.
+    """Matches with a catalogue's positions in place of approximate ones, exposure by exposure.
 
     Parameters
     ----------

@@ -29,17 +29,12 @@ _MAX_VOTES = 400_000  # at most
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """Triangles, their corners in the order of the opposite sides, longest first.
+    """Triangles, their corners in the order of the opposite sides, longest first."""
 
-    `shape` (T, 2) holds the logarithms of the middle and the shortest side in units of the longest,
-    `log_size` (T,) that of the longest.  `left` says whether the corners (T, 3), indices of stars,
-    go round anticlockwise: a mirror changes it.
-    """
-
-    corners: Int
-    shape: Float
-    log_size: Float
-    left: NDArray[np.bool_]
+    corners: Int  # (T, 3), indices of stars
+    shape: Float  # (T, 2), logarithms of middle and shortest side over the longest
+    log_size: Float  # (T,), of the longest side
+    left: NDArray[np.bool_]  # (T,), anticlockwise; a mirror changes it
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -48,7 +43,7 @@ class Triangles:
 def triangles_of(stars: Complex, anchors: Int, neighbours: int) -> Triangles:
     """Triangles of each anchor with two of its nearest `neighbours`, of stars x + i y (N,).
 
-    Each once, without the nearly flat and the nearly isosceles ones.
+    Each stands once; nearly flat and nearly isosceles ones are left out.
     """
     points = np.stack([stars.real, stars.imag], axis=-1)
     neighbours = min(neighbours, len(stars) - 1)
@@ -92,22 +87,18 @@ class Level:
 
     @cached_property
     def triangles(self) -> Triangles:
-        """Of each star with two of its nearest neighbours."""
+        """Triangles of each star with two of its nearest neighbours."""
         return triangles_of(self.stars, np.arange(len(self.stars)), _NEIGHBOURS[1])
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """w = turn z + target.
-
-    `agreeing` stars are brought together by it, of the triangles that voted for it; `slack`, the
-    median of their distances, says how far the map may be off.
-    """
+    """Similarity w = turn z + target that triangles have voted for."""
 
     turn: complex
     target: complex
-    agreeing: int
-    slack: float
+    agreeing: int  # stars of these triangles that it brings together
+    slack: float  # median of their distances: how far the map may be off
 
 
 def candidates(

@@ -15,37 +15,23 @@ Float = NDArray[np.float64]
 
 _BRIGHT = 600  # stars of each list that vote when magnitudes are known
 _PATCHES = (400, 100, 25)  # detections of a patch in the middle that vote when they are not
-_PAIRS = 1_000_000  # differences that a patch may take
+_PAIRS = 1_000_000  # differences of a patch at most
 _SURE = -8.0  # log10 of chance at which no further vote is held
 _WIDTHS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of a bin, in mean distances between stars
-_RING = 5  # half-width in bins of the surroundings that say what chance gives
+_RING = 5  # half-width in bins of the surroundings that count chance pairs
 
 
 @dataclass(frozen=True, eq=False)
 class Vote:
-    """The best supported offset.
+    """Best supported offset."""
 
-    Parameters
-    ----------
-    offset : ndarray, shape (2,)
-        To be added to the first positions.
-    width : float
-        Of the bin that won.
-    count, expected : float
-        Pairs in that bin, and how many chance puts there.
-    log10_chance : float
-        Logarithm of the probability that chance puts as many into any bin.
-    voters, voted : ndarray, shape (n, 2) and (m, 2)
-        The positions and reference positions that took part.
-    """
-
-    offset: Float
-    width: float
-    count: int
-    expected: float
-    log10_chance: float
-    voters: Float
-    voted: Float
+    offset: Float  # (2,), to be added to the first positions
+    width: float  # of the bin that won
+    count: int  # pairs in that bin
+    expected: float  # pairs there by chance
+    log10_chance: float  # of the probability that chance puts as many into any bin
+    voters: Float  # (n, 2), positions that took part
+    voted: Float  # (m, 2), reference positions that took part
 
 
 def vote_offset(
@@ -55,25 +41,13 @@ def vote_offset(
     reference_mag: Float | None,
     max_offset: float | None,
 ) -> Vote:
-    """Offset that brings the most positions onto reference positions.
+    """Offset that brings the most positions (N, 2) onto reference positions (M, 2).
 
     With magnitudes the brightest of both lists vote first.  If that is not clear, detections of a
     patch in the middle vote with all reference stars near it: smaller patches with larger
-    surroundings, until the surroundings are the whole catalogue.
-
-    Parameters
-    ----------
-    positions : ndarray, shape (N, 2)
-    reference : ndarray, shape (M, 2)
-    mag, reference_mag : ndarray or None
-    max_offset : float or None
-        Largest offset on either axis; None: any.
-
-    Returns
-    -------
-    Vote
-        The least likely by chance, also over several widths of bins, so that neither the errors nor
-        a small rotation need be known.
+    surroundings, until the surroundings are the whole catalogue.  The vote returned is the least
+    likely by chance, also over several widths of bins, so that neither the errors nor a small
+    rotation need be known.  `max_offset` is the largest on either axis.
     """
     best: Vote | None = None
     for a, b in _electorates(positions, reference, mag, reference_mag):
@@ -120,10 +94,9 @@ def mean_spacing(points: Float) -> float:
 
 
 def _peak(d: Float, width: float) -> tuple[Float, int, float, float]:
-    """The fullest bin of a histogram that is never built: only filled bins are counted.
+    """Fullest bin of a histogram: mean difference, number, number by chance, log10 probability.
 
-    Returns the middle of its differences, their number, that by chance, and log10 of its
-    probability.
+    The histogram is never built: only filled bins are counted.
     """
     best: tuple[int, Float] = (0, np.zeros(2))
     n_bins = 1

@@ -1,1 +1,1 @@
-"""Columns of any file to matches: what the user says, what the names say, and which rows count."""
+"""Columns of any file to matches: the user's options, known names of columns, and valid rows."""

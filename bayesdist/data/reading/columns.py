@@ -37,7 +37,7 @@ Float = NDArray[np.float64]
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
     """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or else the option.
 
-    Refused where both say nothing, where they contradict each other, or where the columns do.
+    Refused where both are missing, where they contradict each other, or where the columns do.
     """
     if unit is not None:
         check_unit(unit, where="unit")
@@ -76,7 +76,7 @@ def is_on_sky(
 ) -> bool:
     """True where ra, dec are the reference positions, not u, v; refused when the user names both.
 
-    `found` is the column of each quantity, `columns` what the user names.
+    `found` is the column of each quantity, `columns` those that the user names.
     """
     named = {key for key, column in (columns or {}).items() if column}
     plane, sky = named & {"u", "v"}, named & {"ra", "dec"}
@@ -87,7 +87,7 @@ def is_on_sky(
     on_sky, on_plane = {"ra", "dec"} <= set(found), {"u", "v"} <= set(found)
     if plane or not on_sky:
         return False
-    # beside a magnitude B, the U and V of a table are magnitudes, too
+    # with a magnitude B, the U and V of a table are magnitudes, too
     return bool(sky) or not on_plane or "b" in {name.lower() for name in names}
 
 
@@ -132,7 +132,7 @@ def columns_read(
 
 
 def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:
-    """Arguments of `MatchTable` from some rows of a table, with columns as `needed_columns`."""
+    """Arguments of `MatchTable` from rows of a table, with columns as `needed_columns`."""
     found, column = quantities.found, quantities.__getitem__
     out: dict[str, Any] = {}
     out["x"], out["y"] = (_pixels(column(key), options.pixel_origin) for key in ("x", "y"))
@@ -167,7 +167,7 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
     if "mag" in found:
         out["mag"] = column("mag").numbers()
     elif "flux" in found:
-        with contextlib.suppress(InputError):  # magnitudes are needed by few: none for all then
+        with contextlib.suppress(InputError):  # magnitudes are rarely needed: then no star has one
             flux = column("flux").numbers()
             if (flux > 0).all():
                 out["mag"] = -2.5 * np.log10(flux)
@@ -225,7 +225,7 @@ def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None
 
 
 def plane_unit(unit: str | None, *, source: str) -> str:
-    """Unit of u and v that come from the sky; an option that says another is refused."""
+    """Unit of u and v that come from the sky; another one by option is refused."""
     if unit not in (None, "arcsec"):
         raise InputError(
             f"unit is {unit}, but sky positions come to the tangent plane in arcsec",
@@ -240,7 +240,7 @@ def nominal_columns(
 ) -> tuple[str, ...]:
     """'u_nominal' and 'v_nominal' where a table has them, else nothing.
 
-    Refused is one without the other; and both beside sky positions where no tangent point is given:
+    Refused is one without the other; and both with sky positions where no tangent point is given:
     the plane on which they lie is not to depend on which stars were matched.
     """
     pair = ("u_nominal", "v_nominal")

@@ -1,4 +1,4 @@
-"""Which files a path names, of which format they are, and which exposures they stand for."""
+"""Files that a path names, their formats, and the exposures they stand for."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def input_files(path: PathLike | Sequence[PathLike]) -> list[Path]:
     Raises
     ------
     InputError
-        When there are none, or a file stands twice.
+        When there are none, or a file is repeated.
     """
     given = [path] if isinstance(path, str | os.PathLike) else list(path)
     if not given:
@@ -79,7 +79,7 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
     if is_matchup(lines):
         return "matchup"
     if name.endswith("uvwxympq"):
-        return "hst1pass"  # its reader says what is wrong with it
+        return "hst1pass"  # its reader finds what is wrong
     if is_text_table(lines) or is_fits(file):
         return "table"
     raise FormatError(

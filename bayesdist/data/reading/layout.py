@@ -1,4 +1,4 @@
-"""What the columns of a table are taken for, to be told and written down before it is read."""
+"""Interpretation of the columns of a table, to be shown and written down before it is read."""
 
 from __future__ import annotations
 
@@ -21,38 +21,21 @@ __all__ = ["TableLayout", "table_layout"]
 
 PathLike = str | os.PathLike[str]
 
-MAX_ROWS_READ = 200_000  # rows of a large table, for what its columns may be
+MAX_ROWS_READ = 200_000  # rows of a large table that are read to interpret its columns
 MAX_CHIPS = 200
 MIN_ROWS_ON_CHIP = 20  # rows: flags and qualities have values that are rare
 
 
 @dataclass(frozen=True)
 class TableLayout:
-    """The columns of a table, and what they are taken for.
+    """Columns of a table, and their interpretation."""
 
-    Parameters
-    ----------
-    names : tuple of str
-        All columns.
-    taken : dict of str to str
-        Column of each quantity that is read.
-    origin : int
-        Of the pixels, by names and header.
-    why : str
-        What says so; empty where nothing does.
-    like_chips : dict of str to int
-        Columns that nothing was taken from and that may be chips: a few whole numbers or names,
-        and how many.
-    dated : bool
-        Whether the header has the date of the exposure.
-    """
-
-    names: tuple[str, ...]
-    taken: dict[str, str]
-    origin: int
-    why: str
-    like_chips: dict[str, int]
-    dated: bool
+    names: tuple[str, ...]  # all columns
+    taken: dict[str, str]  # column of each quantity that is read
+    origin: int  # of the pixels, by names and header
+    why: str  # reason for the origin; empty where there is none
+    like_chips: dict[str, int]  # number of values of unused columns that may be chips
+    dated: bool  # True where the header has the date of the exposure
 
 
 def table_layout(
@@ -61,24 +44,10 @@ def table_layout(
     *,
     read_sigma: bool = True,
 ) -> TableLayout | None:
-    """What the columns of a file of matches are taken for; of several files, those of the first.
+    """Layout of a file of matches, or of the first of several; None of files with fixed columns.
 
-    Parameters
-    ----------
-    path, columns
-        As `read_matches`.
-    read_sigma : bool
-        Whether columns of errors are read.
-
-    Returns
-    -------
-    TableLayout or None
-        None of files whose format fixes the columns.
-
-    Raises
-    ------
-    InputError
-        As `read_matches`.
+    Arguments and errors are as for `read_matches`; `read_sigma` is True where columns of errors are
+    read.
     """
     file = input_files(path)[0]
     if kind_of(file, columns) != "table":
@@ -105,7 +74,7 @@ def table_layout(
 
 
 def _values_like_chips(column: Any) -> int:
-    """How many chips there are if these are chips; 0 where they can be none."""
+    """Number of chips if these values are chips; 0 where they cannot be."""
     values = np.asarray(getattr(column, "unmasked", column))
     if values.ndim != 1 or values.dtype.kind not in "iuSU" or getattr(column, "unit", None):
         return 0

@@ -1,4 +1,4 @@
-"""What the user says of the columns of a table, checked once."""
+"""Options for the columns of a table, checked once."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class ReadOptions:
     ----------
     columns : mapping of str to str, optional
         Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag flux
-        colour star u_nominal v_nominal, and beside ra and dec sigma_ra sigma_dec pm_ra pm_dec
+        colour star u_nominal v_nominal, and with ra and dec sigma_ra sigma_dec pm_ra pm_dec
         sigma_pm_ra sigma_pm_dec corr_ra corr_dec parallax sigma_parallax catalogue_epoch.  What is
         not named is looked for under its usual names (`ALIASES`), in any case of letters; an empty
         name leaves a quantity out.  With ra and dec, u and v are the tangent plane in arcsec.
     unit : {'pix', 'arcsec', 'mas', 'deg'}, optional
-        Unit of u and v, where the file does not say.
+        Unit of u and v, where the file states none.
     sigma : {'columns', 'by_magnitude'} or float, optional
-        Where errors come from: from columns; left to be estimated from residuals by magnitude (they
+        Source of errors: columns; left to be estimated from residuals by magnitude (they
         are then None); or one number, in the unit of u and v.
     pixel_origin : {0, 1}, optional
         Coordinate of the centre of the first pixel; by default 1, or 0 where names or header are
@@ -86,7 +86,7 @@ class ReadOptions:
 
 
 def check_sigma(sigma: str | float) -> None:
-    """Refuse what the option `sigma` cannot be."""
+    """Refuse an invalid option `sigma`."""
     if isinstance(sigma, str):
         good = sigma in ("columns", "by_magnitude")
     else:

@@ -31,7 +31,7 @@ __all__ = ["read_matches"]
 
 
 PathLike = str | os.PathLike[str]
-IN_MEMORY = "table"  # what a table that is no file is called in errors
+IN_MEMORY = "table"  # name of a table that is no file, in errors
 
 
 def read_matches(
@@ -59,7 +59,7 @@ def read_matches(
     format : str, optional
         'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
         'hst1pass' (lists with raw and corrected positions),
-        'matchup' (such lists beside the MATCHUP master that they are then matched with),
+        'matchup' (such lists with the MATCHUP master that they are then matched with),
         'astrometry.net' (corr.fits), or 'auto': by name and content.
     columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
         As `ReadOptions`.
@@ -117,7 +117,7 @@ def _with_errors(table: MatchTable, sigma: str | float) -> MatchTable:
 def _read_plain(
     files: Sequence[Path], kinds: Sequence[str], options: ReadOptions, *, in_parts: bool
 ) -> MatchTable:
-    """Files that hold matches themselves."""
+    """Matches from files that hold them."""
     names: Sequence[str | None] = exposure_names(files)
     if in_parts or (len(files) == 1 and kinds[0] == "table"):
         names = [None] * len(files)
@@ -142,7 +142,7 @@ def _read_plain(
 def _with_common_point(
     tables: Mapping[Path, Table], kinds: Iterable[str], options: ReadOptions
 ) -> ReadOptions:
-    """One tangent point for all files: each by itself would choose its own."""
+    """Options with one tangent point for all files: each by itself would choose its own."""
     if options.tangent_point is not None or len(tables) < 2:
         return options
     corr = "astrometry.net" in set(kinds)
@@ -156,7 +156,7 @@ def _with_common_point(
 
 
 def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> ReadOptions:
-    """One numbering of the chips of all files, where these give names."""
+    """Options with one numbering of the chips of all files, where these give names."""
     if options.chips is not None or len(tables) < 2:
         return options
     names: set[str] = set()
@@ -186,7 +186,7 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
 def _read_with_master(
     files: Sequence[Path], kinds: Sequence[str], options: ReadOptions
 ) -> MatchTable:
-    """hst1pass lists, matched with the MATCHUP master among the files."""
+    """Matches of hst1pass lists with the MATCHUP master among the files."""
     masters: list[Path] = []
     lists: list[Path] = []
     for file, kind in zip(files, kinds, strict=True):

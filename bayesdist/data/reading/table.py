@@ -1,4 +1,4 @@
-"""`matches_from_table`: a MatchTable of whatever has columns."""
+"""MatchTable from any object with columns."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ __all__ = ["as_table", "matches_from_table", "own_epoch", "sky_positions", "with
 
 Float = NDArray[np.float64]
 
-_SPARED = frozenset((*SPARED, "colour", "flux"))  # read for what they are worth
+_SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them
 
 
 def as_table(data: Any, source: str) -> Table:
-    """An astropy Table of whatever has columns."""
+    """Astropy Table from any object with columns."""
     if isinstance(data, Table):
         return data
     try:
@@ -59,7 +59,7 @@ def sky_positions(
 
 
 def with_sky_columns(table: Table) -> Table:
-    """A table whose SkyCoord columns are columns of ra and dec, in degrees.
+    """Table whose SkyCoord columns are columns of ra and dec, in degrees.
 
     `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS); without such it is the table itself.
     """

@@ -1,9 +1,9 @@
-"""What the motion of the Earth does to positions: parallax, and the scale of aberration.
+"""Effects of the Earth's motion on positions: parallax, and the scale of aberration.
 
     VAFACTOR = sqrt(1 - b^2) / (1 - n . b),    b = velocity / c
 
 Towards the apex of the motion the stars crowd together: a true offset on the sky is VAFACTOR times
-what a scale free of aberration gives for the pixels (Cox & Gilliland 2002, HST Calibration
+the offset by a scale free of aberration for the pixels (Cox & Gilliland 2002, HST Calibration
 Workshop).  Aberration is conformal, so the factor is the same in all directions.
 """
 
@@ -82,25 +82,11 @@ def velocity_aberration(
 
 
 def parallax_factors(epoch: ArrayLike, ra: float, dec: float) -> Float:
-    """Displacement towards east and north per unit of parallax, seen from the Earth.
+    """Displacements (E, 2) to east and north per unit of parallax, at decimal (Julian) years (E,).
 
-    A satellite in low orbit is within 5e-5 au of its centre.
-
-    Parameters
-    ----------
-    epoch : array_like, shape (E,)
-        Decimal (Julian) years.
-    ra, dec : float
-        Degrees, ICRS.
-
-    Returns
-    -------
-    ndarray, shape (E, 2)
-
-    Notes
-    -----
-    Green, Spherical Astronomy (1985), section 8; the Earth's place by astropy's own ephemeris
-    (ERFA's epv00), which needs no file.
+    As seen from the Earth, for ICRS degrees; a satellite in low orbit is within 5e-5 au of its
+    centre.  Green, Spherical Astronomy (1985), section 8; the Earth's position by astropy's own
+    ephemeris (ERFA's epv00), which needs no file.
     """
     from astropy.coordinates import get_body_barycentric
     from astropy.time import Time

@@ -1,4 +1,4 @@
-"""Reference positions on the sky, with what a catalogue says of their errors and motions.
+"""Reference positions on the sky, with the errors and motions of a catalogue.
 
 Positions are brought to the epoch of the exposures: space motion by astropy, the parallax as seen
 from the Earth, errors with those of the motion and the parallax.
@@ -36,28 +36,14 @@ _STANDS = 1e-3  # years, over which nothing moves
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSky:
-    """Reference positions as they are compared with the detections.
+    """Reference positions as they are compared with the detections."""
 
-    Parameters
-    ----------
-    ra, dec : ndarray, shape (N,)
-        Degrees.
-    sigma : ndarray, shape (2, N), or None
-        Standard errors along east and north, arcsec; None where the table has none.
-    motion : ndarray, shape (2, N), or None
-        Proper motions to the east (with the factor cos(dec)) and north, arcsec per year.
-    sigma_motion : ndarray, shape (2, N), or None
-        Their standard errors.
-    notes : tuple of str
-        What was done, as clauses.
-    """
-
-    ra: Float
-    dec: Float
-    sigma: Float | None
-    motion: Float | None
-    sigma_motion: Float | None
-    notes: tuple[str, ...]
+    ra: Float  # (N,), degrees
+    dec: Float  # (N,), degrees
+    sigma: Float | None  # (2, N), per axis along east and north, arcsec
+    motion: Float | None  # (2, N), to east (with cos(dec)) and north, arcsec/yr
+    sigma_motion: Float | None  # (2, N), errors of the motions
+    notes: tuple[str, ...]  # treatment of the positions, as clauses
 
 
 def sky_columns(quantities: Quantities) -> tuple[Float, Float]:
@@ -99,10 +85,10 @@ def reference_sky(
     epoch: Float | None = None,
     catalogue_epoch: float | None = None,
 ) -> ReferenceSky:
-    """Positions at `epoch`, with errors and motions where the table has them.
+    """Reference positions at `epoch`, with errors and motions where the table has them.
 
     `epoch` (N,) is that of the exposures, `catalogue_epoch` that of the positions where there is no
-    column of it.  Used beside ra and dec, where they are there: sigma_ra, sigma_dec, pm_ra, pm_dec
+    column of it.  Used with ra and dec, where they are there: sigma_ra, sigma_dec, pm_ra, pm_dec
     and their errors, corr_ra and corr_dec (of position and motion on one axis), parallax and its
     error.  Refused are half a pair, and units that are missing or wrong.
     """
@@ -150,7 +136,7 @@ def reference_sky(
 def _pair(
     quantities: Quantities, keys: tuple[str, str], unit: str, *, missing: bool = False
 ) -> Float | None:
-    """Both columns of a pair (2, N) in a unit; None where neither is there."""
+    """Columns of a pair (2, N) in a unit; None where neither is there."""
     have = [key for key in keys if key in quantities]
     if len(have) == 1:
         other = keys[1 - keys.index(have[0])]
@@ -165,7 +151,7 @@ def _pair(
 
 
 def _optional(quantities: Quantities, key: str, unit: str) -> Float | None:
-    """A column of which stars may have no value: it is 0 then."""
+    """Column of which stars may lack a value: it is 0 then."""
     if key not in quantities:
         return None
     return _in_unit(quantities[key], key, unit, missing=True)

@@ -100,7 +100,7 @@ def tangent_plane(
     where: str = "",
     place: Place = row_number,
 ) -> tuple[Float, Float]:
-    """Sky positions on the plane that touches the sky at a point.
+    """Positions of the sky on the plane that touches it at a point.
 
     Parameters
     ----------
@@ -156,24 +156,11 @@ def onto_plane(
     where: str = "",
     place: Place = row_number,
 ) -> dict[str, Any]:
-    """Columns u, v, tangent_point of stars, and sigma_u, pm_u, sigma_pm_u where these are given.
+    """Columns u, v, tangent_point of stars in arcsec; sigma_u, pm_u, sigma_pm_u where given.
 
-    Parameters
-    ----------
-    ra, dec : ndarray, shape (N,)
-        Degrees.
-    point : tuple of float or None
-        Tangent point; None is the mean direction.
-    sigma, motion, sigma_motion : ndarray, shape (2, N), optional
-        Standard errors, proper motions and their errors to the east (with the factor cos(dec)) and
-        to the north, in seconds of arc (per year).
-    where, place
-        As `tangent_plane`.
-
-    Returns
-    -------
-    dict
-        In seconds of arc.
+    `ra`, `dec` (N,) and `point` are in degrees, None being the mean direction; errors, motions and
+    their errors (2, N) are to the east (with the factor cos(dec)) and to the north, in arcsec (per
+    year).
     """
     point = mean_direction(ra, dec) if point is None else point
     u, v = tangent_plane(ra, dec, point, where=where, place=place)
@@ -191,17 +178,9 @@ def onto_plane(
 
 
 def plane_axes(point: tuple[float, float]) -> Float:
-    """Unit vectors to the east, to the north and to the tangent point, as the rows of a matrix.
+    """Unit vectors to east, north and tangent point (degrees), as the rows (3, 3) of a matrix.
 
-    Parameters
-    ----------
-    point : tuple of float
-        Tangent point (ra0, dec0), degrees.
-
-    Returns
-    -------
-    ndarray, shape (3, 3)
-        A position of the plane lies in the direction (xi, eta, 1) @ rows, xi and eta in radians.
+    A position of the plane lies in the direction (xi, eta, 1) @ rows, xi and eta in radians.
     """
     a, d = np.radians(point)
     return np.array(
@@ -214,20 +193,7 @@ def plane_axes(point: tuple[float, float]) -> Float:
 
 
 def sky_of_plane(xi: ArrayLike, eta: ArrayLike, point: tuple[float, float]) -> tuple[Float, Float]:
-    """Sky positions of points of a tangent plane: the inverse of `tangent_plane`.
-
-    Parameters
-    ----------
-    xi, eta : array_like
-        Seconds of arc.
-    point : tuple of float
-        Tangent point (ra0, dec0), degrees.
-
-    Returns
-    -------
-    ra, dec : ndarray
-        Degrees, ra in [0, 360).
-    """
+    """Right ascension in [0, 360) and declination, degrees, of points (arcsec) of a plane."""
     xi, eta = np.asarray(xi, float) / ARCSEC, np.asarray(eta, float) / ARCSEC
     x, y, z = np.moveaxis(np.stack([xi, eta, np.ones_like(xi)], axis=-1) @ plane_axes(point), -1, 0)
     return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))

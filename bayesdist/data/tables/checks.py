@@ -87,7 +87,7 @@ def refuse_half(pair: tuple[str, str], present: Container[str], *, where: str, w
 
 
 def check_not_finite(value: str) -> None:
-    """Refuse what the option `not_finite` cannot be."""
+    """Refuse an invalid option `not_finite`."""
     if value not in NOT_FINITE:
         raise InputError(
             f"not_finite is {value!r}",

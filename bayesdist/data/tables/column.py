@@ -20,7 +20,7 @@ __all__ = ["EncodedColumn", "Place", "SourceColumn", "encoded", "row_number", "y
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-Place = Callable[[int], str]  # what a row is called in an error, by its index in the arrays
+Place = Callable[[int], str]  # name of a row in an error, by its index in the arrays
 Array = TypeVar("Array", Float, Int)
 
 _YEARS = (1800.0, 2200.0)  # epochs outside are a wrong unit, not a date
@@ -45,49 +45,27 @@ def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[
 
 @dataclass(frozen=True, eq=False)
 class EncodedColumn:
-    """A column of few different values, each of which is read only once.
+    """Column of few different values, each of which is read only once."""
 
-    Parameters
-    ----------
-    codes : ndarray of int, shape (N,)
-        Which of `labels` each row has.
-    labels : ndarray, shape (L,)
-        In the order of their first appearance.
-    unit : str, optional
-    """
-
-    codes: Int
-    labels: NDArray[Any]
+    codes: Int  # (N,), into `labels`
+    labels: NDArray[Any]  # (L,), in the order of their first appearance
     unit: str | None = None
 
     @property
     def plain(self) -> NDArray[Any]:
-        """The value of each row."""
+        """Value of each row (N,)."""
         return self.labels[self.codes]
 
 
 @dataclass(frozen=True, eq=False)
 class SourceColumn:
-    """A column with the names that an error needs.
+    """Column with the names that an error needs."""
 
-    Parameters
-    ----------
-    values : astropy Column, Quantity, Time, `EncodedColumn` or array, shape (N,)
-    source : str
-        File.
-    name : str
-        Column.
-    place : callable, optional
-        Name of a row, by its index in `values`.
-    usual_unit : str, optional
-        Unit of a column of this name, where the file gives none.
-    """
-
-    values: Any
-    source: str
-    name: str
-    place: Place = row_number
-    usual_unit: str | None = None
+    values: Any  # (N,): astropy Column, Quantity, Time, `EncodedColumn` or array
+    source: str  # file
+    name: str  # column
+    place: Place = row_number  # name of a row, by its index
+    usual_unit: str | None = None  # of columns of this name, where the file gives none
 
     @property
     def where(self) -> str:
@@ -101,12 +79,12 @@ class SourceColumn:
         return apu.Unit(self.usual_unit) if own is None and self.usual_unit else own
 
     def fail(self, index: int, cause: str, do: str = "correct the row or drop it") -> InputError:
-        """The error about one value."""
+        """Error about one value."""
         where = f"{self.source}, {self.place(index)}, column {self.name!r}"
         return InputError(cause, where=where, do=do)
 
     def _plain(self) -> NDArray[Any]:
-        """The values as a one-dimensional array without masked ones."""
+        """Values as a one-dimensional array without masked ones."""
         mask = np.broadcast_to(getattr(self.values, "mask", False), np.shape(self.values))
         if np.ndim(self.values) != 1:
             raise InputError(
@@ -124,7 +102,7 @@ class SourceColumn:
         return np.asarray(getattr(plain, "value", plain))
 
     def _by_label(self, read: Callable[[SourceColumn], Array]) -> Array:
-        """What is read from the labels, for each row."""
+        """Values that are parsed label by label, for each row."""
         column = self.values
         try:
             return read(replace(self, values=Column(column.labels, unit=column.unit)))[column.codes]
@@ -132,17 +110,7 @@ class SourceColumn:
             return read(replace(self, values=Column(column.plain, unit=column.unit)))
 
     def numbers(self) -> Float:
-        """Finite numbers, in the unit of the file.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-
-        Raises
-        ------
-        InputError
-            For text, a missing value, NaN or infinity.
-        """
+        """Numbers (N,) in the file's unit; text, a missing value, NaN or infinity is refused."""
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.numbers)
         values = self._plain()
@@ -163,17 +131,7 @@ class SourceColumn:
         return out
 
     def numbers_or(self, value: float) -> Float:
-        """Numbers, with one value in place of those that are missing or not finite.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-
-        Raises
-        ------
-        InputError
-            For text.
-        """
+        """Numbers (N,), with `value` where missing or not finite; text is refused."""
         if isinstance(self.values, EncodedColumn):
             return replace(self, values=self.values.plain).numbers_or(value)
         mask = absent(self.values, not_finite=True)
@@ -186,7 +144,7 @@ class SourceColumn:
     def _parsed(
         self, texts: NDArray[Any], parse: Callable[[str], Any], wanted: str
     ) -> NDArray[Any]:
-        """Each text parsed; the first that is not what is wanted ends it."""
+        """Parsed texts; the first one that cannot be parsed is refused."""
         out = []
         for index, text in enumerate(texts):
             try:
@@ -198,13 +156,7 @@ class SourceColumn:
         return np.array(out)
 
     def integers(self) -> Int:
-        """Whole numbers.
-
-        Raises
-        ------
-        InputError
-            For anything else.
-        """
+        """Whole numbers (N,); anything else is refused."""
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.integers)
         if np.asarray(getattr(self.values, "unmasked", self.values)).dtype.kind == "i":
@@ -217,13 +169,7 @@ class SourceColumn:
         return values.astype(np.int64)
 
     def labels(self) -> tuple[Int, tuple[str, ...]]:
-        """Codes, and the names that they stand for in the order of their first appearance.
-
-        Returns
-        -------
-        codes : ndarray of int, shape (N,)
-        names : tuple of str
-        """
+        """Codes (N,), and their names in the order of their first appearance."""
         if isinstance(self.values, EncodedColumn):
             own, unique = replace(self, values=self.values.labels).labels()
             return own[self.values.codes], unique
@@ -239,19 +185,10 @@ class SourceColumn:
         return again[codes], unique
 
     def years(self) -> Float:
-        """Epochs as decimal years.
+        """Epochs (N,) as decimal years; no date, or one outside 1800 to 2200, is refused.
 
         Numbers are years, or Modified Julian Dates where the column's unit is the day; texts are
         such numbers or ISO dates.
-
-        Returns
-        -------
-        ndarray, shape (N,)
-
-        Raises
-        ------
-        InputError
-            For what is no date, or lies outside 1800 to 2200.
         """
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.years)
@@ -313,7 +250,7 @@ class SourceColumn:
         return np.array(years)[codes]
 
     def _year(self, text: str) -> float:
-        """Year of a date, or of a number that stands among dates."""
+        """Decimal year of a date, or of a number that stands among dates."""
         if _all_numbers([text]):
             number = Column([float(text)], unit=getattr(self.values, "unit", None))
             return float(replace(self, values=number)._numeric_years()[0])

@@ -1,4 +1,4 @@
-"""Table files to an astropy Table; whatever is wrong with one becomes one clear error."""
+"""Table files to an astropy Table; anything wrong with one becomes one clear error."""
 
 from __future__ import annotations
 
@@ -39,36 +39,24 @@ _FITS = b"SIMPLE  ="
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """`naming_faults`, with the warnings of readers silenced.
+    """Context of `naming_faults` in which the warnings of readers are silenced.
 
-    Python keeps its rules for warnings once for all threads: what several of them do at a time does
-    without.
+    Python keeps its rules for warnings once for all threads, so that several threads at a time must
+    do without.
     """
     with naming_faults(path), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # units are judged later, column by column
+        warnings.simplefilter("ignore")  # units are checked later, column by column
         warnings.filterwarnings("error", message=".*truncated.*")
         yield
 
 
 @contextmanager
 def naming_faults(path: Path, where: str = "") -> Iterator[None]:
-    """Turn whatever goes wrong while a file is read into an error that names the file.
+    """Turn any failure while a file is read into an error that names the file, or `where` in it.
 
-    Readers of damaged files raise exceptions of every kind, so all are taken; only our own pass as
-    they are.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-    where : str, optional
-        File and part of it, for damage.
-
-    Raises
-    ------
-    InputError
-        When the system refuses to read.
-    FormatError
-        When the content is not what the format demands.
+    Readers of damaged files raise exceptions of every kind, so all are caught; only our own pass as
+    they are.  InputError when the system refuses to read, FormatError when the content is not what
+    the format demands.
     """
     try:
         yield
@@ -90,7 +78,7 @@ def naming_faults(path: Path, where: str = "") -> Iterator[None]:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text file, with their ends; what cannot be read or is no text is refused."""
+    """Lines of a text file, with their ends; a file that is unreadable or no text is refused."""
     with reading(path), path.open(encoding="utf-8", newline="") as stream:
         return stream.readlines()
 
@@ -167,7 +155,7 @@ def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
     for number, table in enumerate(tables, 1):
         if len(tables) > 1 and "EXT_NUMBER" not in table.colnames:
             table["EXT_NUMBER"] = number
-        table.meta = {}  # what SExtractor was told
+        table.meta = {}  # settings of SExtractor
     out = vstack(tables, metadata_conflicts="silent") if len(tables) > 1 else tables[0]
     for key in ("MJD-OBS", "DATE-OBS"):
         if key in image:
@@ -242,23 +230,11 @@ def is_fits(path: Path) -> bool:
 
 
 def read_table(path: Path) -> Table:
-    """Table of a file, by its extension.
+    """Table of a file, by its extension; one that is missing, damaged or unknown is refused.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        .ecsv, .csv, .tsv, .fits (first table extension, of FITS_LDAC the objects; also .fits.gz),
-        .parquet, .vot or .xml (VOTable), .tbl or .ipac; other names by content: FITS, and text as
-        `parse_text_table` knows it.
-
-    Returns
-    -------
-    astropy.table.Table
-
-    Raises
-    ------
-    InputError
-        When the file is missing, of another kind, damaged or truncated.
+    Known are .ecsv, .csv, .tsv, .fits (first table extension, of FITS_LDAC the objects; also
+    .fits.gz), .parquet, .vot or .xml (VOTable), .tbl and .ipac; other names by content: FITS, and
+    text as `parse_text_table` knows it.
     """
     name = path.name.lower().removesuffix(".gz")
     reader = next((r for end, r in TABLE_SUFFIXES.items() if name.endswith(end)), None)

@@ -1,4 +1,4 @@
-"""Which column is what: by the user, or by the names, units and origins that programs give."""
+"""Quantities of columns: by the user, or by the names, units and origins that programs give."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ PAIRS = (
 )
 
 _MAS, _MOTION = "mas", "mas / yr"
-# of columns that a catalogue documents; two of its other names beside them say that it is this one
+# of columns that a catalogue documents; two of its other names with them show that it is this one
 _CATALOGUES: tuple[tuple[dict[str, str], frozenset[str]], ...] = (
     (  # Gaia archive
         {
@@ -123,7 +123,7 @@ _FROM_ZERO = {
     **dict.fromkeys(("xcentroid", "x_centroid", "x_fit"), "photutils"),
     **dict.fromkeys(("slot_centroid_x", "base_sdsscentroid_x"), "the LSST pipelines"),
 }
-# program, and columns that stand beside its x, y
+# program, and columns that it writes with its x, y
 _COUNTS_FROM_ZERO: tuple[tuple[str, frozenset[str]], ...] = (
     ("sep", frozenset(("tnpix", "xcpeak"))),
     ("photutils", frozenset(("aperture_sum",))),
@@ -141,7 +141,7 @@ def find_columns(
     source: str,
     pairs: Iterable[tuple[str, str]] = (),
 ) -> dict[str, str]:
-    """Which column of a file is what, for the quantities that it has.
+    """Column of each quantity that a file has.
 
     `mapping` gives what the user names (an empty name leaves a quantity out), `aliases` the usual
     names, in lower case, for the rest; of `pairs` the names go together: those of which the file
@@ -192,7 +192,7 @@ def _nearest(name: str, choices: Iterable[str]) -> str:
 def known_unit(name: str, names: Iterable[str]) -> str | None:
     """Unit that a column has by its name, where its file gives none, or None.
 
-    A catalogue is recognised by two of its `names` beside this one.
+    A catalogue is recognised by two of its `names` apart from this one.
     """
     name, others = name.lower(), {other.lower() for other in names}
     if name in _DAYS:
@@ -204,9 +204,9 @@ def known_unit(name: str, names: Iterable[str]) -> str | None:
 
 
 def origin_of(column: str, names: Iterable[str], header: Mapping[str, Any]) -> tuple[int, str]:
-    """Coordinate (0 or 1) of the centre of the first pixel, and why it is that.
+    """Coordinate (0 or 1) of the centre of the first pixel, and the reason.
 
-    `column` is that of x; the reason is empty where nothing is said of it, and 1 is FITS's own.
+    `column` is that of x; where the reason is empty nothing is known, and 1 is FITS's own.
     """
     for key, value in header.items():
         if str(key).lower() in _ORIGIN_KEYS and str(value).strip() in ("0", "1"):

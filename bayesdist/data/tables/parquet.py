@@ -32,22 +32,12 @@ _BUFFER = 2**18  # bytes: without a buffer, Arrow loads the columns of a whole r
 
 @dataclass(frozen=True, eq=False)
 class RowBlock:
-    """Consecutive rows of a file, with the columns that an astropy Table would have.
+    """Consecutive rows of a file, with the columns that an astropy Table would have."""
 
-    Parameters
-    ----------
-    first : int
-        0-based row in the file of the first one.
-    columns : mapping of str to pyarrow.ChunkedArray
-    units : mapping of str to str
-    encoded : collection of str
-        Columns to be given as `EncodedColumn`.
-    """
-
-    first: int
+    first: int  # row in the file of the first one, from 0
     columns: Mapping[str, pyarrow.ChunkedArray]
     units: Mapping[str, str]
-    encoded: Collection[str]
+    encoded: Collection[str]  # columns to be given as `EncodedColumn`
 
     @property
     def colnames(self) -> list[str]:
@@ -68,24 +58,13 @@ class RowBlock:
 
 @dataclass(frozen=True, eq=False)
 class ParquetPart:
-    """What is known of a Parquet file without its rows.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-    group_rows : tuple of int
-        Rows of each row group.
-    colnames : tuple of str
-    units : mapping of str to str
-    texts : frozenset of str
-        Columns of strings, or of dictionaries.
-    """
+    """Description of a Parquet file without its rows."""
 
     path: Path
-    group_rows: tuple[int, ...]
+    group_rows: tuple[int, ...]  # rows of each row group
     colnames: tuple[str, ...]
     units: Mapping[str, str]
-    texts: frozenset[str]
+    texts: frozenset[str]  # columns of strings, or of dictionaries
 
     @property
     def n_rows(self) -> int:
@@ -121,25 +100,10 @@ class ParquetPart:
         stop: int | None = None,
         size: int,
     ) -> Iterator[RowBlock]:
-        """Rows `start` to `stop`, not more than `size` at a time.
+        """Blocks of rows `start` to `stop` (from 0), of at most `size` rows each.
 
-        Parameters
-        ----------
-        columns : sequence of str
-        encoded : collection of str
-            Those that are to be given as `EncodedColumn`.
-        start, stop : int
-            0-based; to the end by default.
-        size : int
-
-        Yields
-        ------
-        RowBlock
-
-        Raises
-        ------
-        InputError
-            When the file is damaged, gone, or not what it was when it was described.
+        Columns of `encoded` are given as `EncodedColumn`.  InputError when the file is damaged,
+        gone, or not what it was when it was described.
         """
         import pyarrow
 
@@ -165,7 +129,7 @@ class ParquetPart:
     def _batches(
         self, columns: Sequence[str], encoded: Collection[str], start: int, stop: int
     ) -> Iterator[pyarrow.RecordBatch]:
-        """The rows as they are decoded."""
+        """Rows as they are decoded."""
         import pyarrow
 
         if start >= stop:
@@ -175,7 +139,7 @@ class ParquetPart:
         with _opened(self.path, self.texts & set(encoded)) as stored:
             if _group_rows(stored) != self.group_rows or _names(stored) != self.colnames:
                 raise self._changed()
-            # only next() is guarded: what the consumer raises is not the file's fault
+            # only next() is guarded: exceptions of the consumer are not the file's fault
             decoded = stored.iter_batches(_BATCH, row_groups=groups, columns=list(columns))
             while True:
                 try:
@@ -201,7 +165,7 @@ class ParquetPart:
         groups: Sequence[int],
         error: Exception,
     ) -> InputError:
-        """The error about the first row group that cannot be read."""
+        """Error about the first row group that cannot be read."""
         where = str(self.path)
         for group in groups:
             if self._edges[group + 1] <= reached:
@@ -221,21 +185,7 @@ class ParquetPart:
 
 
 def describe_part(path: Path) -> ParquetPart:
-    """What the end of a Parquet file says about it.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-
-    Returns
-    -------
-    ParquetPart
-
-    Raises
-    ------
-    InputError
-        When the file is missing, damaged or no Parquet.
-    """
+    """Description of a Parquet file from its footer; one that is missing or damaged is refused."""
     import pyarrow
 
     with _opened(path) as stored, naming_faults(path):
@@ -258,7 +208,7 @@ def describe_part(path: Path) -> ParquetPart:
 
 @contextmanager
 def _opened(path: Path, as_codes: Collection[str] = ()) -> Iterator[pyarrow.parquet.ParquetFile]:
-    """A file of which no more is held than what is being decoded."""
+    """Open file of which only the part being decoded is held in memory."""
     import pyarrow.parquet
 
     with naming_faults(path):

@@ -1,4 +1,4 @@
-"""The columns of a table by what they are."""
+"""Columns of a table by quantity."""
 
 from __future__ import annotations
 
@@ -23,31 +23,18 @@ class Columns(Protocol):
         """Rows."""
 
     def __getitem__(self, name: str) -> Any:
-        """What `SourceColumn` takes."""
+        """Values as `SourceColumn` takes them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Quantities:
-    """Columns of a table by what they are.
-
-    Parameters
-    ----------
-    table : Columns
-    found : mapping of str to str
-        Column of each quantity.
-    source : str
-        File, for errors.
-    place : callable, optional
-        Name of a row, by its index.
-    names : sequence of str, optional
-        All columns of the file, where the table has but some: they say which catalogue it is.
-    """
+    """Columns of a table by quantity."""
 
     table: Columns
-    found: Mapping[str, str]
-    source: str
-    place: Place = row_number
-    names: Sequence[str] = ()
+    found: Mapping[str, str]  # column of each quantity
+    source: str  # file, for errors
+    place: Place = row_number  # name of a row, by its index
+    names: Sequence[str] = ()  # all columns of the file: they tell which catalogue it is
 
     def __contains__(self, key: str) -> bool:
         return key in self.found

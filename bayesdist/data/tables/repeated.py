@@ -1,4 +1,4 @@
-"""Rows that stand twice in a table, whether it is held in memory or streams by.
+"""Repeated rows of a table that is held in memory or streamed.
 
 Rows are hashed to one integer each, so that ten million of them need one sort, not one for each
 key; only rows whose hashes meet are compared in full.  Of a table that streams by, the hashes are
@@ -36,32 +36,17 @@ def first_duplicate(keys: Keys) -> tuple[int, int] | None:
 
 
 def buckets_for(n_rows: int) -> int:
-    """Into how many buckets the hashes of `n_rows` rows are to be sorted."""
+    """Number of buckets into which the hashes of `n_rows` rows are to be sorted."""
     return max(1, -(-n_rows // HELD))
 
 
 def first_repetition(batches: Batches, buckets: int) -> tuple[int, int] | None:
-    """A pair of rows that agree in all keys, of a table that is gone through batch by batch.
+    """Row numbers of a row and of its first repetition in all keys; None where no row repeats.
 
-    Parameters
-    ----------
-    batches : callable
-        Gives the table anew at each call: an iterable of batches of rows, each a sequence of keys
-        as `first_duplicate` takes them.
-    buckets : int
-        1 / `buckets` of the hashes are held at a time.
-
-    Returns
-    -------
-    tuple of int, or None
-        Row numbers, counted over all batches, of a row and of its first repetition; None where no
-        row repeats.  It is the earliest such pair, unless more than 100 000 different rows repeat:
-        then it is the earliest of the first of them that come to light.
-
-    Raises
-    ------
-    InputError
-        When the scratch folder is full.
+    `batches` gives the table anew at each call: an iterable of batches of rows, each a sequence of
+    keys as `first_duplicate` takes them; 1 / `buckets` of the hashes are held at a time.  The pair
+    is the earliest one, unless more than 100 000 different rows repeat: then it is the earliest of
+    the first of them that are found.  InputError when the scratch folder is full.
     """
     waiting: list[UInt] = []
     for k, hashes in enumerate(_bucketed(batches, buckets)):
@@ -99,7 +84,7 @@ def _hashed(keys: Keys) -> UInt:
 
 
 def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
-    """The hashes of each bucket; the table is gone through once."""
+    """Hashes of each bucket; the table is read once."""
     if buckets == 1:
         found = [_hashed(keys) for keys in batches()]
         yield np.concatenate(found) if found else np.zeros(0, np.uint64)
@@ -130,7 +115,7 @@ def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
 
 
 def _joined(pieces: Iterable[UInt]) -> Iterator[UInt]:
-    """The same hashes in pieces of a size that keeps the list of places in the file short."""
+    """Hashes in larger pieces, so that the list of their positions in the file stays short."""
     waiting: list[UInt] = []
     for piece in pieces:
         waiting.append(piece)
@@ -142,7 +127,7 @@ def _joined(pieces: Iterable[UInt]) -> Iterator[UInt]:
 
 
 def _repeated(hashed: UInt) -> UInt:
-    """Hashes that stand more than once; the array is sorted in place."""
+    """Hashes that occur more than once; the array is sorted in place."""
     hashed.sort()
     twice = hashed[1:][hashed[1:] == hashed[:-1]]
     return np.unique(twice)

@@ -1,4 +1,4 @@
-"""Units stop at the door: every unit in a file becomes one of four words, or an error."""
+"""Units are resolved on reading: every unit in a file becomes one of four words, or an error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["UNITS", "check_unit", "conversion", "length_advice", "unit_of", "wit
 
 UNITS = ("pix", "arcsec", "mas", "deg")
 
-# what other programs write where astropy expects 'pix' or 'deg'
+# names that other programs write where astropy expects 'pix' or 'deg'
 _SPELLINGS = {
     "pixels": "pix",
     "pixel": "pix",
@@ -36,7 +36,7 @@ def check_unit(unit: str, *, where: str = "unit") -> str:
 
 
 def length_advice(unit: str) -> str:
-    """What to do with positions in a length, as millimetres of a focal plane; empty for others."""
+    """Advice on positions in a length, as millimetres of a focal plane; empty for other units."""
     parsed = apu.Unit(unit.strip(), parse_strict="silent")
     if parsed.physical_type != "length":
         return ""
@@ -47,7 +47,7 @@ def length_advice(unit: str) -> str:
 
 
 def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
-    """Unit of a table's column, None where it has none; one that nobody knows is refused."""
+    """Unit of a table's column, None where it has none; an unknown one is refused."""
     unit = getattr(column, "unit", None)
     if unit is None:
         return None
@@ -63,7 +63,7 @@ def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
 
 
 def conversion(unit: apu.UnitBase, to: str, *, where: str) -> float:
-    """Factor that brings values of `unit` to `to`; an error where they measure different things."""
+    """Factor from values of `unit` to those of `to`; units of different quantities are refused."""
     try:
         return float(unit.to(apu.Unit(to)))
     except apu.UnitConversionError:

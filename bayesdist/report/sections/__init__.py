@@ -1,4 +1,4 @@
-"""What the report of a run shows, section by section: importing this registers all of it."""
+"""Sections of the report of a run; importing this registers all of them."""
 
 from bayesdist.report.contents import REPORT
 from bayesdist.report.sections import explorer

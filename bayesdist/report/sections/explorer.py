@@ -1,4 +1,4 @@
-"""Numbers that a page carries so that it can compute the budget, and show maps, by itself."""
+"""Numbers of a page from which it computes the budget, and shows maps, by itself."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ Float = NDArray[np.float64]
 
 MOMENT_DIGITS = 7  # quadratic forms of them cancel in part
 MAP_DIGITS = 5
-MOST_POINTS = 65  # of a map on the longer side: no pointer tells more of them apart
+MOST_POINTS = 65  # of a map on the longer side: a pointer cannot separate more of them
 _COLORS = 12
 
 
 @REPORT.data(needs=("surface",))
 def budget_data(r: ReportInput) -> dict[str, Any]:
-    """The budget as a function of position, epoch and magnitude."""
+    """Budget as a function of position, epoch and magnitude."""
     s = r.surface
     assert s is not None
     nodes = s.spans[0].nodes
@@ -70,7 +70,7 @@ def budget_data(r: ReportInput) -> dict[str, Any]:
 
 @REPORT.data()
 def map_data(r: ReportInput) -> dict[str, Any]:
-    """The maps that a pointer reads: radial uncertainty and pixel area."""
+    """Maps that a pointer reads: radial uncertainty and pixel area."""
     chips = r.chips
     layers = []
     for k, first in enumerate(chips[0].maps):
@@ -110,13 +110,13 @@ def _layer(name: str, unit: str, maps: list[Float], digits: int = MAP_DIGITS) ->
 
 
 def _step(n: int) -> int:
-    """Every how many points are kept, so that the outermost ones are among them."""
+    """Step between the points that stay, so that the outermost ones are among them."""
     steps = [k for k in range(1, n) if (n - 1) % k == 0 and (n - 1) // k < MOST_POINTS]
     return steps[0] if steps else 1
 
 
 def _triangles(moments: Float) -> list[list[list[float | None]]]:
-    """By node and axis, the upper triangle row by row; what stands twice is added up."""
+    """Upper triangles row by row, by node and axis; symmetric pairs are added up."""
     K = moments.shape[-1]
     i, j = np.triu_indices(K)
     values = moments[..., i, j] * np.where(i == j, 1.0, 2.0)

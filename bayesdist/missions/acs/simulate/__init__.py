@@ -1,7 +1,7 @@
-"""The ACS/WFC calibration campaign on 47 Tucanae, of known truth.
+"""Simulated calibration campaign of ACS/WFC on 47 Tucanae, with its truth.
 
-What ACS ISR 2015-06 had before it, and what it could not know: star lists of exposures over twelve
-years, a standard catalogue, a log; and the distortion, tables, frames and stars they came from.
+Input as of ACS ISR 2015-06: star lists of exposures over twelve years, a standard catalogue, a log;
+and, unknown to a calibration, the distortion, tables, frames and stars behind them.
 """
 
 from bayesdist.missions.acs.simulate.campaign import AcsCampaign

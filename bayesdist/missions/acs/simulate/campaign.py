@@ -1,4 +1,4 @@
-"""A simulated campaign: what a calibration starts from, with the truth beside it."""
+"""Simulated campaign: the input of a calibration, and its truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was measured on one exposure: stars with their errors, blends, and what is no star."""
+"""Detections of one exposure: stars with their errors, blends, and false detections."""
 
 from __future__ import annotations
 
@@ -18,54 +18,30 @@ __all__ = ["Detector", "cte_shift", "star_list"]
 Float = NDArray[np.float64]
 
 BORDER = 5.0  # pixels: too close to an edge for a fit
-LIMIT, SOFT = -7.5, 0.3  # magnitude at which half of the stars are found, and width of the fall
+LIMIT, SOFT = -7.5, 0.3  # magnitude at which half of the stars are found, and width of the decline
 SATURATED = -14.0  # Figure 5
 
 LAUNCH = 2002.2
 CTE = 0.1  # pixels after 12 years and 2048 transfers at magnitude -9 (Section 3)
-REACH = 2.0  # pixels from which a neighbour is not told apart
+REACH = 2.0  # pixels within which a neighbour is blended
 
 
 @dataclass(frozen=True)
 class Detector:
-    """How exposures are measured.
+    """Errors of the detections of an exposure."""
 
-    Parameters
-    ----------
-    centroid : float
-        Factor on the centroid errors; 0 gives exact positions.
-    false : float
-        Share of a list that is no star: cosmic rays and junk.
-    blended : float
-        Share of the stars that something beside them moves.
-    cte : bool
-        Whether trailed charge moves the positions.
-    """
-
-    centroid: float = 1.0
-    false: float = 0.05
-    blended: float = 0.01
-    cte: bool = False
+    centroid: float = 1.0  # factor on the centroid errors; 0 gives exact positions
+    false: float = 0.05  # fraction of a list that is no star: cosmic rays and junk
+    blended: float = 0.01  # fraction of the stars that a close neighbour displaces
+    cte: bool = False  # True where trailed charge displaces the positions
 
 
 def cte_shift(chip: int, y: Float, mag: Float, epoch: float) -> Float:
-    """Shift along y by charge that is left behind during the readout.
+    """Shift along y (N,), pixels, by charge that is left behind during the readout.
 
-    ACS ISR 2015-06, Section 3: about 0.1 px, growing with time, with the number of transfers and
-    to the faint end.  WFC1 is read out at its upper edge and WFC2 at its lower one; the trail
-    points away from it.
-
-    Parameters
-    ----------
-    chip : int
-    y : ndarray, shape (N,)
-    mag : ndarray, shape (N,)
-    epoch : float
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        Pixels, to be added to y.
+    ACS ISR 2015-06, Section 3: about 0.1 px, growing with time, with the number of transfers and to
+    the faint end.  WFC1 is read out at its upper edge and WFC2 at its lower one; the trail points
+    away from it.
     """
     transfers = (2048.5 - y if chip == 1 else y - 0.5) / 2048.0
     size = CTE * max(epoch - LAUNCH, 0.0) / 12.0 * transfers * 10 ** (0.15 * (mag + 9.0))
@@ -75,22 +51,7 @@ def cte_shift(chip: int, y: Float, mag: Float, epoch: float) -> Float:
 def star_list(
     truth: AcsTruth, exposure: str, detector: Detector, rng: np.random.Generator
 ) -> tuple[StarList, DetectionTruth]:
-    """Measure an exposure.
-
-    Parameters
-    ----------
-    truth : AcsTruth
-        Its `detections` are not used.
-    exposure : str
-    detector : Detector
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    StarList
-        In no order.
-    DetectionTruth
-    """
+    """Simulated detections of an exposure, in no order, and their truth."""
     e = truth.frames.names.index(exposure)
     epoch = truth.log[exposure].epoch
     u, v = truth.stars.at(epoch)
@@ -138,7 +99,7 @@ def _measured(
         y = y + cte_shift(chip.number, y, mag, epoch)
     moved = detector.centroid * error * rng.standard_normal((2, n))
 
-    # a neighbour draws the centroid by its share of the light
+    # a neighbour draws the centroid by its fraction of the light
     blended = rng.uniform(size=n) < detector.blended
     distance = REACH * np.sqrt(rng.uniform(size=n))
     angle = rng.uniform(0.0, 2.0 * np.pi, n)

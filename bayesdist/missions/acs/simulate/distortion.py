@@ -1,10 +1,10 @@
-"""The distortion of ACS/WFC as a model and its true parameters.
+"""Distortion of ACS/WFC as a model and its true parameters.
 
 Linear terms and their drift are those of ACS ISR 2015-06, Tables 1-3 and Section 4.4.1, in the
 report's gauge: WFC2 is the reference, there A_1 = B_1 = 0 and A_3 = 0, and WFC1 lies in the system
 of WFC2.  The report does not print the higher terms.  They are made up here, to one or two digits
-of the size that they have in the tables which the observatory delivers: a displacement of some 65
-pixels in the corners.
+of their size in the tables which the observatory delivers: a displacement of some 65 pixels in the
+corners.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def acs_model() -> DistortionModel:
 
 
 def acs_solution(filter: str = "F606W") -> tuple[DistortionModel, Float]:
-    """The true distortion in a filter.
+    """True distortion in a filter.
 
     Parameters
     ----------

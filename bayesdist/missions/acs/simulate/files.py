@@ -1,4 +1,4 @@
-"""A campaign as a folder of files, and back."""
+"""Simulated campaign as a folder of files, written and read."""
 
 from __future__ import annotations
 

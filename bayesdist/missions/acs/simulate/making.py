@@ -44,7 +44,7 @@ def simulate_acs(
     pa_v3: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> AcsCampaign:
-    """The campaign of ACS ISR 2015-06: star lists of 47 Tuc, and what they were made from.
+    """Campaign of ACS ISR 2015-06: star lists of 47 Tuc, and their truth.
 
     Each part has random numbers of its own: an option that changes one leaves the others as they
     are.
@@ -52,7 +52,7 @@ def simulate_acs(
     Parameters
     ----------
     folder : path-like, optional
-        Where to write it, as `write_acs`.
+        Folder to write it to, as `write_acs`.
     seed : int, optional
     n_exposures : int, optional
         In F606W.
@@ -63,9 +63,9 @@ def simulate_acs(
     n_other : int, optional
         Exposures in each other filter.
     fine_scale : bool, optional
-        Whether there are look-up tables of the detector and of the filters.
+        True for look-up tables of the detector and of the filters.
     cte : bool, optional
-        Whether trailed charge moves the positions.
+        True where trailed charge displaces the positions.
     scatter : float, optional
         Standard deviation of A_2, B_2 and B_3 from exposure to exposure, mostly common to both
         chips.
@@ -74,9 +74,9 @@ def simulate_acs(
     centroid : float, optional
         Factor on the centroid errors; 0 gives exact positions.
     false : float, optional
-        Share of each list that is no star.
+        Fraction of each list that is no star.
     blended : float, optional
-        Share of the stars that something beside them moves, by up to half a pixel.
+        Fraction of the stars that a close neighbour displaces, by up to half a pixel.
     pa_v3 : float, optional
         One roll angle for all exposures, degrees, in place of angles that follow the Sun.
     progress : callable, optional
@@ -89,7 +89,7 @@ def simulate_acs(
     Raises
     ------
     InputError
-        For an unknown or repeated filter, too few exposures or stars, shares outside [0, 1), a
+        For an unknown or repeated filter, too few exposures or stars, fractions outside [0, 1), a
         negative size, and as `write_acs`.
     """
     _check(filters, n_exposures=n_exposures, n_other=n_other)

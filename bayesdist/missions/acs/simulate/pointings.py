@@ -1,4 +1,4 @@
-"""When and where the telescope looked: the log of the exposures and their true frames.
+"""Pointings in time and on the sky: the log of the exposures and their true frames.
 
 ACS ISR 2015-06, Section 3: 110 exposures over twelve years, all roll angles, dithered over the
 catalogue.  The roll follows the Sun, as that of HST must, so that velocity aberration goes with
@@ -33,7 +33,7 @@ SPANS = ((2002.3, 2007.1), (SM4 + 0.02, 2014.6))  # ACS was off between them
 DITHER = 1500.0  # pixels to each side: the frame stays inside the catalogue
 MIDDLE = (0.0, 1040.0)  # of the two chips, from the reference pixel of WFC2
 OFF_NOMINAL = 20.0  # degrees that the roll may differ from that towards the Sun
-POINTING = 10.0  # pixels (0.5"): what the guide stars leave, and the log does not know
+POINTING = 10.0  # pixels (0.5"): error of the guide stars, which the log does not include
 ROLL = np.radians(0.003)
 
 ORBIT = 7.5  # km/s
@@ -42,45 +42,27 @@ INCLINATION = np.radians(28.5)
 # Angle from V2 to the U axis of the reference gauge (along X of WFC2)
 TO_V2 = -2.234
 MUCH = 10.0  # times the usual deviation: an outlying exposure
-OWN = 0.25  # of the deviations that the chips share: those of WFC1 by itself
+OWN = 0.25  # of the deviations common to the chips: those of WFC1 by itself
 ZERO_POINT = {"F435W": 0.9, "F475W": 0.3, "F606W": 0.0, "F814W": 0.5}
 
 
 @dataclass(frozen=True, eq=False)
 class AcsFrames:
-    """How each exposure's system lies on the catalogue.
+    """Maps from each of E exposures to the catalogue.
 
         (u, v) = centre + vafactor R(angle) (I + shared) w,   w = P(x', y') + own (x', y')
 
     with P the polynomial of the chip in the reference gauge, and `own` only on WFC1.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Of the E exposures.
-    centre : ndarray, shape (E, 2)
-        Position of the reference pixel of WFC2 in the catalogue, pixels.
-    angle : ndarray, shape (E,)
-        Rotation in radians.
-    vafactor : ndarray, shape (E,)
-        Scale by velocity aberration.
-    shared, own : ndarray, shape (E, 2, 2)
-        Deviation of the linear terms in this exposure (breathing): of both chips together, and of
-        WFC1 beyond that.
-    outlying : ndarray of bool, shape (E,)
-        Exposures whose deviations are drawn ten times larger.
-    zero_point : ndarray, shape (E,)
-        Measured less catalogue magnitude.
     """
 
     names: tuple[str, ...]
-    centre: Float
-    angle: Float
-    vafactor: Float
-    shared: Float
-    own: Float
-    outlying: NDArray[np.bool_]
-    zero_point: Float
+    centre: Float  # (E, 2), reference pixel of WFC2 in the catalogue, pixels
+    angle: Float  # (E,), radians
+    vafactor: Float  # (E,), scale by velocity aberration
+    shared: Float  # (E, 2, 2), deviation of the linear terms (breathing), both chips
+    own: Float  # (E, 2, 2), of WFC1 beyond that
+    outlying: NDArray[np.bool_]  # (E,), deviations drawn ten times larger
+    zero_point: Float  # (E,), measured less catalogue magnitude
 
     def __len__(self) -> int:
         return len(self.names)
@@ -89,20 +71,9 @@ class AcsFrames:
 def exposures_of(
     filter: str, n: int, rng: np.random.Generator, *, pa_v3: float | None = None
 ) -> tuple[Exposure, ...]:
-    """Exposures in a filter, evenly spread over the years in which ACS worked.
+    """Exposures in a filter by rising epoch, evenly spread over the years in which ACS worked.
 
-    Parameters
-    ----------
-    filter : str
-    n : int
-    rng : numpy.random.Generator
-    pa_v3 : float, optional
-        One roll angle for all, degrees, in place of those that follow the Sun.
-
-    Returns
-    -------
-    tuple of Exposure
-        By rising epoch.
+    `pa_v3` is one roll angle for all, degrees, in place of those that follow the Sun.
     """
     lengths = np.array([end - start for start, end in SPANS])
     # one in each of n equal stretches of the observing time
@@ -148,23 +119,11 @@ def catalog_rotation(pa_v3: float) -> float:
 def frames_of(
     log: ExposureLog, rngs: Sequence[np.random.Generator], *, scatter: float, outlying: float
 ) -> AcsFrames:
-    """True frames of the exposures of a log.
+    """True frames of the exposures of a log, off its pointing by some 10 pixels and 0.003 degrees.
 
-    Parameters
-    ----------
-    log : ExposureLog
-        With vafactor, pa_v3, ra and dec.
-    rngs : sequence of numpy.random.Generator
-        One for each exposure.
-    scatter : float
-        Standard deviation of A_2, B_2 and B_3 from exposure to exposure.
-    outlying : float
-        Probability of an outlying exposure.
-
-    Returns
-    -------
-    AcsFrames
-        Off the pointing of the log by some 10 pixels, and off its roll by some 0.003 degrees.
+    The log has vafactor, pa_v3, ra and dec; each exposure has random numbers of its own.  `scatter`
+    is the standard deviation of A_2, B_2 and B_3 from exposure to exposure, `outlying` the
+    probability of an outlying exposure.
     """
     log.require("vafactor", "pa_v3", "ra", "dec")
     n = len(log)

@@ -1,7 +1,7 @@
-"""The field beside 47 Tucanae: its stars as they are, and as the standard catalogue has them.
+"""Field west of 47 Tucanae: its true stars, and their standard catalogue.
 
 ACS ISR 2015-06, Section 2: 53917 stars, tangent plane in ACS/WFC pixels, (5000, 5000) at the centre
-of the field 6.7' west of the cluster, epoch 2004.5.  u grows to the west and v to the north.
+of the field 6.7' west of the cluster, epoch 2004.5. u grows to the west and v to the north.
 """
 
 from __future__ import annotations
@@ -45,23 +45,13 @@ POOR = 0.08  # 4270 of 53917 lie above the line of Figure 3
 
 @dataclass(frozen=True, eq=False)
 class TrueStars:
-    """Stars as they are.
+    """True positions, motions and magnitudes of the stars (N,)."""
 
-    Parameters
-    ----------
-    u, v : ndarray, shape (N,)
-        Positions at 2004.5, pixels of the catalogue.
-    pm_u, pm_v : ndarray, shape (N,)
-        Pixels per year.
-    mag : ndarray, shape (N,)
-        Instrumental magnitude, -2.5 log10(flux / exposure time).
-    """
-
-    u: Float
+    u: Float  # at 2004.5, pixels of the catalogue
     v: Float
-    pm_u: Float
+    pm_u: Float  # pixels per year
     pm_v: Float
-    mag: Float
+    mag: Float  # instrumental, -2.5 log10(flux / exposure time)
 
     def __len__(self) -> int:
         return len(self.u)
@@ -73,18 +63,10 @@ class TrueStars:
 
 
 def centroid_error(mag: Float) -> Float:
-    """Error of a measured position on each axis, pixels.
+    """Error of a measured position on each axis, pixels, at instrumental magnitudes.
 
-    Parameters
-    ----------
-    mag : ndarray
-        Instrumental magnitude.
-
-    Returns
-    -------
-    ndarray
-        0.01 px at -14 and 0.02 px at -10 (Section 2.2 and Figure 3), from there with the noise of
-        the photons and then of the sky; above saturation at -14 growing with the excess.
+    0.01 px at -14 and 0.02 px at -10 (Section 2.2 and Figure 3), from there with the noise of the
+    photons and then of the sky; above saturation at -14 growing with the excess.
     """
     flux = 10 ** (-0.4 * (np.asarray(mag, float) + 10.0))
     noise = 0.015**2 / flux * (1.0 + 0.3 / flux)
@@ -94,17 +76,7 @@ def centroid_error(mag: Float) -> Float:
 
 
 def true_stars(n: int, rng: np.random.Generator) -> TrueStars:
-    """Stars of the field, denser towards the cluster in the east.
-
-    Parameters
-    ----------
-    n : int
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    TrueStars
-    """
+    """True stars of the field, denser towards the cluster in the east."""
     u, v = np.zeros(0), np.zeros(0)
     nearest = CENTRE[0] - HALF_SIZE - CLUSTER[0]  # of the edge of the field to the cluster
     while len(u) < n:
@@ -127,23 +99,12 @@ def true_stars(n: int, rng: np.random.Generator) -> TrueStars:
 def measured_catalogs(
     stars: TrueStars, rng: np.random.Generator
 ) -> tuple[ReferenceCatalog, ReferenceCatalog, ReferenceCatalog]:
-    """The standard catalogue, and the mean positions before and after SM4.
+    """Standard catalogue (2004.5, with motions), and mean positions before and after SM4.
 
     Errors are normal, of the quoted size, and independent: of the stars, of the axes, of positions
     and motions, and of the three catalogues.  Motions are as good as a difference of two mean
-    positions; of one star in twelve they are poor.
-
-    Parameters
-    ----------
-    stars : TrueStars
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    catalog : ReferenceCatalog
-        Epoch 2004.5, with motions.
-    early, late : ReferenceCatalog
-        Without motions, each star with the mean epoch of its observations.
+    positions; of one star in twelve they are poor.  The mean positions are without motions, each
+    star at the mean epoch of its observations.
     """
     n = len(stars)
     mag = stars.mag + 0.01 * rng.standard_normal(n)

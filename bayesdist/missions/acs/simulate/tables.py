@@ -1,4 +1,4 @@
-"""The fine-scale distortion: random look-up tables of the published size.
+"""Fine-scale distortion: random look-up tables of the published size.
 
 Sizes are the longest vectors of ACS ISR 2015-06: 0.17 px for the grid of pixels (Figure 7 and
 Section 4.3.1), half of that on WFC2 (Section 4.3), and for the filters those of Figures 11-13.
@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 
 STEP = 64.0
 SHAPE = (32, 64)  # nodes along y and x
-ORDER = 5  # what a polynomial of this order can follow is left out of the tables
+ORDER = 5  # the tables are orthogonal to polynomials of this order
 FINE = 16.0  # pixels between the points of integrals over the chip
 
 DETECTOR_LONGEST = {1: 0.17, 2: 0.085}
@@ -31,7 +31,7 @@ DETECTOR_LENGTH = 200.0
 COLUMNS = 4096 / 60  # "every 68th column": 60 equal strips of the mask
 COLUMN_AMPLITUDE = 0.1  # of the longest vector
 
-# Figures 12, 13, 11; F814W is not shown, and is given what the text says filters reach
+# Figures 12, 13, 11; F814W is not shown, and has the largest value for filters in the text
 FILTER_LONGEST = {"F435W": 0.062, "F475W": 0.08, "F606W": 0.032, "F814W": 0.05}
 FILTER_LENGTH = 150.0  # "spatially coherent over ~150 pixels", Section 4.3.2
 
@@ -54,11 +54,11 @@ def _factor(length: float) -> Float:
 
 @lru_cache(maxsize=2)
 def _followed(chip: int) -> Float:
-    """Orthonormal basis (2 nodes, 84) of what a polynomial could follow in a chip's table.
+    """Orthonormal basis (2 nodes, 84) of the parts of a chip's table that a polynomial can follow.
 
-    Its values at the nodes along x and y; and the nodes' shares in the integral over the chip of
-    the polynomial times the displacement of u and of v, for that is what a fit of the polynomial
-    alone would take from the table.
+    Its values at the nodes along x and y; and the nodes' parts in the integral over the chip of the
+    polynomial times the displacement of u and of v, for a fit of the polynomial alone would take
+    that from the table.
     """
     model, theta = acs_solution()
     basis = PolynomialBasis(ORDER, CHIPS[0].size, HALF)
@@ -87,7 +87,7 @@ def _followed(chip: int) -> Float:
 
 
 def _without_polynomial(values: Float, chip: int) -> Float:
-    """Values at the nodes (2, nodes) less what a polynomial could follow: truth has one place."""
+    """Values at the nodes (2, nodes) less those a polynomial could follow: the truth is unique."""
     q, flat = _followed(chip), values.ravel()
     for _ in range(2):  # once more for the last digits
         flat = flat - q @ (q.T @ flat)
@@ -104,17 +104,9 @@ def detector_tables(rng: np.random.Generator) -> tuple[LookupTable, ...]:
     """Tables of the grid of pixels, one for each chip.
 
     A smooth random field, and along x the saw-tooth of a mask that was stepped over the columns.
-    Nodes 64 pixels apart see the saw-tooth of 68 pixels as a slow beat.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    tuple of LookupTable
-        Free of polynomials up to order 5: the sum over the nodes of value times polynomial is 0,
-        and a fit of polynomials to evenly spread stars finds nothing in u and v.
+    Nodes 64 pixels apart see the saw-tooth of 68 pixels as a slow beat.  Free of polynomials up to
+    order 5: the sum over the nodes of value times polynomial is 0, and a fit of polynomials to
+    evenly spread stars finds nothing in u and v.
     """
     x, _ = _nodes()
     out = []
@@ -127,17 +119,7 @@ def detector_tables(rng: np.random.Generator) -> tuple[LookupTable, ...]:
 
 
 def filter_tables(filter: str, rng: np.random.Generator) -> tuple[LookupTable, ...]:
-    """Tables of a filter, one for each chip, as smooth and as free of polynomials.
-
-    Parameters
-    ----------
-    filter : str
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    tuple of LookupTable
-    """
+    """Tables of a filter, one for each chip, as smooth and as free of polynomials."""
     n = SHAPE[0] * SHAPE[1]
     fields = [(_factor(FILTER_LENGTH) @ rng.standard_normal((n, 2))).T for _ in CHIPS]
     longest = [

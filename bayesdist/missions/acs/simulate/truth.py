@@ -1,4 +1,4 @@
-"""What a simulated campaign was made from, and the way between pixels and the catalogue in it."""
+"""Truth of a simulated campaign, and its maps between pixels and the catalogue."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ __all__ = ["LINEAR_TERMS", "AcsTruth", "DetectionTruth"]
 Float = NDArray[np.float64]
 
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
-CLOSE = 1e-10  # pixels: what an inverse may be off
-EXACT = 1e-13  # step in scaled pixels at which Newton's method has arrived
+CLOSE = 1e-10  # pixels: largest error of an inverse
+EXACT = 1e-13  # step in scaled pixels at which Newton's method has converged
 STEPS = 30
 
 
 @dataclass(frozen=True, eq=False)
 class DetectionTruth:
-    """What the detections of one exposure are, in the order of its list.
+    """Truth of the detections of one exposure, in the order of its list.
 
     Parameters
     ----------
     star : ndarray of int64, shape (N,)
         Row of the star in the catalogue; -1 for a false detection.
     blended : ndarray of bool, shape (N,)
-        Stars whose position is drawn towards something beside them.
+        Stars whose position is drawn towards a close neighbour.
     """
 
     star: NDArray[np.int64]
@@ -43,7 +43,7 @@ class DetectionTruth:
 
 @dataclass(frozen=True, eq=False)
 class AcsTruth:
-    """What a campaign was made from.
+    """Truth of a simulated campaign.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class AcsTruth:
     settings: Mapping[str, object]
 
     def to_catalog(self, exposure: str, x: ArrayLike, y: ArrayLike, chip: ArrayLike) -> Float:
-        """Where pixels of an exposure lie in the catalogue.
+        """Positions in the catalogue of pixels of an exposure.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class AcsTruth:
     def to_pixels(
         self, exposure: str, u: ArrayLike, v: ArrayLike, chip: int
     ) -> tuple[Float, Float]:
-        """Raw pixels of a chip that show places of the catalogue: the inverse of `to_catalog`.
+        """Raw pixels of a chip at positions of the catalogue: the inverse of `to_catalog`.
 
         Parameters
         ----------
@@ -111,7 +111,7 @@ class AcsTruth:
         Returns
         -------
         x, y : ndarray, shape (N,)
-            FITS 1-based pixels, to 1e-9; NaN where the place is far off the chip.
+            FITS 1-based pixels, to 1e-9; NaN where the position is far off the chip.
         """
         e = self.frames.names.index(exposure)
         field = Field(self.model.basis(chip), self._on_catalog(e, chip))
@@ -178,16 +178,9 @@ class AcsTruth:
 
 
 class Field:
-    """A polynomial map of one chip and its inverse.
+    """Polynomial map of one chip, with Legendre coefficients (2, K), and its inverse."""
 
-    Parameters
-    ----------
-    basis : PolynomialBasis
-    coef : ndarray, shape (2, K)
-        Legendre coefficients.
-    """
-
-    MARGIN = 0.15  # beyond the edges, in halves of the chip: how far the inverse is looked for
+    MARGIN = 0.15  # beyond the edges, in halves of the chip: range of the inverse
 
     def __init__(self, basis: PolynomialBasis, coef: Float) -> None:
         self.basis = basis
@@ -211,7 +204,7 @@ class Field:
         return np.linalg.solve(A, np.stack([u, v]) - self.powers[0, 0][:, None])
 
     def near(self, u: Float, v: Float) -> NDArray[np.bool_]:
-        """Which positions (N,) may lie on the chip."""
+        """Boolean mask of the positions (N,) that may lie on the chip."""
         X, Y = self._linear_inverse(u, v)
         out: NDArray[np.bool_] = np.maximum(np.abs(X), np.abs(Y)) < 1.0 + self.MARGIN
         return out

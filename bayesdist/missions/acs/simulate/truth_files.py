@@ -1,4 +1,4 @@
-"""The truth of a campaign as files, and back."""
+"""Truth of a campaign as files, written and read."""
 
 from __future__ import annotations
 
@@ -25,19 +25,7 @@ MATRIX = ("uu", "uv", "vu", "vv")
 
 
 def write_truth(truth: AcsTruth, folder: Path) -> None:
-    """Write theta.ecsv, exposures.ecsv, stars, tables and detections .parquet.
-
-    Parameters
-    ----------
-    truth : AcsTruth
-    folder : pathlib.Path
-        It must exist.
-
-    Raises
-    ------
-    InputError
-        When a file cannot be written.
-    """
+    """Write theta.ecsv, exposures.ecsv, stars, tables and detections .parquet to a folder."""
     theta = Table({"name": list(truth.model.names), "unit": list(truth.model.units)})
     for filter, values in truth.theta.items():
         theta[filter] = values
@@ -62,22 +50,9 @@ def write_truth(truth: AcsTruth, folder: Path) -> None:
 
 
 def read_truth(folder: Path, log: ExposureLog) -> AcsTruth:
-    """Read what `write_truth` wrote.
+    """Truth that `write_truth` wrote for the campaign of a log.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-    log : ExposureLog
-        Of the campaign.
-
-    Returns
-    -------
-    AcsTruth
-
-    Raises
-    ------
-    InputError
-        For files that are missing or damaged.
+    InputError for files that are missing or damaged.
     """
     folder = Path(folder)
     theta = read_table(folder / "theta.ecsv")
@@ -115,7 +90,7 @@ def read_truth(folder: Path, log: ExposureLog) -> AcsTruth:
 
 
 def _frames_table(truth: AcsTruth) -> Table:
-    """One row for each exposure: frame, deviations, and the linear terms that come of them."""
+    """Table of the exposures: frame, deviations, and the linear terms that follow from them."""
     frames = truth.frames
     out = Table({"exposure": list(frames.names)})
     out["epoch"] = truth.log.values("epoch")
@@ -141,7 +116,7 @@ def _matrices(table: Table, name: str) -> np.ndarray:
 
 
 def _write_tables(truth: AcsTruth, path: Path) -> None:
-    """One row for each node."""
+    """Write the look-up tables, one row for each node."""
     rows: dict[str, list[Any]] = {key: [] for key in ("chip", "filter", "x", "y", "dx", "dy")}
     labels = tuple(dict.fromkeys(table.filter for table in truth.tables))
     for table in truth.tables:

@@ -1,6 +1,6 @@
-"""The first weeks of a calibration: lists of stars that nobody has paired yet, and a poor guess.
+"""First weeks of a calibration: unpaired lists of stars, and a poor initial distortion.
 
-The distortion is WISE's of WSDC D-T033.  The guess is an optical model like its Code V model:
+The distortion is WISE's of WSDC D-T033.  The initial one is an optical model like its Code V model:
 turned by 270 degrees it resembles the truth (section 4: longest vector 3.513 px, longest difference
 to W2 1.658 px); as delivered it is worse than none (section 2).
 """
@@ -34,7 +34,7 @@ REFERENCE_SIGMA = 0.03  # px: 2MASS, some 80 mas
 
 
 def optical_model(band: str = "W2", turn: int = 270) -> tuple[DistortionModel, Float]:
-    """An optical model that resembles the true distortion once it is turned.
+    """Optical model that resembles the true distortion once it is turned.
 
     Parameters
     ----------
@@ -82,8 +82,8 @@ def optical_model(band: str = "W2", turn: int = 270) -> tuple[DistortionModel, F
 
 
 def _turned_back(field: Float, terms: tuple[tuple[int, int], ...]) -> Float:
-    """A field (2, K) of Legendre products over a square, turned by -90 degrees."""
-    there = np.empty_like(field)  # at the place (-y, x)
+    """Field (2, K) of Legendre products over a square, turned by -90 degrees."""
+    there = np.empty_like(field)  # at the position (-y, x)
     for k, (i, j) in enumerate(terms):
         there[:, terms.index((j, i))] = (-1) ** i * field[:, k]
     return np.stack([there[1], -there[0]])
@@ -122,7 +122,7 @@ def simulate_unpaired(
     density: float = 1e-3,
     common: float = 0.8,
 ) -> UnpairedStars:
-    """Lists of stars of many frames, before anybody has paired them.
+    """Lists of stars of many frames, unpaired.
 
     False pairs come about as in the sky: by reference stars that happen to lie near a detection.
 
@@ -136,7 +136,7 @@ def simulate_unpaired(
     density : float
         Reference stars that were not detected, for each square pixel of the undistorted frame.
     common : float
-        Share of the detections that the reference catalogue has, too.
+        Fraction of the detections that the reference catalogue has, too.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def simulate_unpaired(
     Raises
     ------
     InputError
-        For an unknown band, or a share outside 0 to 1.
+        For an unknown band, or a fraction outside 0 to 1.
     """
     if not 0 <= common <= 1:
         raise InputError(f"the share of common stars is {common}", do="give one from 0 to 1")

@@ -1,4 +1,4 @@
-"""Sets of pairs as partitioned Parquet, with the truth beside them."""
+"""Sets of pairs as partitioned Parquet, with their truth."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ UNITS["colour"] = "mag"
 def write_wise_set(
     one: WiseSet, folder: str | os.PathLike[str], *, threads: int = 2, force: bool = False
 ) -> int:
-    """Write the pairs of a band, and what they were made from.
+    """Write the pairs of a band, and their truth.
 
     Chunks are made and written in as many threads as are asked for; memory is that of so many
-    chunks.  What is written does not depend on their number.
+    chunks.  The files do not depend on their number.
 
     Parameters
     ----------
     one : WiseSet
     folder : path-like
         ``w1/part-00000.parquet`` and so on hold the pairs, with columns x, y, u, v, sigma, mag,
-        colour, epoch, frame, band; ``truth/w1/`` of each pair whether it is false, in the same
+        colour, epoch, frame, band; ``truth/w1/`` of each pair True if it is false, in the same
         files and rows; ``truth/w1.ecsv`` the distortion; ``truth/w1_pattern.ecsv`` the partition
         pattern, where there is one.
     threads : int, optional
@@ -145,7 +145,7 @@ def _write_truth(one: WiseSet, n_false: int, folder: Path) -> None:
 
 
 def _pattern_table(one: WiseSet) -> Table:
-    """One row for each axis and block; the polynomial that is taken off stands in the meta-data."""
+    """Table of the axes and blocks; the polynomial that is subtracted is in the meta-data."""
     pattern = one.pattern
     assert pattern is not None
     axis, row, column = (index.ravel() for index in np.indices(pattern.local.shape[:3]))

@@ -23,38 +23,23 @@ NODES = 16  # on half an axis, for means over the array
 def match_radius(r2: Float) -> Float:
     """Radius of the match circle in pixels: tight at the centre, wider where distortion is large.
 
-    Parameters
-    ----------
-    r2 : ndarray
-        Squared distance from the centre of the array; 1 in the corners.
-
-    Returns
-    -------
-    ndarray
+    `r2` is the squared distance from the centre of the array, 1 in the corners.
     """
     return RADIUS[0] + (RADIUS[1] - RADIUS[0]) * r2
 
 
 @dataclass(frozen=True, eq=False)
 class Interlopers:
-    """How likely a pair is false, by the density of its frame and its place on the array.
+    """Probability of false pairs, by the density of the frame and the position on the array."""
 
-    Parameters
-    ----------
-    density : ndarray, shape (F,)
-        Reference stars per square pixel of each frame.
-    unlisted : float
-        Share of sources without a counterpart among the reference stars.
-    """
-
-    density: Float
-    unlisted: float
+    density: Float  # (F,), reference stars per square pixel of each frame
+    unlisted: float  # fraction of sources without a counterpart in the reference
 
     def probability(self, frame: NDArray[np.int64], r2: Float) -> Float:
         """Probability that pairs (N,) are false.
 
-        Of sources with a counterpart all are paired with it, of those without one each that has
-        a star within the match circle.
+        Of sources with a counterpart all are paired with it, of those without one each that has a
+        star within the match circle.
         """
         caught = self.unlisted * _chance(self.density[frame], r2)
         return caught / (caught + (1.0 - self.unlisted))
@@ -67,24 +52,9 @@ class Interlopers:
 
 
 def interlopers(survey: Survey, scale: float, share: float) -> Interlopers:
-    """False matches that are a given share of all pairs.
+    """False matches whose expected fraction of all pairs is `share`, at `scale` arcsec per pixel.
 
-    Parameters
-    ----------
-    survey : Survey
-    scale : float
-        Arcsec per pixel.
-    share : float
-        Expected share of false matches among the pairs.
-
-    Returns
-    -------
-    Interlopers
-
-    Raises
-    ------
-    InputError
-        For a share outside [0, 1).
+    InputError for a fraction outside [0, 1).
     """
     if not 0.0 <= share < 1.0:
         raise InputError(

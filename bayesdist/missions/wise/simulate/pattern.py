@@ -1,4 +1,4 @@
-"""What the partition of the point-spread function leaves in the residuals.
+"""Pattern in the residuals by the partition of the point-spread function.
 
 WSDC D-T033, section 5: point sources are fitted with a template that changes from block to block of
 the array; the residuals show the blocks, 5 x 5 of them in W1 and W2, 2 x 2 in W3, none in W4.
@@ -25,20 +25,13 @@ BLOCKS = {"W1": 5, "W2": 5, "W3": 2}  # on each axis
 class PartitionPattern:
     """Offsets that are linear within each block and jump at its edges.
 
-    Parameters
-    ----------
-    basis : PolynomialBasis
-    local : ndarray, shape (2, k, k, 3)
-        By axis, row and column of the block: offset at its centre and tilts along x and y (the
-        change from the centre to the edge), in pixels.
-    smooth : ndarray, shape (2, n_terms)
-        The polynomial that is taken off, so that there is one truth for the coefficients: over the
-        array the pattern has no part that the polynomial could follow.
+    `smooth` is the polynomial that is subtracted, so that the truth of the coefficients is unique:
+    over the array the pattern has no part that the polynomial could follow.
     """
 
     basis: PolynomialBasis
-    local: Float
-    smooth: Float
+    local: Float  # (2, k, k, 3), by axis, row, column: offset, tilts on x, y; pixels
+    smooth: Float  # (2, n_terms)
 
     @property
     def blocks(self) -> int:
@@ -50,7 +43,7 @@ class PartitionPattern:
         return self.blocked(x, y) - self.basis.evaluate(x, y) @ self.smooth.T
 
     def blocked(self, x: Float, y: Float) -> Float:
-        """As `offsets`, without what is taken off."""
+        """Offsets (N, 2) without the subtracted polynomial, at pixels (N,)."""
         k = self.blocks
         at = []
         for scaled in self.basis.scaled(x, y):
@@ -65,22 +58,7 @@ class PartitionPattern:
 def partition_pattern(
     basis: PolynomialBasis, blocks: int, sigma: tuple[float, float], rng: np.random.Generator
 ) -> PartitionPattern:
-    """A pattern of given size.
-
-    Parameters
-    ----------
-    basis : PolynomialBasis
-        Of the distortion, over the array.
-    blocks : int
-        On each axis.
-    sigma : tuple of float
-        Root mean square over the array on x and on y, in pixels.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    PartitionPattern
-    """
+    """Pattern of so many blocks on each axis, with an rms of `sigma` pixels on x and y."""
     local = rng.standard_normal((2, blocks, blocks, 3))
     raw = PartitionPattern(basis, local, np.zeros((2, basis.n_terms)))
     x, y, weight = _nodes(basis, blocks)

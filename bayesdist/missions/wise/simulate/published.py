@@ -1,4 +1,4 @@
-"""What the report of the WISE calibration prints (WSDC D-T033)."""
+"""Printed values of the report of the WISE calibration (WSDC D-T033)."""
 
 from __future__ import annotations
 
@@ -86,22 +86,14 @@ RESIDUAL_SIGMAS = {
 
 @dataclass(frozen=True)
 class WiseArray:
-    """A detector array.
-
-    Parameters
-    ----------
-    size : tuple of float
-        Columns and rows.
-    scale : float
-        Arcsec per pixel.
-    """
+    """Detector array: columns and rows, and arcsec per pixel."""
 
     size: tuple[float, float]
     scale: float
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Reference pixel, FITS 1-based: where Appendix B's u = v = 0."""
+        """Reference pixel, FITS 1-based: u = v = 0 of Appendix B."""
         return (self.size[0] + 1) / 2, (self.size[1] + 1) / 2
 
 

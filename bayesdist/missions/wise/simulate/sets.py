@@ -1,4 +1,4 @@
-"""Sets of pairs of full size: what one is made of, and its rows chunk by chunk."""
+"""Sets of pairs of full size: their ingredients, and their rows chunk by chunk."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class PairChunk:
     sigma : ndarray, shape (N,)
         Quoted error on each axis, WISE's and 2MASS's together, in pixels.
     false : ndarray of bool, shape (N,)
-        Which pairs are false matches: the truth, which a calibration does not know.
+        True for false matches: the truth, which a calibration does not know.
     """
 
     x: Float
@@ -68,7 +68,7 @@ class PairChunk:
 
 @dataclass(frozen=True, eq=False)
 class WiseSet:
-    """The pairs of a band: all that they follow from.
+    """Pairs of a band, by the ingredients that determine them.
 
     Parameters
     ----------
@@ -76,14 +76,14 @@ class WiseSet:
     pairs : int
     seed : int
     false_share : float
-        Expected share of false matches.
+        Expected fraction of false matches.
     model : DistortionModel
     theta : ndarray, shape (30,)
         The published distortion: the truth.
     survey : Survey
     interlopers : Interlopers
     pattern : PartitionPattern or None
-        What is left in the residuals, where it is asked for.
+        Pattern in the residuals, where it is asked for.
     """
 
     band: str
@@ -142,7 +142,7 @@ class WiseSet:
         )
         error += self._corrected(X, Y)
         if self.pattern is not None:
-            # the template displaces what WISE measures of its own source, whatever it is matched to
+            # the template displaces WISE's measurement of its own source, whatever it is matched to
             error -= self.pattern.blocked(x, y).T
         mag = population.magnitudes(counts)
         return PairChunk(x, y, error[0], error[1], frame, mag, colour, sigma, false)
@@ -156,7 +156,7 @@ class WiseSet:
 
     @cached_property
     def _tables(self) -> list[Float]:
-        """Legendre coefficients [i, j] of u and of v, with what is taken off the pattern."""
+        """Legendre coefficients [i, j] of u and of v, with the subtracted part of the pattern."""
         i, j = np.array(self.model.basis().terms).T
         out = []
         for axis in (0, 1):
@@ -186,7 +186,7 @@ def wise_set(
     false_share: float = 0.03,
     partition: bool = False,
 ) -> WiseSet:
-    """A set of pairs of WISE detections and 2MASS stars.
+    """Set of pairs of WISE detections and 2MASS stars.
 
     Parameters
     ----------
@@ -196,9 +196,9 @@ def wise_set(
     seed : int, optional
         Bands do not depend on each other.
     false_share : float, optional
-        Expected share of false matches among the pairs.
+        Expected fraction of false matches among the pairs.
     partition : bool, optional
-        Whether the partition of the point-spread function shows in the residuals.
+        True where the partition of the point-spread function shows in the residuals.
 
     Returns
     -------
@@ -207,7 +207,7 @@ def wise_set(
     Raises
     ------
     InputError
-        For an unknown band, no pairs, and a share outside [0, 1).
+        For an unknown band, no pairs, and a fraction outside [0, 1).
     """
     model, theta = wise_solution(band)
     pairs = SAMPLE_SIZES[band] if pairs is None else pairs
@@ -235,6 +235,6 @@ _FRAMES, _PATTERN, _FIRST_CHUNK = range(3)
 
 
 def _generator(band: str, seed: int, part: int) -> np.random.Generator:
-    """Random numbers of one part of a band: what one takes moves no other."""
+    """Random numbers of one part of a band, independent of those of other parts."""
     key = (WISE_BANDS.index(band), part)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))

@@ -1,4 +1,4 @@
-"""The published distortion of a band as a model, and small tables of pairs that follow it."""
+"""Published distortion of a band as a model, and small tables of pairs that follow it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FAINT, BRIGHT = 14.5, 7.0
 
 
 def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
-    """The published distortion of a band as a model and its parameters.
+    """Published distortion of a band as a model and its parameters.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def simulate_wise(
     band : str
     rng : numpy.random.Generator
     fraction : float
-        Share of false matches.
+        Fraction of false matches.
     jitter : float
         Error beyond the quoted ones, in pixels: the partition of the point-spread function
         (section 5 of the report) leaves residuals of this size.

@@ -1,4 +1,4 @@
-"""A stand-in for the optical model that the WISE report compares its bands with."""
+"""Mock of the optical model that the WISE report compares its bands with."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bayesdist.products.formats.common.cards import text_card
 
 __all__ = ["STAND_IN_TURN", "write_stand_in"]
 
-BAND = "W2"  # whose longest differences from the optical model the stand-in has
+BAND = "W2"  # whose longest differences from the optical model the mock has
 STAND_IN_TURN = 270
 
 HISTORY = (
@@ -25,23 +25,13 @@ HISTORY = (
 
 
 def write_stand_in(path: Path) -> None:
-    """Write the model as it was delivered: turned by 270 degrees it resembles all bands.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
-    """
+    """Write the model as it was delivered: turned by 270 degrees it resembles all bands."""
     model, theta = optical_model(BAND, STAND_IN_TURN)
     array, basis = WISE_ARRAYS[BAND], model.basis()
     forward = basis.to_monomials(theta.reshape(2, -1))
     for axis, term in enumerate(((1, 0), (0, 1))):
         forward[axis, basis.terms.index(term)] -= 1.0
-    forward[:, 0] = 0.0  # what is left of the reference pixel is rounding
+    forward[:, 0] = 0.0  # the rest at the reference pixel is rounding
     a, b = (dict(zip(basis.terms, map(float, one), strict=True)) for one in forward)
     nx, ny = array.size
     sip = SipHeader(

@@ -22,30 +22,18 @@ COUNTS = 0.3  # slope of the logarithm of star counts by magnitude
 REFERENCE_ARCSEC = 0.08  # 2MASS positions on each axis
 STAR_COLOUR = (0.0, 0.15)  # mean and standard deviation, magnitudes
 RED_COLOUR = (2.5, 0.8)  # galaxies and the like that 2MASS does not list
-RED = 0.5  # share of them among the false matches
+RED = 0.5  # fraction of them among the false matches
 
 
 @dataclass(frozen=True)
 class Population:
-    """Sources of a band that have been paired.
+    """Paired sources of a band."""
 
-    Parameters
-    ----------
-    scale : float
-        Arcsec per pixel.
-    bright, faint : float
-        Limits in magnitudes: saturation, and about what single exposures reach.
-    floor : float
-        Centroid error of bright sources on each axis, in pixels.
-    at_limit : float
-        Centroid error that the background adds for the faintest ones, in pixels.
-    """
-
-    scale: float
-    bright: float
-    faint: float
-    floor: float
-    at_limit: float
+    scale: float  # arcsec per pixel
+    bright: float  # limit of saturation, mag
+    faint: float  # limit of single exposures, about, mag
+    floor: float  # centroid error of bright sources on each axis, pixels
+    at_limit: float  # centroid error by the background at the faint limit, pixels
 
     @property
     def reference(self) -> float:
@@ -54,41 +42,26 @@ class Population:
 
     @property
     def brightest(self) -> float:
-        """Share of the counts that lies beyond the bright limit."""
+        """Fraction of the counts that lies beyond the bright limit."""
         return float(10 ** (COUNTS * (self.bright - self.faint)))
 
     def magnitudes(self, counts: Float) -> Float:
-        """Magnitudes, by the share of the counts that is brighter."""
+        """Magnitudes, by the fraction of the counts that is brighter."""
         return self.faint + np.log10(counts) / COUNTS
 
     def sigma(self, counts: Float) -> Float:
-        """Error of pairs on each axis, in pixels: WISE's and 2MASS's together.
+        """Error of pairs on each axis, pixels, WISE's and 2MASS's together.
 
-        Parameters
-        ----------
-        counts : ndarray
-            Share of the counts that is brighter; uniform from `brightest` to 1 over the pairs.
-
-        Returns
-        -------
-        ndarray
+        `counts`, the fraction of the counts that is brighter, is uniform from `brightest` to 1.
         """
         # limited by the background: the error goes with 10^(0.4 m), which is counts^(4/3)
         noise = self.at_limit * counts * np.cbrt(counts)
         return np.sqrt(noise**2 + (self.floor**2 + self.reference**2))
 
     def colours(self, false: NDArray[np.bool_], rng: np.random.Generator) -> Float:
-        """Magnitude at the shortest wavelength detected less that at the longest.
+        """Magnitudes (N,) at the shortest wavelength less those at the longest, of pairs.
 
-        Parameters
-        ----------
-        false : ndarray of bool, shape (N,)
-            Half of the false matches are red.
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        ndarray, shape (N,)
+        Half of the false matches are red.
         """
         out = STAR_COLOUR[0] + STAR_COLOUR[1] * rng.standard_normal(false.size)
         red = np.flatnonzero(false)

@@ -1,4 +1,4 @@
-"""The frames that pairs come from: when they were taken, and how crowded their sky is."""
+"""Frames of the pairs: their epochs, and the density of stars on their sky."""
 
 from __future__ import annotations
 
@@ -26,24 +26,14 @@ ARCSEC2 = 3600.0**2
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Frames.
+    """Frames: names, epochs and densities of stars."""
 
-    Parameters
-    ----------
-    names : tuple of str
-        Scan and frame, as '00350a001'.
-    epoch : ndarray, shape (F,)
-        Decimal years.
-    density : ndarray, shape (F,)
-        2MASS sources per square arcsec.
-    """
-
-    names: tuple[str, ...]
-    epoch: Float
-    density: Float
+    names: tuple[str, ...]  # scan and frame, as '00350a001'
+    epoch: Float  # (F,), decimal years
+    density: Float  # (F,), 2MASS sources per square arcsec
 
     def share(self) -> Float:
-        """Share of the pairs that each frame has: they go with the density."""
+        """Fraction of the pairs in each frame, proportional to the density."""
         return self.density / self.density.sum()
 
 
@@ -52,14 +42,6 @@ def survey(n_frames: int = FRAMES) -> Survey:
 
     The stars are a plane-parallel layer: their number goes with the cosecant of the galactic
     latitude, 2500 per square degree at the poles and at most 20 times as many.
-
-    Parameters
-    ----------
-    n_frames : int, optional
-
-    Returns
-    -------
-    Survey
     """
     number = np.arange(n_frames)
     scan, frame = np.divmod(number, PER_SCAN)

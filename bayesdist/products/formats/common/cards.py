@@ -28,7 +28,7 @@ def text_card(keyword: str, value: str, comment: str = "") -> str:
 
 
 def convergence_cards(solution: object) -> list[str]:
-    """Whether the posterior behind a product may be relied on; nothing for a linear fit."""
+    """Cards that tell if the posterior behind a product has converged; none for a linear fit."""
     convergence = getattr(solution, "convergence", None)
     if convergence is None:
         return []
@@ -49,7 +49,7 @@ def keyword_of(card: str) -> str:
 
 
 def header_of(cards: Iterable[str]) -> fits.Header:
-    """The header that the cards make."""
+    """Header of these cards."""
     return fits.Header.fromstring("".join(cards))
 
 

@@ -1,6 +1,6 @@
-"""Polynomials in two variables by their coefficients {(i, j): c} of x^i y^j, and which is which.
+"""Polynomials in two variables by their coefficients {(i, j): c} of x^i y^j, and their names.
 
-The only place that knows which coefficient of a format multiplies which powers of x and y:
+This is the only module that knows which coefficient of a format multiplies which powers of x and y:
 
 =========  =======================  =====================================
 format     coefficient              multiplies
@@ -43,7 +43,7 @@ _SIP = re.compile(r"(A|B|AP|BP|AE|BE)_(\d)_(\d)")
 # Starting points of the search for an extremum: the interior grid, and the best of all to refine.
 _GRID, _BEST = 65, 8
 _HALVINGS = 30  # of the grid's step: what is left is below rounding at a smooth maximum
-_BORDER = 2**16  # steps along an edge at most: a size may be a slip of the pen
+_BORDER = 2**16  # steps along an edge at most: a size may be a misprint
 
 
 def idctab_column(prefix: str, i: int, j: int) -> str:
@@ -72,17 +72,9 @@ def sip_powers(keyword: str) -> tuple[str, int, int] | None:
 
 
 def coefficient_matrix(coefficients: Coefficients, order: int | None = None) -> Float:
-    """Matrix whose entry [i, j] multiplies x^i y^j.
+    """Matrix (n + 1, n + 1) whose entry [i, j] multiplies x^i y^j.
 
-    Parameters
-    ----------
-    coefficients : mapping of (int, int) to float
-    order : int, optional
-        Terms above this total order are left out, as astropy.wcs does.
-
-    Returns
-    -------
-    ndarray, shape (n + 1, n + 1)
+    Terms above the total `order` are left out, as astropy.wcs does.
     """
     kept = {k: c for k, c in coefficients.items() if order is None or sum(k) <= order}
     n = max((max(k) for k in kept), default=0)
@@ -95,20 +87,7 @@ def coefficient_matrix(coefficients: Coefficients, order: int | None = None) -> 
 def evaluate(
     coefficients: Coefficients, x: ArrayLike, y: ArrayLike, order: int | None = None
 ) -> Float:
-    """Values of a polynomial.
-
-    Parameters
-    ----------
-    coefficients : mapping of (int, int) to float
-    x, y : array_like
-        Same shapes.
-    order : int, optional
-        Terms above this total order are left out.
-
-    Returns
-    -------
-    ndarray, same shape
-    """
+    """Values of a polynomial, without terms above the total `order`."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     return polynomial.polyval2d(x, y, coefficient_matrix(coefficients, order))
 
@@ -119,7 +98,7 @@ def largest_magnitude(
     y_range: tuple[float, float],
     order: int | None = None,
 ) -> float:
-    """Largest |p(x, y)| over a rectangle, its border included.
+    """Largest |p(x, y)| over a rectangle with its border, without terms above the total `order`.
 
     The border is looked at every unit step and the interior on a grid; the best points of both are
     refined by steps that are halved, so that the result is a maximum and not a sample.
@@ -154,7 +133,7 @@ def largest_magnitude(
 
 
 def _candidates(low: Float, high: Float) -> tuple[Float, Float]:
-    """A grid over the rectangle and every unit step along its border."""
+    """Points of a grid over the rectangle, and at every unit step along its border."""
     gx, gy = np.meshgrid(*np.linspace(low, high, _GRID).T)
     ex, ey = (
         np.linspace(a, b, min(int(np.ceil(b - a)), _BORDER) + 1)

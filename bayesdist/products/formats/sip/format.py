@@ -1,4 +1,4 @@
-"""The SIP header as a format."""
+"""Format entry of the SIP header."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["FORMAT", "Settings"]
 
 
 class Settings(FormatSettings):
-    """A SIP header."""
+    """Configuration of a SIP header."""
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
@@ -48,7 +48,7 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
 def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
-    """A header for each chip."""
+    """Headers, one for each chip."""
     from bayesdist.products.formats.sip.build import build_sip  # no file that is read needs it
 
     notes = [*calibration.notes, *([calibration.plane.note] if calibration.plane.note else [])]

@@ -1,4 +1,4 @@
-"""Where an image lies on the sky and how its pixels are moved, in words, as astropy.wcs has it."""
+"""Text on the position of an image on the sky and on its distortion, as astropy.wcs has them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from bayesdist.products.formats.common.document import Finding
 
 __all__ = ["Words", "first_line", "pv_keywords", "sky_words"]
 
-_NODES = 9  # points of each axis that are sent to the sky and back
+_NODES = 9  # points of each axis that are projected to the sky and back
 _PV_OF_TAN = 5  # more than the standard gives a TAN: SCAMP's older headers, which are TPV
-_BACK = 1e-3  # of a pixel: farther from where they began points have not come back
+_BACK = 1e-3  # of a pixel: largest closure error of points that count as recovered
 
 
 @dataclass
 class Words:
-    """What is found of one header: lines of text, and what is wrong in it."""
+    """Lines of text on one header, and its findings."""
 
     lines: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
@@ -36,7 +36,7 @@ class Words:
 
 
 def first_line(error: Exception) -> str:
-    """What an error of astropy.wcs says, without wcslib's own heading."""
+    """First line of an error of astropy.wcs, without wcslib's own heading."""
     text = [line.strip() for line in str(error).splitlines() if line.strip()]
     told = [line for line in text if not line.startswith("ERROR ")] or text
     return (told[0] if told else type(error).__name__).rstrip(".")
@@ -48,7 +48,7 @@ def pv_keywords(header: fits.Header, key: str) -> list[str]:
 
 
 def sky_words(wcs: WCS, header: fits.Header, size: tuple[int, int] | None, words: Words) -> None:
-    """Where the image lies, its scale, parity and distortion, and whether pixels come back."""
+    """Position on the sky, scale, parity and distortion, and the closure of pixels."""
     key = wcs.wcs.alt.strip()
     where = f"WCS {key}".strip()
     celestial = wcs.celestial if wcs.naxis > 2 else wcs
@@ -121,7 +121,7 @@ def _field(wcs: WCS, size: tuple[int, int]) -> str:
 
 
 def _tables(wcs: WCS) -> Iterator[str]:
-    """Look-up tables that astropy.wcs applies."""
+    """Lines on look-up tables that astropy.wcs applies."""
     kinds = (
         ("D2IM", "pixels, before the polynomial", (wcs.det2im1, wcs.det2im2)),
         ("CPDIS", "pixels, after it", (wcs.cpdis1, wcs.cpdis2)),
@@ -139,7 +139,7 @@ def _tables(wcs: WCS) -> Iterator[str]:
 def _distortion(
     wcs: WCS, header: fits.Header, size: tuple[int, int] | None, words: Words, where: str
 ) -> None:
-    """How far pixels are moved, and whether they come back from the sky."""
+    """Lines on the distortion in pixels, and on its closure."""
     if size is None:
         return
     x, y = np.meshgrid(*(np.linspace(1, n, _NODES) for n in size))
@@ -169,7 +169,7 @@ def _distortion(
             "on the distortion, which does not converge",
         )  # fmt: skip
         return
-    except Exception as error:  # as above: what astropy.wcs says
+    except Exception as error:  # as above: astropy.wcs's finding
         words.doubt("warning", where, f"astropy.wcs has no way back: {first_line(error)}")
         return
     off = float(np.hypot(*(back - pixels[seen]).T).max())
@@ -179,7 +179,7 @@ def _distortion(
 
 
 def _withoutpv_keywords(header: fits.Header, wcs: WCS) -> WCS | None:
-    """The system as it were without TPV's distortion; None where it is of another kind."""
+    """System without TPV's distortion; None where it is of another kind."""
     types = [str(header.get(f"CTYPE{k}", "")) for k in (1, 2)]
     scamp = all(t.endswith("-TAN") for t in types) and len(pv_keywords(header, "")) > _PV_OF_TAN
     if wcs.wcs.alt.strip() or wcs.sip is not None or wcs.naxis != 2 or wcs.wcs.lng != 0:

@@ -1,4 +1,4 @@
-"""The world coordinate systems of a file in words, as astropy.wcs has them."""
+"""Text on the world coordinate systems of a file, as astropy.wcs reads them."""
 
 from __future__ import annotations
 
@@ -32,25 +32,21 @@ _TABLES = ("CPDIS1", "CPDIS2", "D2IMDIS1", "D2IMDIS2", "AXISCORR")
 
 
 def _wcs_cards(header: fits.Header) -> tuple[tuple[str, str], ...]:
-    """What of a header its positions depend on: of two with the same, one is enough to show."""
+    """Cards that the positions of a header depend on: of two with equal ones, one is shown."""
     found = {(c.keyword, str(c.value)) for c in header.cards if _WCS.match(c.keyword)}
     return tuple(sorted(found))
 
 
 def describe_wcs(file: Content) -> list[str]:
-    """Lines of text of every world coordinate system of a file, with what is wrong in it.
+    """Lines of text on every world coordinate system of a file, with its findings.
 
-    HDUs that repeat the system of an earlier one are named with it.
-
-    Raises
-    ------
-    FormatError
-        For SIP keywords that are missing or no numbers.
+    HDUs that repeat the system of an earlier one are named with it.  FormatError for SIP keywords
+    that are missing or no numbers.
     """
     shown: dict[tuple[tuple[str, str], ...], list[Hdu]] = {}
     several = sum(holds_wcs(hdu.header) for hdu in file.hdus) > 1
     for hdu in file.hdus:
-        # what places the nodes of a table is told with the image that uses it
+        # the nodes of a table are described with the image that uses it
         aside = several and hdu.label.partition(",")[0] in _TABLE_HDUS
         if holds_wcs(hdu.header) and not aside:
             shown.setdefault((*_wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
@@ -72,7 +68,7 @@ def _label(hdu: Hdu) -> str:
 
 
 def _hdu_lines(file: Content, hdu: Hdu, name: str, others: Sequence[Hdu] = ()) -> list[str]:
-    """All lines of one HDU."""
+    """Lines of one HDU."""
     header, words, terms = hdu.header, Words(), list[str]()
     size = image_size(header)
     if "A_ORDER" in header:
@@ -105,7 +101,7 @@ def _hdu_lines(file: Content, hdu: Hdu, name: str, others: Sequence[Hdu] = ()) -
 
 
 def _systems(file: Content, hdu: Hdu, words: Words) -> list[WCS]:
-    """Every system of a header that astropy.wcs can make."""
+    """Systems of a header that astropy.wcs can make."""
     out = []
     header = hdu.header
     primary = any(k.startswith(("CTYPE", "CRVAL")) and k[-1].isdigit() for k in header)
@@ -140,7 +136,7 @@ def _system(file: Content, header: fits.Header, key: str, words: Words) -> WCS |
         try:
             wcs = WCS(header, fobj, key=key)
             wcs.wcs.set()
-        except Exception as error:  # whatever it is, it is what astropy.wcs says of this header
+        except Exception as error:  # any of them is astropy.wcs's finding on this header
             words.doubt("error", where, f"astropy.wcs cannot read it: {first_line(error)}")
             return None
     old = []
@@ -158,7 +154,7 @@ def _system(file: Content, header: fits.Header, key: str, words: Words) -> WCS |
 
 @contextmanager
 def _quiet_log() -> Iterator[None]:
-    """Without astropy's own remarks on CTYPE, which the findings make."""
+    """Context without astropy's own remarks on CTYPE, which the findings repeat."""
     before = log.level
     log.setLevel("ERROR")
     try:
@@ -168,7 +164,7 @@ def _quiet_log() -> Iterator[None]:
 
 
 def _tells(warning: warnings.WarningMessage) -> bool:
-    """Whether a warning is of positions: of dates and of the lint of units nobody needs to know."""
+    """True for a warning on positions: those on dates and on the lint of units are left out."""
     message = str(warning.message)
     return issubclass(warning.category, FITSFixedWarning) and not message.startswith(
         ("'datfix'", "'obsfix'", "RADECSYS", "The WCS transformation has more axes")
@@ -176,7 +172,7 @@ def _tells(warning: warnings.WarningMessage) -> bool:
 
 
 def _axes(wcs: WCS, header: fits.Header, key: str, *, above: bool) -> list[str]:
-    """What every axis is; `above` where SIP's lines have said a part."""
+    """Lines on every axis; `above` where SIP's lines have given a part."""
     w = wcs.wcs
     frame = f", {w.radesys}" if w.radesys else ""
     if w.radesys and np.isfinite(w.equinox) and w.radesys.startswith("FK"):

@@ -26,12 +26,12 @@ __all__ = [
 Row = tuple[str, ...]
 
 _SIGNIFICANT = 3.0  # sigmas
-FIXED = 5e-3  # 10^-6, or 10^-3 of a length: errors below it say that a term is held
+FIXED = 5e-3  # 10^-6, or 10^-3 of a length: a term with errors below it is held
 
 
 @REPORT.table("campaign-time", needs=("campaign",))
 def time_tables(r: ReportInput) -> Iterator[TextTable]:
-    """Gauge, lines of each term, changes at the breaks, scatter and claims."""
+    """Tables of the gauge, lines of each term, changes at the breaks, scatter and claims."""
     c = campaign_of(r)
     found, joint = c.section("time_dependence"), c.summary.get("lines") or []
     names = {chip.number: chip.name for chip in c.chips}
@@ -51,7 +51,7 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
         if rows:
             table = _line_table(term, rows, names, alone, published.get(term, ()), c)
             yield replace(table, note=" ".join(text for text in (table.note, note) if text))
-            note = ""  # said once, under the first of them
+            note = ""  # shown once, under the first of them
     if found.get("breaks"):
         yield _changes(found["breaks"], c.unit)
     if c.section("scatter"):
@@ -99,7 +99,7 @@ def _line_table(
     published: tuple[PublishedLine, ...],
     c: CampaignResults,
 ) -> TextTable:
-    """alpha and beta of a term: joint, exposure by exposure, and published."""
+    """Table of alpha and beta of a term: joint, exposure by exposure, and published."""
     factor, unit = _scale(term, c.unit)
     own = [row for row in (*joint, *alone.values()) if _is_of(row, term)]
     # as many digits for all of this run's, so that they can be compared; others as printed
@@ -134,7 +134,7 @@ def _line_table(
 
 
 def _why_errors_differ(c: CampaignResults) -> str:
-    """Why two fits of the same stars give two errors, for those who see them side by side."""
+    """Note on why two fits of the same stars give two errors."""
     n = count(len(c.matching) if c.series is None else len(c.series.exposures))
     return (
         "The two σ of this run may differ, here and in the tables below. An exposure that is fitted"
@@ -151,7 +151,7 @@ def _scale(term: str, unit: str) -> tuple[float, str]:
 
 
 def _is_free(row: Mapping[str, Any], unit: str) -> bool:
-    """Whether the data have a say: the gauge fixes terms of the reference chip."""
+    """True where the data constrain the term: the gauge fixes terms of the reference chip."""
     return bool(row["sigma_alpha"] * _scale(row["term"], unit)[0] > FIXED)
 
 

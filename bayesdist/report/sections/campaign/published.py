@@ -1,4 +1,4 @@
-"""Published linear terms of ACS/WFC, to stand beside those of a run.
+"""Published linear terms of ACS/WFC, to be compared with those of a run.
 
 ACS ISR 2015-06 (Kozhurina-Platais et al. 2015), Tables 1 to 3, and Section 4.4.1; filter F606W.
 """
@@ -13,21 +13,13 @@ __all__ = ["SOURCE", "WHERE", "PublishedLine", "published_lines"]
 
 SOURCE = "ACS ISR 2015-06"
 
-# term: where it stands
+# term: its table
 WHERE = {"A_2": "Table 1", "B_3": "Table 2", "B_2": "Table 3", "B_1": "Section 4.4.1"}
 
 
 @dataclass(frozen=True)
 class PublishedLine:
-    """alpha + beta (TIME - RDATE), with formal errors.
-
-    Parameters
-    ----------
-    chip : str
-    rdate : float
-    alpha, sigma_alpha, beta, sigma_beta : float
-        A term that stands still has a rate of zero without error.
-    """
+    """Line alpha + beta (TIME - RDATE), with formal errors; for a constant term beta is 0."""
 
     chip: str
     rdate: float
@@ -66,21 +58,7 @@ LINES: dict[str, tuple[PublishedLine, ...]] = {
 def published_lines(
     config: Mapping[str, Any], filter: str, chips: tuple[str, ...]
 ) -> dict[str, tuple[PublishedLine, ...]]:
-    """The published lines where the run is of the same detector and filter; else none.
-
-    Parameters
-    ----------
-    config : mapping
-        The resolved configuration: the release says instrument and detector.
-    filter : str
-    chips : tuple of str
-        Their names.
-
-    Returns
-    -------
-    dict of str to tuple of PublishedLine
-        By term.
-    """
+    """Published lines by term where the run is of their detector and filter; else none."""
     release = config.get("products", {}).get("release") or {}
     detector = (release.get("instrument", "ACS"), release.get("detector", "WFC"))
     same = detector == ("ACS", "WFC") and set(chips) == {"WFC1", "WFC2"} and filter == "F606W"
