@@ -78,14 +78,6 @@ class NotConvergedError(BayesdistError):
 
 
 class RenamedError(BayesdistError):
-    """A command under a name that it no longer has.
-
-    Parameters
-    ----------
-    old, new : str
-    """
+    """A command under a name that it no longer has."""
 
     exit_code = 2
-
-    def __init__(self, old: str, new: str) -> None:
-        super().__init__(f"the command {old!r} is {new!r} now", do=f"say 'bayesdist {new}'")

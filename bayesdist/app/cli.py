@@ -60,7 +60,10 @@ class _Root(LazyGroup):
         if found is not None:
             return found
         if cmd_name in RENAMED:
-            raise RenamedError(cmd_name, RENAMED[cmd_name])
+            new = RENAMED[cmd_name]
+            raise RenamedError(
+                f"the command {cmd_name!r} is {new!r} now", do=f"say 'bayesdist {new}'"
+            )
         if cmd_name in mission_names():
             mission = load_mission(cmd_name)
             return LazyGroup(cmd_name, help=mission.title, lazy=mission.commands)
