@@ -37,8 +37,7 @@ def without(fields: Float, norm: Float) -> Float:
 
 
 def frame_between(old: Float, now: Float, model: DistortionModel) -> tuple[Float, Float]:
-    """Frame (matrix, shift) of the model's kind that brings the release nearest to the new values.
-    """
+    """Frame (matrix, shift) of the model's kind that brings the release nearest to new values."""
     if model.frames == "none":
         return np.eye(2), np.zeros(2)
     norm = mean_squares(model).reshape(old.shape)[:, 0]

@@ -47,8 +47,7 @@ def select_order(
     rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
 ) -> OrderSelection:
-    """Comparison of at least two polynomial orders, for a model of one chip without frames and
-    time.
+    """Comparison of two or more polynomial orders, for one chip without frames and time dependence.
 
     Stars are clipped once, by the two-pass fit of the highest order, and alike for all orders; the
     model's own order does not matter.  `bins` (surfaces) and `regions` (held out, each made of

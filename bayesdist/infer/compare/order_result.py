@@ -61,10 +61,9 @@ class HeldOutOrders:
     log_density: Float
 
     def difference(self, low: int, high: int) -> tuple[float, float]:
-        """Log predictive density of a higher order minus that of a lower one, both axes, and its
-        error.
+        """Log predictive density of a higher order minus that of a lower one, with its error.
 
-        The standard error is from the scatter between the groups.
+        Both axes together; the standard error is from the scatter between the groups.
         """
         a, b = self.orders.index(low), self.orders.index(high)
         each = (self.log_density[:, b] - self.log_density[:, a]).sum(axis=-1)

@@ -46,8 +46,7 @@ def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float,
 
 
 def check_periods(periods: Periods) -> None:
-    """Raise InputError for fewer than two periods, one that ends before it begins, or an overlap.
-    """
+    """Raise InputError for fewer than two periods, one that ends before it begins, or overlap."""
     if len(periods) < 2:
         raise InputError(
             f"{len(periods)} periods are given",
