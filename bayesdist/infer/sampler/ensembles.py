@@ -164,8 +164,7 @@ class Ensembles:
     # -- where the walkers start ------------------------------------------------------------------
 
     def starts(self) -> tuple[list[Walkers], NDArray[np.bool_], int]:
-        """First states from the pilot, mask (ensembles, n) of proposals taken, number of further
-        ones.
+        """First states from the pilot, mask (ensembles, n) of used proposals, number of new ones.
 
         Where the pilot is too short for so many walkers, further proposals are evaluated.
         """
