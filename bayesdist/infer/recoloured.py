@@ -20,8 +20,8 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Recoloured(Derived):
-    """A solution whose draws are rescaled to the covariance `cov`; the shape of their distribution
-    stays.
+    """A solution whose draws are rescaled to the covariance `cov`; their distribution keeps its
+    shape.
     """
 
     source: Solution
@@ -63,8 +63,9 @@ class Recoloured(Derived):
 
 
 def with_spread(posterior: Posterior, before: Float, after: Float) -> Posterior:
-    """Posterior whose deviations are mapped from covariance `before` to `after` (see
-    `recolouring`); its mean and all else stay.
+    """Posterior whose deviations are mapped from covariance `before` to `after`; its mean stays.
+
+    The map is that of `recolouring`; all else but theta is unchanged.
     """
     spread, mean = recolouring(before, after), posterior.mean
     return replace(posterior, theta=mean + (posterior.theta - mean) @ spread.T)

@@ -133,10 +133,10 @@ def departures(sums: LotSums, about: Float, n_terms: list[int]) -> Float:
 def held_out_gain(sums: LotSums, about: Float, n_terms: list[int]) -> Float:
     """Log predictive density (L, orders, 2) of every lot by each order's fit to all others.
 
-    It is minus half the chi-square of the lot, of u and of v, plus that about `about` (2, K), and
-    so up to a constant that all orders share.  The coefficients' own uncertainty is not added to
-    the errors: where a star's leverage h is small, that would change the expectation by terms of
-    the second order in h only.
+    It is minus half the difference of the lot's chi-square, of u and of v, from that about the
+    coefficients `about` (2, K), and so up to a constant that all orders share.  The coefficients'
+    own uncertainty is not added to the errors: where a star's leverage h is small, that would
+    change the expectation by terms of the second order in h only.
     """
     weight = sums.weight.sum(axis=0) - sums.weight
     right = sums.right.sum(axis=0) - sums.right

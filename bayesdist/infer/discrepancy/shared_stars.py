@@ -62,9 +62,9 @@ def shared_stars(
 
         log p(w) = sum over stars and axes of [g^2 w^2 / (1 + w^2 h) - log(1 + w^2 h)] / 2
 
-    in which stars that are matched once say nothing that a jitter would not say as well, and are
-    left out.  The table has codes of the stars; `median` is that of the half-Cauchy prior of w, in
-    the unit of u, v.
+    Stars that are matched once are left out: their likelihood could not separate w from a jitter.
+    The table has codes of the stars; `median` is that of the half-Cauchy prior of w, in the unit of
+    u, v.
     """
     assert table.star is not None
     stars, order = prepare(model, table)

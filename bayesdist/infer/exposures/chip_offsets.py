@@ -78,7 +78,7 @@ class Settling:
     ) -> Settling:
         """Transformation for the shifts of single chips among the kinds of deviation.
 
-        The groups of the data tell the chips and the epoch of each exposure.  `held` (D,) are
+        The groups of the data give the chips and the epoch of each exposure; `held` (D,) are
         parameters with a prior of their own, `outlying` (E,) exposures that went wrong.
         """
         names = {name: k for k, name in enumerate(model.names)}

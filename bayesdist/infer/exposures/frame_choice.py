@@ -72,7 +72,7 @@ def frames_that_help(matches: MatchTable, model: DistortionModel) -> FrameChoice
 def _scatter(matches: MatchTable, model: DistortionModel) -> float:
     """Median length of the residuals, corrected for the model's degrees of freedom.
 
-    The first fit takes all matches alike; in the next ones its scatter tells which are false.
+    The first fit weights all matches alike; in the next ones its scatter separates false ones.
     """
     median = 1.0
     for _ in range(FITS):

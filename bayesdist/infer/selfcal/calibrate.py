@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 
 MOST_ROUNDS = 12
 SHRINK = 0.5  # smallest factor on the linking length from round to round
-REACH = 12.0  # smallest linking length, in errors
+REACH = 12.0  # errors below which the linking length does not shrink
 SETTLED = 1e-3  # fraction of the detections that may change their star,
 FEWEST = 4  # or this number: two at the edge of the linking length, each with its successor
 ALIKE = 0.02  # change of the number of detections by which the errors hardly change

@@ -19,7 +19,7 @@ Float = NDArray[np.float64]
 
 FEWEST = 2  # reference stars that fix position, rotation and scale
 FAR = 5.0  # times the median distance from the map: not the reference star, but a neighbour
-CLOSE = 0.01  # pixels: distances below this are never too large
+CLOSE = 0.01  # pixels: smallest median distance in this limit
 
 
 @dataclass(frozen=True, eq=False)
