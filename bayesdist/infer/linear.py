@@ -158,7 +158,17 @@ class LinearFit:
         return scaled_cholesky(self.cov)  # parameters fixed by a gauge have no error
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors (n, D) from the Gaussian with this mean and covariance."""
+        """Parameter vectors from the Gaussian with this mean and covariance.
+
+        Parameters
+        ----------
+        n : int
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        ndarray, shape (n, D)
+        """
         return self.mean + rng.standard_normal((n, len(self.mean))) @ self._root.T
 
 

@@ -20,9 +20,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Recoloured(Derived):
-    """A solution whose draws are rescaled to the covariance `cov`; their distribution keeps its
-    shape.
-    """
+    """Solution whose draws are rescaled to the covariance `cov`, in which they keep their shape."""
 
     source: Solution
     cov: Float

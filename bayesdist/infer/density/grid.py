@@ -28,7 +28,7 @@ Line = dict[float, Conditional]  # nodes by their value on one axis
 N_NODES = 25
 N_SCALES, STRIDE = 17, 2  # nodes of log s_out; then every other one of log j is enough
 DROP = 18.0  # distance (in log density) below the top to which the grid extends: 1e-8 lies beyond
-NOTHING = 40.0  # as far below the top nodes are placed that were not searched for
+NOTHING = 40.0  # distance below the top that is assigned to nodes that were not searched for
 NEAR = 1e-4  # Newton decrement at which a node's search stops
 # number of outliers, and their scale over the core's, below which the scale may be open
 FEW, CLOSE = 30.0, 2.0

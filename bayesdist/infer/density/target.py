@@ -78,7 +78,7 @@ class Target:
         """Value, gradient (D,) and minus the Hessian of the log posterior at one point: one pass.
 
         With `em` the curvature has the EM weights, whose distortion part is never indefinite;
-        otherwise it may be away from the mode.
+        otherwise it may be indefinite away from the mode.
         """
         model = self.model
         theta, h = psi[: self.n_theta], psi[self.n_theta :]

@@ -62,7 +62,7 @@ def cells_per_side(n_groups: int) -> int:
 def cell_sums(stars: Stars, scores: Scores, side: int) -> CellSums:
     """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`."""
     g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
-    # Where a star may or may not be a false match its curvature is negative. Such stars are left
+    # Where a star may or may not be a false match its curvature is negative.  Such stars are left
     # out, so that every sum of curvatures is that of a possible likelihood.
     good = (h_uu > 0) & (h_vv > 0)
     h_uu, h_uv, h_vv = (np.where(good, h, 0.0) for h in (h_uu, h_uv, h_vv))

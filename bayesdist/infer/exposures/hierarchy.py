@@ -44,7 +44,7 @@ Float = NDArray[np.float64]
 
 SCALE = 1e-4  # of the prior on tau: variation of the scale by velocity aberration in a year
 # A focal plane that breathes moves its chips too: then the gap's deviations repeat those of scale
-# and shear, and taken as independent they would halve the error of a drift. At four times their
+# and shear, and taken as independent they would halve the error of a drift.  At four times their
 # scatter they reduce it by 3 %.
 CAUTION = 4.0
 MOST_OUTLYING = 0.2  # fraction of the exposures beyond which they are the rule

@@ -143,7 +143,12 @@ class TablePosterior:
     def rows(self, x: Float, y: Float, axis: int, *, refitted: bool = False) -> Float:
         """Derivatives (N, n_nodes) of the shift along an axis by the node values.
 
-        `refitted` as in `position_sigma`.
+        Parameters
+        ----------
+        x, y : ndarray, shape (N,)
+        axis : int
+        refitted : bool
+            As in `position_sigma`.
         """
         out: Float = interpolation(self.grid, x, y).toarray()
         if refitted:

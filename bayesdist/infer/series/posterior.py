@@ -224,7 +224,7 @@ class SeriesPosterior:
         there = design.matrix(t, code, breaks)[0]
         y = (series.values - series.centre) / series.spread
         # a single exposure that lies off gives no information: its error is as much wider as that
-        # is probable. Where its neighbours do so too, the deviation is common to them
+        # is probable.  Where its neighbours do so too, the deviation is common to them
         order = np.argsort(series.epoch, kind="stable")
         p = np.concatenate([[0.0], self.outlier_probability[order], [0.0]])
         off = np.empty(len(series))

@@ -121,7 +121,7 @@ class ClusterShards(Shards):
         self._end()
 
     def _on_each(self, function: Task, **options: Any) -> list[Future]:
-        # Tied to some workers, loosely. Tasks that are not, and few, count as roots of a graph:
+        # Tied to some workers, loosely.  Tasks that are not, and few, count as roots of a graph:
         # Dask then spreads them without regard to the positions of the shards, which would travel.
         workers = sorted(self._workers()) or None
         return self._client.map(

@@ -142,7 +142,13 @@ class OutlierMixture:
         return out
 
     def bind(self, scale: float) -> Hyper:
-        """Mixture with its priors scaled to the data, whose median quoted error is `scale`."""
+        """Mixture with its priors scaled to the data.
+
+        Parameters
+        ----------
+        scale : float
+            Median quoted error.
+        """
         return Hyper(self, scale)
 
 
