@@ -114,9 +114,7 @@ class StarSums:
         return out
 
     def shared(self, influence: list[Float], variances: list[Float]) -> Float:
-        """Covariances (levers, D, D) by errors of variances (n_stars, 2) common to a star's
-        matches.
-        """
+        """Covariances (levers, D, D) by errors, of variances (n_stars, 2), common to a star."""
         D, n_stars = influence[0].shape[2], len(variances[0])
         out = np.zeros((len(variances), D, D))
         step = max(1, SCRATCH // (16 * D * len(variances)))

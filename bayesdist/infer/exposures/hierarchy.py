@@ -48,7 +48,8 @@ SCALE = 1e-4  # of the prior on tau: variation of the scale by velocity aberrati
 # scatter they reduce it by 3 %.
 CAUTION = 4.0
 MOST_OUTLYING = 0.2  # fraction of the exposures beyond which they are the rule
-LEAST_DETERMINED = 0.5  # fraction of the E deviations of a kind that the data must determine
+# smallest sum over E deviations of a kind of the parts that the data determine
+LEAST_DETERMINED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,7 +384,7 @@ def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> No
 def _require_determined(scatter: Scatter, model: DistortionModel) -> None:
     """Raise DegenerateError where data hardly constrain a kind of deviation more than its prior."""
     _, factor = scatter.posterior(scatter.scale / scatter.caution)
-    # number of the E deviations of a kind that are known from the data rather than from the prior
+    # part of each deviation that is known from the data rather than from the prior
     known = 1 - factor.variances()[scatter.index] / scatter.scale[scatter.kind] ** 2
     determined = np.bincount(scatter.kind, known)
     if (determined < LEAST_DETERMINED).any():

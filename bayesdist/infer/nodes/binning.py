@@ -44,7 +44,7 @@ def binned_table(
     x, y : array_like, shape (N,)
         Raw pixels.
     shift : array_like, shape (N, 2)
-        Pixels to be added to them.
+        Corrections to be added to them, pixels.
     chip : Chip
     order : int, optional
         Subtract the part that a polynomial of this order describes; left in by default, as in the

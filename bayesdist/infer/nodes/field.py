@@ -57,7 +57,7 @@ def field_table(
     x, y : array_like, shape (N,)
         Raw pixels.
     shift : array_like, shape (N, 2)
-        Pixels to be added to them: see `pixel_shifts`.
+        Corrections to be added to them, pixels: see `pixel_shifts`.
     variance : array_like, shape (N, 2)
         Square of its error, square pixels.
     chip : Chip

@@ -76,7 +76,7 @@ def run_certified(
     """Chains by way of a surrogate, its certificate, and True if a second stage made them exact.
 
     The second stage is 'always', 'never', or 'auto': where its expected passes are affordable.
-    Otherwise the draws have converged only when the certificate is granted.  InputError for an
+    Without it the draws have converged only when the certificate is granted.  InputError for an
     unknown second stage, and as `certify`; DegenerateError and NotConvergedError as `run_chains`
     and `draw_surrogate`.
     """

@@ -375,7 +375,7 @@ def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ..
 
 
 def _chip_moves(model: DistortionModel) -> Float:
-    """Shifts and linear maps (D, n) of each further chip, if no star ties it to the first."""
+    """Shifts and linear maps (D, n) of each further chip, free if no star ties it to the first."""
     starts = [
         model.coefficient_slice(c.number, axis).start for c in model.chips[1:] for axis in (0, 1)
     ]

@@ -21,10 +21,8 @@ Int = NDArray[np.int64]
 
 LEAST_DETECTIONS = 2  # of a star that gives information about the distortion
 MOTIONS = {"none": 2, "proper_motion": 4, "parallax": 5}
-VAGUE = (
-    # precision, in the unit of u, v, that makes a star's matrix positive and is no information
-    1e-12
-)
+# precision, in the unit of u, v, that makes a star's matrix positive and is no information
+VAGUE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
