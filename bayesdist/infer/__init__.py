@@ -1,4 +1,4 @@
-"""From matches to knowledge: the linear fit, the outlier mixture, and its posterior."""
+"""Fits and posteriors of a distortion model: least squares, outlier mixture, sampling."""
 
 from __future__ import annotations
 

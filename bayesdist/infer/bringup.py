@@ -1,9 +1,9 @@
-"""The bring-up of a calibration: match, fit, match again, until the corners are there too.
+"""Bring-up of a calibration: match, fit and match again, until the corners are covered too.
 
-WSDC D-T033, sections 2 and 3: with a distortion that is hardly known, pairs are found near the
-centre only; each fit brings more of the detector within reach.  What keeps the loop from following
-false pairs: a place on the detector counts only where more pairs are found than chance gives, pairs
-elsewhere are left out, and the polynomial's order rises as the place does.
+WSDC D-T033, sections 2 and 3: with a distortion that is hardly known, matches are found near the
+centre only; each fit brings more of the detector within reach. Three rules stop the loop from
+following false matches: a part of the detector counts only where there are more matches than chance
+gives, matches elsewhere are left out, and the polynomial's order rises as that part does.
 """
 
 from __future__ import annotations
@@ -27,32 +27,31 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-FIRST_ORDER = 2  # of the first fit; each round may take one order more
-GROWS = 0.01  # share of the bins by which the coverage must rise to count as growing
-SETTLED = 0.005  # of the radius in the centre: how far the model may still move
+FIRST_ORDER = 2  # polynomial order of the first fit; each round may take one order more
+GROWS = 0.01  # fraction of the bins by which the coverage must rise to count as growing
+SETTLED = 0.005  # fraction of the radius in the centre by which the model may still change
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One match and the fit to it.
+    """One round of the bring-up: the matches and the fit to them.
 
     Parameters
     ----------
     order : int
-        Of the fit.
+        Polynomial order of the fit.
     acceptance : RadialLimit
+        Matching radius, centre to corners.
     n_pairs : int
-        All pairs.
+        All matches.
     n_believed : int
-        Those in covered bins, which were fitted.
+        Matches in covered bins, which were fitted.
     n_false : float
-        False ones that are to be expected among those believed, from what displaced detections
-        find.
+        Expected number of false matches among those fitted, from what displaced detections find.
     coverage : float
-        Share of the detector's bins, of those with detections, that have enough more pairs than
-        chance gives.
+        Fraction of the detector's bins with detections that have enough more matches than chance.
     rms : float
-        Of the residuals that the fit kept, one axis.
+        Rms residual of the matches that the fit used, one axis.
     moved : float
         Largest change of the model over the detector.
     theta : ndarray, shape (n_params,)
@@ -72,7 +71,7 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class BringUp:
-    """How a calibration came about.
+    """Result of a bring-up: its rounds, the last fit and the matches of that fit.
 
     Parameters
     ----------
@@ -80,13 +79,13 @@ class BringUp:
     fit : LinearFit
         Of the last round.
     matches : MatchTable
-        The believed pairs of the last round; exposures are the frames.
+        Matches fitted in the last round; exposures are the frames.
     index, reference_index : ndarray of int, shape (n_believed,)
-        Rows of the believed pairs in the two lists.
+        Rows of these matches in the two lists.
     covered : ndarray of bool, shape (bins, bins)
-        Which bins [iy, ix] of the detector are covered in the last round.
+        Bins [iy, ix] of the detector that are covered in the last round.
     settled : bool
-        Whether the last fit moved no more.
+        True if the last fit changed the model no more.
     """
 
     rounds: tuple[Round, ...]
@@ -99,7 +98,7 @@ class BringUp:
 
     @property
     def sentence(self) -> str:
-        """How it ended."""
+        """Sentence for reports: convergence, coverage, number of matches and their rms."""
         first, last = self.rounds[0], self.rounds[-1]
         end = "settled" if self.settled else "has NOT settled"
         out = (
@@ -127,21 +126,21 @@ def bring_up(
     rejection: Rejection = DEFAULT_REJECTION,
     max_rounds: int = 30,
 ) -> BringUp:
-    """Match and fit in turn until the whole detector is covered and nothing moves.
+    """Match and fit in turn until the whole detector is covered and the model changes no more.
 
-    As long as the coverage grows, pairs are accepted within a radius that is larger in the corners;
-    then within the radius of the centre everywhere, with even weights.
+    As long as the coverage grows, matches are accepted within a radius that is larger in the
+    corners; then within the radius of the centre everywhere, with even weights.
 
     Parameters
     ----------
     detections : FrameStars
-        On the detector.
+        Pixel positions on the detector.
     reference : FrameStars
         Undistorted positions in the frames.
     model : DistortionModel
         One chip, without frames and time dependence.
     start : ndarray, shape (n_params,), optional
-        First guess; by default none: the detections' pixels are taken for undistorted positions.
+        First guess; without one, the detections' pixels are taken as undistorted positions.
     acceptance : RadialLimit
         Of the first rounds.  The radius in the centre must allow for the offset there.
     bins : int
@@ -159,7 +158,7 @@ def bring_up(
     ------
     InputError
         For a model of several chips or with frames, a start of another length, a detection outside
-        the detector, or when nowhere on the detector more pairs are found than chance gives.
+        the detector, or when nowhere on the detector more matches are found than chance gives.
     DegenerateError
         As `fit_linear`, when in the end too little of the detector is covered.
     """
@@ -182,7 +181,7 @@ def bring_up(
     while True:
         found = field.match(theta, rule, len(rounds) + 1)
         matches = field.table(found)
-        # the last fit is that of the model itself, which refuses pairs that cover too little
+        # the last fit is that of the model itself, which refuses matches that cover too little
         last = settled or len(rounds) + 1 >= max_rounds
         order = model.order if last else order
         fit = fit_linear(matches, model, rejection=rejection) if last else None
@@ -219,7 +218,7 @@ def bring_up(
 def _partial_fit(
     matches: MatchTable, model: DistortionModel, order: int, rejection: Rejection
 ) -> LinearFit:
-    """Fit of the part of the detector that has pairs, as if it were a detector of its own."""
+    """Fit of the part of the detector that has matches, as if it were a detector of its own."""
     low = [max(0.0, np.floor(z.min() - 0.5)) for z in (matches.x, matches.y)]
     high = [np.ceil(z.max() + 0.5) - 1.0 for z in (matches.x, matches.y)]
     chip = model.chips[0]
@@ -234,7 +233,7 @@ def _partial_fit(
 
 
 def _in_model(fit: LinearFit, model: DistortionModel) -> Float:
-    """Parameters of a fit of part of the detector, in those of the model."""
+    """Parameters (n_params,) of the full model for a fit of part of the detector."""
     if fit.model == model:
         return fit.mean
     basis, part = model.basis(), fit.model.basis()

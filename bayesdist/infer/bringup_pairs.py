@@ -1,4 +1,4 @@
-"""Pairs that a calibration in the making may believe: where more are found than chance gives."""
+"""Matches for a bring-up, taken from bins of the detector with more of them than chance gives."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 RARE = 1e-3
-DISPLACED = 10.0  # radii in the corners
+DISPLACED = 10.0  # in units of the radius in the corners
 GRID = 17  # points on each axis where models are compared
-OF_THE_BEST = 0.5  # a bin has at least this share of the pairs that good bins have
+OF_THE_BEST = 0.5  # a bin has at least this fraction of the matches that good bins have
 _DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """Pairs in covered bins: their rows in both lists, and what else was found."""
+    """Matches in covered bins, and the statistics of the matching."""
 
-    index: Int
-    partner: Int
-    n_pairs: int
-    n_false: float
+    index: Int  # row of each match in the detections
+    partner: Int  # row of each match in the reference
+    n_pairs: int  # all matches, outside covered bins too
+    n_false: float  # expected number of false ones in covered bins
     covered: Bool
-    coverage: float
+    coverage: float  # fraction of the bins with detections that are covered
 
 
 class Field:
-    """The two lists, and the bins of the detector."""
+    """Detections, reference stars and the bins of the detector."""
 
     def __init__(
         self, detections: FrameStars, reference: FrameStars, model: DistortionModel, bins: int
@@ -69,11 +69,11 @@ class Field:
         self.grid = FrameStars(x, y, np.ones(len(x)), np.zeros(len(x), np.int64))
 
     def positions(self, theta: Float | None, stars: FrameStars) -> Float:
-        """Undistorted positions (N, 2); None stands for no distortion."""
+        """Undistorted positions (N, 2); without parameters the pixel positions themselves."""
         return stars.points if theta is None else self.model.predict(theta, stars.x, stars.y)
 
     def distance(self, before: Float | None, now: Float) -> float:
-        """Largest difference over the detector."""
+        """Largest difference of two models over the detector."""
         step = self.positions(now, self.grid) - self.positions(before, self.grid)
         return float(np.hypot(*step.T).max())
 
@@ -86,12 +86,12 @@ class Field:
         return index, partner
 
     def match(self, theta: Float | None, rule: RadialLimit, number: int) -> Believed:
-        """Pairs where more are found than chance gives."""
+        """Matches of a round in the bins that have more of them than chance gives."""
         stars, n_bins = self.detections, self.bins**2
         position = self.positions(theta, stars)
         radius = rule.at(stars.x, stars.y, self.size)
         index, partner = self._paired(position, radius)
-        # displaced by more than the detector is distorted, detections find strangers only
+        # displaced by more than the detector is distorted, detections find false matches only
         chance = np.zeros(n_bins)
         for direction in _DIRECTIONS:
             moved = position + DISPLACED * rule.corner * np.array(direction)
@@ -114,18 +114,18 @@ class Field:
             index=index[good],
             partner=partner[good],
             n_pairs=len(index),
-            # only a detection without its own partner takes a stranger
+            # only a detection without its own reference star takes another one
             n_false=n_chance * (n - int(good.sum())) / (n - n_chance),
             covered=covered,
             coverage=float(covered.sum() / (there > 0).sum()),
         )
 
     def table(self, found: Believed) -> MatchTable:
-        """The pairs as matches."""
+        """Match table of the accepted matches, with the frames as exposures."""
         stars, others = self.detections, self.reference
         sigma = np.hypot(stars.sigma[found.index], others.sigma[found.partner])
         frames, exposure = np.unique(stars.frame[found.index], return_inverse=True)
-        return MatchTable.of_distinct_rows(  # no detection has two partners
+        return MatchTable.of_distinct_rows(  # no detection has two reference stars
             x=stars.x[found.index],
             y=stars.y[found.index],
             u=others.x[found.partner],
@@ -141,14 +141,10 @@ class Field:
 
 
 def _covered(count: Int, there: Int, chance: Float) -> Bool:
-    """Bins in which more detections have a partner than chance gives, and not much fewer than best.
+    """Boolean mask (n_bins,) of bins with more matches than chance and not far below the best bins.
 
-    Parameters
-    ----------
-    count, there : ndarray of int, shape (n_bins,)
-        Pairs, and detections.
-    chance : ndarray, shape (n_bins,)
-        Pairs of displaced detections.
+    `count` has the matches, `there` the detections and `chance` the matches of displaced detections
+    in each bin.
     """
     has = there > 0
     expected = np.maximum(chance, there * (chance.sum() / there.sum()))

@@ -1,9 +1,9 @@
 """Solutions as netCDF files, written whole or not at all, and read with one clear error.
 
 fit.nc holds a linear fit, posterior.nc a posterior, as a tree that ArviZ and xarray open: groups
-posterior, sample_stats, diagnostics; of tables in memory also observed_data, constant_data and,
-where that is not too large, log_likelihood.  What the posterior says of each star of larger data
-stands beside it, in the parts of `stars/`.
+posterior, sample_stats, diagnostics; for tables in memory also observed_data, constant_data and,
+where that is not too large, log_likelihood. Values for each star of larger data are in separate
+files, in the parts of `stars/`.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ __all__ = ["load_fit", "load_posterior", "save_fit", "save_posterior"]
 ENGINE: Final = "h5netcdf"
 SCHEMA = 2
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
-MOST_STARS = 1_000_000  # whose data are repeated here
-LARGEST = 16_000_000  # bytes of log-likelihood that are kept star by star and draw by draw
+MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file
+LARGEST = 16_000_000  # bytes of log-likelihood that are stored star by star and draw by draw
 FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
 
 
@@ -49,7 +49,7 @@ def save_posterior(
     *,
     provenance: Mapping[str, object] | None = None,
 ) -> None:
-    """Write a posterior.
+    """Write a posterior to a netCDF file.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def save_posterior(
     path : path
         Replaced atomically.
     provenance : mapping, optional
-        JSON-able facts about the run, kept as an attribute.
+        JSON-able facts about the run, stored as an attribute.
     """
     import xarray as xr
 
@@ -98,7 +98,7 @@ def save_posterior(
     if matches is not None and len(matches) <= MOST_STARS:
         groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
         groups["constant_data"] = _constants(posterior, matches, xr)
-        # of one draw alone where the places of stars go with it
+        # of one draw only where the stars' positions are unknowns too
         few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
         if few and not posterior.own_places:
             values = star_log_likelihood(posterior, matches)
@@ -139,7 +139,7 @@ def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[n
 
 
 def load_posterior(path: str | Path) -> Posterior:
-    """Read a posterior back.
+    """Posterior from a file.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def _plain(value: object) -> object:
 
 
 def save_fit(fit: LinearFit, path: str | Path) -> None:
-    """Write a linear fit; the file is replaced atomically."""
+    """Write a linear fit to a netCDF file, which is replaced atomically."""
     import xarray as xr
 
     names = list(fit.model.names)
@@ -234,7 +234,7 @@ def save_fit(fit: LinearFit, path: str | Path) -> None:
 
 
 def load_fit(path: str | Path) -> LinearFit:
-    """Read a linear fit back.
+    """Linear fit from a file.
 
     Raises
     ------
@@ -264,7 +264,7 @@ def load_fit(path: str | Path) -> LinearFit:
 def _write(data: xr.Dataset | xr.DataTree, path: str | Path) -> None:
     """Write a dataset or a tree, replaced atomically.
 
-    The file is put together in memory: on a full disk HDF5 itself would crash when it is closed.
+    The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
     """
     content = data.to_netcdf(engine=ENGINE)
     with atomic_path(path) as temporary:
@@ -273,19 +273,9 @@ def _write(data: xr.Dataset | xr.DataTree, path: str | Path) -> None:
 
 @contextmanager
 def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
-    """Turn whatever goes wrong while a file is read into one error.
+    """Turn any exception while a file is read into one FormatError.
 
-    Parameters
-    ----------
-    path : Path
-    what : str
-        What the file should be: 'a posterior', 'a fit'.
-    stage : str
-        The stage that makes it.
-
-    Raises
-    ------
-    FormatError
+    `what` names the expected content ('a posterior', 'a fit'), `stage` the stage that makes it.
     """
     if not path.exists():
         raise FormatError(
@@ -293,7 +283,7 @@ def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
         )
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # foreign HDF5 files are told of below
+            warnings.simplefilter("ignore")  # foreign HDF5 files are reported below
             yield
     except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise FormatError(

@@ -1,8 +1,8 @@
-"""The weighted linear fit: two passes with rejection, frames relinearised, formal covariance.
+"""Weighted linear fit: two passes with rejection, relinearised frames, formal covariance.
 
-The procedure of the WISE programme gnDSTR (WSDC D-T033, section 3): fit, drop pairs whose residual
-chi-square or absolute residual is beyond a limit, fit again; optional extra weight towards the
-corners.
+The procedure of the WISE programme gnDSTR (WSDC D-T033, section 3): fit, drop matches whose
+residual chi-square or absolute residual is beyond a limit, fit again; optional extra weight towards
+the corners.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ __all__ = ["Clip", "LinearFit", "Rejection", "build_model", "fit_linear", "resid
 
 Float = NDArray[np.float64]
 
-MEDIAN_STARS = 1_000_000  # stars that a median is taken of
+MEDIAN_STARS = 1_000_000  # largest number of stars whose median is taken
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """How a two-pass fit leaves stars out and weights them.
+    """Rejection limits and weights of a two-pass fit.
 
     Parameters
     ----------
@@ -66,27 +66,19 @@ NO_REJECTION = Rejection(np.inf, None)
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """The rule by which the first pass leaves stars out: limits on its residuals.
+    """Limits on the residuals of the first pass, beyond which stars are left out of the second."""
 
-    Parameters
-    ----------
-    theta : ndarray, shape (D,)
-        Parameters of the first pass.
-    chi2_limit, abs_limit : float
-        In the unit of u, v; stars beyond either are left out.
-    """
-
-    theta: Float
+    theta: Float  # of the first pass
     chi2_limit: float
-    abs_limit: float
+    abs_limit: float  # in the unit of u, v
 
     def keeps(self, model: DistortionModel, matches: MatchTable) -> NDArray[np.bool_]:
-        """Which stars (N,) of a table stay."""
+        """Boolean mask (N,) of a table's stars within both limits."""
         stars, order = prepare(model, matches)
         return in_table_order(self.keeps_of(stars), order).astype(bool)
 
     def keeps_of(self, stars: Stars) -> NDArray[np.bool_]:
-        """Which of some stars (N,) stay, in their own order."""
+        """Boolean mask (N,) of prepared stars within both limits, in their own order."""
         residual = stars.residuals(self.theta)
         chi2 = residual[:, 0] ** 2 / stars.var_u + residual[:, 1] ** 2 / stars.var_v
         r2 = (residual**2).sum(axis=1)
@@ -105,20 +97,20 @@ class LinearFit:
     cov : ndarray, shape (D, D)
         Formal covariance; with extra corner weights the sandwich form, which stays a covariance.
     clip : Clip
-        What was left out of the second pass.
+        Limits beyond which stars were left out of the second pass.
     n_rows, n_used : int
-        All stars, and those of the second pass.
+        Number of all stars, and of the stars in the second pass.
     rms_u, rms_v : float
         Rms residuals of the stars used, in the unit of u, v.
     rms_rejected : float
         Rms residual, of both axes, of the stars left out; 0 where there are none.
     rejected : dict of str to int
-        Stars left out of the second pass, by reason.
+        Number of stars left out of the second pass, by reason.
     chi2 : float
         Of the stars used, with the quoted errors.
     dof : int
     condition : float
-        Of the normal matrix scaled to unit diagonal.
+        Condition number of the normal matrix scaled to unit diagonal.
     """
 
     model: DistortionModel
@@ -154,16 +146,16 @@ class LinearFit:
 
     @property
     def n_rejected(self) -> int:
-        """Stars left out of the second pass."""
+        """Number of stars left out of the second pass."""
         return self.n_rows - self.n_used
 
     def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
-        """Which stars (N,) of a table the second pass uses."""
+        """Boolean mask (N,) of a table's stars that the second pass uses."""
         return self.clip.keeps(self.model, matches)
 
     @cached_property
     def _root(self) -> Float:
-        return scaled_cholesky(self.cov)  # what a gauge holds has no error
+        return scaled_cholesky(self.cov)  # parameters fixed by a gauge have no error
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors from the Gaussian with this mean and covariance.
@@ -191,7 +183,7 @@ def build_model(
     frames: str = "none",
     time: TimeDependence | None = None,
 ) -> DistortionModel:
-    """A model that fits a table: its chips, exposures and unit.
+    """Distortion model that fits a table: its chips, exposures and unit.
 
     Parameters
     ----------
@@ -267,7 +259,7 @@ def fit_linear(
         With errors.
     model : DistortionModel
     rejection : Rejection
-        Which stars are left out of the second pass, and extra weight in the corners.
+        Limits beyond which stars are left out, and extra weight in the corners.
     priors : GaussianPriors, optional
         Gaussian priors on named parameters.
     compute : Compute, optional
@@ -347,7 +339,7 @@ def _fitted(
 
 
 def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
-    """Chi-square of every so manieth star."""
+    """Chi-square of every n-th star, both axes."""
     residual = stars.residuals(theta)[::every]
     var = np.stack([stars.var_u[::every], stars.var_v[::every]], axis=1)
     return ((residual**2 / var).sum(axis=1),)

@@ -1,4 +1,4 @@
-"""The posterior as a result: draws, their moments, and how far they can be trusted."""
+"""The posterior as a result: draws, their moments and convergence."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SamplerInfo:
-    """How the draws were made.
+    """Record of how the draws were made.
 
     Parameters
     ----------
@@ -33,6 +33,7 @@ class SamplerInfo:
     passes : int
         Evaluations of the likelihood of all stars.
     acceptance : float
+        Fraction of accepted proposals.
     wall_s : float
         Seconds of this session.
     seed : int
@@ -64,11 +65,11 @@ class Posterior:
         One chain for each independent ensemble; its draws are those of the first walker, then of
         the second, and so on.
     hyper : dict of str to ndarray, shape (chains, draws)
-        Of 'f', 'j', 's_out' those that were sampled, in natural form.
+        Sampled ones of 'f', 'j' and 's_out', in natural form.
     log_prob : ndarray, shape (chains, draws)
         Log posterior density, up to a constant.
     n_stars, n_flagged : int
-        All stars, and those that are more likely false matches than not.
+        Number of all stars, and of those that are more likely false matches than not.
     n_false : float
         Expected number of false matches: the sum of the probabilities.
     reference_sigma : float
@@ -78,8 +79,8 @@ class Posterior:
     certificate : Certificate, optional
         Of the surrogate, where one was made.
     own_places : bool
-        Whether the places of the stars are unknowns of the same solution, as in a self-calibration:
-        the matches then have those that go with the mean, and with no other draw.
+        True if the stars' positions are unknowns of the solution, as in a self-calibration: the
+        matches then have the positions of the mean, which are those of no other draw.
     """
 
     model: DistortionModel
@@ -107,7 +108,7 @@ class Posterior:
 
     @property
     def approximation(self) -> str:
-        """What every output has to say of draws that are not exact; empty where they are."""
+        """Warning for every output that the draws are not exact; empty where they are."""
         if self.sampler.exact or self.certificate is None:
             return ""
         return self.certificate.statement
@@ -143,7 +144,7 @@ class Posterior:
         return np.quantile(self.flat, [tail, 1 - tail], axis=0).T
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Random draws of theta, without replacement as far as they reach.
+        """Random draws of theta, without replacement as long as there are enough.
 
         Parameters
         ----------

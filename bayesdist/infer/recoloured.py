@@ -1,4 +1,4 @@
-"""A solution with another covariance: wider by errors that its fit did not know, or narrower."""
+"""Solutions with another covariance, for errors that their fit did not know or counted too much."""
 
 from __future__ import annotations
 
@@ -20,13 +20,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Recoloured(Derived):
-    """A solution whose draws are spread to another covariance; they keep their shape.
-
-    Parameters
-    ----------
-    source : Solution
-    cov : ndarray, shape (D, D)
-    """
+    """Solution whose draws are rescaled to the covariance `cov`, in which they keep their shape."""
 
     source: Solution
     cov: Float
@@ -43,7 +37,7 @@ class Recoloured(Derived):
 
     @property
     def mean(self) -> Float:
-        """That of the source."""
+        """Mean (D,) of the source."""
         return self.source.mean
 
     @property
@@ -56,7 +50,7 @@ class Recoloured(Derived):
         return recolouring(np.asarray(self.source.cov), self.cov)
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors (n, D): draws of the source, spread to this covariance.
+        """Parameter vectors (n, D): draws of the source, rescaled to this covariance.
 
         A sum with independent noise would not do: the difference of the covariances may have
         negative eigenvalues, where errors that a fit takes for independent cancel.
@@ -67,35 +61,18 @@ class Recoloured(Derived):
 
 
 def with_spread(posterior: Posterior, before: Float, after: Float) -> Posterior:
-    """A posterior whose deviations of one covariance are given another; its mean stays.
+    """Posterior whose deviations are mapped from covariance `before` to `after`; its mean stays.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    before, after : ndarray, shape (D, D)
-        As `recolouring`.
-
-    Returns
-    -------
-    Posterior
-        With other draws of theta; all else is as it was.
+    The map is that of `recolouring`; all else but theta is unchanged.
     """
     spread, mean = recolouring(before, after), posterior.mean
     return replace(posterior, theta=mean + (posterior.theta - mean) @ spread.T)
 
 
 def recolouring(before: Float, after: Float) -> Float:
-    """Linear map that gives deviations of one covariance another.
+    """Linear map A (D, D) with A before A^T = after; the identity where the two are equal.
 
-    Parameters
-    ----------
-    before, after : ndarray, shape (D, D)
-        Positive definite, but for parameters without variance, which are held.
-
-    Returns
-    -------
-    ndarray, shape (D, D)
-        A with A before A^T = after; the identity where the two are equal, and for what is held.
+    Both are positive definite, but for parameters without variance, which A leaves as they are.
     """
     free = np.flatnonzero(np.diag(before) > 0)
     inner = np.ix_(free, free)

@@ -1,10 +1,10 @@
-"""The skew of the gnDSTR model: the angle between the detector's axes on the sky, as a constraint.
+"""Skew of the gnDSTR model, the angle between the detector's axes on the sky, as a constraint.
 
 WSDC D-T033, section 1: a polynomial for each axis "plus a skew factor applied to Y", constrained to
-zero.  With all linear terms in both polynomials the skew is no parameter beside them: a solution
-(u, v) = S(skew) w, whose w has perpendicular axes at the reference pixel, is again a polynomial of
-the same order.  The skew is a function of four linear coefficients.  To fit it is to leave them
-free, and both axes are fitted apart; to fix it is one condition on them, and that ties the axes.
+zero. With all linear terms in both polynomials the skew is no additional parameter: a solution (u,
+v) = S(skew) w, whose w has perpendicular axes at the reference pixel, is again a polynomial of the
+same order. The skew is a function of four linear coefficients. To fit it is to leave them free, and
+both axes are fitted apart; to fix it is one condition on them, and that ties the axes.
 
 For e_x, e_y, the images of one pixel along x and along y at the reference pixel::
 
@@ -32,7 +32,7 @@ SETTLED = 1e-14  # radians
 
 @dataclass(frozen=True)
 class Skew:
-    """Angle by which the axes miss being perpendicular.
+    """Deviation of the angle between the axes from 90 degrees.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Skew:
 
 
 def skew_of(solution: LinearFit | Posterior, *, chip: int | None = None) -> Skew:
-    """The skew that a solution's linear terms hold, with its error.
+    """Skew in a solution's linear terms, with its error.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def skew_of(solution: LinearFit | Posterior, *, chip: int | None = None) -> Skew
     Returns
     -------
     Skew
-        At the reference pixel; drift and exposure frames left aside.
+        At the reference pixel; drift and exposure frames are left out.
     """
     value, gradient = _skew(solution.model, solution.mean, chip)
     # rounding may leave the variance of what was imposed below zero
@@ -72,10 +72,10 @@ def skew_of(solution: LinearFit | Posterior, *, chip: int | None = None) -> Skew
 def fit_with_skew(
     fit: LinearFit, skew: float = 0.0, sigma: float = 0.0, *, chip: int | None = None
 ) -> LinearFit:
-    """A solution under a condition on its skew, without another pass over the data.
+    """Linear fit under a condition on its skew, without another pass over the data.
 
-    Chi-square is quadratic in the coefficients: the free solution and its covariance hold all that
-    the data say.  The skew is not linear in the coefficients, so that the condition is linearised
+    Chi-square is quadratic in the coefficients, so the free solution and its covariance hold all
+    that the data say.  The skew is not linear in the coefficients: the condition is linearised
     where the solution lies, until it does not move.
 
     Parameters
@@ -93,8 +93,7 @@ def fit_with_skew(
     -------
     LinearFit
         `chi2` of the stars is raised by what the condition costs, and `dof` by the one number that
-        the condition adds.  What the clipping kept, and `rms_u` and `rms_v`, stay those of the free
-        solution.
+        the condition adds.  The stars used, `rms_u` and `rms_v` stay those of the free solution.
 
     Raises
     ------
@@ -114,7 +113,7 @@ def fit_with_skew(
         value, gradient = _skew(fit.model, theta, chip)
         moves = fit.cov @ gradient
         variance = float(gradient @ moves) + sigma**2
-        # the condition at the free solution, as its tangent at theta sees it
+        # the condition linearised at theta, evaluated at the free solution
         missing = skew - value - float(gradient @ (fit.mean - theta))
         new = fit.mean + moves * (missing / variance)
         step = abs(float(gradient @ (new - theta)))
@@ -133,7 +132,7 @@ def fit_with_skew(
 
 
 def _skew(model: DistortionModel, theta: Float, chip: int | None) -> tuple[float, Float]:
-    """The skew, and its derivative by theta."""
+    """Skew in radians, and its derivative (D,) with respect to theta."""
     basis = model.basis(chip)
     slices = [model.coefficient_slice(chip, axis) for axis in (0, 1)]
     rows = basis.monomial_matrix[[basis.terms.index((1, 0)), basis.terms.index((0, 1))]]

@@ -1,14 +1,14 @@
-"""The error of the reference catalogue: one star has one error, in however many exposures it is.
+"""Effect of reference-catalogue errors, which a star has in common in all of its exposures.
 
-A fit counts every match as a measurement of its own, with the catalogue's error in its sigma.  But
-a star that is matched in many exposures is wrong in all of them by the same amount (and by a proper
-motion that is wrong by the same amount), so this part of the error does not average out.  With
-normal matrix H and the sums G_s over all matches of star s (`star_sums`),
+A fit counts every match as an independent measurement, with the catalogue's error in its sigma.
+But a star that is matched in many exposures is wrong in all of them by the same amount (and by a
+proper motion that is wrong by the same amount), so this part of the error does not average out.
+With normal matrix H and the sums G_s over all matches of star s (`star_sums`),
 
     cov = H^-1 [sum_s G_s Sigma_s G_s^T] H^-1
 
-is what the errors Sigma_s of the catalogue do to the parameters.  The fit has already counted the
-diagonal part, sum_i instead of (sum_i)^2.
+is the covariance of the parameters by the errors Sigma_s of the catalogue.  The fit has already
+counted the diagonal part, sum_i instead of (sum_i)^2.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class StarCovariance:
-    """What the errors of the catalogue do to the parameters of a solution.
+    """Covariance of a solution's parameters by the errors of the catalogue.
 
     Parameters
     ----------
     total : ndarray, shape (D, D)
         Covariance of the parameters' error that the catalogue causes.
     counted : ndarray, shape (D, D)
-        The part of it that is in the solution's covariance: that of errors which are independent
-        from match to match.  Zero where the quoted errors are without the catalogue's.
+        The part of it that is in the solution's covariance, by errors taken as independent from
+        match to match.  Zero where the quoted errors do not contain the catalogue's.
     motions : ndarray, shape (D, D), optional
         The part of `total` that the errors of the proper motions cause; None where there are none.
     """
@@ -52,7 +52,7 @@ class StarCovariance:
 
     @property
     def extra(self) -> Float:
-        """What has to be added to the solution's covariance."""
+        """Covariance (D, D) to add to the solution's own."""
         return self.total - self.counted
 
 
@@ -71,7 +71,7 @@ def star_covariance(
     included: bool = True,
     frames: bool = True,
 ) -> StarCovariance:
-    """Covariance of the parameters by the errors of the catalogue.
+    """Covariance of a solution's parameters by the errors of the catalogue.
 
     Parameters
     ----------
@@ -92,11 +92,11 @@ def star_covariance(
         Probability that a match is true.  By default 1 for the stars that a fit used and 0 for
         those that it left out.
     included : bool
-        Whether the quoted errors of the matches contain the catalogue's.
+        True if the quoted errors of the matches contain the catalogue's.
     frames : bool
-        Whether the frames of the exposures are followed exactly.  Without, polynomials and drift
-        still are, in a fraction of the time (a seventh with 110 exposures), and the errors of the
-        frames change only as far as they are correlated with those.
+        True to propagate to the frames of the exposures exactly.  If False, only polynomials and
+        drift are exact, in a fraction of the time (a seventh with 110 exposures), and the errors of
+        the frames change only as far as they are correlated with those.
 
     Returns
     -------
@@ -151,10 +151,10 @@ def star_covariance(
 def _require_contained(
     matches: MatchTable, code: Int, variances: list[Float], levers: list[Float]
 ) -> None:
-    """Refuse quoted errors that are smaller than the catalogue's part of them."""
+    """Raise InputError for quoted errors that are smaller than the catalogue's part of them."""
     for axis, quoted in enumerate((matches.sigma_u, matches.sigma_v)):
         if quoted is None:
-            continue  # which `prepare` refuses
+            continue  # `prepare` refuses these
         part = sum(lever**2 * v[code, axis] for lever, v in zip(levers, variances, strict=True))
         small = quoted**2 < part * (1 - 1e-9)
         if small.any():
@@ -185,7 +185,7 @@ def _codes(matches: MatchTable, star: ArrayLike | None) -> Int:
 
 
 def _by_star(values: ArrayLike, n_stars: int, name: str, *, signed: bool = False) -> Float:
-    """Values of every star, one or n_stars or more of them given."""
+    """Values of every star, from one for all or an array of n_stars or more."""
     values = np.asarray(values, float)
     if values.ndim and (values.ndim > 1 or len(values) < n_stars):
         raise InputError(

@@ -1,8 +1,8 @@
-"""What the error of a single star of the catalogue has in common with a solution.
+"""Covariance of single catalogue stars' errors with a solution.
 
-With the notation of `star_sums`, an error c_s of star s moves the parameters by H^-1 G_s c_s.  So
-a star that is seen again, in an exposure that was no part of the fit, has an error that the
-solution's own is correlated with: cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
+With the notation of `star_sums`, an error c_s of star s moves the parameters by H^-1 G_s c_s.  So a
+star that is seen again, in an exposure that was no part of the fit, has an error with which the
+solution's own is correlated: cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
 """
 
 from __future__ import annotations
@@ -26,24 +26,15 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class StarErrors:
-    """Errors of a catalogue by code of the star.
+    """Errors of a catalogue by code of the star."""
 
-    Parameters
-    ----------
-    position : ndarray, shape (S, 2)
-        Standard errors, in the unit of u, v.
-    motion : ndarray, shape (S, 2), optional
-        In that unit per year.
-    epoch : ndarray, shape (S,), optional
-        Dates at which errors of positions and motions are uncorrelated.
-    """
-
-    position: Float
-    motion: Float | None = None
+    position: Float  # standard errors (S, 2), in the unit of u, v
+    motion: Float | None = None  # errors (S, 2) of proper motions, in that unit per year
+    # dates (S,) at which errors of positions and motions are uncorrelated
     epoch: Float | None = None
 
     def levers(self, star: Int, epoch: Float | None) -> Float:
-        """How the errors of position and motion move matches, shape (levers, n)."""
+        """Derivatives (levers, n) of matched positions by the errors of position and motion."""
         one = np.ones(len(star))
         if self.motion is None or self.epoch is None or epoch is None:
             return one[None]
@@ -51,12 +42,12 @@ class StarErrors:
 
     @property
     def variances(self) -> Float:
-        """Of positions, then of motions where there are any: shape (levers, S, 2)."""
+        """Variances (levers, S, 2) of positions, and then of motions where there are any."""
         parts = [self.position] if self.motion is None else [self.position, self.motion]
         return np.asarray(np.stack(parts) ** 2)
 
     def at(self, star: Int, epoch: Float | None) -> Float:
-        """Variances (n, 2) of the catalogue's positions of some matches."""
+        """Variances (n, 2) of the catalogue's positions for some matches."""
         levers = self.levers(star, epoch)
         variances = self.variances[: len(levers), star]
         return np.asarray(np.einsum("ln,lna->na", levers**2, variances))
@@ -64,20 +55,12 @@ class StarErrors:
 
 @dataclass(frozen=True, eq=False)
 class StarInfluence:
-    """Errors of a catalogue, and what they have in common with polynomials and drift of a solution.
-
-    Parameters
-    ----------
-    errors : StarErrors
-    codes : ndarray of int, shape (k,)
-        Stars, rising, of which the following is known.  Of others there is none: no solution has
-        seen them.
-    by : ndarray, shape (levers, 2, k, n_distortion)
-        How the parameters move with the errors of these stars on either axis.
-    """
+    """Errors of a catalogue, and their effect on polynomials and drift of a solution."""
 
     errors: StarErrors
-    codes: Int
+    codes: Int  # stars (k,) in the solution, ascending; all others have no effect on it
+    # derivatives (levers, 2, k, n_distortion) of the parameters by these stars' errors on either
+    # axis
     by: Float
 
     def with_solution(self, star: Int, epoch: Float | None) -> Float:
@@ -99,21 +82,9 @@ class StarInfluence:
 def star_influence(
     fit: LinearFit, matches: MatchTable, errors: StarErrors, codes: Int
 ) -> StarInfluence:
-    """How single stars of a catalogue have moved a fit.
+    """Effect on a fit of the catalogue errors of the stars `codes` (k,), ascending.
 
-    Parameters
-    ----------
-    fit : LinearFit
-        Without extra weight in the corners.
-    matches : MatchTable
-        Those that it was made from, with errors and codes of the stars.
-    errors : StarErrors
-    codes : ndarray of int, shape (k,)
-        Stars that are asked for, rising.
-
-    Returns
-    -------
-    StarInfluence
+    The fit has no extra weight in the corners; `matches` are its own, with errors and star codes.
     """
     assert matches.star is not None
     model, D = fit.model, fit.model.n_distortion

@@ -1,10 +1,11 @@
-"""Sums over the matches of each star: how an error that it has in all of them moves parameters.
+"""Sums over the matches of each star: the derivatives of the parameters by an error common to them.
 
 With residual weights W and the derivatives J of all matches i of star s,
 
     G_s = sum_i a_i J_i^T W_i
 
-where a_i says how the error moves the match: 1 for a position, t - t0 for a proper motion.
+where a_i is the derivative of the match's position by the error: 1 for a position, t - t0 for a
+proper motion.
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ __all__ = ["StarSums", "influence_by_group"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-SCRATCH = 64_000_000  # bytes of the stars' sums that are held at a time
+SCRATCH = 64_000_000  # bytes of the stars' sums in memory at a time
 
 
 def influence_by_group(
     model: DistortionModel, theta: Float, groups: Groups, cov: Float | None, D: int
 ) -> list[Float]:
-    """For each group the matrices (2, K, D) from weighted basis functions to D parameters.
+    """Matrices (2, K, D) for each group, from weighted basis functions to D parameters.
 
-    With a covariance these are changes of the first D parameters; without, gradients by them.
+    With a covariance these are changes of the first D parameters; without, gradients with respect
+    to them.
     """
     out = []
     for columns, d in model.effective_jacobian(theta, groups):
@@ -47,28 +49,16 @@ def influence_by_group(
 
 @dataclass(frozen=True, eq=False)
 class StarSums:
-    """Matches in the order of their groups, and of their stars within each.
+    """Matches sorted by group, and by star within each group."""
 
-    Parameters
-    ----------
-    starts : ndarray of int, shape (G + 1,)
-    code : ndarray of int, shape (N,)
-    phi : list of ndarray, shape (n_g, K)
-        Basis functions of each group.
-    weight : ndarray, shape (2, N)
-        Of both axes.
-    levers : list of ndarray, shape (N,)
-        How an error of the star moves the match: first 1, then years where stars move.
-    cross : ndarray, shape (N,), optional
-        Weight of either axis in the score of the other.
-    """
-
-    starts: Int
-    code: Int
-    phi: list[Float]
-    weight: Float
+    starts: Int  # first match (G + 1,) of each group
+    code: Int  # star (N,) of each match
+    phi: list[Float]  # basis functions (n_g, K) of each group
+    weight: Float  # weights (2, N) of both axes
+    # derivatives (N,) of the match's position by an error of the star: first 1, then years where
+    # stars move
     levers: list[Float]
-    cross: Float | None = None
+    cross: Float | None = None  # weight (N,) of either axis in the score of the other
 
     @classmethod
     def of(
@@ -79,7 +69,7 @@ class StarSums:
         levers: list[Float],
         cross: Float | None = None,
     ) -> StarSums:
-        """From matches in the order of `stars`, with the codes of their stars (N,)."""
+        """Sums for matches in the order of `stars`, with the codes of their stars (N,)."""
         bounds = [slice(a, b) for a, b in zip(stars.starts[:-1], stars.starts[1:], strict=True)]
         order = np.concatenate(
             [rows.start + np.argsort(code[rows], kind="stable") for rows in bounds]
@@ -101,7 +91,7 @@ class StarSums:
         )
 
     def each(self, influence: list[Float], first: int, end: int) -> Float:
-        """Sums of the stars first to end, of each lever and axis: (levers, 2, stars, D)."""
+        """Sums (levers, 2, stars, D) of the stars first to end, for each lever and axis."""
         out = np.zeros((len(self.levers), 2, end - first, influence[0].shape[2]))
         for g, phi in enumerate(self.phi):
             a = int(self.starts[g])
@@ -110,7 +100,7 @@ class StarSums:
             if lo == hi:
                 continue
             rows, at = slice(a + lo, a + hi), code[lo:hi] - first
-            new = np.flatnonzero(np.diff(at, prepend=-1))  # a star may stand twice in a group
+            new = np.flatnonzero(np.diff(at, prepend=-1))  # a star may occur twice in a group
             twice = len(new) < len(at)
             for axis in (0, 1):
                 pull = (phi[lo:hi] * self.weight[axis, rows, None]) @ influence[g][axis]
@@ -124,7 +114,7 @@ class StarSums:
         return out
 
     def shared(self, influence: list[Float], variances: list[Float]) -> Float:
-        """Covariances (levers, D, D) by errors of variances (n_stars, 2) that a star has once."""
+        """Covariances (levers, D, D) by errors, of variances (n_stars, 2), common to a star."""
         D, n_stars = influence[0].shape[2], len(variances[0])
         out = np.zeros((len(variances), D, D))
         step = max(1, SCRATCH // (16 * D * len(variances)))
@@ -138,7 +128,7 @@ class StarSums:
         return out
 
     def independent(self, influence: list[Float], variances: list[Float]) -> Float:
-        """Covariance (D, D) by such errors, were each match a star of its own."""
+        """Covariance (D, D) by the same errors if they were independent from match to match."""
         D = influence[0].shape[2]
         out = np.zeros((D, D))
         for g, phi in enumerate(self.phi):

@@ -1,11 +1,11 @@
-"""Does a released solution still describe new matches?
+"""Test of a released solution against new matches.
 
-The new matches are fitted by themselves, with the polynomial order of the release, frames of their
-own for every exposure, the drift held at its released rates, and the outlier mixture with its
-jitter anew.  Their polynomials at their mean date, laid on the released ones by the one frame that
-no data can tell, differ by a change whose covariance is that of the fit plus that of the release at
-this date, extrapolated rates included.  Exposures of a campaign deviate from their polynomials as
-those of the release scatter, and what no data can tell are then their shifts and rotations alone.
+The new matches are fitted independently, with the polynomial order of the release, own frames for
+every exposure, the drift fixed at its released rates, and the outlier mixture with its jitter anew.
+Their polynomials at their mean date, mapped to the released ones by the frame that no data can
+determine, differ by a change whose covariance is that of the fit plus that of the release at this
+date, extrapolated rates included.  Exposures of a campaign deviate from their polynomials with the
+scatter of the release; no data can then determine their shifts and rotations alone.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_e
 
 Float = NDArray[np.float64]
 
-SAMPLE = 1_000_000  # matches that tell the mean date
-HELD = 1e-4  # of its own sigma: how exactly a released rate is held
+SAMPLE = 1_000_000  # matches from which the mean date is computed
+HELD = 1e-4  # sigma of a fixed rate, in units of its released sigma
 
 
 @dataclass(frozen=True, eq=False)
 class NewFit:
-    """The new matches fitted by themselves.
+    """Independent fit of the new matches.
 
     Parameters
     ----------
     released : View
         The released polynomials and their drift, without frames.
     fit : LinearFit
-        Least squares of the new matches, which seeds the mixture.
+        Least squares of the new matches, which starts the mixture.
     theta : ndarray, shape (D,)
         Mode of the mixture, in the model of `fit`.
     cov : ndarray, shape (D, D)
     hyper : dict of str to float
-        'j', 'f', 's_out' at the mode, those of them that the mixture has.
+        'j', 'f', 's_out' at the mode, as far as the mixture has them.
     target : Target
         Density of the new matches.
     psi : ndarray
@@ -64,9 +64,9 @@ class NewFit:
     scatter : ndarray, shape (q,)
         Inverse variances of the parameters of an exposure; zero for those that are free.
     extra : ndarray, shape (n, n) or None
-        What errors that all the matches of a star share add to the covariance of the polynomials.
+        Added to the covariance of the polynomials for errors that all matches of a star share.
     common : ndarray, shape (n_distortion, n) or None
-        Covariance of the release with these polynomials, by stars that both have.
+        Covariance of the release with these polynomials, by stars in both.
     """
 
     released: View
@@ -83,12 +83,12 @@ class NewFit:
 
     @property
     def model(self) -> DistortionModel:
-        """Of the new matches: the released structure with their exposures."""
+        """Model of the new matches: the released structure with their exposures."""
         return self.fit.model
 
     @property
     def open(self) -> DistortionModel:
-        """A model whose frames are those that no data can tell."""
+        """Model with only those frame parameters that no data can determine."""
         if self.model.gauge == "first":
             return self.model
         return replace(
@@ -102,7 +102,7 @@ class NewFit:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What the new matches say has changed.
+    """Difference of the new matches' polynomials from the released ones.
 
     Parameters
     ----------
@@ -113,14 +113,13 @@ class Change:
     released : ndarray, shape (chips, 2, K)
         Released polynomials at that date.
     difference : ndarray, shape (chips, 2, K)
-        New minus released, in the frame of the release; what frames could take up is taken out.
+        New minus released, in the frame of the release, without what frames could absorb.
     cov : ndarray, shape (n, n)
         Of the difference, n = 2 K chips.
     released_cov : ndarray, shape (n, n)
-        Of the released polynomials at that date, and of whatever else is common to all the new
-        matches.
+        Of the released polynomials at that date, and of all other errors common to the new matches.
     taken : ndarray, shape (n, q)
-        Fields that frames take up.
+        Fields that frames absorb.
     test : FieldTest
         Of the whole difference.
     frame : tuple of ndarray
@@ -147,13 +146,12 @@ def fit_new(
     compute: Compute | None = None,
     scatter: Mapping[str, float] | None = None,
 ) -> NewFit:
-    """Fit new matches by themselves.
+    """Fit new matches independently of the release.
 
     Parameters
     ----------
     released : Solution
-        A fit or a posterior; its frames, those of the exposures it was made from, play no part but
-        for their kind.
+        A fit or a posterior; only the kind of its frames matters, not the frames of its exposures.
     matches : MatchTable or PartitionedMatches
         With errors.
     mixture : OutlierMixture, optional
@@ -162,8 +160,8 @@ def fit_new(
         As of `fit_linear`.
     compute : Compute, optional
     scatter : mapping of str to float, optional
-        Standard deviations by which exposures of a campaign deviate, as their parameters are named:
-        'scale', ...  Of such a release they have to be given.
+        Standard deviations of a campaign's exposures, by the name of the parameter: 'scale', ...
+        Required for such a release.
 
     Returns
     -------
@@ -207,7 +205,7 @@ def fit_new(
 
 
 def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
-    """The released structure with the exposures of new matches.
+    """Released structure with the exposures of new matches.
 
     Raises
     ------
@@ -239,14 +237,14 @@ def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
 
 
 def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
-    """How the new matches differ from the release.
+    """Difference of the new matches' polynomials from the release.
 
     Parameters
     ----------
     new : NewFit
     draws : float
-        Effective draws from which the released covariance was estimated: worth the more, the
-        smaller its share of the whole is (Welch and Satterthwaite).
+        Effective draws from which the released covariance was estimated; they are worth the more,
+        the smaller its fraction of the whole is (Welch and Satterthwaite).
 
     Returns
     -------
@@ -298,7 +296,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
 
 
 def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
-    """Priors that hold the drift at its released values."""
+    """Priors that fix the drift at its released values."""
     priors = GaussianPriors.none(model)
     rows = slice(released.model.n_polynomial, released.model.n_distortion)
     centre, precision = priors.centre.copy(), priors.precision.copy()
@@ -312,7 +310,7 @@ def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
 def _with_scatter(
     priors: GaussianPriors, model: DistortionModel, scatter: Mapping[str, float]
 ) -> GaussianPriors:
-    """The priors with those of the deviations of all exposures."""
+    """Priors extended by those of the deviations of all exposures."""
     precision = priors.precision.copy()
     for code in range(len(model.exposures)):
         first = model.frame_slice(code).start
@@ -344,10 +342,10 @@ def with_star_errors_of(
     matches: MatchTable,
     released: tuple[LinearFit, MatchTable] | None = None,
 ) -> NewFit:
-    """A fit of new matches that knows that a star has one error.
+    """New fit whose covariance includes the catalogue errors that the matches of a star share.
 
-    A star has one error in all of its new exposures, and where the release was made with the same
-    catalogue, it has moved both sides: what it moved alike is no change.
+    A star has one error in all of its new exposures.  Where the release was made with the same
+    catalogue, that error has moved both sides, and what it moved alike is no change.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Periods: when they begin and end, and sums over the matches of each."""
+"""Periods: their begin and end, and sums over the matches of each."""
 
 from __future__ import annotations
 
@@ -21,23 +21,9 @@ MOST_MJD = 2e6  # some five thousand years: calendars end not far beyond
 
 
 def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
-    """Periods of some days about Modified Julian Dates, for `sum_by_period`.
+    """Periods of `days` about Modified Julian Dates, in decimal years, by name of the central date.
 
-    Parameters
-    ----------
-    centres : sequence of float
-    days : float
-        Length of each.
-
-    Returns
-    -------
-    dict of str to tuple of float
-        Decimal years, by the centres' dates.
-
-    Raises
-    ------
-    InputError
-        For a length that is not positive, and a centre that is no date.
+    InputError for a length that is not positive, and a centre that is no date.
     """
     if not days > 0:
         raise InputError(
@@ -50,7 +36,7 @@ def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float,
             where="periods",
             do="give days such as 55212.5",
         )
-    # the time scale of the epochs that a file gives as Modified Julian Dates
+    # time scale of the epochs that a file gives as Modified Julian Dates
     edges = np.asarray(centres, float)[:, None] + np.array([-days / 2, days / 2])
     years = np.asarray(Time(edges, format="mjd", scale="tt").decimalyear, float)
     return {
@@ -60,13 +46,7 @@ def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float,
 
 
 def check_periods(periods: Periods) -> None:
-    """Refuse periods that cannot be compared.
-
-    Raises
-    ------
-    InputError
-        For less than two, for one that ends before it begins, and for two that overlap.
-    """
+    """Raise InputError for fewer than two periods, one that ends before it begins, or overlap."""
     if len(periods) < 2:
         raise InputError(
             f"{len(periods)} periods are given",
@@ -91,26 +71,11 @@ def check_periods(periods: Periods) -> None:
 
 
 def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable], Any]) -> Any:
-    """Sum over the pairs of each period of a task: one pass over the data, piece by piece.
+    """Sum of a task over the matches of each period, from one pass over the data in chunks.
 
-    Parameters
-    ----------
-    matches : MatchTable or PartitionedMatches
-        With epochs.
-    periods : mapping of str to tuple of float
-        First epoch of each period, and the epoch at which it is over, in decimal years.  Pairs
-        outside all of them are not used.
-    task : callable
-        Of the pairs of a period that one piece of the data holds; what it returns adds.
-
-    Returns
-    -------
-    dict of str to what the task returns
-
-    Raises
-    ------
-    InputError
-        Without epochs, for periods that overlap, and for a period without pairs.
+    The matches need epochs; those outside all periods [first, end) are not used.  `task` gets the
+    matches of a period in one chunk, and its results are added.  InputError without epochs, for
+    periods that overlap, and for a period without matches.
     """
     where = ", ".join(matches.sources)
     if not matches.has_epoch:

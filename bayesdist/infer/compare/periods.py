@@ -1,9 +1,9 @@
-"""Models of several periods, how far they differ, and with what significance.
+"""Models of several periods, their differences, and the significance of these.
 
 WSDC D-T033, Appendix C.  The normal equations of the periods add up to those of all data, so that
-the model of each period, the combined one and all that is to be known of their differences come
-from these sums.  The combined model shares its data with each period: with A_p = N^-1 N_p, the
-share of period p in the normal equations, it is sum_q A_q theta_q, hence
+the model of each period, the combined one and all statistics of their differences come from these
+sums.  The combined model shares its data with each period: with A_p = N^-1 N_p, the fraction of
+period p in the normal equations, it is sum_q A_q theta_q, hence
 
     theta_p - theta = (1 - A_p) theta_p - sum_{q != p} A_q theta_q,
 
@@ -48,16 +48,16 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PeriodSums:
-    """All that the pairs of one period say: sums, which add over pieces of the data.
+    """Sums over the matches of one period, which add over chunks of the data.
 
     Parameters
     ----------
     equations : NormalEquations
-        About the mean of the fit of all data, with the pairs that it uses.
+        About the mean of the fit of all data, with the matches that it uses.
     squares : NormalEquations or None
-        The same with squared weights, where extra weights make the sandwich necessary.
+        With squared weights, where extra weights make the sandwich necessary.
     n : int
-        Pairs used.
+        Number of matches used.
     """
 
     equations: NormalEquations
@@ -72,13 +72,13 @@ class PeriodSums:
 
 
 def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:
-    """Sums over some pairs of one period.
+    """Sums over some matches of one period.
 
     Parameters
     ----------
     stars : Stars
     fit : LinearFit
-        Of all data: its model, and its rule for leaving pairs out, which is then one for all.
+        Of all data: its model, and its rule for leaving matches out, which is then one for all.
     radial_weight : float
         As the fit's.
 
@@ -106,19 +106,19 @@ def _check_model(model: DistortionModel) -> None:
 def compare_periods(
     fit: LinearFit, sums: Mapping[str, PeriodSums], *, rescale: bool = True
 ) -> PeriodComparison:
-    """The model of each period, and how they differ from the combined one.
+    """Model of each period, and the differences from the combined one.
 
     Parameters
     ----------
     fit : LinearFit
-        Of all data, as `sums_of_stars` was given.
+        Of all data, as given to `sums_of_stars`.
     sums : mapping of str to PeriodSums
         Two or more periods.  Together they are the combined data set, of which `fit` need not be
-        the fit: where pairs lie outside all periods it is not.
+        the fit: where matches lie outside all periods it is not.
     rescale : bool
-        Whether all errors are multiplied by one factor, the root of chi-square per degree of
-        freedom about the models of the periods.  Without it, quoted errors that are too small make
-        a change of noise.
+        True to multiply all errors by one factor, the root of chi-square per degree of freedom
+        about the models of the periods.  Otherwise quoted errors that are too small make a change
+        of noise.
 
     Returns
     -------
@@ -129,7 +129,7 @@ def compare_periods(
     Raises
     ------
     InputError
-        For less than two periods, and for a model with frames or time dependence.
+        For fewer than two periods, and for a model with frames or time dependence.
     DegenerateError
         When a period does not determine the model, naming the parameters.
     """
@@ -198,7 +198,7 @@ class CoefficientChange:
     ----------
     names : tuple of str, length D
     difference, sigma : ndarray, shape (D,)
-        And its standard error.
+        Difference and its standard error.
     """
 
     names: tuple[str, ...]
@@ -207,12 +207,12 @@ class CoefficientChange:
 
     @property
     def z(self) -> Float:
-        """Differences in units of their errors, shape (D,)."""
+        """Differences (D,) in units of their errors."""
         return self.difference / self.sigma
 
     @property
     def p_value(self) -> Float:
-        """Two-sided probability of each difference, of each by itself, shape (D,)."""
+        """Two-sided probability (D,) of each difference, regardless of the others."""
         return np.asarray(2 * norm.sf(np.abs(self.z)))
 
 
@@ -229,11 +229,11 @@ class PeriodComparison:
     covs : ndarray, shape (P, D, D)
         Covariance of each, independent of the others.
     shares : ndarray, shape (P, D, D)
-        A_p = N^-1 N_p; they add up to one.
+        A_p = N^-1 N_p; their sum is the identity.
     counts : tuple of int
-        Pairs of each.
+        Number of matches in each.
     error_scale : float
-        What the quoted errors were multiplied by.
+        Factor on the quoted errors.
     """
 
     model: DistortionModel
@@ -257,7 +257,7 @@ class PeriodComparison:
         return self.names.index(period)
 
     def _contrast(self, period: str, against: str | None) -> Float:
-        """Factors (P, D, D) by which the means make a difference."""
+        """Factors (P, D, D) on the means that give a difference."""
         D = self.means.shape[1]
         out = np.zeros_like(self.covs)
         p = self._code(period)
@@ -268,7 +268,7 @@ class PeriodComparison:
             out[p], out[q] = np.eye(D), -np.eye(D)
             return out
         out[:] = -self.shares
-        # 1 - A_p without the cancellation that a period with most of the data brings
+        # 1 - A_p without the cancellation that occurs for a period with most of the data
         out[p] = np.delete(self.shares, p, axis=0).sum(axis=0)
         return out
 
@@ -306,7 +306,7 @@ class PeriodComparison:
         period, against
             As `difference`.
         monomial : bool
-            Coefficients of pixel offsets, as SIP has them, in place of Legendre ones.
+            True for coefficients of pixel offsets, as in SIP, in place of Legendre ones.
 
         Returns
         -------
@@ -315,7 +315,7 @@ class PeriodComparison:
         difference, cov = self.difference(period, against)
         if monomial:
             both = (self.model.basis(chip.number).monomial_matrix for chip in self.model.chips)
-            # parameters without time and frames: u and v of each chip, in a row
+            # without time and frames the parameters are u and v of each chip in turn
             to_monomials = block_diag(*(m for m in both for _ in (0, 1)))
             difference, cov = to_monomials @ difference, to_monomials @ cov @ to_monomials.T
         return CoefficientChange(self.model.names, difference, np.sqrt(np.diag(cov)))
@@ -334,7 +334,7 @@ class PeriodComparison:
         grid: int = 33,
         n_draws: int = 2000,
     ) -> PositionChange:
-        """The largest difference over the array with its significance.
+        """Largest difference over the array with its significance.
 
         Parameters
         ----------
@@ -344,8 +344,8 @@ class PeriodComparison:
         grid : int
             Points along each axis, from edge to edge of the detector.
         n_draws : int
-            Fields of noise that the largest difference is compared with; its probability is not
-            told below 1 / (n_draws + 1).
+            Fields of noise that the largest difference is compared with; its probability is at
+            least 1 / (n_draws + 1).
 
         Returns
         -------
@@ -384,8 +384,8 @@ class PeriodComparison:
     def homogeneity(self) -> FieldTest:
         """Chi-square of the periods about one model for all.
 
-        Of the differences of all periods but one from the combined model, with their joint
-        covariance: the last one follows from them.
+        Computed from the differences of all periods but one from the combined model, with their
+        joint covariance: the last one follows from them.
         """
         contrasts = [self._contrast(name, None) for name in self.names[:-1]]
         cov = np.block(

@@ -1,4 +1,4 @@
-"""Which stars are false matches: probabilities averaged over posterior draws."""
+"""Probabilities of stars to be false matches, averaged over posterior draws."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 MOST_DRAWS, LEAST_DRAWS = 64, 8
-EVALUATIONS = 200_000_000  # of a star, that the average may cost
+EVALUATIONS = 200_000_000  # largest number of evaluations of a star for the average
 
 
 @dataclass(frozen=True, eq=False)
 class Memberships:
-    """What the posterior says of each star.
+    """Outlier probability and log-likelihood of each star.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Memberships:
     log_likelihood_variance : ndarray, shape (N,)
         Over the draws.
     draws : int
-        How many draws were averaged.
+        Number of draws averaged.
     """
 
     outlier_probability: Float
@@ -55,7 +55,7 @@ class Memberships:
     draws: int
 
     def in_table_order(self, order: Int) -> Memberships:
-        """Brought back from the order of prepared stars to that of their table."""
+        """Values reordered from prepared stars to their table."""
         return Memberships(
             in_table_order(self.outlier_probability, order),
             in_table_order(self.log_likelihood, order),
@@ -104,9 +104,9 @@ def memberships_of(posterior: Posterior, stars: Stars) -> Memberships:
 
 
 def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
-    """The draws over which memberships are averaged: theta (n, D), and the mixture at each.
+    """Draws over which memberships are averaged: theta (n, D), and the mixture at each.
 
-    The mean alone where places of stars go with it: beside other draws they would not be theirs.
+    Only the mean where the stars' positions are unknowns: at other draws they would be different.
     """
     if posterior.own_places:
         theta, h = (one.mean(axis=0, keepdims=True) for one in sampled_points(posterior))
@@ -129,14 +129,9 @@ def star_log_likelihood(posterior: Posterior, matches: MatchTable) -> Float:
 
 
 def count_outliers(shards: Shards, hyper: Hyper, theta: Float, h: Float) -> tuple[int, float]:
-    """Stars that are more likely false matches than not, and the expected number of false ones.
+    """Number of stars that are more likely false than not, and the expected number of false ones.
 
-    Parameters
-    ----------
-    shards : Shards
-    hyper : Hyper
-    theta, h : ndarray, shape (n, D) and (n, n_hyper)
-        All draws; some of them are used.
+    `theta` (n, D) and `h` (n, n_hyper) are all draws; some of them are used.
     """
     theta, h = some_draws(theta, h, len(shards))
     flagged, expected = shards.sum(_count, theta, hyper.constants(h))
@@ -144,9 +139,9 @@ def count_outliers(shards: Shards, hyper: Hyper, theta: Float, h: Float) -> tupl
 
 
 def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
-    """Probability of being an outlier, log-likelihood and its square (3, N), averaged over draws.
+    """Outlier probability, log-likelihood and its square (3, N), averaged over draws.
 
-    A task for `Shards.sum` is made of it by what sums over the stars.
+    With a sum over the stars it makes a task for `Shards.sum`.
     """
     powers, order = stars.powers(theta), stars.model.order
     if circle := stars.circle(constants):

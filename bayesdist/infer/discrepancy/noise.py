@@ -1,4 +1,4 @@
-"""Variance of the stars' scores over the detector, relative to what the likelihood says."""
+"""Variance of the stars' scores over the detector, relative to the likelihood's prediction."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ LEAST, MOST = 0.25, 100.0
 
 
 def score_excess(information: Information) -> Float:
-    """Ratio of the variance of the scores to their curvature: by chip, cell and axis (chips, C, 2).
+    """Ratio (chips, C, 2) of the variance of the scores to their curvature, by chip, cell and axis.
 
-    Where the likelihood is right the two agree.  Ratios of blocks of the detector are drawn
-    towards their mean as their own errors and their scatter about it ask for (a normal model of
-    their logarithms, by moments: DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177).
+    Where the likelihood is right the two agree.  Ratios of blocks of the detector are shrunk to
+    their mean as their own errors and their scatter about it require (a normal model of their
+    logarithms, by moments: DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177).
     """
     sums = information.sums
     side, n_chips = sums.side, len(information.model.chips)
@@ -54,19 +54,19 @@ def score_excess(information: Information) -> Float:
 
 
 def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
-    """The covariance by the stars' scatter, on the whole not below the formal one, and its ratio.
+    """Covariance by the stars' scatter, on the whole not below the formal one, and their ratio.
 
-    Quoted errors that are too large are the user's statement: residuals cannot tell them from
-    matches that were cut.
+    Quoted errors that are too large are the user's statement: residuals cannot distinguish them
+    from matches that were cut.
     """
-    # a little of the formal one, so that no direction is without variance
+    # a small part of the formal one, so that no direction is without variance
     noise = 0.99 * noise + 0.01 * formal
     ratio = float(np.sum(scaled_inverse(formal) * noise)) / len(formal)
     return noise * max(1.0, 1 / ratio), ratio
 
 
 def shrunk_ratios(top: Float, bottom: Float, n: Float) -> Float:
-    """Ratios of sums over blocks, drawn towards their mean."""
+    """Ratios of sums over blocks, shrunk to their mean."""
     mean = top.sum() / bottom.sum()
     good = (n >= STARS_PER_BLOCK / 6) & (bottom > 0) & (top > 0)
     out = np.full(len(n), mean)

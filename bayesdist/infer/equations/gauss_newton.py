@@ -17,12 +17,12 @@ __all__ = ["gauss_newton", "refuse_absorbed_drift", "starting_point"]
 Float = NDArray[np.float64]
 
 RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
-STALLED = 1e-4  # formal errors: steps that are smaller, and do not shrink, are rounding
-TURNS = 50  # of this iteration
+STALLED = 1e-4  # formal errors: steps below this that do not shrink are rounding
+TURNS = 50  # most iterations
 
 
 def starting_point(first: NormalEquations, model: DistortionModel, priors: GaussianPriors) -> Float:
-    """Frames from linear maps of the exposures, then polynomials with the frames held."""
+    """Starting parameters: frames from linear maps, then polynomials for these frames."""
     groups = first.groups
     theta = np.zeros(model.n_params)
     if model.n_frame:
@@ -38,13 +38,13 @@ def starting_point(first: NormalEquations, model: DistortionModel, priors: Gauss
 
 
 def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) -> None:
-    """Frames of `theta` from linear maps: of each exposure that shares a chip with a known one."""
+    """Set the frames of `theta` from linear maps, each exposure after one with a common chip."""
     groups, o = first.groups, np.asarray(model.origin)
     affine = np.array([_affine(w, r) for w, r in zip(first.weight, first.right, strict=True)])
     of_chip: dict[int, Float] = {}  # constant and linear coefficients of w, before the frame
 
     def enter(e: int) -> None:
-        """Learn the chips of an exposure whose frame is known."""
+        """Take the chips' linear maps from an exposure whose frame is known."""
         M, d = model.frame(theta, e)
         for g in np.flatnonzero(groups.exposure == e):
             if int(groups.chip[g]) not in of_chip and np.isfinite(affine[g]).all():
@@ -79,7 +79,7 @@ def refuse_absorbed_drift(
     model: DistortionModel,
     priors: GaussianPriors,
 ) -> None:
-    """Refuse frames that absorb the drift of the linear terms.
+    """Raise an error for frames that absorb the drift of the linear terms.
 
     With a curved polynomial such a degeneracy is not exact, and the fit would follow its valley to
     numbers that mean nothing.  On the linear part of the model it is exact, and shows.
@@ -96,7 +96,7 @@ def refuse_absorbed_drift(
 
 
 def _affine(weight: Float, right: Float) -> Float:
-    """Constant and linear coefficients (2, 3) of one group by itself; NaN where undetermined."""
+    """Constant and linear coefficients (2, 3) of one group alone; NaN where undetermined."""
     out = np.full((2, 3), np.nan)
     for axis, pair in ((0, 0), (1, 2)):
         W = weight[pair][:3, :3]
@@ -111,7 +111,7 @@ def gauss_newton(
     model: DistortionModel,
     priors: GaussianPriors,
 ) -> Float:
-    """Solve, moving the equations instead of passing over the data again."""
+    """Solution of the equations, which are moved instead of passing over the data again."""
     groups = equations.groups
     prior = priors.matrix(model)
     about = model.effective(theta, groups)
@@ -129,8 +129,8 @@ def gauss_newton(
         moved = np.abs(about - before).sum(axis=2).max()
         if moved < RELINEARISED * model.pixel_size(theta):
             return theta
-        # off the area of the stars rounding moves high orders by more than that for ever: what
-        # counts is the step in formal errors, and without frames there is nothing but rounding
+        # outside the area of the stars rounding always moves high orders by more than that: the
+        # criterion is the step in formal errors, and without frames there is nothing but rounding
         last, decrement = decrement, float(pull @ step)
         if decrement >= last / 4 and (not model.n_frame or decrement < STALLED**2):
             return theta

@@ -36,7 +36,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def one_thread(function: F) -> F:
-    """A function with all its linear algebra on one thread, to be used as a decorator.
+    """Decorator by which a function does all its linear algebra on one thread.
 
     The matrices are small: a second thread gains little on them, and loses much on a machine that
     has other work.
@@ -69,20 +69,11 @@ def scaled_inverse(matrix: Float) -> Float:
 
 
 class FieldTest(NamedTuple):
-    """Chi-square of a whole field of differences.
-
-    Parameters
-    ----------
-    chi2 : float
-    dof : int
-        Rank of the covariance.
-    p_value : float
-        Probability of a chi-square as large.
-    """
+    """Chi-square of a whole field of differences."""
 
     chi2: float
-    dof: int
-    p_value: float
+    dof: int  # rank of the covariance
+    p_value: float  # probability of a larger chi-square
 
     @classmethod
     def of(cls, white: Float, *, shrink: float = 1.0) -> FieldTest:
@@ -99,24 +90,13 @@ def chi_square(
     norm: Float | None = None,
     draws: float = np.inf,
 ) -> FieldTest:
-    """Chi-square of a difference, from which some fields may have been taken out.
+    """Chi-square of a difference (n,), from which some fields may have been taken out.
 
-    Parameters
-    ----------
-    difference : ndarray, shape (n,)
-    cov : ndarray, shape (n, n)
-        Before they were taken out.  Terms without variance are no part of the test.
-    without : ndarray, shape (n, q), optional
-        Fields that were taken out of the difference.
-    norm : ndarray, shape (n,), optional
-        Mean square of each term, which makes them comparable.
-    draws : float
-        Effective draws from which the covariance was estimated: the inverse of an estimate is too
-        large by (n - 1) / (n - dof - 2) (Hartlap et al. 2007), which is taken back.
-
-    Returns
-    -------
-    FieldTest
+    `cov` (n, n) is the covariance before that; terms without variance are no part of the test.
+    `without` (n, q) are the fields, and `norm` (n,) the mean square of each term, which makes them
+    comparable.  `draws` is the effective number of draws from which the covariance was estimated:
+    the inverse of an estimate is too large by (n - 1) / (n - dof - 2) (Hartlap et al. 2007), which
+    is corrected.
     """
     known = known_terms(cov)
     y, C = difference[known], cov[np.ix_(known, known)]
@@ -137,15 +117,15 @@ def chi_square(
 
 
 def known_terms(cov: Float) -> NDArray[np.bool_]:
-    """Boolean mask (n,) of the parameters that a covariance speaks of."""
+    """Boolean mask (n,) of the parameters with variance."""
     variance = np.diag(cov)
     return np.asarray(variance > 1e-20 * variance.max(initial=0.0))
 
 
 def determined(matrix: Float) -> Float:
-    """Root R (n, rank) of the inverse of a positive semidefinite matrix where it has one: R R^T.
+    """Root R (n, rank) of the inverse, R R^T, of a positive semidefinite matrix where it has one.
 
-    Eigenvalues that rounding hides are none.
+    Eigenvalues at the level of rounding count as zero.
     """
     diagonal = np.diag(matrix)
     known = diagonal > 0

@@ -1,7 +1,7 @@
-"""The fused passes over the stars, compiled: the only place that knows numba.
+"""Compiled passes over the stars: the only package that uses numba.
 
 Polynomials are evaluated on the fly by Horner's rule from the effective coefficients, so that no
-design matrix is read from memory.  Sums are taken over fixed pieces of the data and therefore do
+design matrix is read from memory.  Sums are taken over fixed chunks of the data and therefore do
 not depend on the number of threads.
 """
 

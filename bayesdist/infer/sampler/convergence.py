@@ -1,8 +1,8 @@
-"""Has the sampler converged?  Judged over independent ensembles, never over coupled walkers.
+"""Convergence of the sampler, judged over independent ensembles, never over coupled walkers.
 
 Differential evolution couples the walkers of an ensemble.  Then two estimates of the effective
 sample size are made and the smaller counts: that of the walkers laid end to end, and that of the
-ensemble averages, which sees a drift that all walkers share (Goodman and Weare 2010, section 5).
+ensemble averages, which shows a drift that all walkers share (Goodman and Weare 2010, section 5).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _COLUMNS = ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
 
 @dataclass(frozen=True)
 class Limits:
-    """What a converged run has to reach.
+    """Targets of a converged run.
 
     Parameters
     ----------
@@ -55,14 +55,14 @@ class Convergence:
     names : tuple of str
         theta, then the hyperparameters as sampled.
     rhat, ess_bulk, ess_tail, mcse_mean, mcse_sd : ndarray, shape (D,)
-        NaN for parameters that are held: they do not move and are not judged.
+        NaN for fixed parameters, which are not judged.
     pareto_k : float
         Of the importance weights of the independence proposal (Vehtari et al. 2024).
     importance_efficiency : float
-        Effective share of the proposal's draws.
+        Effective fraction of the proposal's draws.
     converged : bool
     reasons : tuple of str
-        Why not, worst parameter named; empty when converged.
+        Failed criteria, with the worst parameter; empty when converged.
     limits : Limits
     """
 
@@ -94,7 +94,7 @@ class Convergence:
         return float(np.nanmin(self.ess_tail))
 
     def among(self, names: tuple[str, ...]) -> Convergence:
-        """The same verdict with further names, of parameters that are held and not judged."""
+        """Convergence with further names, of parameters that are fixed and not judged."""
         at = [names.index(name) for name in self.names]
 
         def spread(values: Float) -> Float:
@@ -115,23 +115,11 @@ def diagnose(
     coupled: bool,
     n_outside: int = 0,
 ) -> Convergence:
-    """Diagnostics from the draws after warm-up.
+    """Diagnostics from the draws after warm-up: chains (ensembles, steps, walkers, D).
 
-    Parameters
-    ----------
-    chains : ndarray, shape (ensembles, steps, walkers, D)
-    names : tuple of str
-    log_weights : ndarray, shape (n,)
-        Log importance weights of independent proposals.
-    limits : Limits
-    coupled : bool
-        Whether the walkers of an ensemble influence each other.
-    n_outside : int
-        Further proposals, which fell outside the support and have weight zero.
-
-    Returns
-    -------
-    Convergence
+    `log_weights` (n,) are log importance weights of independent proposals; `n_outside` further ones
+    fell outside the support and have weight zero.  `coupled` if the walkers of an ensemble
+    influence each other.
     """
     az = _arviz()
 
@@ -178,7 +166,7 @@ def diagnose(
                 f" ({int(bad.sum())} of {D} parameters)"
             )
     # every walker counts at least as one draw, even if it never moved: many walkers must not
-    # make up for walkers that do not mix
+    # compensate for walkers that do not mix
     each_walker = float(np.minimum(bulk, tail).min()) / (E * W)
     if each_walker < LEAST_PER_WALKER:
         k = int(np.argmin(np.minimum(bulk, tail)))
@@ -202,7 +190,7 @@ def diagnose(
 
 
 def _arviz() -> Any:
-    """ArviZ, without its daily notice, of which a user of ours can make nothing."""
+    """ArviZ, without its daily notice, which does not concern users of this package."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
         import arviz  # takes seconds: only where it is needed
@@ -223,7 +211,7 @@ def _coupled_ess(chains: Float, each) -> Float:
 
 
 def importance_efficiency(log_weights: Float, n_outside: int = 0) -> float:
-    """Effective share of draws with these log weights, and of others with weight zero."""
+    """Effective fraction of draws with these log weights, and of others with weight zero."""
     if not len(log_weights):
         return 0.0
     weights = np.exp(log_weights - log_weights.max())
@@ -233,8 +221,8 @@ def importance_efficiency(log_weights: Float, n_outside: int = 0) -> float:
 def pareto_k(log_weights: Float) -> float:
     """Shape of the Pareto tail of importance weights; above 0.7 they cannot be trusted.
 
-    0 where no weight is more than twice the mean: there is no tail then, and the shape of weights
-    that are all but equal says nothing.
+    0 where no weight is more than twice the mean: there is no tail then, and the shape of nearly
+    equal weights means nothing.
     """
     az = _arviz()
 
@@ -250,21 +238,11 @@ def pareto_k(log_weights: Float) -> float:
 
 
 def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, float]:
-    """Importance weights whose tail is that of a Pareto distribution, and the shape of that tail.
+    """Importance weights (n,) of sum 1 with a Pareto tail, and the shape k of that tail.
 
-    Parameters
-    ----------
-    log_weights : ndarray, shape (n,)
-    independent : float
-        Effective share of the draws.
-
-    Returns
-    -------
-    weights : ndarray, shape (n,)
-        Of sum 1.
-    k : float
-        Above 0.7 they cannot be trusted.
+    `independent` is the effective fraction of the draws.  With k above 0.7 the weights cannot be
+    trusted.
     """
-    with np.errstate(over="ignore"):  # inside arviz, of draws whose weight is nothing
+    with np.errstate(over="ignore"):  # inside arviz, of draws of negligible weight
         smoothed, k = _arviz().psislw(log_weights, reff=independent)
     return np.exp(smoothed), float(k)

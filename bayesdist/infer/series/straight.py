@@ -1,6 +1,6 @@
 """Lines as published: coefficient by coefficient, segment by segment, by least squares.
 
-Beside the posterior it shows what the two-step way gives: Tables 1-3 of ACS ISR 2015-06.
+For comparison with the posterior: the two-step way of Tables 1-3 of ACS ISR 2015-06.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class StraightLines:
     chi2 : ndarray, shape (S, k)
         Against the formal errors of the exposures; infinite where there are none.
     count : ndarray, shape (S,)
-        Exposures.
+        Number of exposures.
     """
 
     reference: Float
@@ -58,8 +58,8 @@ def straight_lines(series: Series, course: Course, *, weighted: bool = False) ->
     course : Course
         Of kind 'line', or 'lines' with given breaks.
     weighted : bool
-        Weight with the formal errors, and propagate them.  By default each exposure counts the
-        same, and the errors come from the scatter about the line.
+        True to weight with the formal errors, and propagate them.  By default exposures have equal
+        weights, and the errors come from the scatter about the line.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What one star says of the model at a solution: gradient and curvature of its log-likelihood."""
+"""Gradient and curvature of each star's log-likelihood by its position, at a solution."""
 
 from __future__ import annotations
 
@@ -23,20 +23,11 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """The likelihood of a star at one point: a mixture, or least squares with rejection.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (D,)
-    clip : Clip or None
-        Which stars least squares uses.
-    constants : Constants or None
-        Of the mixture at one point.
-    """
+    """Likelihood of a star at one point: a mixture, or least squares with rejection."""
 
     theta: Float
-    clip: Clip | None
-    constants: Constants | None
+    clip: Clip | None  # limits of least squares
+    constants: Constants | None  # of the mixture at one point
 
     def of(self, stars: Stars) -> Float:
         """Gradient by the model's u and v, and minus the second derivatives uu, uv, vv: (5, N)."""
@@ -60,29 +51,18 @@ class Scores:
         outlier = 1 / out if self.constants.kind == GAUSSIAN else 0.0
         w = np.stack([1 / (stars.var_u + j2), 1 / (stars.var_v + j2)])
         mean = (1 - p) * w + p * outlier
-        # by how much the membership turns with the position
+        # derivative of the membership by position
         turn = (outlier - w) * r
         uu, vv = mean - p * (1 - p) * turn**2
         return np.stack([*(mean * r), uu, -p * (1 - p) * turn[0] * turn[1], vv])
 
 
 def scores_of(solution: Solution) -> Scores:
-    """The likelihood that a solution was made with, at its mean.
+    """Likelihood of a Posterior, LinearFit or HierarchicalFit, at its mean.
 
-    Parameters
-    ----------
-    solution : Posterior, LinearFit or HierarchicalFit
-        The mixture of a posterior is taken at the mean of its sampled coordinates: location and
-        scale of a symmetric density say next to nothing of each other.
-
-    Returns
-    -------
-    Scores
-
-    Raises
-    ------
-    InputError
-        For what is made from a solution: a view holds neither its mixture nor its clipping.
+    The mixture of a posterior is taken at the mean of its sampled coordinates: location and scale
+    of a symmetric density are nearly independent.  InputError for solutions made from others: a
+    view has neither the mixture nor the clipping.
     """
     theta = np.asarray(solution.mean, float)
     if isinstance(solution, Posterior):
