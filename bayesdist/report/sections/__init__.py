@@ -1,5 +1,11 @@
-"""What the report of a run shows, section by section: importing this registers all of it."""
+"""What the report of a run shows, section by section: importing this registers all of it.
 
+What missions add to the report is registered by the modules that they name, after the rest.
+"""
+
+from importlib import import_module
+
+from bayesdist.mission import missions
 from bayesdist.report.contents import REPORT
 from bayesdist.report.sections import explorer
 from bayesdist.report.sections.campaign import lines, lookup, matching, release, selfcal, series
@@ -40,3 +46,7 @@ __all__ = [
     "series",
     "status",
 ]
+
+for _mission in missions().values():
+    if _mission.report:
+        import_module(_mission.report)
