@@ -11,8 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from bayesdist.lazy import lazy_name
-
-__version__ = "0.1.0"
+from bayesdist.version import __version__
 
 _HOMES = {
     "bayesdist.errors": ("BayesdistError", "InputError"),

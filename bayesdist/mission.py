@@ -1,4 +1,4 @@
-"""A mission: what a package adds to the command line for one instrument.
+"""A mission: what a package adds for one instrument, and how it is found.
 
 A package names it in its pyproject.toml, and it is found there::
 
@@ -11,18 +11,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from bayesdist.errors import InputError
 
-__all__ = ["GROUP", "Mission", "load_mission", "mission_names", "missions"]
+__all__ = ["GROUP", "Mission", "load_mission", "load_object", "mission_names", "missions"]
 
 GROUP = "bayesdist.missions"
 
 
 @dataclass(frozen=True)
 class Mission:
-    """What belongs to one mission; all commands are "module:object", loaded when they are used.
+    """What belongs to one mission, as "module:object" that is loaded when it is used.
 
     Parameters
     ----------
@@ -34,12 +36,22 @@ class Mission:
         Of `bayesdist simulate`.
     beside_core : mapping of str to str
         Commands that stand beside those of the core.
+    match_formats : mapping of str to str
+        Formats of files of matches, by name: each a `bayesdist.data.MatchFormat`.
+    error_terms : mapping of str to str
+        Kinds of `[[budget]]` rows with one sigma: each makes an error term of name, kind, sigma,
+        solution and source, as `bayesdist.assess.terms.parameters.ScaleError`.
+    report : str
+        Module that registers figures and tables with `bayesdist.report.contents.REPORT`.
     """
 
     title: str
     commands: Mapping[str, str] = field(default_factory=dict)
     simulate: Mapping[str, str] = field(default_factory=dict)
     beside_core: Mapping[str, str] = field(default_factory=dict)
+    match_formats: Mapping[str, str] = field(default_factory=dict)
+    error_terms: Mapping[str, str] = field(default_factory=dict)
+    report: str = ""
 
 
 @cache
@@ -77,3 +89,9 @@ def load_mission(name: str) -> Mission:
 def missions() -> dict[str, Mission]:
     """All missions that are installed, by name."""
     return {name: load_mission(name) for name in mission_names()}
+
+
+def load_object(where: str) -> Any:
+    """Object that "module:object" names."""
+    module, _, name = where.partition(":")
+    return getattr(import_module(module), name)

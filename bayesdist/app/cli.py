@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 
 import click
 
-from bayesdist import __version__
 from bayesdist.app.commands.groups import LazyGroup
 from bayesdist.errors import BayesdistError, RenamedError
 from bayesdist.mission import load_mission, mission_names, missions
+from bayesdist.version import __version__
 
 __all__ = ["main"]
 

@@ -27,9 +27,9 @@ from bayesdist.app.selfcal.config import GaugeBlock, SelfcalBlock
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
-from bayesdist.assess.terms.forms import GIVEN
-from bayesdist.assess.terms.given import said_by_user
-from bayesdist.assess.terms.parameters import LINEAR_KINDS, ScaleError
+from bayesdist.assess.terms.forms import GIVEN, ErrorTerm
+from bayesdist.assess.terms.given import TERM_KINDS, said_by_user
+from bayesdist.assess.terms.kinds import one_size_kinds, one_size_term
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.data.tables.units import length_advice
 from bayesdist.errors import ConfigError, InputError
@@ -287,13 +287,21 @@ class BudgetBlock(Section):
     """An error term that the data cannot show."""
 
     name: str
-    kind: Literal["random", "systematic", "scale", "rotation"]
+    kind: str
     sigma_u: Annotated[float, Field(ge=0)] | None = None
     sigma_v: Annotated[float, Field(ge=0)] | None = None
     sigma: Annotated[float, Field(ge=0)] | None = None
     unit: Unit = "pix"
     source: str = GIVEN
     in_residuals: bool = False
+
+    @field_validator("kind")
+    @classmethod
+    def _known_kind(cls, kind: str) -> str:
+        known = (*TERM_KINDS, *one_size_kinds())
+        if kind not in known:
+            raise ValueError(f"kind is {kind!r}; choose one of {', '.join(known)}")
+        return kind
 
     def names(self, *words: str) -> bool:
         """Whether one of some words is in the row's name."""
@@ -309,7 +317,7 @@ class BudgetBlock(Section):
     def _sigma_of_its_kind(self) -> BudgetBlock:
         axes = self.sigma_u is not None and self.sigma_v is not None
         neither = self.sigma_u is None and self.sigma_v is None
-        if self.kind in LINEAR_KINDS:
+        if self.kind not in TERM_KINDS:
             if self.sigma is None or not neither:
                 raise ValueError(
                     f"a budget term of kind {self.kind!r} has one sigma, relative or in radians; "
@@ -681,10 +689,10 @@ class Config(Section):
             if b.sigma_u is not None and b.sigma_v is not None
         )
 
-    def linear_terms(self, solution: Solution) -> tuple[ScaleError, ...]:
-        """The user's terms of the error budget that grow with the distance from the middle."""
+    def linear_terms(self, solution: Solution) -> tuple[ErrorTerm, ...]:
+        """The user's terms of the error budget that have one size: scale, rotation, a mission's."""
         return tuple(
-            ScaleError(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
+            one_size_term(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
             for b in self.budget
             if b.sigma is not None
         )

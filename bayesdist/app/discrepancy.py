@@ -21,7 +21,7 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.discrepancy.storage import discrepancy_from_arrays, discrepancy_to_arrays
 from bayesdist.infer.equations.scaled import scaled_cholesky
-from bayesdist.infer.recoloured import with_spread
+from bayesdist.infer.posterior.recoloured import with_spread
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 if TYPE_CHECKING:

@@ -29,8 +29,8 @@ from bayesdist.files import sha256_of
 from bayesdist.infer import Matches, Posterior
 from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan_dates
 from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
-from bayesdist.infer.density.memberships import count_outliers
 from bayesdist.infer.linear import Rejection
+from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.report.comparison import change_over_time, difference_vectors
 from bayesdist.report.drawing import save_figures
 

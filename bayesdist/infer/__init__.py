@@ -9,7 +9,7 @@ from bayesdist.lazy import lazy_name
 _HOMES = {
     "bayesdist.infer.catalogue.by_magnitude": ("fit_by_magnitude",),
     "bayesdist.infer.catalogue.star_errors": ("StarCovariance", "star_covariance"),
-    "bayesdist.infer.density.memberships": ("Memberships", "memberships"),
+    "bayesdist.infer.posterior.memberships": ("Memberships", "memberships"),
     "bayesdist.infer.equations.priors": ("GaussianPriors",),
     "bayesdist.infer.exposures.alone": ("ExposureSolutions", "fit_exposures"),
     "bayesdist.infer.exposures.hierarchy": (
@@ -27,7 +27,7 @@ _HOMES = {
         "fit_with_tables",
     ),
     "bayesdist.infer.posterior": ("Posterior", "SamplerInfo"),
-    "bayesdist.infer.sampler.convergence": ("Convergence", "Limits"),
+    "bayesdist.infer.convergence": ("Convergence", "Limits"),
     "bayesdist.infer.sampler.sample": ("sample",),
     "bayesdist.infer.stars.mixture": ("OutlierMixture",),
     "bayesdist.infer.stars.shards": ("Compute", "Matches", "Shards", "load"),

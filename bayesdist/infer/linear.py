@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +26,8 @@ from bayesdist.infer.equations.rank import check_coverage, require_full_rank
 from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
+from bayesdist.infer.transforms import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-
-if TYPE_CHECKING:
-    from bayesdist.infer.posterior import Posterior
 
 __all__ = ["Clip", "LinearFit", "Rejection", "build_model", "fit_linear", "residuals"]
 
@@ -345,7 +342,7 @@ def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
     return ((residual**2 / var).sum(axis=1),)
 
 
-def residuals(solution: LinearFit | Posterior, matches: MatchTable) -> Float:
+def residuals(solution: Solution, matches: MatchTable) -> Float:
     """Data minus the model at a solution's mean.
 
     Parameters

@@ -12,8 +12,9 @@ import pytest
 from astropy.table import Table, vstack
 
 from bayesdist.app import matches
-from bayesdist.data import RvbTransform, open_matches, read_rvb
+from bayesdist.data import open_matches, read_rvb
 from bayesdist.infer import load_fit
+from bayesdist.missions.wise.rvb.transform import RvbTransform
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table
 from tests.app.support import cli, good, refused, snapshot, summary_of
 
@@ -178,6 +179,20 @@ def test_transform_moves_the_reference_positions(tmp_path):
     # what it writes is calibrated
     config = rvb_job(tmp_path / "job", rvb_pairs(), data={"matches": str(tmp_path / "out")})
     good("check", config)
+
+
+def test_a_fitted_transformation_leaves_nothing_linear(tmp_path):
+    path = write_rvb_table(rvb_pairs(false=0.0), tmp_path / "pairs.tbl")
+    shown = good("wise", "rvb", "transform", path, "-o", tmp_path / "out", "--fit")
+    assert "fitted: shift_u" in shown.out
+    new = read_rvb(tmp_path / "out").matches
+    # what is left of offsets, scales and rotation, and what pairs with such errors leave of it
+    for offset in (new.u - new.x, new.v - new.y):
+        slopes = np.linalg.lstsq(np.stack([np.ones(len(new)), new.x - 254.5, new.y - 254.5], 1),
+                                 offset, rcond=None)[0]  # fmt: skip
+        assert abs(slopes[0]) < 1e-2 and (np.abs(slopes[1:]) < 2e-4).all()
+    refused(tmp_path, "wise", "rvb", "transform", path, "-o", tmp_path / "again", "--fit",
+            "--dx", 1, words=["given, and one is to be fitted"])  # fmt: skip
 
 
 def test_rereference_undoes_what_free_solutions_took_up(tmp_path):

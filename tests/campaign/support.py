@@ -21,7 +21,7 @@ from bayesdist.data import MatchTable
 from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
-from bayesdist.infer.recoloured import Recoloured
+from bayesdist.infer.posterior.recoloured import Recoloured
 from bayesdist.infer.series import Series
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_model, read_acs
 from bayesdist.missions.acs.simulate.pointings import OWN

@@ -16,10 +16,10 @@ from bayesdist.data import (
     rvb_files,
     rvb_open,
     stream_rvb,
-    write_rvb,
 )
 from bayesdist.data.rvb_open import open_rvb
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.rvb.write import write_rvb
 from tests.data.test_rvb import assert_same, rvb_table, write
 
 SIZE = (1016.0, 1016.0)

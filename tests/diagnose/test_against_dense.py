@@ -12,7 +12,7 @@ from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.diagnose.score.score import regressor_tests
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
-from bayesdist.infer.stars.likelihood import scores_of
+from bayesdist.infer.posterior.likelihood import scores_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel
 

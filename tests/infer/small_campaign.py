@@ -10,7 +10,7 @@ import numpy as np
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import LinearFit
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
-from bayesdist.infer.recoloured import Recoloured
+from bayesdist.infer.posterior.recoloured import Recoloured
 from bayesdist.infer.transforms import lines, without_frames
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import CHIP_DEVIATIONS

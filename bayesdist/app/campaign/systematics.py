@@ -20,7 +20,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.recoloured import with_spread
+from bayesdist.infer.posterior.recoloured import with_spread
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 if TYPE_CHECKING:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
 
 import click
 
 from bayesdist.errors import InputError
+from bayesdist.mission import load_object
 
 __all__ = ["LazyGroup"]
 
@@ -41,8 +41,7 @@ class LazyGroup(click.Group):
         InputError
             When that is no command.
         """
-        module, _, name = target.partition(":")
-        command = getattr(import_module(module), name)
+        command = load_object(target)
         if not isinstance(command, click.Command):
             raise InputError("is no command", where=target, do="mend the package that names it")
         return command

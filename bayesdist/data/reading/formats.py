@@ -9,6 +9,7 @@ from pathlib import Path
 
 from bayesdist.data.astrometrynet import is_astrometrynet
 from bayesdist.data.hst1pass import is_hst1pass, is_matchup
+from bayesdist.data.reading.mission_formats import mission_formats
 from bayesdist.data.tables.files import TABLE_SUFFIXES, is_binary, is_fits, read_lines, read_table
 from bayesdist.data.tables.text import is_text_table
 from bayesdist.errors import FormatError, InputError
@@ -67,7 +68,11 @@ def _expanded(path: Path) -> list[Path]:
 
 
 def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
-    """Format of a file, by its name and then by its content."""
+    """Format of a file: one that a mission adds, else by its name and then by its content."""
+    if columns is None and file.is_file():
+        for own, one in mission_formats().items():
+            if one.recognizes(file):
+                return own
     name = file.name.lower().removesuffix(".gz")
     if name.endswith(tuple(TABLE_SUFFIXES)):
         if columns is None and name.endswith((".fits", ".fit")):

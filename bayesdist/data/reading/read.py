@@ -18,6 +18,7 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.chips import numbered, text_labels
 from bayesdist.data.reading.formats import FORMATS, exposure_names, input_files, kind_of
+from bayesdist.data.reading.mission_formats import mission_formats
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
 from bayesdist.data.reading.table import matches_from_table, sky_positions
 from bayesdist.data.sky.tangent import mean_direction
@@ -118,13 +119,14 @@ def _read_plain(
     files: Sequence[Path], kinds: Sequence[str], options: ReadOptions, *, in_parts: bool
 ) -> MatchTable:
     """Matches from files that hold them."""
+    own = mission_formats()
     names: Sequence[str | None] = exposure_names(files)
-    if in_parts or (len(files) == 1 and kinds[0] == "table"):
+    if in_parts or (len(files) == 1 and kinds[0] in ("table", *own)):
         names = [None] * len(files)
     tables = {
-        file: read_table(file)
+        file: own[kind].read(file) if kind in own else read_table(file)
         for file, kind in zip(files, kinds, strict=True)
-        if kind in ("table", "astrometry.net")
+        if kind in ("table", "astrometry.net", *own)
     }
     options = _with_common_chips(tables, _with_common_point(tables, kinds, options))
     readers: dict[str, Callable[[Path, str | None], MatchTable]] = {
@@ -134,6 +136,7 @@ def _read_plain(
             tables[file], options, source=str(file), exposure_name=name
         ),
     }
+    readers |= dict.fromkeys(own, readers["table"])
     return MatchTable.concatenate(
         [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
     )

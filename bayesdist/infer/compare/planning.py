@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import scaled_cholesky, scaled_inverse
-from bayesdist.infer.recoloured import Recoloured
+from bayesdist.infer.posterior.recoloured import Recoloured
 from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.sampler.convergence import importance_efficiency, pareto_k
+from bayesdist.infer.convergence import importance_efficiency, pareto_k
 
 __all__ = ["Quality", "draws_per_effective", "quality_of", "rejection", "warmup_steps"]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.posterior.likelihood import Scores
 from bayesdist.infer.stars.stars import Stars, cell_of
 from bayesdist.model import Groups, merge_groups
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.posterior.likelihood import Scores
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 

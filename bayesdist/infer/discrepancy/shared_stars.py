@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
-from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.posterior.likelihood import Scores
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 

@@ -24,7 +24,7 @@ from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.stars.likelihood import Scores, scores_of
+from bayesdist.infer.posterior.likelihood import Scores, scores_of
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars.stars import cell_of, prepare
 from bayesdist.infer.transforms import Solution

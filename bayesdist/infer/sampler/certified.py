@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.proposal import GridProposal, Random
 from bayesdist.infer.density.target import Target
+from bayesdist.infer.posterior.certificate import Certificate
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
-from bayesdist.infer.sampler.convergence import diagnose
 from bayesdist.infer.sampler.ensembles import Whitening
 from bayesdist.infer.sampler.lookahead import Page, pilot_page
 from bayesdist.infer.sampler.move_schedule import Plan, expected_passes
-from bayesdist.infer.sampler.surrogate import Certificate, Surrogate, certify, draw_surrogate
+from bayesdist.infer.sampler.surrogate import Surrogate, certify, draw_surrogate
 
 __all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
 

@@ -15,6 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
+from bayesdist.infer.convergence import (
+    LEAST_PER_WALKER,
+    Convergence,
+    Limits,
+    diagnose,
+)
 from bayesdist.infer.density.importance import (
     Quality,
     draws_per_effective,
@@ -24,12 +30,6 @@ from bayesdist.infer.density.importance import (
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.sampler.checkpoints import Block
-from bayesdist.infer.sampler.convergence import (
-    LEAST_PER_WALKER,
-    Convergence,
-    Limits,
-    diagnose,
-)
 from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
 from bayesdist.infer.sampler.lookahead import pilot_page
 from bayesdist.infer.sampler.move_schedule import (

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from bayesdist.infer.sampler.convergence import LEAST_PER_WALKER, Convergence, Limits
+from bayesdist.infer.convergence import LEAST_PER_WALKER, Convergence, Limits
 
 __all__ = [
     "EFFICIENT",

@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.grid import build_proposal
-from bayesdist.infer.density.memberships import count_outliers
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.sampler.convergence import Limits
-from bayesdist.infer.sampler.surrogate import Certificate
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars.stars import Stars

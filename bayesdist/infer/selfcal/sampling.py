@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError
+from bayesdist.infer.convergence import Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.sampler.chains import Settings, run_chains
-from bayesdist.infer.sampler.convergence import Limits
 from bayesdist.infer.selfcal.normal import memberships
 from bayesdist.infer.selfcal.proposal import propose
 from bayesdist.infer.selfcal.solve import Solution

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.sampler.convergence import Convergence, Limits, diagnose
+from bayesdist.infer.convergence import Convergence, Limits, diagnose
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.gibbs import sweep
 from bayesdist.infer.series.problem import Problem, State, break_likelihood

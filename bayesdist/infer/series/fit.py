@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.sampler.convergence import Limits
+from bayesdist.infer.convergence import Limits
 from bayesdist.infer.series.chains import run
 from bayesdist.infer.series.course import Course
 from bayesdist.infer.series.design import Design

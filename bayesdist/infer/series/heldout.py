@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
-from bayesdist.infer.sampler.convergence import smoothed_weights
+from bayesdist.infer.convergence import smoothed_weights
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
 from bayesdist.infer.series.small import cholesky, solve_factor

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.sampler.convergence import Convergence
+from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.series.chains import Draws, Engine
 from bayesdist.infer.series.correlated import Correlated, Shared
 from bayesdist.infer.series.course import Course

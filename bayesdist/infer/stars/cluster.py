@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any
 
-from bayesdist import __version__
 from bayesdist.data.partitioned import PartPiece
 from bayesdist.data.pieces import Piece
 from bayesdist.errors import InputError
@@ -32,6 +31,7 @@ from bayesdist.infer.stars.shards import Compute, Matches, Shards, Task, shard_o
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel
+from bayesdist.version import __version__
 
 try:
     import dask
@@ -321,7 +321,7 @@ def _require_version(client: Any) -> None:
 
     def version() -> str:  # a local function travels whole, and needs no bayesdist over there
         try:
-            from bayesdist import __version__
+            from bayesdist.version import __version__
         except ImportError:
             return "none"
         return __version__

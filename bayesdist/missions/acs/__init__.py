@@ -1,4 +1,4 @@
-"""ACS of the Hubble Space Telescope: a simulated campaign, and what its handbook shows."""
+"""ACS of HST: a simulated campaign, published lines, and what its handbook shows."""
 
 from bayesdist.mission import Mission
 
@@ -10,4 +10,5 @@ MISSION = Mission(
     title="HST: what its handbooks show of a calibration.",
     commands={"handbook": f"{_COMMANDS}:handbook", "pam": f"{_COMMANDS}:pam"},
     simulate={"acs": f"{_COMMANDS}:simulate"},
+    report="bayesdist.missions.acs.published",
 )

@@ -36,7 +36,7 @@ def handbook(file: str, output: str, **options: Any) -> None:
 
     FILE is an IDCTAB, a run, or whatever 'compare' takes.
     """
-    from bayesdist.missions.acs.handbook import handbook as written
+    from bayesdist.missions.acs.handbook.command import handbook as written
 
     click.echo(written(file, output, **options))
 

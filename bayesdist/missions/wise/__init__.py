@@ -8,7 +8,12 @@ _COMMANDS = "bayesdist.missions.wise.commands"
 
 MISSION = Mission(
     title="WISE: its bands beside each other, its pairs and its files.",
-    commands={name: f"{_COMMANDS}:{name}" for name in ("bands", "rotate", "rvb")},
+    commands={
+        "bands": f"{_COMMANDS}:bands",
+        "bring-up": f"{_COMMANDS}:bring_up",
+        "rotate": f"{_COMMANDS}:rotate",
+        "rvb": f"{_COMMANDS}:rvb",
+    },
     simulate={"wise": f"{_COMMANDS}:simulate"},
     beside_core={"demo": f"{_COMMANDS}:demo"},
 )

@@ -1,4 +1,4 @@
-"""Commands of WISE: demo, bands, rotate, rvb, and its simulated pairs."""
+"""Commands of WISE: demo, bands, bring-up, rotate, rvb, and its simulated pairs."""
 
 from __future__ import annotations
 
@@ -69,6 +69,32 @@ def bands(
     click.echo(text)
 
 
+@command(name="bring-up")
+@click.argument("detections", metavar="DETECTIONS")
+@click.argument("reference", metavar="REFERENCE")
+@new_folder
+@click.option("--band", required=True, metavar="W1")
+@click.option("--order", type=int, default=4, metavar="N", help="Of the polynomial in the end.")
+@click.option(
+    "--radius",
+    type=float,
+    default=1.0,
+    metavar="A",
+    help="Within which pairs are accepted in the array's centre, pixels.",
+)
+@click.option("--corner-radius", type=float, default=3.0, metavar="A", help="... in its corners.")
+@click.option("--optical", metavar="FILE", help="SIP header or WISE meta-data to begin with.")
+@click.option("--rotation", type=float, default=0.0, metavar="DEG", help="Of the optical model.")
+def bring_up(detections: str, reference: str, output: str, **options: Any) -> None:
+    """Pairs and distortion from lists of stars that nobody has paired.
+
+    DETECTIONS and REFERENCE have columns x, y, sigma and frame, in pixels of the band.
+    """
+    from bayesdist.missions.wise.bring_up.command import bring_up_files
+
+    click.echo(bring_up_files(detections, reference, output, **options))
+
+
 @command()
 @click.argument("file", metavar="FILE")
 @click.option("--angle", type=float, default=0.0, metavar="DEG", help="From x towards y.")
@@ -120,12 +146,13 @@ def _pairs(function: Callable[..., None]) -> Callable[..., None]:
     help="Relative to one: 1e-4 stretches x by so much.",
 )
 @click.option("--scale-y", type=float, default=0.0, metavar="A", help="Relative to one.")
+@click.option("--fit", is_flag=True, help="These five from the pairs, by least squares.")
 def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
     """All pairs by one linear transformation.
 
     FILE is an IPAC table, Parquet, or a folder.
     """
-    from bayesdist.missions.wise.rvb import transform_files
+    from bayesdist.missions.wise.rvb.command import transform_files
 
     click.echo(transform_files(files, output, **options))
 
@@ -140,7 +167,7 @@ def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
 )
 def rereference(files: tuple[str, ...], output: str, **options: Any) -> None:
     """Each frame from one solution to another."""
-    from bayesdist.missions.wise.rvb import rereference_files
+    from bayesdist.missions.wise.rvb.command import rereference_files
 
     click.echo(rereference_files(files, output, **options))
 

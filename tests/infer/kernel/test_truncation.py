@@ -16,10 +16,10 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load, sample
 from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import conditional_mode, starting_point
-from bayesdist.infer.density.memberships import memberships, star_log_likelihood
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.kernel import circle
-from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.posterior.likelihood import Scores
+from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
 from tests.seeds import over
 
 from ..selected import SIGMA, selected

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from astropy.table import Table
 from scipy import stats
 
+from bayesdist.data import read_rvb
 from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.matching.pairs import mutual_pairs
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError
-from bayesdist.infer.bringup import bring_up
+from bayesdist.missions.wise.bring_up.iterate import bring_up
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.missions.wise.simulate.bringup import optical_model, simulate_unpaired
+from bayesdist.missions.wise.simulate.stand_in import write_stand_in
 from bayesdist.model import Chip, DistortionModel
+from tests.app.support import good, refused
 
 STARTS = {
     "nothing": None,
@@ -200,6 +204,42 @@ def test_an_end_before_it_settled_is_said(scene):
     up = bring_up(scene.detections, scene.reference, scene.model, acceptance=RULE, max_rounds=2)
     assert not up.settled and len(up.rounds) == 2
     assert "has NOT settled in 2 rounds" in up.sentence
+
+
+def write_lists(scene, folder):
+    """The two lists as files, and an optical model."""
+    for name in ("detections", "reference"):
+        stars = getattr(scene, name)
+        table = Table({key: getattr(stars, key) for key in ("x", "y", "sigma")})
+        table["frame"] = [f"{k:02d}a" for k in stars.frame]
+        table.write(folder / f"{name}.ecsv")
+    write_stand_in(folder / "optical.hdr")
+    return folder / "detections.ecsv", folder / "reference.ecsv"
+
+
+@pytest.mark.parametrize("optical", [False, True])
+def test_the_command_gives_the_pairs_of_the_function(scene, ups, tmp_path, optical):
+    lists, out = write_lists(scene, tmp_path), tmp_path / "out"
+    start = ("--optical", tmp_path / "optical.hdr") if optical else ()
+    shown = good("wise", "bring-up", *lists, "-o", out, "--band", "W2", "--radius", RULE.centre,
+                 "--corner-radius", RULE.corner, *start)  # fmt: skip
+    up = ups["delivered" if optical else "nothing"]
+    assert up.sentence in shown.out
+    rounds = Table.read(out / "rounds.ecsv")
+    assert rounds["n_believed"].tolist() == [one.n_believed for one in up.rounds]
+    found = read_rvb(out / "pairs")
+    assert found.band == "W2" and len(found) == len(up.matches)
+    for name in ("x", "y", "u", "v", "sigma_u"):
+        np.testing.assert_array_equal(getattr(found.matches, name), getattr(up.matches, name))
+
+
+def test_lists_without_errors_are_refused(scene, tmp_path):
+    detections, reference = write_lists(scene, tmp_path)
+    table = Table.read(detections)
+    table.remove_column("sigma")
+    table.write(detections, overwrite=True)
+    refused(tmp_path, "wise", "bring-up", detections, reference, "-o", tmp_path / "out", "--band",
+            "W2", words=["detections.ecsv", "no column 'sigma'"])  # fmt: skip
 
 
 def test_wrong_requests_are_refused(scene):

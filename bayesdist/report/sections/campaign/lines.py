@@ -10,12 +10,7 @@ from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
 from bayesdist.report.numbers import MISSING, count, display_scale, interval, number, rounded
-from bayesdist.report.sections.campaign.published import (
-    SOURCE,
-    WHERE,
-    PublishedLine,
-    published_lines,
-)
+from bayesdist.report.sections.campaign.published import Published, published_terms
 from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
 from bayesdist.report.texttable import TextTable, listing
 
@@ -25,6 +20,7 @@ __all__ = [
 
 Row = tuple[str, ...]
 
+TERMS = ("A_2", "B_3", "B_2", "B_1", "A_3")  # in the order of their tables
 _SIGNIFICANT = 3.0  # sigmas
 FIXED = 5e-3  # 10^-6, or 10^-3 of a length: a term with errors below it is held
 
@@ -35,7 +31,7 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
     c = campaign_of(r)
     found, joint = c.section("time_dependence"), c.summary.get("lines") or []
     names = {chip.number: chip.name for chip in c.chips}
-    published = published_lines(c.config, c.filter, tuple(names.values()))
+    published = published_terms(c.config, c.filter, tuple(names.values()))
     if c.section("gauge"):
         yield _gauge(c)
     terms = dict.fromkeys(row["term"] for row in joint)
@@ -45,11 +41,11 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
         if row["alpha"] is not None
     }
     note = _why_errors_differ(c) if alone else ""
-    for term in [t for t in (*WHERE, "A_3") if t in terms]:
+    for term in [t for t in TERMS if t in terms]:
         rows = [row for row in joint if row["term"] == term and _is_free(row, c.unit)]
         rows.sort(key=lambda row: (row["segment"], names[row["chip"]]))
         if rows:
-            table = _line_table(term, rows, names, alone, published.get(term, ()), c)
+            table = _line_table(term, rows, names, alone, published.get(term), c)
             yield replace(table, note=" ".join(text for text in (table.note, note) if text))
             note = ""  # shown once, under the first of them
     if found.get("breaks"):
@@ -96,7 +92,7 @@ def _line_table(
     joint: list[Mapping[str, Any]],
     names: Mapping[int, str],
     alone: Mapping[tuple[str, int], Mapping[str, Any]],
-    published: tuple[PublishedLine, ...],
+    published: Published | None,
     c: CampaignResults,
 ) -> TextTable:
     """Table of alpha and beta of a term: joint, exposure by exposure, and published."""
@@ -116,10 +112,10 @@ def _line_table(
         if (label, row["segment"]) in alone:
             numbers = _numbers(alone[label, row["segment"]], factor, digits)
             rows.append((*head, "exposures, then line", *numbers))
-        for one in published:
+        for one in () if published is None else published.lines:
             if one.chip == chip and abs(one.rdate - row["epoch0"]) < 1e-6:
-                rows.append((*head, SOURCE, *_numbers(vars(one), factor, vars(one))))
-    source = f"; published: {SOURCE}, {WHERE[term]}" if published else ""
+                rows.append((*head, published.source, *_numbers(vars(one), factor, vars(one))))
+    source = f"; published: {published.source}, {published.where}" if published else ""
     system = ""
     if c.section("gauge"):
         system = f", in the system of {c.chip_name(c.section('gauge')['chip'])}"

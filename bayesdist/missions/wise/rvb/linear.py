@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.rvb_transform import PARAMETERS, RvbTransform
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 
 __all__ = [
     "FIVE",
@@ -132,6 +132,13 @@ class TransformFit:
     def sigma(self) -> Float:
         """Formal errors of the six parameters."""
         return np.sqrt(np.diag(self.cov))
+
+    @property
+    def sentence(self) -> str:
+        """The parameters with their errors, in words."""
+        values = zip(PARAMETERS, self.transform.values, self.sigma, strict=True)
+        found = ", ".join(f"{name} {value:.6g} +- {sigma:.2g}" for name, value, sigma in values)
+        return f"fitted: {found} (pixels, radians, relative); chi-square {self.chi2:.4g}/{self.dof}"
 
     def covariance_at(self, u: ArrayLike, v: ArrayLike) -> Float:
         """Covariance of transformed positions that comes from the parameters.

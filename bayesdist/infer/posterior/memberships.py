@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
-from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.posterior.posterior import Posterior
 from bayesdist.infer.stars.mixture import Hyper
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bayesdist.assess.detector_numbers import detector_numbers
-from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.report.arrows import Arrows, magnification_of, vector_map
 from bayesdist.report.fields import Grid, contour_levels, scalar_map
 from bayesdist.report.numbers import size_of

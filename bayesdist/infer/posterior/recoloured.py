@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.equations.scaled import scaled_cholesky
-from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.posterior.posterior import Posterior
 from bayesdist.infer.transforms import Derived, Solution
 from bayesdist.model import DistortionModel
 

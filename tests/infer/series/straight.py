@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.errors import DegenerateError
 from bayesdist.infer.series.course import Course
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.series import Series
@@ -50,38 +49,11 @@ class StraightLines:
 
 
 def straight_lines(series: Series, course: Course, *, weighted: bool = False) -> StraightLines:
-    """Fit each coefficient with a line in each segment.
+    """Line of each coefficient in each segment.
 
-    Parameters
-    ----------
-    series : Series
-    course : Course
-        Of kind 'line', or 'lines' with given breaks.
-    weighted : bool
-        True to weight with the formal errors, and propagate them.  By default exposures have equal
-        weights, and the errors come from the scatter about the line.
-
-    Returns
-    -------
-    StraightLines
-
-    Raises
-    ------
-    DegenerateError
-        For another course, fewer than three exposures in a segment, and weights that do not exist.
+    By default each exposure counts the same, and the errors come from the scatter about the line;
+    with `weighted` the formal errors weight, and are propagated.
     """
-    if course.kind not in ("line", "lines") or course.find:
-        raise DegenerateError(
-            f"course {course.name!r} is no set of lines with known breaks",
-            where=series.source,
-            do="ask for 'line', or for 'lines' with breaks",
-        )
-    if weighted and not np.all(series.sigma > 0):
-        raise DegenerateError(
-            "some exposures have no formal errors to weight with",
-            where=series.source,
-            do="fit without weights",
-        )
     design = Design(course, series)
     segment = design.segment(series.epoch)[0]
     shape = (course.n_segments, series.n_coefficients)
@@ -90,12 +62,6 @@ def straight_lines(series: Series, course: Course, *, weighted: bool = False) ->
         rows = segment == s
         since = series.epoch[rows] - design.reference[s]
         columns = np.stack([np.ones(rows.sum()), since], axis=1)
-        if rows.sum() < 3:
-            raise DegenerateError(
-                f"segment {s + 1} has {rows.sum()} exposures, and a line with errors needs three",
-                where=series.source,
-                do="take this break away",
-            )
         for j in range(series.n_coefficients):
             sigma = series.sigma[rows, j]
             weight = sigma**-2 if weighted else np.ones(rows.sum())

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.sampler.convergence import Convergence
-from bayesdist.infer.sampler.surrogate import Certificate
+from bayesdist.infer.convergence import Convergence
+from bayesdist.infer.posterior.certificate import Certificate
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
 

@@ -7,14 +7,14 @@ import pytest
 
 from bayesdist.data import matches as tables
 from bayesdist.infer import GaussianPriors, OutlierMixture, load, memberships
-from bayesdist.infer.density import memberships as membership
-from bayesdist.infer.density.memberships import (
+from bayesdist.infer.density.target import Target
+from bayesdist.infer.posterior import memberships as membership
+from bayesdist.infer.posterior.memberships import (
     count_outliers,
     sampled_points,
     some_draws,
     star_log_likelihood,
 )
-from bayesdist.infer.density.target import Target
 
 from ..oracle import star_terms
 from ..support import MIXTURES, TWO_CHIPS, posterior_at, residual_of, simulated, table, target_of

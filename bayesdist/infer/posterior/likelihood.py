@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
-from bayesdist.infer.density.memberships import sampled_points, star_averages
 from bayesdist.infer.kernel import GAUSSIAN, Constants
 from bayesdist.infer.linear import Clip
-from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.posterior.memberships import sampled_points, star_averages
+from bayesdist.infer.posterior.posterior import Posterior
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.transforms import Solution
 

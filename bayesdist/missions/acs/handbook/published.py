@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bayesdist.assess.detector_numbers import DetectorNumbers
+from bayesdist.missions.acs.handbook.numbers import DetectorNumbers
 
 __all__ = ["handbook_rows"]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.assess.whole_detector import WholeDetector
+from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.model.grid import mesh
 
 __all__ = ["DetectorNumbers", "detector_numbers"]

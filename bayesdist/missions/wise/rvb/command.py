@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from math import radians
+from operator import add
 from pathlib import Path
 
-from bayesdist.data import (
-    MatchTable,
-    RvbPairs,
-    RvbTransform,
-    read_solutions,
-    rereference,
-    stream_rvb,
-    transformed,
-    write_rvb,
-)
+from bayesdist.data import MatchTable, RvbPairs, stream_rvb
 from bayesdist.data.rvb import chosen_band
 from bayesdist.data.rvb_files import ARRAY_SIZE, open_rvb_files
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.rvb.linear import fit_transform, linear_moments
+from bayesdist.missions.wise.rvb.solutions import read_solutions
+from bayesdist.missions.wise.rvb.transform import RvbTransform, rereference, transformed
+from bayesdist.missions.wise.rvb.write import write_rvb
 
 __all__ = ["rereference_files", "transform_files"]
 
@@ -35,6 +32,7 @@ def transform_files(
     rotation: float = 0.0,
     scale_x: float = 0.0,
     scale_y: float = 0.0,
+    fit: bool = False,
 ) -> str:
     """Pairs with all reference positions moved by one linear transformation.
 
@@ -53,6 +51,9 @@ def transform_files(
         Degrees, from x towards y.
     scale_x, scale_y : float
         Relative to one.
+    fit : bool
+        The five parameters are those that bring reference positions to the detections, by least
+        squares.
 
     Returns
     -------
@@ -62,19 +63,33 @@ def transform_files(
     Raises
     ------
     InputError
-        For no transformation, and as `stream_rvb`, `transformed` and `write_rvb`.
+        For no transformation, one that is both given and to be fitted, and as `stream_rvb`,
+        `transformed` and `write_rvb`.
     """
     transform = RvbTransform(dx, dy, radians(rotation), scale_x, scale_y)
-    if transform == RvbTransform():
+    if (transform == RvbTransform()) != fit:
         raise InputError(
-            "no transformation is asked for",
+            "a transformation is given, and one is to be fitted"
+            if fit
+            else "no transformation is asked for",
             where="bayesdist wise rvb transform",
-            do="give --dx, --dy, --rotation, --scale-x or --scale-y",
+            do="give --fit, or --dx, --dy, --rotation, --scale-x or --scale-y",
         )
     columns = columns or {}
     band = _band(files, band, columns)
-    transform = replace(transform, centre=_centre(band))
-    return _written(files, output, band, columns, lambda matches: transformed(matches, transform))
+    found = ""
+    if fit:
+        pieces = stream_rvb(files, band=band, columns=columns)
+        best = fit_transform(
+            reduce(add, (linear_moments(one.matches, _centre(band)) for one in pieces))
+        )
+        transform, found = best.transform, f"\n{best.sentence}"
+    else:
+        transform = replace(transform, centre=_centre(band))
+    written = _written(
+        files, output, band, columns, lambda matches: transformed(matches, transform)
+    )
+    return written + found
 
 
 def rereference_files(

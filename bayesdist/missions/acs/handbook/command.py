@@ -15,10 +15,10 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
 from bayesdist.app.sessions import session_of
-from bayesdist.assess.detector_numbers import detector_numbers
-from bayesdist.assess.whole_detector import WholeDetector
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
+from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 
 if TYPE_CHECKING:
     from bayesdist.assess import BinnedResiduals
@@ -64,10 +64,14 @@ def handbook(
         For what cannot be read or written.
     """
     # figures take seconds to import
+    from bayesdist.missions.acs.handbook.figures import (
+        area_figure,
+        non_linear_figure,
+        residual_figure,
+    )
+    from bayesdist.missions.acs.handbook.published import handbook_rows
     from bayesdist.products.detectors import acs_detector
     from bayesdist.report.drawing import save_figures
-    from bayesdist.report.handbook_numbers import handbook_rows
-    from bayesdist.report.whole_detector import area_figure, non_linear_figure, residual_figure
 
     if detector is not None:
         detector = acs_detector(detector).name

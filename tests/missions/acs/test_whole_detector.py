@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bayesdist.assess.detector_numbers import detector_numbers
-from bayesdist.assess.whole_detector import WholeDetector
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.errors import InputError
+from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 
 SIZE = (400.0, 200.0)
 

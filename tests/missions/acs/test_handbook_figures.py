@@ -7,15 +7,14 @@ import pytest
 from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose
 
-from bayesdist.assess.detector_numbers import detector_numbers
-from bayesdist.assess.whole_detector import WholeDetector
 from bayesdist.diagnose.residuals.binned import binned_sums
+from bayesdist.missions.acs.handbook.figures import area_figure, non_linear_figure, residual_figure
+from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.published import handbook_rows
+from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.products import read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
-from bayesdist.report.handbook_numbers import handbook_rows
-from bayesdist.report.whole_detector import area_figure, non_linear_figure, residual_figure
-
-from ..products.siaf_acs import SCALE, siaf_calibration
+from tests.products.siaf_acs import SCALE, siaf_calibration
 
 
 @pytest.fixture(scope="module")

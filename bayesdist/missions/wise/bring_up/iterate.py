@@ -17,8 +17,8 @@ from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.errors import InputError
-from bayesdist.infer.bringup_pairs import Field
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.missions.wise.bring_up.pairs import Field
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["BringUp", "Round", "bring_up"]

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from bayesdist.infer import Limits
-from bayesdist.infer.sampler.convergence import diagnose, pareto_k
+from bayesdist.infer.convergence import diagnose, pareto_k
 
 E, T, W = 4, 1500, 8
 NAMES = ("a", "b", "c")

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bayesdist.data import MatchTable
-from bayesdist.data.rvb_linear import (
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.missions.wise.rvb.linear import (
     FIVE,
     LinearMoments,
     TransformFit,
@@ -17,9 +18,8 @@ from bayesdist.data.rvb_linear import (
     linear_moments,
     relative_to,
 )
-from bayesdist.data.rvb_solutions import read_solutions
-from bayesdist.data.rvb_transform import PARAMETERS, RvbTransform, rereference, transformed
-from bayesdist.errors import DegenerateError, InputError
+from bayesdist.missions.wise.rvb.solutions import read_solutions
+from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform, rereference, transformed
 
 CENTRE = (508.5, 508.5)
 POINTS = np.random.default_rng(1).uniform(0.5, 1016.5, (40, 2))
