@@ -357,6 +357,7 @@ class Session:
             rng=self.rng("assess"),
             priors=self.config.discrepancy.priors(),
             parameter_priors=self.priors,
+            sample=self._sample,
             stars=matches if isinstance(matches, MatchTable) else None,
         )
 
