@@ -186,7 +186,7 @@ class Format:
     parse : callable
         From a `Content` to what the file holds; None for a file of another kind.
     describe : callable
-        From what `parse` gave to lines of text, findings excluded.
+        From what `parse` gave to lines of text, its `finding_lines` at the end.
     lint : callable, optional
         From what `parse` gave to findings; of a format without checks there are none.
     calibration : callable, optional
