@@ -8,7 +8,7 @@ one band against another.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -213,7 +213,7 @@ def fit_transform(
         step = np.linalg.solve(normal, by.T @ (right - weight @ _offset(now)))
         values = now.values
         values[which] += step
-        now = RvbTransform(*values.tolist(), centre=centre)
+        now = replace(now, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
         # in units of the errors: far below what matters, or what rounding leaves of the offsets
         if step @ normal @ step < max(1e-16, 1e-28 * moments.chi2):
             break
