@@ -11,6 +11,7 @@ import sys
 import typing
 from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
 import click
 import numpy as np
@@ -24,7 +25,7 @@ from bayesdist.app.config import Config
 from .docs_blocks import DOCS, blocks, run_page
 
 ROOT = DOCS.parent
-PAGES = sorted([*DOCS.glob("*.md"), ROOT / "README.md", ROOT / "examples" / "README.md"])
+PAGES = sorted([*DOCS.glob("*.md"), *ROOT.glob("[CR]*.md"), ROOT / "examples" / "README.md"])
 # what make docs needs beyond the test extra's other packages
 SITE = ("sphinx", "myst_parser", "numpydoc", "pydata_sphinx_theme", "sphinx-mathjax-offline")
 
@@ -95,7 +96,7 @@ def test_every_block_that_could_run_is_run():
     """Pages with blocks of console or Python are those that tests above go through."""
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
-    assert run == {*tutorials, "posterior_file.md"}
+    assert run == {*tutorials, "posterior_file.md", "new_instrument.md"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
@@ -238,6 +239,15 @@ def test_every_command_is_documented_with_its_options():
             name = max(option.opts, key=len)
             if name not in ("--quiet", "--output"):
                 assert name in everywhere, f"{words} {name}"
+
+
+@pytest.mark.parametrize("page", [DOCS / "architecture.md", ROOT / "CONTRIBUTING.md"], ids=str)
+def test_names_and_files_of_the_code_are_there(page):
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`(bayesdist(?:\.\w+)+)`", text):
+        assert resolve_name(name), name
+    for name in re.findall(r"`((?:bayesdist|docs|tests)/[\w./]+)`", text):
+        assert "NAME" in name or (ROOT / name).exists(), name
 
 
 def test_the_reference_names_all_that_is_public():

@@ -17,6 +17,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 
 from bayesdist.app.campaign.config import CampaignBlock, ReleaseBlock, TablesBlock
 from bayesdist.app.config_errors import as_config_error
@@ -298,9 +299,10 @@ class BudgetBlock(Section):
     @field_validator("kind")
     @classmethod
     def _known_kind(cls, kind: str) -> str:
-        known = (*TERM_KINDS, *one_size_kinds())
-        if kind not in known:
-            raise ValueError(f"kind is {kind!r}; choose one of {', '.join(known)}")
+        *others, last = known = (*TERM_KINDS, *one_size_kinds())
+        if kind not in known:  # in the words of a Literal
+            listed = ", ".join(map(repr, others))
+            raise PydanticCustomError("literal_error", f"Input should be {listed} or {last!r}")
         return kind
 
     def names(self, *words: str) -> bool:

@@ -6,14 +6,16 @@ import os
 import subprocess
 import sys
 import tomllib
+from importlib import import_module
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 
 from bayesdist.app.commands.groups import LazyGroup
-from bayesdist.mission import GROUP, Mission
+from bayesdist.mission import GROUP, Mission, load_object
 from tests.app.support import REPOSITORY, one_sentence
 
 MEGACAM = """
@@ -27,6 +29,23 @@ MISSION = Mission(title="MegaCam: mosaics.", commands={"ccds": "megacam:ccds"})
 @click.option("--rows", type=int, default=4, help="Of the mosaic.")
 def ccds(rows):
     click.echo(f"{9 * rows} CCDs")
+"""
+
+
+PAIRS = """
+import numpy as np
+from astropy.table import Table
+from bayesdist.data import MatchFormat
+from bayesdist.mission import Mission
+
+def read(path):
+    x, y, u, v = np.loadtxt(path, skiprows=1).T / 10
+    table = Table({"x": x, "y": y, "u": u, "v": v})
+    table["u"].unit = table["v"].unit = "arcsec"
+    return table
+
+TENTHS = MatchFormat(lambda path: path.read_text().startswith("tenths"), read)
+MISSION = Mission(title="MegaCam.", match_formats={"tenths": "megacam:TENTHS"})
 """
 
 
@@ -58,6 +77,19 @@ def test_a_package_adds_its_mission(tmp_path):
     assert "[default: 4]" in shown and "--quiet" in shown
 
 
+def test_a_package_adds_a_format_of_matches(tmp_path):
+    """Of others' names, of a text that would else be a table: what it reads is a table's."""
+    installed(tmp_path, PAIRS)
+    values = np.random.default_rng(1).integers(10, 10_000, (50, 4))
+    rows = "\n".join(" ".join(map(str, row)) for row in values)
+    (tmp_path / "pairs.txt").write_text(f"tenths of a pixel\n{rows}\n")
+    done = called(tmp_path, "init", "c.toml", "--matches", "pairs.txt")
+    assert "for 50 matches" in done.stdout, done.stderr
+    config = tomllib.loads((tmp_path / "c.toml").read_text())
+    assert max(config["detector"]["size"]) <= 1024  # a tenth of the numbers in the file
+    assert config["data"].get("unit", "arcsec") == "arcsec"
+
+
 def test_a_mission_that_cannot_be_loaded_is_named(tmp_path):
     installed(tmp_path, "import no_such_package")
     done = called(tmp_path, "megacam", "ccds")
@@ -75,3 +107,6 @@ def test_our_missions_name_commands_that_are_there(name):
         for command, where in commands.items():
             found = LazyGroup.load(where)
             assert isinstance(found, click.Command) and found.name == command
+    for where in (*mission.match_formats.values(), *mission.error_terms.values()):
+        assert load_object(where)
+    assert not mission.report or import_module(mission.report)

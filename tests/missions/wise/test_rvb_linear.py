@@ -13,10 +13,8 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.rvb.linear import (
     FIVE,
     LinearMoments,
-    TransformFit,
     fit_transform,
     linear_moments,
-    relative_to,
 )
 from bayesdist.missions.wise.rvb.solutions import read_solutions
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform, rereference, transformed
@@ -75,14 +73,6 @@ def test_derivatives(a):
         e = step * np.eye(6)[k]
         numerical = (flat(a.values + e) - flat(a.values - e)) / (2 * step)
         np.testing.assert_allclose(column, numerical, atol=1e-8)
-
-
-def test_other_pixels(rng):
-    """W4's pixels are twice as large: the same map of the sky, told in W1 pixels."""
-    w4 = RvbTransform(0.3, -0.2, 0.01, 0.002, -0.001, 0.0, (254.5, 254.5))
-    w1 = w4.in_pixels(2.0, CENTRE)
-    points = rng.uniform(0.5, 508.5, (20, 2))
-    close(w1((points - 254.5) * 2 + 508.5), (w4(points) - 254.5) * 2 + 508.5)
 
 
 def pairs(rng, n=400, transform=None, sigma=(0.05, 0.1), extent=(0.5, 1016.5), **columns):
@@ -202,41 +192,6 @@ def test_moments_add(rng):
         whole + linear_moments(matches, (1.0, 1.0))
 
 
-def test_the_covariance_of_transformed_positions(rng):
-    fit = fit_transform(linear_moments(pairs(rng), CENTRE))
-    draws = rng.multivariate_normal(fit.transform.values, fit.cov, 20_000, method="eigh")
-    at = np.array([[10.0, 900.0], [508.5, 508.5]])
-    moved = np.array([RvbTransform(*one.tolist())(at) for one in draws])
-    found = fit.covariance_at(*at.T)
-    for k in range(2):
-        sample = np.cov(moved[:, k].T)
-        scale = np.sqrt(np.outer(np.diag(sample), np.diag(sample)))
-        np.testing.assert_allclose(found[k] / scale, sample / scale, atol=0.04)
-    # in the centre only the shifts matter
-    np.testing.assert_allclose(found[1], fit.cov[:2, :2], rtol=1e-12)
-
-
-def test_one_band_relative_to_another_with_the_covariance_of_both(rng):
-    a, b = RvbTransform(0.5, 0.2, 0.03, 0.002, -0.001), RvbTransform(-1.0, 2.0, -0.02, 0.004, 0.01)
-    one, other = (fit_transform(linear_moments(pairs(rng, transform=t), CENTRE)) for t in (a, b))
-    found = relative_to(one, other)
-    close(found.transform(other.transform(POINTS)), one.transform(POINTS))
-
-    def relative(x, y):
-        return RvbTransform(*y.tolist()).inverse().then(RvbTransform(*x.tolist())).values
-
-    by, step = np.empty((6, 12)), 1e-6
-    at = np.concatenate([one.transform.values, other.transform.values])
-    for k in range(12):
-        e = step * np.eye(12)[k]
-        by[:, k] = (relative(*np.split(at + e, 2)) - relative(*np.split(at - e, 2))) / (2 * step)
-    cov = by[:, :6] @ one.cov @ by[:, :6].T + by[:, 6:] @ other.cov @ by[:, 6:].T
-    scale = np.sqrt(np.outer(np.diag(cov), np.diag(cov)))
-    np.testing.assert_allclose(found.cov / scale, cov / scale, atol=1e-6)
-    nothing = TransformFit(RvbTransform(), np.zeros((6, 6)), 0.0, 0)
-    np.testing.assert_allclose(relative_to(one, nothing).cov, one.cov, atol=1e-18)
-
-
 def frames_of(rng, n_frames, n, detector):
     """Stars on nominal pixels, and what the detector does to each frame's true pointing.
 
@@ -313,23 +268,6 @@ def test_linear_terms_are_lost_with_free_scales_and_found_with_fixed_ones(rng):
     back = rereference(moved, fixed, free)
     np.testing.assert_allclose(back.u, matches.u, atol=1e-9)
     np.testing.assert_allclose(back.v, matches.v, atol=1e-9)
-
-
-def test_band_to_band_terms_come_out_of_pairs_with_common_solutions(rng):
-    """Solutions of band 1 and an offset known beforehand, which the second band corrects."""
-    known, beyond = RvbTransform(1.0, -2.0, 0.01), RvbTransform(0.05, 0.02, 3e-4, 2e-4, -1e-4)
-    fits = []
-    for detector in (RvbTransform(), beyond):
-        matches, free, fixed = frames_of(rng, 10, 4000, detector)
-        offset = known if detector is beyond else RvbTransform()
-        # the frames as solved in band 1, then the band's known offset
-        band1 = {name: one.then(offset.inverse()) for name, one in fixed.items()}
-        both = {name: one.then(offset) for name, one in band1.items()}
-        fits.append(fit_transform(linear_moments(rereference(matches, free, both), CENTRE)))
-    relative = relative_to(fits[1], fits[0])
-    pull = (relative.transform.values - beyond.values)[:5] / relative.sigma[:5]
-    assert (pull**2).sum() < 20.5
-    assert np.abs(relative.transform.values[:3] / relative.sigma[:3]).min() > 5
 
 
 def test_what_the_pairs_do_not_determine_is_named(rng):

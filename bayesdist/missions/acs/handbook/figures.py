@@ -7,7 +7,7 @@ degrees.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -66,7 +66,13 @@ def non_linear_figure(
         key=nice_below(longest / 1.5),
         pad=11,
     )
-    ring = {"ms": 6, "mfc": "none", "mec": PALETTE["vermilion"], "mew": 1.3, "zorder": 5}
+    ring: dict[str, Any] = {
+        "ms": 6,
+        "mfc": "none",
+        "mec": PALETTE["vermilion"],
+        "mew": 1.3,
+        "zorder": 5,
+    }
     panels.all_axes[0].plot(*place, "o", **ring)
     return panels.figure
 

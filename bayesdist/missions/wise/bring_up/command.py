@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from bayesdist.app.folder import whole_folder
 from bayesdist.app.screen import table_text
@@ -24,6 +25,8 @@ from bayesdist.missions.wise.rvb.write import write_rvb
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["bring_up_files"]
+
+Float = NDArray[np.float64]
 
 _COLUMNS = {
     "x": ("x",),
@@ -80,8 +83,8 @@ def bring_up_files(
     centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
     model = DistortionModel(order, (Chip(1, band, size, centre),))
     start = None if optical is None else _start(model, band, optical, rotation)
-    lists = _read_lists(Path(detections), Path(reference))
-    up = bring_up(*lists, model, start, acceptance=RadialLimit(radius, corner_radius))
+    stars, others = _read_lists(Path(detections), Path(reference))
+    up = bring_up(stars, others, model, start, acceptance=RadialLimit(radius, corner_radius))
     rows = [{"round": k, **asdict(one)} for k, one in enumerate(up.rounds, 1)]
     rows = [{name: row[name] for name in ("round", *_SHOWN)} for row in rows]
     with whole_folder(Path(output)) as folder:
@@ -90,9 +93,7 @@ def bring_up_files(
     return f"{table_text(rows, 4)}\n{up.sentence}\n{output}/pairs: calibrate with format = 'rvb'"
 
 
-def _start(
-    model: DistortionModel, band: str, optical: str | Path, rotation: float
-) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _start(model: DistortionModel, band: str, optical: str | Path, rotation: float) -> Float:
     """Parameters of an optical model, without terms beyond the order of the model."""
     chip = model.chips[0]
     arcsec = 2.75 * ARRAY_SIZE["W1"][0] / chip.size[0]

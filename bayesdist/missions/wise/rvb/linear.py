@@ -1,17 +1,15 @@
 """The linear transformation between reference stars and detections, by least squares.
 
-It takes constant and linear offsets out of a set of pairs (TRSrvb in WSDC D-T033, section 3), and
-of pairs that are referred to common frame solutions it tells translation, rotation and scales of
-one band against another.
+It takes constant and linear offsets out of a set of pairs (TRSrvb in WSDC D-T033, section 3).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
@@ -23,7 +21,6 @@ __all__ = [
     "TransformFit",
     "fit_transform",
     "linear_moments",
-    "relative_to",
 ]
 
 Float = NDArray[np.float64]
@@ -140,25 +137,6 @@ class TransformFit:
         found = ", ".join(f"{name} {value:.6g} +- {sigma:.2g}" for name, value, sigma in values)
         return f"fitted: {found} (pixels, radians, relative); chi-square {self.chi2:.4g}/{self.dof}"
 
-    def covariance_at(self, u: ArrayLike, v: ArrayLike) -> Float:
-        """Covariance of transformed positions that comes from the parameters.
-
-        Parameters
-        ----------
-        u, v : array_like, shape (N,)
-
-        Returns
-        -------
-        ndarray, shape (N, 2, 2)
-        """
-        du = np.asarray(u, float) - self.transform.centre[0]
-        dv = np.asarray(v, float) - self.transform.centre[1]
-        by = np.zeros((len(du), 2, 6))
-        by[:, 0, 0] = by[:, 1, 1] = 1.0
-        by[:, 0, 2], by[:, 0, 3] = by[:, 1, 4], by[:, 1, 5] = du, dv
-        by = by @ self.transform.jacobian()
-        return by @ self.cov @ by.swapaxes(1, 2)
-
 
 def fit_transform(
     moments: LinearMoments,
@@ -213,7 +191,7 @@ def fit_transform(
         step = np.linalg.solve(normal, by.T @ (right - weight @ _offset(now)))
         values = now.values
         values[which] += step
-        now = RvbTransform(*values.tolist(), centre=centre)
+        now = replace(now, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
         # in units of the errors: far below what matters, or what rounding leaves of the offsets
         if step @ normal @ step < max(1e-16, 1e-28 * moments.chi2):
             break
@@ -247,38 +225,3 @@ def _require_rank(normal: Float, names: Sequence[str]) -> None:
             where="linear transformation",
             do="give pairs all over the array, or hold some of these",
         )
-
-
-def relative_to(fit: TransformFit, reference: TransformFit) -> TransformFit:
-    """What one band has to be transformed by beyond another: translation, rotation and scales.
-
-    Parameters
-    ----------
-    fit, reference : TransformFit
-        Of two bands whose pairs are independent, referred to the same frame solutions, in the same
-        pixels (`RvbTransform.in_pixels`).
-
-    Returns
-    -------
-    TransformFit
-        reference^-1, then fit; with the covariance of both.
-    """
-    one, other = fit.transform, reference.transform
-    if one.centre != other.centre:
-        raise ValueError("the transformations have different centres")
-    back = other.inverse()
-    both = back.then(one)
-    # first order: M = A B^-1 and t = a - M b, with (A, a) of the fit and (B, b) of the reference
-    B_inv, b = back.matrix, other.shift
-    by_fit, by_reference = np.zeros((6, 6)), np.zeros((6, 6))
-    for k in range(6):
-        change = np.eye(6)[k]
-        dt, dM = change[:2], change[2:].reshape(2, 2)
-        by_fit[:, k] = np.concatenate([dt - dM @ B_inv @ b, (dM @ B_inv).ravel()])
-        of_matrix = -both.matrix @ dM @ B_inv
-        by_reference[:, k] = np.concatenate([-both.matrix @ dt - of_matrix @ b, of_matrix.ravel()])
-    inner = np.linalg.inv(both.jacobian())
-    first = inner @ by_fit @ one.jacobian()
-    second = inner @ by_reference @ other.jacobian()
-    cov = first @ fit.cov @ first.T + second @ reference.cov @ second.T
-    return TransformFit(both, cov, fit.chi2 + reference.chi2, fit.dof + reference.dof)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,7 @@ def read_solutions(
             numbers = numbers * _radians(column)
         values[:, PARAMETERS.index(name)] = numbers
     return {
-        names[code]: RvbTransform(*row.tolist(), centre=centre)
+        names[code]: replace(RvbTransform(*row.tolist()), centre=centre)
         for code, row in zip(codes, values, strict=True)
     }
 

@@ -148,24 +148,6 @@ class RvbTransform:
         back = np.linalg.inv(self.matrix)
         return RvbTransform.of_matrix(back, -back @ self.shift, self.centre)
 
-    def in_pixels(self, factor: float, centre: tuple[float, float]) -> RvbTransform:
-        """The same transformation of a detector with other pixels.
-
-        Parameters
-        ----------
-        factor : float
-            Size of these pixels in units of the others: 2 from W4 to W1.
-        centre : tuple of float
-            What the centre is called in the other pixels.
-
-        Returns
-        -------
-        RvbTransform
-        """
-        return replace(
-            self, shift_u=self.shift_u * factor, shift_v=self.shift_v * factor, centre=centre
-        )
-
     def jacobian(self) -> Float:
         """Derivatives of shift and matrix by the parameters.
 

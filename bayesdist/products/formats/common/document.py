@@ -142,7 +142,7 @@ class Format:
     parse : callable
         From a `Content` to the parsed file; None for a file of another kind.
     describe : callable
-        From the parsed file to lines of text, findings excluded.
+        From the parsed file to lines of text, its `finding_lines` at the end.
     lint : callable, optional
         From the parsed file to findings; of a format without checks there are none.
     calibration : callable, optional

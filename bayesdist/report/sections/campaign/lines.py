@@ -10,7 +10,7 @@ from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
 from bayesdist.report.numbers import MISSING, count, display_scale, interval, number, rounded
-from bayesdist.report.sections.campaign.published import Published, published_terms
+from bayesdist.report.sections.campaign.published import Published, PublishedLine, published_terms
 from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
 from bayesdist.report.texttable import TextTable, listing
 
@@ -103,6 +103,11 @@ def _line_table(
         key: min((row[key] for row in own if row[key] * factor > FIXED), default=0.0)
         for key in ("sigma_alpha", "sigma_beta")
     }
+    lines: tuple[PublishedLine, ...] = ()
+    source = cited = ""
+    if published is not None:
+        lines, source = published.lines, published.source
+        cited = f"; published: {source}, {published.where}"
     rows: list[Row] = []
     for row in joint:
         chip = names[row["chip"]]
@@ -112,15 +117,14 @@ def _line_table(
         if (label, row["segment"]) in alone:
             numbers = _numbers(alone[label, row["segment"]], factor, digits)
             rows.append((*head, "exposures, then line", *numbers))
-        for one in () if published is None else published.lines:
+        for one in lines:
             if one.chip == chip and abs(one.rdate - row["epoch0"]) < 1e-6:
-                rows.append((*head, published.source, *_numbers(vars(one), factor, vars(one))))
-    source = f"; published: {published.source}, {published.where}" if published else ""
+                rows.append((*head, source, *_numbers(vars(one), factor, vars(one))))
     system = ""
     if c.section("gauge"):
         system = f", in the system of {c.chip_name(c.section('gauge')['chip'])}"
     return TextTable(
-        f"{name_of_term(term)}: α + β (TIME − RDATE){system}{source}",
+        f"{name_of_term(term)}: α + β (TIME − RDATE){system}{cited}",
         ("Chip", "RDATE", "From", "α", f"σ α [{unit}]", f"β [{unit}/yr]", f"σ β [{unit}/yr]"),
         tuple(rows),
         words=(0, 2),
