@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
-from astropy.io import fits
-
+from bayesdist.products.formats.common.cards import holds_wcs
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Format
 
-__all__ = ["FORMAT", "describe", "holds_wcs"]
-
-# Without one of these nothing ties pixels to a world.
-_NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
-
-
-def holds_wcs(header: fits.Header) -> bool:
-    """True where a header ties its pixels to a world."""
-    return any(_NEEDED.match(keyword) for keyword in header)
+__all__ = ["FORMAT", "describe"]
 
 
 def _parse(content: Content) -> Content | None:

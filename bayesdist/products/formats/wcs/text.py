@@ -12,12 +12,12 @@ from astropy import log
 from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
+from bayesdist.products.formats.common.cards import holds_wcs
 from bayesdist.products.formats.common.content import Content, Hdu
 from bayesdist.products.formats.common.document import finding_lines
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import image_size, parsed
 from bayesdist.products.formats.sip.text import coefficient_lines, sip_lines
-from bayesdist.products.formats.wcs.format import holds_wcs
 from bayesdist.products.formats.wcs.sky import Words, first_line, pv_keywords, sky_words
 
 __all__ = ["describe_wcs"]
