@@ -8,10 +8,10 @@ Everything public is here and is loaded when it is first used::
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from bayesdist.lazy import lazy_name
+from bayesdist.version import __version__
 
 _HOMES = {
     "bayesdist.errors": ("BayesdistError", "InputError"),
@@ -40,6 +40,7 @@ _HOMES = {
         "LinearFit",
         "OutlierMixture",
         "Posterior",
+        "Rejection",
         "build_model",
         "fit_by_magnitude",
         "fit_linear",
@@ -49,8 +50,8 @@ _HOMES = {
         "sample",
         "save_posterior",
     ),
-    "bayesdist.simulate": (
-        "simulate_matches",
+    "bayesdist.simulate": ("simulate_matches", "simulate_partitioned"),
+    "bayesdist.missions.wise.simulate": (
         "simulate_wise",
         "simulate_wise_partitioned",
         "wise_solution",
@@ -81,19 +82,16 @@ _HOMES = {
     ),
     "bayesdist.app.run": ("run",),
 }
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
-__all__ = ["__version__", *sorted(_HOME_OF)]
+__all__ = ["__version__", *sorted(name for names in _HOMES.values() for name in names)]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME_OF:
-        return getattr(import_module(_HOME_OF[name]), name)
-    raise AttributeError(f"module 'bayesdist' has no attribute {name!r}")
+    return lazy_name(__name__, _HOMES, name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME_OF})
+    return sorted({*globals(), *__all__})
 
 
 if TYPE_CHECKING:

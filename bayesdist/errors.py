@@ -14,6 +14,7 @@ __all__ = [
     "InputError",
     "NotConvergedError",
     "NotSettledError",
+    "RenamedError",
 ]
 
 
@@ -74,3 +75,9 @@ class NotConvergedError(BayesdistError):
     """The sampler did not reach its targets and ``--strict`` was given."""
 
     exit_code = 3
+
+
+class RenamedError(BayesdistError):
+    """A command under a name that it no longer has."""
+
+    exit_code = 2

@@ -7,8 +7,8 @@ delivered, and from the same model turned by 270 degrees.  Every start should en
 import numpy as np
 
 from bayesdist.data.rvb_accept import RadialLimit
-from bayesdist.infer.bringup import bring_up
-from bayesdist.simulate.bringup import optical_model, simulate_unpaired
+from bayesdist.missions.wise.bring_up.iterate import bring_up
+from bayesdist.missions.wise.simulate.bringup import optical_model, simulate_unpaired
 
 STARTS = {
     "from nothing": None,

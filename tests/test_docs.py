@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import ast
 import json
 import os
@@ -12,19 +11,21 @@ import sys
 import typing
 from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
+import click
 import numpy as np
 import pytest
 from pydantic import BaseModel
 
 import bayesdist as bd
-from bayesdist.app.cli import _parser
+from bayesdist.app.cli import bayesdist as root
 from bayesdist.app.config import Config
 
 from .docs_blocks import DOCS, blocks, run_page
 
 ROOT = DOCS.parent
-PAGES = sorted([*DOCS.glob("*.md"), ROOT / "README.md", ROOT / "examples" / "README.md"])
+PAGES = sorted([*DOCS.glob("*.md"), *ROOT.glob("[CR]*.md"), ROOT / "examples" / "README.md"])
 # what make docs needs beyond the test extra's other packages
 SITE = ("sphinx", "myst_parser", "numpydoc", "pydata_sphinx_theme", "sphinx-mathjax-offline")
 
@@ -95,7 +96,7 @@ def test_every_block_that_could_run_is_run():
     """Pages with blocks of console or Python are those that tests above go through."""
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
-    assert run == {*tutorials, "posterior_file.md"}
+    assert run == {*tutorials, "posterior_file.md", "new_instrument.md"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
@@ -216,26 +217,37 @@ def _values(annotation: object) -> set[object]:
     return {value for part in parts for value in _values(part)}
 
 
-def _commands(parser: argparse.ArgumentParser, path: str = "bayesdist"):
-    """Each command with its parser, those with a second word by both."""
-    subs = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
-    if not subs:
-        yield path, parser
-    for sub in subs:
-        for name, inner in sub.choices.items():
-            yield from _commands(inner, f"{path} {name}")
+def _commands(group: click.Group, path: str = ""):
+    """Each command by its words, those in groups of groups too."""
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        words = f"{path} {name}".strip()
+        if isinstance(command, click.Group):
+            yield from _commands(command, words)
+        else:
+            yield words, command
 
 
 def test_every_command_is_documented_with_its_options():
     text = (DOCS / "commands.md").read_text(encoding="utf-8")
     everywhere = "\n".join(p.read_text(encoding="utf-8") for p in DOCS.glob("*.md"))
-    for path, parser in _commands(_parser()):
-        name = path.removeprefix("bayesdist ")
-        assert re.search(rf"bayesdist (?:[\w]+ \| )*{name}\b", text), path
-        for action in parser._actions:
-            option = max(action.option_strings, key=len, default="")
-            if option not in ("", "--help", "--quiet", "--output"):
-                assert option in everywhere, f"{path} {option}"
+    for words, command in _commands(root):
+        assert f"bayesdist {words} " in text, words
+        assert command.help, words
+        for option in (one for one in command.params if isinstance(one, click.Option)):
+            name = max(option.opts, key=len)
+            if name not in ("--quiet", "--output"):
+                assert name in everywhere, f"{words} {name}"
+
+
+@pytest.mark.parametrize("page", [DOCS / "architecture.md", ROOT / "CONTRIBUTING.md"], ids=str)
+def test_names_and_files_of_the_code_are_there(page):
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`(bayesdist(?:\.\w+)+)`", text):
+        assert resolve_name(name), name
+    for name in re.findall(r"`((?:bayesdist|docs|tests)/[\w./]+)`", text):
+        assert "NAME" in name or (ROOT / name).exists(), name
 
 
 def test_the_reference_names_all_that_is_public():

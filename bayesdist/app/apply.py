@@ -27,7 +27,7 @@ from bayesdist.calibration.apply import (
 )
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import fitted_inverse
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from bayesdist.errors import InputError
 
 __all__ = ["METHODS", "apply_to_table"]

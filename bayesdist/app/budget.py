@@ -7,16 +7,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.judging import errors_of, products_of
+from bayesdist.app.judging import errors_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
-from bayesdist.assess.budget.budget import TOTAL
-from bayesdist.assess.budget.place import PlaceBudget, place_budget
-from bayesdist.assess.requirements.verdict import effective_draws
-from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
+from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.errors import InputError
 
 __all__ = ["budget_at"]
@@ -63,7 +61,6 @@ def budget_at(
         require(session, "budget", ("fit", "sample"))
         number_of = _chip(session, chip, str(run))
         errors = errors_of(session)
-        noise = (2.0 * effective_draws(session.solution, errors.n_draws)) ** -0.5
         x, y = zip(at, *to, strict=True)
         found = place_budget(
             errors,
@@ -73,9 +70,6 @@ def budget_at(
             epoch=session.epoch if epoch is None else epoch,
             magnitude=magnitude,
             relative=bool(to),
-            relative_error=noise,
-            sources={t.name: t.source for t in session.field_terms},
-            products=products_of(session),
         )
         mas = session.config.detector.scale_mas if found.unit == "pix" else None
         return _text(found, at, mas)
@@ -92,16 +86,17 @@ def _chip(session: Session, chip: int | None, run: str) -> int:
     return chips[0].number if chip is None else chip
 
 
-def _text(found: PlaceBudget, at: tuple[float, float], scale_mas: float | None) -> str:
+def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) -> str:
     lines = []
     when = "" if found.epoch is None else f" at {found.epoch:.2f}"
-    of = "" if found.magnitude is None else f", magnitude {found.magnitude:g}"
+    magnitude = found.domain.magnitude
+    of = "" if magnitude is None else f", magnitude {magnitude:g}"
     for k, (x, y) in enumerate(zip(found.x, found.y, strict=True)):
-        place = f"({x:g}, {y:g}) of chip {found.chip}{when}{of}"
-        if found.relative:
+        place = f"({x:g}, {y:g}) of chip {found.domain.chips[0]}{when}{of}"
+        if found.domain.relative:
             place = f"({at[0]:g}, {at[1]:g}) to {place}"
         rows: list[dict[str, Any]] = []
-        for t in found.terms:
+        for t in found.every:
             radial = float(t.radial[k])
             row = {
                 "term": t.name,
@@ -120,6 +115,6 @@ def _text(found: PlaceBudget, at: tuple[float, float], scale_mas: float | None) 
             rows.append(row | {"source": t.source})
         lines += [place, table_text(rows), ""]
     lines.append("1 sigma; terms of the model are correlated and enter the total jointly")
-    if any(t.kind == PRODUCT for t in found.terms):
+    if any(t.kind == PRODUCT for t in found.every):
         lines.append("rows of kind product come on top for whoever uses that file: in no total")
     return "\n".join(lines)

@@ -17,6 +17,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 
 from bayesdist.app.campaign.config import CampaignBlock, ReleaseBlock, TablesBlock
 from bayesdist.app.config_errors import as_config_error
@@ -27,10 +28,11 @@ from bayesdist.app.selfcal.config import GaugeBlock, SelfcalBlock
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
-from bayesdist.assess.terms.fields import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
-from bayesdist.assess.terms.given import GIVEN, said_by_user
-from bayesdist.assess.terms.parameters import LINEAR_KINDS, LinearTerm
-from bayesdist.data.units import length_advice
+from bayesdist.assess.terms.forms import GIVEN, ErrorTerm
+from bayesdist.assess.terms.given import TERM_KINDS, said_by_user
+from bayesdist.assess.terms.kinds import one_size_kinds, one_size_term
+from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
+from bayesdist.data.tables.units import length_advice
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
@@ -286,13 +288,22 @@ class BudgetBlock(Section):
     """An error term that the data cannot show."""
 
     name: str
-    kind: Literal["random", "systematic", "scale", "rotation"]
+    kind: str
     sigma_u: Annotated[float, Field(ge=0)] | None = None
     sigma_v: Annotated[float, Field(ge=0)] | None = None
     sigma: Annotated[float, Field(ge=0)] | None = None
     unit: Unit = "pix"
     source: str = GIVEN
     in_residuals: bool = False
+
+    @field_validator("kind")
+    @classmethod
+    def _known_kind(cls, kind: str) -> str:
+        *others, last = known = (*TERM_KINDS, *one_size_kinds())
+        if kind not in known:  # in the words of a Literal
+            listed = ", ".join(map(repr, others))
+            raise PydanticCustomError("literal_error", f"Input should be {listed} or {last!r}")
+        return kind
 
     def names(self, *words: str) -> bool:
         """Whether one of some words is in the row's name."""
@@ -308,7 +319,7 @@ class BudgetBlock(Section):
     def _sigma_of_its_kind(self) -> BudgetBlock:
         axes = self.sigma_u is not None and self.sigma_v is not None
         neither = self.sigma_u is None and self.sigma_v is None
-        if self.kind in LINEAR_KINDS:
+        if self.kind not in TERM_KINDS:
             if self.sigma is None or not neither:
                 raise ValueError(
                     f"a budget term of kind {self.kind!r} has one sigma, relative or in radians; "
@@ -680,10 +691,10 @@ class Config(Section):
             if b.sigma_u is not None and b.sigma_v is not None
         )
 
-    def linear_terms(self, solution: Solution) -> tuple[LinearTerm, ...]:
-        """The user's terms of the error budget that grow with the distance from the middle."""
+    def linear_terms(self, solution: Solution) -> tuple[ErrorTerm, ...]:
+        """The user's terms of the error budget that have one size: scale, rotation, a mission's."""
         return tuple(
-            LinearTerm(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
+            one_size_term(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
             for b in self.budget
             if b.sigma is not None
         )

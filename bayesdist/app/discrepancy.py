@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.fingerprint import fingerprint_of
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.centroid import without
-from bayesdist.assess.terms.correlated import DeviationsTerm, StructureInFit, structure_term
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.assess.terms.correlated import Deviations, StructureErrors
+from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.discrepancy.storage import discrepancy_from_arrays, discrepancy_to_arrays
-from bayesdist.infer.recoloured import with_spread
+from bayesdist.infer.equations.scaled import scaled_cholesky
+from bayesdist.infer.posterior.recoloured import with_spread
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 if TYPE_CHECKING:
@@ -74,25 +75,23 @@ class RunDiscrepancy:
         more = follow @ (cov - formal)[:D, :D] @ follow.T
         return with_spread(posterior, before, before + _least(before, (more + more.T) / 2))
 
-    def fields(self, *, single: bool = False) -> tuple[FieldTerm, ...]:
-        """Errors of parameters, as terms of the budget; with the deviation of single exposures."""
-        terms: list[FieldTerm] = []
-        if self.found.structure:
-            terms.append(StructureInFit(self.found, self.frames))
-        if self.found.linear is not None:
-            terms.append(DeviationsTerm(self.found, single, self.frames))
-        return tuple(terms)
+    def terms(self, *, single: bool = False, left: bool = True) -> tuple[ErrorTerm, ...]:
+        """Terms of the error model; with the deviation of single exposures, and what is left out.
 
-    def structure(self, grid: tuple[int, int], epoch: float | None) -> LocalTerm | None:
-        """What is left out at a position; None where nothing is."""
+        The latter at a position, where no tables stand for it.
+        """
+        out = list[ErrorTerm]()
+        if self.found.structure:
+            out.append(StructureErrors(self.found, self.frames, left))
+        if self.found.linear is not None:
+            out.append(Deviations(self.found, single, self.frames))
+        return tuple(out)
+
+    def structure_sigma(self, domain: EvaluationDomain) -> Float | None:
+        """Standard deviations (N, 2) of what is left out; None where nothing is."""
         if not self.found.structure:
             return None
-        return structure_term(self.found, grid, epoch, frames=self.frames)
-
-    def local(self, grid: tuple[int, int], epoch: float | None) -> tuple[LocalTerm, ...]:
-        """The same, as terms of the budget."""
-        term = self.structure(grid, epoch)
-        return () if term is None else (term,)
+        return StructureErrors(self.found, self.frames).sigma(domain)
 
     @property
     def structure_rms(self) -> float | None:
@@ -123,8 +122,7 @@ class RunDiscrepancy:
 
 def _least(before: Float, more: Float) -> Float:
     """What is added to a covariance, so that no direction loses more than half its variance."""
-    scale = np.sqrt(np.diag(before))
-    root = np.linalg.cholesky(before / np.outer(scale, scale)) * scale[:, None]
+    root = scaled_cholesky(before)
     white = np.linalg.solve(root, np.linalg.solve(root, more).T)
     values, vectors = np.linalg.eigh((white + white.T) / 2)
     turned = root @ vectors

@@ -10,7 +10,7 @@ from astropy.wcs import WCS, FITSFixedWarning
 from numpy.typing import NDArray
 
 from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.tangent import tangent_plane
+from bayesdist.data.sky.tangent import tangent_plane
 from bayesdist.products import SipHeader, sip_header
 
 __all__ = ["sip_positions", "sky_of_header"]

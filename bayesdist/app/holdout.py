@@ -9,12 +9,13 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.kept import kept
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.terms.local import table_of
 from bayesdist.data.holdout import SetAside, Split, exposures_drawn, split_matches
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import LEAST_HELD, HeldOutTruth, held_out_truth
 from bayesdist.errors import InputError
 from bayesdist.model import LookupTable
-from bayesdist.model.grid import grid_pixels
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
@@ -117,16 +118,18 @@ def predictive_of_run(session: Session) -> Predictive:
 
 def local_errors(session: Session) -> tuple[LookupTable, ...]:
     """Errors of positions that belong to places on the detector, as tables of their own."""
-    terms, out = session.local_terms, []
+    grid, out = session.config.assess.grid, []
     for chip in session.posterior.model.chips:
-        parts = [term.sigma[chip.number] for term in terms if chip.number in term.sigma]
-        if not parts:
-            continue
-        x, y = grid_pixels(chip.size, session.config.assess.grid)
-        sigma = np.sqrt(sum(part**2 for part in parts))
-        step = (float(x[1] - x[0]), float(y[1] - y[0]))
-        values = np.moveaxis(np.asarray(sigma), 2, 0)
-        out.append(LookupTable(chip.number, values, first=(float(x[0]), float(y[0])), step=step))
+        where = {"grid": grid, "epoch": session.epoch, "chip": chip.number}
+        domain = EvaluationDomain.of_chips(
+            session.posterior.model, grid, chips=(chip.number,), epoch=session.epoch
+        )
+        structure = session.structure_sigma(**where)
+        parts = [term.sigma(domain) for term in session.local_terms]
+        parts += [] if structure is None else [structure]
+        if parts:
+            sigma = np.sqrt(sum(part**2 for part in parts)).reshape(grid[1], grid[0], 2)
+            out.append(table_of(chip.number, chip.size, sigma))
     return tuple(out)
 
 

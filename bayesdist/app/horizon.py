@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.session import Session, write_table
-from bayesdist.assess.drawn import PositionErrors
+from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.validity import Horizon, horizon_of
 from bayesdist.assess.requirements.verdict import effective_draws
@@ -31,14 +31,14 @@ def last_epoch(session: Session) -> float:
 
 
 def horizons_of(
-    session: Session, errors: PositionErrors, requirements: Sequence[Requirement]
+    session: Session, errors: DrawnErrors, requirements: Sequence[Requirement]
 ) -> tuple[Horizon, ...]:
     """The curve of each requirement that is judged at one date; none without time dependence.
 
     Parameters
     ----------
     session : Session
-    errors : PositionErrors
+    errors : DrawnErrors
     requirements : sequence of Requirement
     """
     years, model = session.config.assess.horizon, session.posterior.model
@@ -47,9 +47,10 @@ def horizons_of(
     last = last_epoch(session)
     epochs = np.linspace(last, last + years, STEPS)
     n_effective = effective_draws(session.solution, errors.n_draws)
+    grid = session.config.assess.grid
     scale = pixel_scale_of(session.solution, scale_mas=session.config.detector.scale_mas)
     return tuple(
-        horizon_of(errors, r, epochs, n_effective=n_effective, pixel_scale=scale)
+        horizon_of(errors, r, epochs, grid=grid, n_effective=n_effective, pixel_scale=scale)
         for r in requirements
         if r.epochs is None
     )

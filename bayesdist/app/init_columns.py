@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bayesdist.data.layout import TableLayout
-from bayesdist.errors import InputError
+from bayesdist.data.reading.layout import TableLayout
 
-__all__ = ["column_lines", "columns_of_options", "quoted"]
+__all__ = ["column_lines", "quoted"]
 
 # names under which SExtractor writes what the image's own WCS makes of the pixels
 _BY_THE_IMAGE = ("alpha_j2000", "alphawin_j2000", "alphapsf_j2000", "sky_centroid.ra")
@@ -21,23 +20,6 @@ _NONE = """\
 def quoted(text: str) -> str:
     """Text as TOML has it."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
-def columns_of_options(given: list[str]) -> dict[str, str] | None:
-    """Columns that are named as KEY=NAME; None where none is.
-
-    Raises
-    ------
-    InputError
-        For what is not KEY=NAME.
-    """
-    pairs = [one.partition("=") for one in given]
-    for key, mark, _ in pairs:
-        if not mark or not key.strip():
-            raise InputError(
-                f"{key!r} is not KEY=NAME", where="--columns", do="write it so, as x=XWIN_IMAGE"
-            )
-    return {key.strip(): name.strip() for key, _, name in pairs} or None
 
 
 def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) -> str:

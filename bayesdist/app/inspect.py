@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bayesdist.app.screen import number, table_text
-from bayesdist.infer import Posterior, load_posterior
-from bayesdist.products.registry import describe
+
+if TYPE_CHECKING:
+    from bayesdist.infer.posterior import Posterior
 
 __all__ = ["inspect"]
 
@@ -30,7 +32,11 @@ def inspect(path: str | Path) -> str:
     """
     path = Path(path)
     if path.is_dir() or path.suffix == ".nc":
+        from bayesdist.infer.files import load_posterior
+
         return _posterior_text(load_posterior(path))
+    from bayesdist.products.registry import describe  # each reading loads what it needs alone
+
     return describe(path)
 
 

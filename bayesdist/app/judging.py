@@ -12,11 +12,14 @@ from bayesdist.app.horizon import horizons_of
 from bayesdist.app.product_terms import product_terms
 from bayesdist.app.session import Session
 from bayesdist.assess import Margin, Requirement, check_requirements, pixel_scale_of
-from bayesdist.assess.budget.detector import DetectorBudget, detector_budget
-from bayesdist.assess.drawn import PositionErrors, position_errors
+from bayesdist.assess.budget.budget import ErrorBudget
+from bayesdist.assess.budget.detector import detector_budget
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.validity import Horizon
 from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms.product_terms import ProductTerm
+from bayesdist.assess.terms.forms import ErrorTerm, Known
+from bayesdist.assess.terms.given import Centroids
 from bayesdist.errors import BayesdistError, InputError
 
 __all__ = [
@@ -36,39 +39,37 @@ HORIZON_DRAWS = 1000  # for each of its epochs
 def _assessment(session: Session, solution: Solution | None, n_draws: int | None) -> dict[str, Any]:
     """What a budget and margins have in common."""
     config = session.config
-    what: dict[str, Any] = {"solution": solution}
     if solution is None:
-        solution = session.systematics.solution
-        what = {
-            "solution": solution,
-            "fields": session.field_terms,
-            "aligned": session.systematics.aligned,
-        }
+        solution, aligned = session.systematics.solution, session.systematics.aligned
+        terms = session.error_terms
     else:
-        what["fields"] = config.linear_terms(solution)
-    return what | {
-        "terms": config.user_terms(),
-        "local": session.local_terms,
+        terms, aligned = session.terms_beside(solution), False
+    return {
+        "solution": solution,
+        "terms": terms,
+        "aligned": aligned,
+        "pixel_scale": pixel_scale_of(solution, scale_mas=config.detector.scale_mas),
         "grid": config.assess.grid,
         "epoch": session.epoch,
         "n_draws": n_draws or config.assess.draws,
         "rng": session.rng("assess"),
-        "pixel_scale": pixel_scale_of(solution, scale_mas=config.detector.scale_mas),
     }
 
 
 def budget_of(
     session: Session, solution: Solution | None = None, n_draws: int | None = None
-) -> DetectorBudget:
+) -> ErrorBudget:
     """The budget of the session's solution with all that is known of its errors.
 
     Another solution is assessed by itself.
     """
-    products = products_of(session) if solution is None else ()
-    return detector_budget(**_assessment(session, solution, n_draws), products=products)
+    what = _assessment(session, solution, n_draws)
+    if solution is None:
+        what["terms"] += products_of(session)
+    return detector_budget(**what)
 
 
-def products_of(session: Session) -> tuple[ProductTerm, ...]:
+def products_of(session: Session) -> tuple[Known, ...]:
     """What the files that are asked for differ by; none where they cannot be made."""
     solution, kept = session.solution, session.__dict__.get("_products")
     if kept is None or kept[0] is not solution:
@@ -81,11 +82,20 @@ def products_of(session: Session) -> tuple[ProductTerm, ...]:
     return kept[1]
 
 
-def errors_of(session: Session) -> PositionErrors:
-    """Draws of all errors of a position, as budget and margins have them."""
-    what = _assessment(session, None, None)
-    del what["epoch"]
-    return position_errors(centroid=session.centroid, **what)
+def errors_of(session: Session) -> DrawnErrors:
+    """Draws of all errors of a position, as budget and margins have them, and of files."""
+    more = (Centroids(session.centroid), *products_of(session))
+    return _drawn(_assessment(session, None, None), more)
+
+
+def _drawn(what: dict[str, Any], more: Sequence[ErrorTerm]) -> DrawnErrors:
+    model = error_model(
+        what["solution"],
+        (*what["terms"], *more),
+        aligned=what["aligned"],
+        pixel_scale=what["pixel_scale"],
+    )
+    return model.drawn(what["n_draws"], what["rng"])
 
 
 def assessed_horizons(session: Session, requirements: Sequence[Requirement]) -> tuple[Horizon, ...]:
@@ -93,9 +103,8 @@ def assessed_horizons(session: Session, requirements: Sequence[Requirement]) -> 
     if session.posterior.model.time is None or not requirements:
         return ()
     what = _assessment(session, None, min(HORIZON_DRAWS, session.config.assess.draws))
-    del what["epoch"]
     centroid = session.centroid if any(r.magnitude is not None for r in requirements) else None
-    found = horizons_of(session, position_errors(centroid=centroid, **what), requirements)
+    found = horizons_of(session, _drawn(what, (Centroids(centroid),)), requirements)
     for one in found:
         log.info("assess: %s", one.sentence)
     return found
@@ -109,7 +118,8 @@ def probability_met(
     The same random numbers serve every candidate.
     """
     what = _assessment(session, None, n_draws) | {"solution": candidate}
-    [margin] = check_requirements(requirements=[requirement], centroid=session.centroid, **what)
+    what["terms"] += (Centroids(session.centroid),)
+    [margin] = check_requirements(requirements=[requirement], **what)
     return margin.probability_met
 
 
@@ -127,12 +137,9 @@ def margins_of(
             centroid = session.centroid
         else:  # without a posterior centroids have no errors yet
             requirements = tuple(_of_any_star(session, r) for r in requirements)
-    margins = check_requirements(
-        requirements=requirements,
-        caveats=caveats,
-        centroid=centroid,
-        **_assessment(session, solution, n_draws),
-    )
+    what = _assessment(session, solution, n_draws)
+    what["terms"] += (Centroids(centroid),)
+    margins = check_requirements(requirements=requirements, caveats=caveats, **what)
     if n_draws is not None:
         return margins
     return tuple(

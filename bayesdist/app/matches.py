@@ -8,7 +8,7 @@ from typing import Any
 
 from bayesdist.app.config import ChipBlock, Data
 from bayesdist.data import input_files, open_matches, read_matches
-from bayesdist.data.parquet_files import describe_part
+from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
 from bayesdist.infer import Matches
 

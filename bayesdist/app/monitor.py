@@ -22,13 +22,15 @@ from bayesdist.assess import misfit_of, partitions_for, star_sums
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
-from bayesdist.data import input_files, sha256_of
+from bayesdist.data import input_files
 from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
 from bayesdist.errors import InputError
+from bayesdist.files import sha256_of
 from bayesdist.infer import Matches, Posterior
 from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan_dates
 from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
-from bayesdist.infer.density.memberships import count_outliers
+from bayesdist.infer.linear import Rejection
+from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.report.comparison import change_over_time, difference_vectors
 from bayesdist.report.drawing import save_figures
 
@@ -118,8 +120,7 @@ def _fitted(
     found = fit_new(
         posterior,
         matches,
-        clip_chi2=config.fit.clip_chi2,
-        clip_abs=config.fit.clip_abs,
+        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
     )
     return posterior, matches, found, ()

@@ -1,4 +1,4 @@
-"""`bayesdist order`: which polynomial order do the data of a configuration ask for?"""
+"""`bayesdist select-order`: which polynomial order do the data of a configuration ask for?"""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from bayesdist.app.output import refuse_existing
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import Session, write_table
-from bayesdist.data import atomic_path
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.files import atomic_path
 from bayesdist.infer.compare.order import select_order
 from bayesdist.infer.compare.order_result import OrderSelection
+from bayesdist.infer.linear import Rejection
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["order"]
@@ -123,8 +124,7 @@ def _compared(session: Session, orders: Sequence[int]) -> OrderSelection:
         session.shards,
         session.model,
         orders=orders,
-        clip_chi2=config.fit.clip_chi2,
-        clip_abs=config.fit.clip_abs,
+        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
     )
 
 

@@ -64,7 +64,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
             raise InputError(
                 f"has no requirement {name!r}" if known else "has no requirements",
                 where=str(run),
-                do=f"name one of {known}" if known else "judge some with 'bayesdist validate'",
+                do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
             )
         content = _content(session)
         lines = [f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bayesdist.app.output import refuse_existing
 from bayesdist.calibration.apply import Positions
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 
 __all__ = [
     "OUT",

@@ -21,8 +21,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.file_positions import sip_positions
 from bayesdist.app.made_files import made_files
 from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms.given import MEASURED
-from bayesdist.assess.terms.product_terms import ProductTerm
+from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.model import corrected
@@ -48,14 +47,14 @@ ROUNDING = 1e-9  # of a pixel
 SKY_ROUNDING = 2e-9  # arcsec: what double precision leaves of an RA of 360 degrees, and back
 
 
-def product_terms(session: Session) -> tuple[ProductTerm, ...]:
+def product_terms(session: Session) -> tuple[Known, ...]:
     """Terms of the files that the configuration asks for.
 
     They are read back from their bytes, so that digits and orders are those of the files; nothing
     of the run is touched.
     """
     release, made = session.config.products.release, made_files(session, session.solution)
-    out: list[ProductTerm] = []
+    out: list[Known] = []
     if "sip" in made:
         headers = {one.chip: sip_of(_content(one)) for one in made["sip"] if one.chip is not None}
         out += _sip_terms(session, ", ".join(one.file_name for one in made["sip"]), headers)
@@ -78,7 +77,7 @@ def _content(built: Built) -> Content:
 
 def _sip_terms(
     session: Session, file: str, headers: Mapping[int, SipHeader], like: SipHeader | None = None
-) -> list[ProductTerm]:
+) -> list[Known]:
     """Forward and inverse of one header for each chip."""
     unit, scale = session.solution.model.unit, session.scale_arcsec
     point = session.tangent_point if like is None else None  # WISE's entries have no CRVAL
@@ -102,7 +101,7 @@ def _sip_terms(
     ]
 
 
-def _idctab_terms(session: Session, file: str, sets: Sequence[Calibration]) -> list[ProductTerm]:
+def _idctab_terms(session: Session, file: str, sets: Sequence[Calibration]) -> list[Known]:
     """Forward, and inverse where there are such rows; one set for each segment of the drift."""
     time = session.solution.model.time
 
@@ -154,14 +153,20 @@ def _released(session: CampaignSession, folder: Path) -> list[Calibration]:
     return [segments.get(k, last) for k in range(n)]
 
 
-def _term(session: Session, file: str, direction: str, shift: Positions) -> ProductTerm:
+def _term(session: Session, file: str, direction: str, shift: Positions) -> Known:
     solution = session.solution
     least = ROUNDING * solution.model.pixel_size(solution.mean)
     if session.tangent_point is not None:
         least = max(least, SKY_ROUNDING / ARCSEC[solution.model.unit])
     against = "the solution" if direction == FORWARD else "its forward terms"
     source = f"{MEASURED}: as written, against {against}"
-    return ProductTerm(f"{file}, {direction}", file, direction, shift, source, least)
+
+    def rounded(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
+        # displacements below this are digits of the arithmetic
+        found = np.asarray(shift(x, y, chip, epoch), float)
+        return np.where(np.abs(found) < least, 0.0, found)
+
+    return Known(Row(f"{file}, {direction}", PRODUCT, source, in_total=False), rounded)
 
 
 def _solution(session: Session, x: Float, y: Float, chip: int, epoch: float | None) -> Float:

@@ -31,7 +31,11 @@ PRINTED = ("filter", "chip", "term", "at_edge", "sigma_at_edge")
 
 
 def release_runs(
-    runs: Sequence[str | Path], output: str | Path, *, force: bool = False, command: str = ""
+    runs: Sequence[str | Path],
+    output: str | Path,
+    *,
+    allow_unconverged: bool = False,
+    command: str = "",
 ) -> str:
     """Write IDCTABs, D2IMFILE and NPOLFILEs of several filters into a new folder.
 
@@ -43,7 +47,7 @@ def release_runs(
         detector's.
     output : path
         New or empty folder.  It appears with all files in it, or not at all.
-    force : bool
+    allow_unconverged : bool
         Also runs that have not converged; the files then say so.
     command : str
         For the record.
@@ -57,7 +61,7 @@ def release_runs(
     ------
     InputError
         For runs that are not finished or do not go together, for one that has not converged unless
-        forced, and a folder that is in use.
+        allowed, and a folder that is in use.
     """
     with ExitStack() as stack:
         sessions: dict[str, CampaignSession] = {}
@@ -72,7 +76,7 @@ def release_runs(
                 )
             sessions[filter] = session
         _require_alike(sessions)
-        doubts = _doubts(sessions, force=force)
+        doubts = _doubts(sessions, allowed=allow_unconverged)
         solutions = _solutions(sessions)
         comparison, why_not = _compared(sessions)
         notes = [*doubts, *_notes(sessions, comparison)]
@@ -171,18 +175,18 @@ def _same_detector(a: CampaignSession, b: CampaignSession) -> bool:
     )
 
 
-def _doubts(sessions: Mapping[str, CampaignSession], *, force: bool) -> list[str]:
+def _doubts(sessions: Mapping[str, CampaignSession], *, allowed: bool) -> list[str]:
     """What has not converged, as sentences."""
     out = []
     for name, session in sessions.items():
         convergence = session.posterior.convergence
         if not convergence.converged:
             why = "; ".join(convergence.reasons)
-            if not force:
+            if not allowed:
                 raise InputError(
                     f"the run of {name} has not converged ({why})",
                     where=str(session.run.path),
-                    do="resume it with more steps, or release it all the same with --force",
+                    do="resume it with more steps, or release it with --allow-unconverged",
                 )
             out.append(f"NOT CONVERGED: the run of {name} ({why}).")
     return out

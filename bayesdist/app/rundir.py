@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from bayesdist import __version__
 from bayesdist.app.campaign.files import campaign_files
 from bayesdist.app.config import Config, load_config, load_text
 from bayesdist.app.config_errors import as_config_error
 from bayesdist.app.selfcal.files import selfcal_files
 from bayesdist.app.star_files import FOLDER, PAIRS, part_files
-from bayesdist.data import atomic_path, input_files, is_leftover, remove_leftovers, sha256_of
-from bayesdist.data.files import made_folder
+from bayesdist.data import input_files
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path, is_leftover, made_folder, remove_leftovers, sha256_of
+from bayesdist.version import __version__
 
 __all__ = ["RunDirectory", "as_json", "write_json"]
 

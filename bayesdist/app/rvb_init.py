@@ -6,10 +6,10 @@ from pathlib import Path
 
 from bayesdist.app.init_columns import column_lines
 from bayesdist.data import input_files
-from bayesdist.data.parquet_files import describe_part
 from bayesdist.data.rvb import rvb_bands, stream_rvb
 from bayesdist.data.rvb_files import ARRAY_SIZE, IPAC, MAGNITUDES, RvbFile, open_rvb_files
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
 
 __all__ = ["is_rvb", "rvb_template"]

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from astropy.table import Table
-from tqdm import tqdm
 
 from bayesdist.errors import InputError
 
@@ -65,6 +63,8 @@ def log_file(path: Path) -> Iterator[None]:
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar on stderr, silent where stderr is no terminal."""
+    from tqdm import tqdm
+
     with tqdm(
         desc=label, unit="step", disable=not sys.stderr.isatty(), leave=False, file=sys.stderr
     ) as bar:
@@ -78,20 +78,19 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 def number(value: Any, digits: int = 4) -> str:
     """A number as a person reads it."""
-    if value is None or (isinstance(value, float) and not np.isfinite(value)):
-        return "-"
-    if isinstance(value, (float, np.floating)):
-        return f"{value:.{digits}g}"
-    return str(value)
+    if isinstance(value, Real) and not isinstance(value, Integral):
+        return f"{value:.{digits}g}" if math.isfinite(value) else "-"
+    return "-" if value is None else str(value)
 
 
 def table_text(rows: list[dict[str, Any]], digits: int = 4) -> str:
-    """Rows as aligned text."""
+    """Rows as aligned text: text to the left, numbers to the right, headings centred."""
     if not rows:
         return "(none)"
-    table = Table({k: [number(row[k], digits) for row in rows] for k in rows[0]})
-    left = [c for c in table.colnames if isinstance(rows[0][c], str)]
-    lines = table.pformat(
-        max_lines=-1, max_width=-1, align=["<" if c in left else ">" for c in table.colnames]
-    )
-    return "\n".join(line.rstrip() for line in lines)
+    columns = []
+    for name, first in rows[0].items():
+        texts = [number(row[name], digits) for row in rows]
+        width = max(3, len(name), *map(len, texts))
+        pad = str.ljust if isinstance(first, str) else str.rjust
+        columns.append([name.center(width), "-" * width, *(pad(text, width) for text in texts)])
+    return "\n".join(" ".join(line).rstrip() for line in zip(*columns, strict=True))

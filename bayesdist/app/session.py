@@ -25,7 +25,6 @@ from bayesdist.app.systematics import Systematics
 from bayesdist.assess import (
     SAMPLE,
     BinnedSums,
-    LocalTerm,
     Misfit,
     StarSample,
     StarSums,
@@ -35,12 +34,13 @@ from bayesdist.assess import (
     star_sums,
 )
 from bayesdist.assess.coverage import Coverage, coverage_of
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map, with_local
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.centroid import centroid_scatter
-from bayesdist.assess.terms.correlated import STRUCTURE
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.data import MagnitudeErrors, MatchTable, atomic_path
+from bayesdist.assess.terms.forms import ErrorTerm
+from bayesdist.assess.terms.local import LocalErrors
+from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.data.holdout import Split
 from bayesdist.diagnose import ScoreTest, score_tests
 from bayesdist.diagnose.holdout.predictive import Predictive
@@ -49,6 +49,7 @@ from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.diagnose.residuals.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.diagnose.residuals.quoted import error_scale, error_scale_sentence
 from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
+from bayesdist.files import atomic_path
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
@@ -65,6 +66,7 @@ from bayesdist.infer import (
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
+from bayesdist.infer.linear import Rejection
 from bayesdist.model import DistortionModel
 
 Float = NDArray[np.float64]
@@ -298,9 +300,7 @@ class Session:
     def _linear(self) -> tuple[LinearFit, MagnitudeErrors | None]:
         fit = self.config.fit
         options: dict[str, Any] = {
-            "clip_chi2": fit.clip_chi2,
-            "clip_abs": fit.clip_abs,
-            "radial_weight": fit.radial_weight,
+            "rejection": Rejection(fit.clip_chi2, fit.clip_abs, fit.radial_weight),
             "priors": self.priors,
         }
         if self.config.data is not None and self.config.data.sigma == "by_magnitude":
@@ -341,7 +341,7 @@ class Session:
         if found is None:
             return Systematics(self.posterior)
         single = self.config.assess.exposure == "single"
-        return Systematics(found.with_noise(self.posterior), found.fields(single=single))
+        return Systematics(found.with_noise(self.posterior), found.terms(single=single))
 
     @cached_property
     def discrepancy(self) -> RunDiscrepancy | None:
@@ -357,6 +357,7 @@ class Session:
             rng=self.rng("assess"),
             priors=self.config.discrepancy.priors(),
             parameter_priors=self.priors,
+            sample=self._sample,
             stars=matches if isinstance(matches, MatchTable) else None,
         )
 
@@ -364,7 +365,7 @@ class Session:
         """What the assessment estimates beside the posterior, anew."""
         keep_discrepancy(self, self.estimate_discrepancy)
         keep_score_tests(self.run, self.made_score_tests())
-        rest = ("systematics", "solution", "field_terms", "centroid", "local_terms", "score_tests")
+        rest = ("systematics", "solution", "centroid", "local_terms", "score_tests")
         for name in ("discrepancy", *rest):
             self.__dict__.pop(name, None)
 
@@ -432,18 +433,41 @@ class Session:
         **where
             As `uncertainty_map`, on the grid and at the epoch of the assessment.
         """
-        local = {term.name: term for term in self.local_terms}
-        return with_local(uncertainty_map(self.solution, **where), local.get(STRUCTURE))
+        return with_local(uncertainty_map(self.solution, **where), self.structure_sigma(**where))
+
+    def structure_sigma(self, **where: Any) -> NDArray[np.float64] | None:
+        """Standard deviations (N, 2) of what the model leaves out on the grid of a chip, if any."""
+        found = self.discrepancy
+        if found is None or not self.structure_is_left:
+            return None
+        return found.structure_sigma(self._domain(**where))
+
+    @property
+    def structure_is_left(self) -> bool:
+        """Whether what the model leaves out at a position is an error of its own."""
+        return True
+
+    def _domain(
+        self, *, grid: tuple[int, int], epoch: float | None, chip: int | None = None
+    ) -> EvaluationDomain:
+        model = self.posterior.model
+        number = model.chips[0].number if chip is None else chip
+        return EvaluationDomain.of_chips(model, grid, chips=(number,), epoch=epoch)
 
     @property
     def signed(self) -> Posterior:
         """The same, from what the run's folder holds: data are not needed."""
         return self.solution
 
-    @cached_property
-    def field_terms(self) -> tuple[FieldTerm, ...]:
-        """Errors that are fields over the detector: those of the run, then the user's."""
-        return (*self.systematics.fields, *self.config.linear_terms(self.systematics.solution))
+    @property
+    def error_terms(self) -> tuple[ErrorTerm, ...]:
+        """Terms of the error model: those of the run, then those that the user gives."""
+        return (*self.systematics.terms, *self.terms_beside(self.systematics.solution))
+
+    def terms_beside(self, solution: Solution) -> tuple[ErrorTerm, ...]:
+        """Those of them that do not rest on the run's solution."""
+        config = self.config
+        return (*config.linear_terms(solution), *self.local_terms, *config.user_terms())
 
     @cached_property
     def centroid(self) -> MagnitudeErrors | None:
@@ -483,10 +507,9 @@ class Session:
         return None
 
     @cached_property
-    def local_terms(self) -> tuple[LocalTerm, ...]:
-        """Errors that were measured beside the solution, on the grid of the assessment."""
-        found = self.discrepancy
-        return () if found is None else found.local(self.config.assess.grid, self.epoch)
+    def local_terms(self) -> tuple[LocalErrors, ...]:
+        """Errors that were measured beside the solution, and differ from place to place."""
+        return ()
 
     @property
     def scale_arcsec(self) -> float | None:

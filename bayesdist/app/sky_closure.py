@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bayesdist.app.file_positions import sky_of_header
 from bayesdist.app.session import Session
 from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.tangent import sky_of_plane
+from bayesdist.data.sky.tangent import sky_of_plane
 
 __all__ = ["SkyClosure", "sky_closure"]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from bayesdist.data import MatchTable
-from bayesdist.data.files import made_folder, remove_leftovers
-from bayesdist.data.parquet_write import write_columns
+from bayesdist.data.write import write_columns
+from bayesdist.files import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Matches, Posterior
-from bayesdist.infer.density.memberships import memberships_of
+from bayesdist.infer.posterior.memberships import memberships_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 
 __all__ = ["FOLDER", "PAIRS", "part_files", "write_star_files"]

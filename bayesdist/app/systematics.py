@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bayesdist.assess.terms.field_terms import FieldTerm
+from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.infer import Posterior
 
 __all__ = ["Systematics"]
@@ -18,12 +18,12 @@ class Systematics:
     ----------
     solution : Posterior
         Its draws hold every error that bears on the parameters.
-    fields : tuple of FieldTerm
-        Errors that are fields over the detector.
+    terms : tuple of ErrorTerm
+        Other errors, and what of the solution's is shown by itself.
     aligned : bool
         Whether errors are those in a new exposure after its shift and rotation have been fitted.
     """
 
     solution: Posterior
-    fields: tuple[FieldTerm, ...] = ()
+    terms: tuple[ErrorTerm, ...] = ()
     aligned: bool = False

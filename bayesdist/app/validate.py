@@ -1,4 +1,4 @@
-"""`bayesdist validate`: the margins of a run against requirements of their own file."""
+"""`bayesdist requirements`: the margins of a run against requirements of their own file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 from bayesdist.app.config import load_requirements
 from bayesdist.app.dates import idle_dates
-from bayesdist.app.demo import margins_text
 from bayesdist.app.horizon import write_horizons
 from bayesdist.app.judging import assessed_horizons, margins_of
 from bayesdist.app.margins import margin_rows, write_margins
@@ -17,6 +16,7 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
 from bayesdist.app.stages import require
+from bayesdist.app.summary_text import margins_text
 from bayesdist.assess import Margin, Requirement
 from bayesdist.errors import InputError
 
@@ -48,7 +48,7 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
     """
     asked = load_requirements(requirements)
     with closing(session_of(RunDirectory.open(run))) as session:
-        require(session, "validate", ("fit", "sample"))
+        require(session, "requirements", ("fit", "sample"))
         with _named_after(requirements, asked):
             margins = margins_of(session, asked)
             horizons = assessed_horizons(session, asked)
@@ -64,7 +64,7 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
     lines = [*_lines(margins), *(one.sentence for one in horizons)]
     lines += [f"WARNING: {text}" for text in warnings if text]
     if outdated:
-        lines.append(f"{report} shows earlier margins; renew it by 'bayesdist report {run}'")
+        lines.append(f"{report} shows earlier margins; renew it by 'bayesdist stage report {run}'")
     return "\n".join(lines), all(m.verdict == "met" for m in margins)
 
 

@@ -1,81 +1,56 @@
 """What a solution is worth: uncertainty maps, error budget, margins against requirements."""
 
-from bayesdist.assess.area import AreaMap, area_map
-from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget, error_budget, error_budgets
-from bayesdist.assess.budget.detector import DetectorBudget, detector_budget
-from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
-from bayesdist.assess.mosaic import chip_places
-from bayesdist.assess.requirements.margins import Margin, Requirement, check_requirements
-from bayesdist.assess.solution import Solution
-from bayesdist.assess.statistics import STATISTICS, field_statistic
-from bayesdist.assess.terms.fields import ErrorFields, error_fields
-from bayesdist.assess.terms.given import TERM_KINDS, LocalTerm, UserTerm
-from bayesdist.assess.units import UNITS, convert, pixel_scale_of
-from bayesdist.assess.vectors import VectorMap, distortion_vectors
-from bayesdist.diagnose.alignment import Alignment, alignment_residuals
-from bayesdist.diagnose.residuals.binned import (
-    BinnedResiduals,
-    BinnedSums,
-    binned_residuals,
-    binned_sums,
-    residual_statistics,
-)
-from bayesdist.diagnose.residuals.misfit import Misfit, misfit_of, partitions_for, worst_misfit
-from bayesdist.diagnose.residuals.sample import SAMPLE, StarSample, star_sample
-from bayesdist.diagnose.residuals.star_sums import (
-    ExposureSums,
-    StarSums,
-    flagged_by_exposure,
-    star_sums,
-)
-from bayesdist.model.grid import DEFAULT_GRID, grid_pixels
+from __future__ import annotations
 
-__all__ = [
-    "DEFAULT_GRID",
-    "SAMPLE",
-    "STATISTICS",
-    "TERM_KINDS",
-    "UNITS",
-    "Alignment",
-    "AreaMap",
-    "BinnedResiduals",
-    "BinnedSums",
-    "BudgetTerm",
-    "DetectorBudget",
-    "ErrorBudget",
-    "ErrorFields",
-    "ExposureSums",
-    "LocalTerm",
-    "Margin",
-    "Misfit",
-    "Requirement",
-    "Solution",
-    "StarSample",
-    "StarSums",
-    "UncertaintyMap",
-    "UserTerm",
-    "VectorMap",
-    "alignment_residuals",
-    "area_map",
-    "binned_residuals",
-    "binned_sums",
-    "check_requirements",
-    "chip_places",
-    "convert",
-    "detector_budget",
-    "distortion_vectors",
-    "error_budget",
-    "error_budgets",
-    "error_fields",
-    "field_statistic",
-    "flagged_by_exposure",
-    "grid_pixels",
-    "misfit_of",
-    "partitions_for",
-    "pixel_scale_of",
-    "residual_statistics",
-    "star_sample",
-    "star_sums",
-    "uncertainty_map",
-    "worst_misfit",
-]
+from typing import Any
+
+from bayesdist.lazy import lazy_name
+
+_HOMES = {
+    "bayesdist.assess.area": ("AreaMap", "area_map"),
+    "bayesdist.assess.budget.budget": ("BudgetTerm", "ErrorBudget"),
+    "bayesdist.assess.budget.detector": ("detector_budget", "error_budget"),
+    "bayesdist.assess.domain": ("EvaluationDomain",),
+    "bayesdist.assess.error_model": ("ErrorModel", "error_model"),
+    "bayesdist.assess.maps": ("UncertaintyMap", "uncertainty_map"),
+    "bayesdist.assess.mosaic": ("chip_places",),
+    "bayesdist.assess.requirements.margins": ("Margin", "Requirement", "check_requirements"),
+    "bayesdist.assess.solution": ("Solution",),
+    "bayesdist.assess.statistics": ("STATISTICS", "field_statistic"),
+    "bayesdist.assess.terms.given": ("TERM_KINDS", "UserTerm"),
+    "bayesdist.assess.terms.local": ("LocalErrors",),
+    "bayesdist.assess.units": ("UNITS", "convert", "pixel_scale_of"),
+    "bayesdist.assess.vectors": ("VectorMap", "distortion_vectors"),
+    "bayesdist.diagnose.alignment": ("Alignment", "alignment_residuals"),
+    "bayesdist.diagnose.residuals.binned": (
+        "BinnedResiduals",
+        "BinnedSums",
+        "binned_residuals",
+        "binned_sums",
+        "residual_statistics",
+    ),
+    "bayesdist.diagnose.residuals.misfit": (
+        "Misfit",
+        "misfit_of",
+        "partitions_for",
+        "worst_misfit",
+    ),
+    "bayesdist.diagnose.residuals.sample": ("SAMPLE", "StarSample", "star_sample"),
+    "bayesdist.diagnose.residuals.star_sums": (
+        "ExposureSums",
+        "StarSums",
+        "flagged_by_exposure",
+        "star_sums",
+    ),
+    "bayesdist.model.grid": ("DEFAULT_GRID", "grid_pixels"),
+}
+
+__all__ = sorted(name for names in _HOMES.values() for name in names)
+
+
+def __getattr__(name: str) -> Any:
+    return lazy_name(__name__, _HOMES, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

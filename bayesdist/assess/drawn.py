@@ -13,145 +13,112 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.domain import Judged, JudgedFields, Place, judged_fields
+from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.judged_statistics import ErrorsOf, drawn_statistics
 from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.fields import MODEL, ErrorDraws, draw_errors
-from bayesdist.assess.terms.given import LocalTerm, UserTerm
-from bayesdist.assess.terms.sizes import drawn_squares, resized
-from bayesdist.data.magnitude_errors import MagnitudeErrors
-from bayesdist.errors import InputError
-from bayesdist.model import PolynomialBasis
-from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.assess.terms.forms import (
+    PRODUCT,
+    ErrorDraws,
+    ErrorField,
+    ErrorTerm,
+    Image,
+    Noise,
+    NoiseField,
+    Row,
+)
+from bayesdist.assess.terms.seeds import generators
 
-__all__ = ["CENTROID", "Judged", "Place", "PositionErrors", "position_errors"]
+__all__ = ["DrawnErrors"]
 
 Float = NDArray[np.float64]
 
-CENTROID = "centroid"
-
-BLOCK = 200_000  # places times draws whose errors a thread holds at once
-SMOOTH_ORDER = 3  # of fields that stand for what may vary over the detector
-SMOOTH_DRAWS = 1000
-BEYOND = 0.5  # magnitudes by which the outermost bins may be left
+BLOCK = 200_000  # positions times draws whose errors a thread holds at once
+MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
 
 
 @dataclass(frozen=True, eq=False)
-class PositionErrors:
+class DrawnErrors:
     """Draws of everything that moves a position.
 
     Parameters
     ----------
-    fields : ErrorDraws
-        Of the errors that are fields over the detector.
-    terms : tuple of UserTerm
-    sigmas : tuple of (float, float)
-        Of these terms, in the unit of the solution.
-    local : tuple of LocalTerm
-    centroid : MagnitudeErrors or None
-        Errors of a star's centroid, in the unit of the solution.
-    grid : tuple of int
-        Points on x and y of a chip.
+    solution : Solution
+    terms : tuple of ErrorTerm
+    draws : tuple of ErrorDraws
+        One for each term.
+    image : Image
     n_draws : int
-    unit : str
-    offsets : ndarray, shape (n_draws, 2)
-        Standard normal: of the systematic terms, one for the whole field.
     seed : int
-        Of the errors that are independent from place to place.
-    squares : ndarray, shape (n_draws, terms, chips, 2)
-        By which the squares of the local terms are multiplied: they are not known better than
-        their errors say.
+        Of the errors that are independent from position to position, and of the terms.
     """
 
-    fields: ErrorDraws
-    terms: tuple[UserTerm, ...]
-    sigmas: tuple[tuple[float, float], ...]
-    local: tuple[LocalTerm, ...]
-    centroid: MagnitudeErrors | None
-    grid: tuple[int, int]
+    solution: Solution
+    terms: tuple[ErrorTerm, ...]
+    draws: tuple[ErrorDraws, ...]
+    image: Image
     n_draws: int
-    unit: str
-    offsets: Float
     seed: int
-    squares: Float
-    _kept: dict[Judged, JudgedFields] = field(default_factory=dict, repr=False)
+    _kept: dict[EvaluationDomain, tuple[ErrorField, ...]] = field(default_factory=dict, repr=False)
 
-    def varied(self) -> tuple[PositionErrors, ...]:
+    @property
+    def unit(self) -> str:
+        """Unit of all errors."""
+        return self.solution.model.unit
+
+    def at(self, domain: EvaluationDomain) -> tuple[ErrorField, ...]:
+        """The errors of each term at the positions of a domain."""
+        if domain not in self._kept:
+            self._kept[domain] = tuple(one.on(domain, self.image) for one in self.draws)
+        return self._kept[domain]
+
+    def rows(self, domain: EvaluationDomain) -> tuple[Row, ...]:
+        """Rows of everything that an error is made of there."""
+        return tuple(row for one in self.at(domain) for row in one.rows)
+
+    def treatments(self, grid: tuple[int, int] | None = None) -> tuple[DrawnErrors, ...]:
         """The same draws with what may vary over the field varying: smoothly, and everywhere.
 
         Nothing where no term may vary.
-        """
-        moving = [t.varies and t.kind == "systematic" and any(s) for t, s in self._sized]
-        if not any(moving):
-            return ()
-        everywhere = [
-            replace(t, kind="random") if moves else t
-            for t, moves in zip(self.terms, moving, strict=True)
-        ]
-        still = [pair for pair, moves in zip(self._sized, moving, strict=True) if not moves]
-        smooth = [
-            self._smooth(*pair, np.random.default_rng([self.seed, k]))
-            for k, (pair, moves) in enumerate(zip(self._sized, moving, strict=True))
-            if moves
-        ]
-        shape = (self.n_draws, len(smooth), *self.squares.shape[2:])
-        return (
-            replace(
-                self,
-                terms=tuple(t for t, _ in still),
-                sigmas=tuple(s for _, s in still),
-                local=(*self.local, *smooth),
-                squares=np.concatenate([self.squares, np.ones(shape)], axis=1),
-            ),
-            replace(self, terms=tuple(everywhere)),
-        )
-
-    def _smooth(
-        self, term: UserTerm, sigma: tuple[float, float], rng: np.random.Generator
-    ) -> LocalTerm:
-        """A term as a smooth field of its size over each chip, larger at the edges than inside.
-
-        As the distortion of a catalogue, or of another camera, would be.
-        """
-        n, drawn = min(self.n_draws, SMOOTH_DRAWS), {}
-        for chip in self.fields.whole.solution.model.chips:
-            basis = PolynomialBasis(SMOOTH_ORDER, chip.size, chip.reference_pixel)
-            phi = basis.evaluate(*mesh(*grid_pixels(chip.size, self.grid)))
-            phi = phi * np.sqrt(len(phi) / np.square(phi).sum())
-            field = rng.standard_normal((n, 2, phi.shape[1])) @ phi.T
-            field = np.swapaxes(field, 1, 2) * sigma
-            drawn[chip.number] = field.reshape(n, *self.grid[::-1], 2)
-        one = {c: np.sqrt(np.mean(np.square(d), axis=0)) for c, d in drawn.items()}
-        return LocalTerm(term.name, one, term.source, drawn=drawn)
-
-    @property
-    def _sized(self) -> list[tuple[UserTerm, tuple[float, float]]]:
-        return list(zip(self.terms, self.sigmas, strict=True))
-
-    def names(self, judged: Judged) -> tuple[str, ...]:
-        """All terms that an error is made of there."""
-        parts = self._fields(judged).parts
-        own = [CENTROID] if judged.magnitude is not None else []
-        return (*parts, *(t.name for t in self.local), *(t.name for t in self.terms), *own)
-
-    def statistics(
-        self,
-        judged: Judged,
-        names: Sequence[str],
-        *,
-        shrink: Mapping[str, float] | None = None,
-        n_draws: int | None = None,
-    ) -> dict[str, Float]:
-        """Statistics of each draw's error over the places.
 
         Parameters
         ----------
-        judged : Judged
+        grid : tuple of int, optional
+            Points of each chip over which a smooth field has its size.
+        """
+        model = self.solution.model
+        others = [
+            getattr(term, "treatments", lambda *_: ())(model, grid) or (term, term)
+            for term in self.terms
+        ]
+        if all(pair == (term, term) for pair, term in zip(others, self.terms, strict=True)):
+            return ()
+        out = []
+        for way in zip(*others, strict=True):
+            random = generators(way, self.seed)
+            draws = tuple(
+                old if new is term else new.draw(self.n_draws, rng)
+                for old, term, new, rng in zip(self.draws, self.terms, way, random, strict=True)
+            )
+            out.append(replace(self, terms=way, draws=draws, _kept={}))
+        return tuple(out)
+
+    def statistics(
+        self,
+        domain: EvaluationDomain,
+        names: Sequence[str],
+        *,
+        scale: Mapping[str, float] | None = None,
+        n_draws: int | None = None,
+    ) -> dict[str, Float]:
+        """Statistics of each draw's error over the positions, or over pairs of them.
+
+        Parameters
+        ----------
+        domain : EvaluationDomain
         names : sequence of str
             Of `STATISTICS`.
-        shrink : mapping of str to float, optional
-            Factors by which terms are multiplied.
+        scale : mapping of str to float, optional
+            Factors by which rows are multiplied.
         n_draws : int, optional
             The first so many of the draws; all by default.
 
@@ -162,226 +129,124 @@ class PositionErrors:
         Raises
         ------
         InputError
-            For a region that holds fewer than four points of the grid, no pair of places that near,
-            a magnitude where no errors by magnitude are known, and a missing epoch.
+            For no pair of positions that near, a magnitude where no errors by magnitude are known,
+            and a missing epoch.
         """
-        (found,) = self.course((judged,), names, shrink=shrink, n_draws=n_draws)
+        (found,) = self.over_epochs(domain, (domain.epoch,), names, scale=scale, n_draws=n_draws)
         return found
 
-    def course(
+    def over_epochs(
         self,
-        cases: Sequence[Judged],
+        domain: EvaluationDomain,
+        epochs: Sequence[float | None],
         names: Sequence[str],
         *,
-        shrink: Mapping[str, float] | None = None,
+        scale: Mapping[str, float] | None = None,
         n_draws: int | None = None,
     ) -> tuple[dict[str, Float], ...]:
         """The same at several epochs, sooner than one by one.
 
         Parameters
         ----------
-        cases : sequence of Judged
-            That differ in their epochs only.
-        names, shrink, n_draws
+        domain : EvaluationDomain
+        epochs : sequence of float or None
+            Decimal years.
+        names, scale, n_draws
             As `statistics`.
 
         Returns
         -------
         tuple of dict of str to ndarray, shape (n_draws,)
-            One for each case.
+            One for each epoch.
         """
-        judged = cases[0]
-        fields, pairs = self._fields(judged), None
-        if judged.relative:
-            pairs = fields.pairs(judged.separation, np.random.default_rng(self.seed))
+        pairs = domain.pairs()
+        if pairs is not None and pairs.shape[1] > MOST_PAIRS:
+            rng = np.random.default_rng(self.seed)
+            pairs = pairs[:, rng.choice(pairs.shape[1], MOST_PAIRS, replace=False)]
         return drawn_statistics(
-            [self._errors(case, shrink or {}) for case in cases],
+            [self.errors(domain.positions.at(epoch), scale) for epoch in epochs],
             names,
             n_draws=n_draws or self.n_draws,
-            n_places=fields.size,
+            n_places=domain.size,
             block=BLOCK,
             seed=self.seed,
             pairs=pairs,
-            over_all=judged.relative and judged.separation is None,
+            over_all=domain.relative == "pairs" and domain.separation is None,
         )
 
-    def worst(self, judged: Judged, axis: str = "") -> Place:
-        """The place at which the error is largest; of two positions, the one farther off.
+    def worst(self, domain: EvaluationDomain, axis: str = "") -> WorstPosition:
+        """The position at which the error is largest; of two, the one farther off.
 
         Parameters
         ----------
-        judged : Judged
+        domain : EvaluationDomain
         axis : {'', 'u', 'v'}
             Of which axis; of both by default.
         """
-        drawn = self._fields(judged)
-        variance = drawn.variance(MODEL)
-        for shared, sigma in self._added(judged, {}):
-            if not (shared and judged.relative):
-                variance = variance + sigma**2
+        variance = sum(
+            one.total()
+            for one in self.at(domain.positions)
+            # what all positions share is no error of a difference
+            if not (one.uniform and domain.relative)
+        )
         total = variance.sum(axis=1) if not axis else variance[:, "uv".index(axis)]
         k = int(np.argmax(total))
-        return Place(*drawn.at(k), float(np.sqrt(total[k])))
+        at = int(domain.chip[k]), float(domain.x[k]), float(domain.y[k])
+        return WorstPosition(*at, float(np.sqrt(total[k])))
 
-    def size(self, judged: Judged, name: str) -> float:
-        """Radial root mean square of one term over the places."""
-        drawn = self._fields(judged)
-        if name in (*drawn.parts, MODEL):
-            variance = drawn.variance(name)
-        else:
-            others = {other: 0.0 for other in self.names(judged) if other != name}
-            variance = sum(s**2 for _, s in self._added(judged, others))
-        return float(np.sqrt(np.mean(variance.sum(axis=1))))
+    def sizes(self, domain: EvaluationDomain) -> dict[str, float]:
+        """Radial root mean square of each row over the positions."""
+        squares: dict[str, Float] = {}
+        for one in self.at(domain.positions):
+            if not any(row.kind == PRODUCT for row in one.rows):
+                squares |= one.squares()
+        return {name: float(np.sqrt(np.mean(s.sum(axis=1)))) for name, s in squares.items()}
 
-    def centroid_at(self, magnitude: float) -> Float:
-        """Errors (2,) of the centroid of a star.
+    def errors(
+        self, domain: EvaluationDomain, scale: Mapping[str, float] | None = None
+    ) -> ErrorsOf:
+        """Errors (d, N, 2) of some draws, given normal numbers for what is independent.
 
-        Raises
-        ------
-        InputError
-            Where no errors by magnitude are known, or none near this one.
+        Parameters
+        ----------
+        domain : EvaluationDomain
+            Of positions, not of differences.
+        scale : mapping of str to float, optional
+            Factors by which rows are multiplied.
         """
-        if self.centroid is None:
-            raise InputError(
-                f"the error of a star of magnitude {magnitude:g} is not known",
-                where="magnitude",
-                do="give the matches magnitudes, or leave it out",
-            )
-        low, high = self.centroid.mag[0] - BEYOND, self.centroid.mag[-1] + BEYOND
-        if not low <= magnitude <= high:
-            raise InputError(
-                f"centroids of magnitude {magnitude:g} were not measured, but those of "
-                f"{low:.1f} to {high:.1f}",
-                where="magnitude",
-                do="name one of these",
-            )
-        return np.ravel(self.centroid.at([magnitude]))
+        scale = scale or {}
+        fields = self.at(domain)
+        noises = [one for f in fields for one in f.noise(scale)]
+        noise, noisy = _together(noises, domain), any(np.any(one.sigma) for one in noises)
+        drawn = [f for f in fields if not isinstance(f, NoiseField)]
 
-    # -- the draws --------------------------------------------------------------------------------
-
-    def _errors(self, judged: Judged, shrink: Mapping[str, float]) -> ErrorsOf:
-        """All terms together; noise is the same at every epoch and for every what-if."""
-        fields, added = self._fields(judged), self._added(judged, shrink, spread=False)
-        shared, single = (
-            np.sqrt(sum(s**2 for is_shared, s in added if is_shared == which))
-            for which in (True, False)
-        )
-        exact = {name: s for name, s in shrink.items() if self._beside(name)}
-        factor = fields.factor({k: s for k, s in shrink.items() if k not in exact})
-        own = [s for _, s in added[2 + len(self.terms) :][: len(self.local)]]
-        model = self.fields.whole.solution.model
-        chip = np.array([model.chip_code(number) for number in fields.places[0]])
-        common = [
-            (self._drawn_at(term, fields), shrink.get(term.name, 1.0))
-            for term in self.local
-            if term.drawn
-        ]
-
-        def error_of(rows: slice, noise: Float) -> Float:
-            error = fields.joint(rows, exact)
-            error *= factor
-            error += self.offsets[rows, None, :] * shared
-            if np.any(single):
-                error += noise * resized(single, own, self.squares[rows], chip)
-            for drawn, size in common:
-                which = np.arange(rows.start, rows.stop) % len(drawn)
-                error += size * drawn[which]
-            return error
+        def error_of(rows: slice, normal: Float) -> Float:
+            out = np.zeros((rows.stop - rows.start, domain.size, 2))
+            if noisy:
+                out += noise(rows, normal)
+            for one in drawn:
+                error = one.errors(rows, scale)
+                if error is not None:
+                    out += error
+            return out
 
         return error_of
 
-    def _fields(self, judged: Judged) -> JudgedFields:
-        """Fields at the points of the region."""
-        key = replace(judged, relative=False, separation=None, magnitude=None)
-        if key not in self._kept:
-            self._kept[key] = judged_fields(self.fields, key, self.grid)
-        return self._kept[key]
 
-    def _beside(self, name: str) -> bool:
-        """Whether a part is drawn together with the joint error, so that it can be taken off it."""
-        if name in self.fields.terms:
-            return name in self.fields.added
-        return self.fields.whole is self.fields.shown
+def _together(noises: Sequence[Noise], domain: EvaluationDomain) -> ErrorsOf:
+    """All independent errors: normal numbers times the root of the sum of variances."""
+    variance = sum((one.sigma**2 for one in noises), np.zeros((domain.size, 2)))
+    sized = [one for one in noises if one.sizes]
 
-    def _drawn_at(self, term: LocalTerm, fields: JudgedFields) -> NDArray[np.floating]:
-        """Draws (n, N, 2) of a local term at the judged points."""
-        on_chips = [
-            term.drawn[f.chip].reshape(len(term.drawn[f.chip]), -1, 2)[:, inside]
-            for f, inside in zip(fields.fields, fields.inside, strict=True)
-        ]
-        return np.concatenate(on_chips, axis=1)
+    def noise_of(rows: slice, normal: Float) -> Float:
+        if not sized:
+            return normal * np.sqrt(variance)
+        drawn = np.tile(variance, (rows.stop - rows.start, 1, 1))
+        for one in sized:
+            for chip, here in domain.by_chip():
+                if chip in one.sizes:
+                    more = one.sizes[chip][rows, None] - 1.0
+                    drawn[:, here] += more * one.sigma[here] ** 2
+        return normal * np.sqrt(np.maximum(drawn, 0.0))
 
-    def _added(
-        self, judged: Judged, shrink: Mapping[str, float], *, spread: bool = True
-    ) -> list[tuple[bool, Float]]:
-        """Whether all places share an error, and its sigmas (N, 2), of terms that are no fields.
-
-        Without `spread` those of terms that have draws of their own are zero.
-        """
-        drawn = self._fields(judged)
-        N = drawn.size
-        out = [(True, np.zeros((N, 2))), (False, np.zeros((N, 2)))]
-        for term, sigma in zip(self.terms, self.sigmas, strict=True):
-            value = np.tile(sigma, (N, 1)) * shrink.get(term.name, 1.0)
-            out.append((term.kind == "systematic", value))
-        for one in self.local:
-            if one.drawn and not spread:
-                out.append((False, np.zeros((N, 2))))
-                continue
-            on_chips = [
-                np.column_stack([s.ravel() for s in one.on(f.chip, self.grid[::-1])])[inside]
-                for f, inside in zip(drawn.fields, drawn.inside, strict=True)
-            ]
-            out.append((False, np.concatenate(on_chips) * shrink.get(one.name, 1.0)))
-        if judged.magnitude is not None:
-            at = self.centroid_at(judged.magnitude)
-            out.append((False, np.tile(at, (N, 1)) * shrink.get(CENTROID, 1.0)))
-        return out
-
-
-def position_errors(
-    solution: Solution,
-    *,
-    terms: Sequence[UserTerm] = (),
-    fields: Sequence[FieldTerm] = (),
-    aligned: bool = False,
-    local: Sequence[LocalTerm] = (),
-    centroid: MagnitudeErrors | None = None,
-    grid: tuple[int, int],
-    n_draws: int,
-    rng: np.random.Generator,
-    pixel_scale: float | None = None,
-) -> PositionErrors:
-    """Draw all errors of a position.
-
-    Parameters
-    ----------
-    solution, terms, fields, aligned, local, grid, n_draws, rng, pixel_scale
-        As `check_requirements`.
-    centroid : MagnitudeErrors, optional
-        Errors of centroids by magnitude, in the unit of the solution.
-
-    Returns
-    -------
-    PositionErrors
-
-    Raises
-    ------
-    InputError
-        For fewer than two draws, and units that need a pixel scale that is not known.
-    """
-    unit = solution.model.unit
-    sigmas = tuple(t.sigma(unit, pixel_scale) for t in terms)
-    return PositionErrors(
-        fields=draw_errors(solution, n_draws, rng, fields=fields, aligned=aligned),
-        terms=tuple(terms),
-        sigmas=sigmas,
-        local=tuple(local),
-        centroid=centroid,
-        grid=grid,
-        n_draws=n_draws,
-        unit=unit,
-        offsets=rng.standard_normal((n_draws, 2)),
-        seed=int(rng.integers(2**63)),
-        squares=drawn_squares(local, [chip.number for chip in solution.model.chips], n_draws, rng),
-    )
+    return noise_of

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution, kind_of, place_of
-from bayesdist.assess.terms.given import LocalTerm
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
@@ -87,22 +86,22 @@ class UncertaintyMap(SigmaMap):
         return float(self.sigma_v.max())
 
 
-def with_local(found: UncertaintyMap, term: LocalTerm | None) -> UncertaintyMap:
-    """A map with what the model leaves out at each position; itself without such a term.
+def with_local(found: UncertaintyMap, sigma: Float | None) -> UncertaintyMap:
+    """A map with what the model leaves out at each position; itself where that is not known.
 
     Parameters
     ----------
     found : UncertaintyMap
-    term : LocalTerm or None
-        On the grid of the map.
+    sigma : ndarray, shape (ny nx, 2), or None
+        Of u and v at the points of the map.
 
     Returns
     -------
     UncertaintyMap
     """
-    if term is None or found.chip not in term.sigma:
+    if sigma is None:
         return found
-    u, v = term.on(found.chip, found.sigma_u.shape)  # type: ignore[arg-type]
+    u, v = sigma.T.reshape(2, *found.sigma_u.shape)
     sigma_u, sigma_v = np.hypot(found.sigma_u, u), np.hypot(found.sigma_v, v)
     return replace(
         found,

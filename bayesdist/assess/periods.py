@@ -25,12 +25,12 @@ from bayesdist.data import MatchTable
 from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit, Matches
-from bayesdist.infer.compare.period_changes import PeriodComparison
+from bayesdist.infer.compare.period_dates import sum_by_period
 from bayesdist.infer.compare.period_verdict import SIGNIFICANT, all_below, period_verdict
 from bayesdist.infer.compare.periods import (
+    PeriodComparison,
     PeriodSums,
     compare_periods,
-    sum_by_period,
     sums_of_stars,
 )
 from bayesdist.infer.compare.positions import PositionChange

@@ -6,7 +6,7 @@ import math
 
 from bayesdist.assess.names import require_known
 from bayesdist.assess.solution import Solution
-from bayesdist.data.units import UNITS
+from bayesdist.data.tables.units import UNITS
 from bayesdist.errors import InputError
 
 __all__ = ["UNITS", "convert", "pixel_doubt", "pixel_scale_of", "require_scale"]

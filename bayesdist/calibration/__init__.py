@@ -1,5 +1,5 @@
-"""Calibrations: what a file for a pipeline holds, as a map from pixels to a plane and back.
+"""Calibrations: content of a file for a pipeline, as a map from pixels to a plane and back.
 
-Nothing here reads or writes a file: formats are made from calibrations and give them, see
-`bayesdist.products`.
+Nothing here reads or writes a file: formats make calibrations from files and files from
+calibrations, see `bayesdist.products`.
 """

@@ -1,4 +1,4 @@
-"""From pixels to the output frame and back, each way with the calibration's error.
+"""Pixels to the output frame and back, each way with the calibration's error.
 
 The four steps of section 4.1.5 of the ACS handbook:
 
@@ -7,7 +7,7 @@ The four steps of section 4.1.5 of the ACS handbook:
 3. these divided by the output scale, SCALE unless another is wanted;
 4. the chip's own offset added, so that all chips lie in one image.
 
-Back it goes by Newton's method on the forward polynomials, exact to rounding.
+The inverse is Newton's method on the forward polynomials, exact to rounding.
 """
 
 from __future__ import annotations
@@ -33,26 +33,11 @@ _EDGE = 257
 
 @dataclass(frozen=True)
 class OutputFrame:
-    """An image without distortion.
+    """Image without distortion; a scale or factor that is not positive is refused."""
 
-    Parameters
-    ----------
-    scale : float
-        Size of its pixels, in the unit of the calibration (arcseconds for an IDCTAB).
-    origin : tuple of float
-        Pixel on which the zero point of the reference chip falls.
-    vafactor : float
-        Velocity aberration of the exposure: positions are stretched by it.
-
-    Raises
-    ------
-    InputError
-        For a scale or factor that is not positive, or an origin that is not finite.
-    """
-
-    scale: float
-    origin: tuple[float, float] = (0.0, 0.0)
-    vafactor: float = 1.0
+    scale: float  # size of its pixels, in the calibration's unit (arcsec for an IDCTAB)
+    origin: tuple[float, float] = (0.0, 0.0)  # pixel of the reference chip's zero point
+    vafactor: float = 1.0  # velocity aberration, by which positions are stretched
 
     def __post_init__(self) -> None:
         for name, value in (("scale", self.scale), ("VAFACTOR", self.vafactor)):
@@ -73,22 +58,12 @@ class OutputFrame:
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Positions, and how well the calibration knows them.
+    """Positions (N,) and their covariance by the calibration."""
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (N,)
-        NaN where there is none.
-    cov : ndarray, shape (N, 2, 2), or None
-        None where the calibration has no errors.
-    chip : ndarray of int, shape (N,)
-        0 where a position lies on no chip.
-    """
-
-    x: Float
+    x: Float  # NaN where there is none
     y: Float
-    cov: Float | None
-    chip: NDArray[np.int64]
+    cov: Float | None  # (N, 2, 2); None where the calibration has no errors
+    chip: NDArray[np.int64]  # 0 where a position lies on no chip
 
     @property
     def sigma_x(self) -> Float:
@@ -102,7 +77,7 @@ class Positions:
 
     @property
     def correlation(self) -> Float:
-        """Between x and y; 0 where one of them is exact."""
+        """Correlation of x and y; 0 where one of them is exact."""
         if self.cov is None:
             return np.full(self.x.shape, np.nan)
         product = self.sigma_x * self.sigma_y
@@ -118,40 +93,16 @@ class Positions:
 
 @dataclass(frozen=True, eq=False)
 class Application:
-    """Chips, and the frame that they are brought to.
+    """Chips and the frame that they are brought to; `images` are subarrays, by chip."""
 
-    Parameters
-    ----------
-    chips : mapping of int to ChipMap
-        By chip number, in one plane (`Calibration.at`); the first one is that to whose zero point
-        the frame is referred.
-    frame : OutputFrame
-    images : mapping of int to Subarray
-        Where pixels are those of a subarray; chips that are not named are whole.
-    """
-
-    chips: Mapping[int, ChipMap]
+    chips: Mapping[int, ChipMap]  # in one plane; the first one's zero point is the frame's origin
     frame: OutputFrame
     images: Mapping[int, Subarray] = field(default_factory=dict)
 
     def forward(self, x: ArrayLike, y: ArrayLike, *, chip: int) -> Positions:
-        """Pixels of one chip to the output frame.
+        """Positions in output pixels of FITS 1-based pixels (N,) of a chip, or of its image.
 
-        Parameters
-        ----------
-        x, y : array_like, shape (N,)
-            FITS 1-based pixels, of the image where the chip has one.
-        chip : int
-
-        Returns
-        -------
-        Positions
-            In output pixels.
-
-        Raises
-        ------
-        InputError
-            For an unknown chip.
+        InputError for an unknown chip.
         """
         c, k = self.chip(chip), self.frame.pixels_per_unit
         x, y = self._image(chip).to_chip(np.atleast_1d(x), np.atleast_1d(y))
@@ -161,24 +112,10 @@ class Application:
         return Positions(at[0], at[1], cov, np.full(x.size, chip))
 
     def inverse(self, X: ArrayLike, Y: ArrayLike, *, chip: int) -> Positions:
-        """Output positions to pixels of one chip, by Newton's method.
+        """Pixels of one chip, or of its image, at output pixels (N,), by Newton's method.
 
-        Parameters
-        ----------
-        X, Y : array_like, shape (N,)
-            Output pixels.
-        chip : int
-
-        Returns
-        -------
-        Positions
-            In pixels of the image, or of the chip where there is none; the polynomials are also
-            followed beyond its edges.  NaN where no pixel was found.
-
-        Raises
-        ------
-        InputError
-            For an unknown chip, or one whose linear part is singular.
+        The polynomials are also followed beyond the chip's edges; NaN where no pixel was found.
+        InputError for an unknown chip, or one whose linear part is singular.
         """
         c, image = self.chip(chip), self._image(chip)
         found, slope = c.pixels(self.plane(X, Y))
@@ -190,17 +127,9 @@ class Application:
         return Positions(*image.from_chip(*found), cov, number)
 
     def locate(self, X: ArrayLike, Y: ArrayLike) -> Positions:
-        """Output positions to pixels of the chip on which each one lies.
+        """Pixels at output pixels (N,) of the chip on which each lies, the first where several do.
 
-        Parameters
-        ----------
-        X, Y : array_like, shape (N,)
-            Output pixels.
-
-        Returns
-        -------
-        Positions
-            NaN and chip 0 for those in gaps and outside; where chips overlap, the first one counts.
+        NaN and chip 0 for those in gaps and outside.
         """
         X, Y = np.atleast_1d(np.asarray(X, float)), np.atleast_1d(np.asarray(Y, float))
         known = all(c.cov is not None for c in self.chips.values())
@@ -221,7 +150,7 @@ class Application:
         return out
 
     def closure(self, chip: int) -> float:
-        """Largest distance, in pixels, between a pixel and what `inverse` makes of its position."""
+        """Largest distance between a pixel and the `inverse` of its position, pixels."""
         x, y = detector_grid(self.chip(chip).basis.size)
         whole = replace(self, images={})
         at = whole.forward(x, y, chip=chip)
@@ -234,13 +163,7 @@ class Application:
         return (at - np.array(self.frame.origin)[:, None]) / self.frame.pixels_per_unit
 
     def chip(self, number: int) -> ChipMap:
-        """The map of a chip.
-
-        Raises
-        ------
-        InputError
-            For an unknown chip.
-        """
+        """Map of a chip; InputError for an unknown one."""
         if number not in self.chips:
             raise InputError(
                 f"there is no chip {number}",
@@ -256,21 +179,7 @@ class Application:
 def frame_that_holds(
     chips: Mapping[int, ChipMap], scale: float, vafactor: float = 1.0
 ) -> tuple[OutputFrame, tuple[int, int]]:
-    """The smallest image that holds all chips.
-
-    Parameters
-    ----------
-    chips : mapping of int to ChipMap
-    scale, vafactor : float
-        As in `OutputFrame`.
-
-    Returns
-    -------
-    frame : OutputFrame
-        Its origin is a whole pixel.
-    size : tuple of int
-        Columns and rows.
-    """
+    """Smallest image that holds all chips, its origin a whole pixel, and its columns and rows."""
     plain = Application(chips, OutputFrame(scale, vafactor=vafactor))
     at = []
     for number, c in chips.items():
@@ -288,6 +197,6 @@ def frame_that_holds(
 
 
 def on_chip(chip: ChipMap, x: Float, y: Float) -> NDArray[np.bool_]:
-    """Whether pixels lie on a chip, edges included; NaN does not."""
+    """Boolean mask of pixels on a chip, edges included; False for NaN."""
     nx, ny = chip.basis.size
     return (x >= 0.5) & (x <= nx + 0.5) & (y >= 0.5) & (y <= ny + 0.5)

@@ -2,8 +2,8 @@
 
 A map holds the area of each pixel on the sky over that of a corrected pixel, SCALE squared.  Flat
 fields make the sky look even, which divides each pixel by its area; the map undoes this, so that
-photometry agrees with that of drizzled images.  So are those of ACS, without velocity aberration.
-Those of WFC3 are relative to the area at one pixel instead.
+photometry agrees with that of drizzled images.  ACS's maps are defined in this way, without
+velocity aberration.  WFC3's are relative to the area at one pixel instead.
 """
 
 from __future__ import annotations
@@ -29,23 +29,7 @@ _MAGNITUDES = 2.5 / np.log(10.0)
 def determinant(
     basis: PolynomialBasis, polynomial: Float, x: Float, y: Float
 ) -> tuple[Float, Float]:
-    """Determinant of the derivatives of two polynomials.
-
-    Parameters
-    ----------
-    basis : PolynomialBasis
-    polynomial : ndarray, shape (2, K)
-        Coefficients of u and v.
-    x, y : ndarray, shape (N,)
-        FITS 1-based pixels.
-
-    Returns
-    -------
-    det : ndarray, shape (N,)
-        det d(u, v) / d(x, y).
-    derivative : ndarray, shape (N, 2 K)
-        Its derivatives by the coefficients.
-    """
+    """Determinants (N,) of d(u, v) / d(x, y), and derivatives (N, 2 K) by the coefficients."""
     px, py = basis.gradient(x, y)
     (ux, vx), (uy, vy) = polynomial @ px.T, polynomial @ py.T
     by_u = vy[:, None] * px - vx[:, None] * py
@@ -54,24 +38,9 @@ def determinant(
 
 
 def pixel_areas(chip: ChipMap, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float | None]:
-    """Area of every pixel of a grid, however fine, in the unit of the map squared.
+    """Areas (ny, nx) of the pixels of a grid, ``|det d(u, v) / d(x, y)|``, and standard deviations.
 
-    Parameters
-    ----------
-    chip : ChipMap
-    x : array_like, shape (nx,)
-    y : array_like, shape (ny,)
-        FITS 1-based pixels.
-
-    Returns
-    -------
-    area : ndarray, shape (ny, nx)
-        ``|det d(u, v) / d(x, y)|``.
-    sigma : ndarray, shape (ny, nx), or None
-        Its standard deviation; None where the map has no errors.
-
-    Notes
-    -----
+    In the unit of the map squared; None in place of the deviations where the map has no errors.
     The determinant is a polynomial of order 2 (n - 1) and its variance one of 4 (n - 1), so that
     both follow exactly from as few nodes as such polynomials need.
     """
@@ -91,7 +60,7 @@ def pixel_areas(chip: ChipMap, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float
 
 
 def _through_nodes(values: Float, nodes: Float, weights: Float, X: Float, Y: Float) -> Float:
-    """The polynomial (Y.size, X.size) through values on a square of Gauss-Legendre nodes."""
+    """Polynomial (Y.size, X.size) through values on a square of Gauss-Legendre nodes."""
     n = nodes.size
     to_coefficients = legendre.legvander(nodes, n - 1).T * weights * (np.arange(n) + 0.5)[:, None]
     c = to_coefficients @ values.reshape(n, n) @ to_coefficients.T  # rows go with y
@@ -100,35 +69,19 @@ def _through_nodes(values: Float, nodes: Float, weights: Float, X: Float, Y: Flo
 
 @dataclass(frozen=True, eq=False)
 class PixelAreaMap:
-    """Relative pixel areas of one image.
-
-    Parameters
-    ----------
-    chip : int
-    area : ndarray, shape (ny, nx)
-        Over that of a corrected pixel.
-    sigma : ndarray, shape (ny, nx), or None
-        Standard deviation; None where the calibration has no errors.
-    scale : float
-        Size of the corrected pixel.
-    unit : str
-        Its unit, that of the calibration.
-    image : Subarray
-    epoch : float or None
-        Decimal years.
-    """
+    """Relative pixel areas of one image."""
 
     chip: int
-    area: Float
-    sigma: Float | None
-    scale: float
-    unit: str
+    area: Float  # (ny, nx), over that of a corrected pixel
+    sigma: Float | None  # (ny, nx); None where the calibration has no errors
+    scale: float  # size of the corrected pixel
+    unit: str  # of the scale and the calibration
     image: Subarray
-    epoch: float | None
+    epoch: float | None  # decimal years
 
     @property
     def magnitude(self) -> Float:
-        """What the map adds to the magnitude of a point source, (ny, nx)."""
+        """Change (ny, nx) of a point source's magnitude by the map."""
         return -2.5 * np.log10(self.area)
 
     @property
@@ -138,24 +91,9 @@ class PixelAreaMap:
 
 
 def pixel_area_map(chip: ChipMap, scale: float, *, image: Subarray = FULL) -> PixelAreaMap:
-    """The pixel area map of a chip, or of a part of it.
+    """Pixel area map of a chip, or of a subarray with a size, for a corrected pixel of `scale`.
 
-    Parameters
-    ----------
-    chip : ChipMap
-    scale : float
-        Size of a corrected pixel, in the unit of the calibration.
-    image : Subarray
-        With its size, unless it is the whole chip.
-
-    Returns
-    -------
-    PixelAreaMap
-
-    Raises
-    ------
-    InputError
-        For a scale that is not positive, or a subarray without size or beyond the chip.
+    InputError for a scale that is not positive, or a subarray without size or beyond the chip.
     """
     number = chip.chip or 1
     where = f"pixel area map of chip {number}"
@@ -177,7 +115,7 @@ def pixel_area_map(chip: ChipMap, scale: float, *, image: Subarray = FULL) -> Pi
 
 
 def _pixels(chip: ChipMap, image: Subarray, where: str) -> tuple[Float, Float]:
-    """Pixels of the chip, columns and rows, that an image shows."""
+    """Columns and rows, in pixels of the chip, that an image shows."""
     nx, ny = (int(n) for n in chip.basis.size)
     if image.size is None and image != FULL:
         raise InputError("the size of the subarray is not known", where=where, do="give it")

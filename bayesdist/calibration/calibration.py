@@ -1,8 +1,8 @@
-"""What a file for a pipeline holds: all chips of a detector in one plane, at any date.
+"""Calibration of a detector: all its chips in one plane, at any date.
 
 A calibration is a solution without the frames of exposures, whether it was fitted or read from a
-file, with what pipelines need besides: the plane it maps to, look-up tables, explicit inverses, the
-dates it holds for.  One calibration is of one filter.
+file, with the further data that pipelines need: the plane it maps to, look-up tables, explicit
+inverses, its validity period.  One calibration is of one filter.
 """
 
 from __future__ import annotations
@@ -29,60 +29,29 @@ ORIGINS = ("stated", "reference", "chip")
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """All chips of a detector in one plane.
+    """Calibration of all chips of a detector in one plane.
 
-    Parameters
-    ----------
-    name : str
-        Of the file or run, for messages.
-    solution : Solution
-        Without frames of exposures; its first chip is the reference chip.
-    plane : Plane
-    instrument, detector, filter : str
-    errors : {'covariance', 'sigma', 'none'}
-        What the solution's covariance is: all of it, standard deviations of monomials without
-        their correlations, or nothing.
-    numbered : bool
-        False for a file that knows of no chip numbers.
-    before, after : tuple of LookupTable
-        Tables in pixels before the polynomial, and in the plane's unit behind it.
-    inverses : mapping of int to ExplicitInverse
-        By chip: from positions about its own zero point, at the reference date.
-    scale : float, optional
-        Size of a corrected pixel in the plane's unit, where the source states one.
-    scale_from : str
-        Where that is from.
-    reference_date : float, optional
-        Decimal years: the date of `at` where none is asked for.  Without it a calibration that
-        depends on time must be asked for one.
-    undated : str
-        What a reader has to know of positions without a date.
-    no_date : str
-        Why it cannot be brought to a date; empty where it can.
-    with_plane : ndarray, shape (D, 4), optional
-        Covariance of the solution's parameters with those of the plane's orientation.
-    notes : tuple of str
-        What else a reader has to know.
+    `inverses` are by chip, from positions about its own zero point, at the reference date.
     """
 
-    name: str
-    solution: Solution
+    name: str  # of the file or run, for messages
+    solution: Solution  # without frames; its first chip is the reference chip
     plane: Plane = field(default_factory=Plane)
     instrument: str = ""
     detector: str = ""
     filter: str = ""
-    errors: str = "covariance"
-    numbered: bool = True
-    before: tuple[LookupTable, ...] = ()
-    after: tuple[LookupTable, ...] = ()
+    errors: str = "covariance"  # 'covariance', 'sigma' (of monomials alone) or 'none'
+    numbered: bool = True  # False for a file without chip numbers
+    before: tuple[LookupTable, ...] = ()  # in pixels, before the polynomial
+    after: tuple[LookupTable, ...] = ()  # in the plane's unit, after it
     inverses: Mapping[int, ExplicitInverse] = field(default_factory=dict)
-    scale: float | None = None
-    scale_from: str = ""
-    reference_date: float | None = None
-    undated: str = ""
-    no_date: str = ""
-    with_plane: Float | None = None
-    notes: tuple[str, ...] = ()
+    scale: float | None = None  # stated size of a corrected pixel, in the plane's unit
+    scale_from: str = ""  # source of the scale
+    reference_date: float | None = None  # decimal years: default of `at`
+    undated: str = ""  # note on positions without a date
+    no_date: str = ""  # reason why it cannot be brought to a date; else empty
+    with_plane: Float | None = None  # (D, 4), covariance with the orientation
+    notes: tuple[str, ...] = ()  # notes for the reader
 
     @property
     def model(self) -> DistortionModel:
@@ -102,25 +71,11 @@ class Calibration:
     # -- forward ----------------------------------------------------------------------------------
 
     def at(self, epoch: float | None = None, *, origin: str = "reference") -> dict[int, ChipMap]:
-        """The polynomials of all chips at a date.
+        """Polynomials of all chips at a date, the reference chip first.
 
-        Parameters
-        ----------
-        epoch : float, optional
-            Decimal years; the reference date by default.
-        origin : {'reference', 'stated', 'chip'}
-            Where (u, v) = 0 is: at the zero point of the reference chip, where the solution has
-            it, or at the zero point of each chip by itself.
-
-        Returns
-        -------
-        dict of int to ChipMap
-            By chip number, the reference chip first.
-
-        Raises
-        ------
-        InputError
-            For a date that it cannot be brought to, or that it needs and is not given.
+        (u, v) = 0 is at the zero point of the reference chip ('reference'), where the solution has
+        it ('stated'), or at the zero point of each chip by itself ('chip').  InputError for a date
+        that it cannot be brought to, or that it needs and is not given.
         """
         draws, notes = sampling_of(self.solution)
         notes = (*notes, *self.notes)
@@ -147,17 +102,17 @@ class Calibration:
         return out
 
     def in_frame(self, epoch: float | None = None) -> dict[int, ChipMap]:
-        """As `at`, for an output frame: from the reference chip's zero point in a free plane."""
+        """Polynomials for an output frame: from the reference chip's zero point in a free plane."""
         return self.at(epoch, origin="reference" if self.plane.kind == "free" else "stated")
 
     def by_chip(self, epoch: float | None = None) -> dict[int, ChipMap]:
-        """As `at`, for chips one by one: in an aperture each about its own zero point."""
+        """Polynomials for chips one by one: in an aperture each about its own zero point."""
         return self.at(epoch, origin="chip" if self.plane.kind == "aperture" else "stated")
 
     def chip(
         self, number: int | None = None, epoch: float | None = None, *, origin: str = "reference"
     ) -> ChipMap:
-        """The polynomial of one chip, the reference chip by default; raises as `at`."""
+        """Polynomial of one chip, the reference chip by default; errors as for `at`."""
         maps = self.at(epoch, origin=origin)
         if number is None:
             return next(iter(maps.values()))
@@ -199,12 +154,7 @@ class Calibration:
     ) -> tuple[Float, Float]:
         """Legendre coefficients (2, K) of a chip, and their derivatives (2 K, D) by the solution.
 
-        Parameters
-        ----------
-        number : int
-            Of the chip.
-        epoch, origin
-            As of `at`.
+        `epoch` and `origin` as for `at`.
         """
         if origin not in ORIGINS:
             raise ValueError(f"the origin is {origin!r}")
@@ -233,7 +183,7 @@ class Calibration:
         return model.effective(self.solution.mean, group)[0], jacobian
 
     def _date(self, epoch: float | None) -> float | None:
-        """The date to evaluate the model at."""
+        """Date at which the model is evaluated."""
         if epoch is not None and not np.isfinite(epoch):
             raise InputError(f"the epoch is {epoch}", do="give it in decimal years")
         if epoch is not None and self.no_date:
@@ -250,15 +200,12 @@ class Calibration:
             )
         return self.reference_date if epoch is None else epoch
 
-    # -- what else --------------------------------------------------------------------------------
+    # -- scale and tables -------------------------------------------------------------------------
 
     def pixel(self, epoch: float | None = None) -> tuple[float, str]:
-        """Size of a corrected pixel in the plane's unit, and where that is from.
+        """Size of a corrected pixel in the plane's unit, and the source of it.
 
-        Raises
-        ------
-        InputError
-            When nothing states it and the pixel at the zero point has no area.
+        InputError when nothing states it and the pixel at the zero point has no area.
         """
         if self.scale is not None:
             return self.scale, self.scale_from
@@ -272,13 +219,13 @@ class Calibration:
     def with_tables(
         self, before: Iterable[LookupTable] = (), after: Iterable[LookupTable] = ()
     ) -> Calibration:
-        """The calibration with look-up tables before and behind its polynomials."""
+        """Calibration with look-up tables before and after its polynomials."""
         return replace(self, before=tuple(before), after=tuple(after))
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """Draws of parameters that are known by their mean and covariance alone."""
+    """Normal distribution of parameters that are known by their mean and covariance alone."""
 
     mean: Float
     cov: Float
@@ -289,7 +236,7 @@ class Gaussian:
 
 
 def gaussian_solution(model: DistortionModel, mean: Float, cov: Float) -> View:
-    """A solution from its mean and covariance."""
+    """Solution from its mean and covariance."""
     return View(model, mean, cov, Gaussian(mean, cov), _same)  # type: ignore[arg-type]
 
 
@@ -308,24 +255,10 @@ def calibration_of(
     before: Iterable[LookupTable] = (),
     scale: tuple[float, str] | None = None,
 ) -> Calibration:
-    """A fit or a posterior as a calibration, without the frames of its exposures.
+    """Calibration of a fit or a posterior, without the frames of its exposures.
 
-    Parameters
-    ----------
-    solution : Solution
-    name : str
-        What to call it.
-    plane : Plane, optional
-        Where (u, v) lie; not known by default.
-    instrument, detector, filter : str
-    before : iterable of LookupTable
-        In pixels, before the polynomial.
-    scale : tuple of (float, str), optional
-        Size of a corrected pixel, and where that is from; of u, v in pixels 1 by default.
-
-    Returns
-    -------
-    Calibration
+    `scale` is the size of a corrected pixel and its source, by default 1 for u, v in pixels; an
+    unknown `plane` is free.
     """
     bare = solution if solution.model.frames == "none" else without_frames(solution)
     if scale is None and bare.model.unit == "pix":
@@ -354,28 +287,12 @@ def calibration_of_maps(
     errors: str = "none",
     **what: object,
 ) -> Calibration:
-    """A calibration from the polynomials of its chips, as files state them.
+    """Calibration from the polynomials of its chips, as files state them.
 
-    Parameters
-    ----------
-    maps : mapping of int to ChipMap
-        By chip number, the reference chip first; of one order and unit, at the reference date.
-    name : str
-    rates : mapping, optional
-        From (chip, axis, i, j) to the rate of a monomial x^i y^j, in the unit per pixel^(i + j) and
-        year; the same terms for every chip.
-    reference_date : float, optional
-        Decimal years, for rates.
-    cov : ndarray, shape (D, D), optional
-        Of the parameters, as the model orders them.
-    errors : str
-        As in `Calibration`.
-    **what
-        As in `Calibration`.
-
-    Returns
-    -------
-    Calibration
+    `maps` are by chip number, the reference chip first, of one order and unit, at the reference
+    date.  `rates` are by (chip, axis, i, j), of monomials x^i y^j, in the unit per pixel^(i + j)
+    and year, the terms being those of every chip.  `cov` (D, D) is of the parameters in the model's
+    order; other arguments are fields of `Calibration`.
     """
     first = next(iter(maps.values()))
     time = None

@@ -1,6 +1,6 @@
 """One chip at one date: a polynomial from pixels to (u, v), with its covariance.
 
-Fits, posteriors and files of every format come down to this, so that any two can be compared,
+Fits, posteriors and files of every format are reduced to this, so that any two can be compared,
 applied, inverted.
 """
 
@@ -29,21 +29,11 @@ SINGULAR = 1e-12  # of the largest slope squared: below that a linear part has n
 
 @dataclass(frozen=True, eq=False)
 class Monomials:
-    """A map as products write it: coefficients of (x - xref)^i (y - yref)^j.
+    """Map as files state it: coefficients of (x - xref)^i (y - yref)^j."""
 
-    Parameters
-    ----------
-    basis : PolynomialBasis
-        For its order, size and reference pixel.
-    values : ndarray, shape (2, K)
-        Of u and v, in the order of `terms`.
-    cov : ndarray, shape (2 K, 2 K), optional
-        u before v.
-    """
-
-    basis: PolynomialBasis
-    values: Float
-    cov: Float | None = None
+    basis: PolynomialBasis  # for order, size and reference pixel
+    values: Float  # (2, K), of u and v, in the order of `terms`
+    cov: Float | None = None  # (2 K, 2 K), u before v
 
     @property
     def terms(self) -> tuple[tuple[int, int], ...]:
@@ -51,57 +41,34 @@ class Monomials:
         return self.basis.terms
 
     def index(self, i: int, j: int) -> int:
-        """Position of a term."""
+        """Index of a term."""
         return self.terms.index((i, j))
 
     @property
     def constant(self) -> Float:
-        """(u, v) at the reference pixel, shape (2,)."""
+        """Position (u, v) at the reference pixel, shape (2,)."""
         return self.values[:, 0]
 
     @property
     def linear(self) -> Float:
-        """d(u, v) / d(x, y) at the reference pixel, shape (2, 2)."""
+        """Derivatives d(u, v) / d(x, y) at the reference pixel, shape (2, 2)."""
         return self.values[:, 1:3]
 
 
 @dataclass(frozen=True, eq=False)
 class ChipMap:
-    """What one calibration says of one chip at one date.
+    """Map of one chip at one date by one calibration."""
 
-    Parameters
-    ----------
-    name : str
-        Of the calibration, for messages.
-    basis : PolynomialBasis
-    unit : str
-        Of u and v.
-    coefficients : ndarray, shape (2, K)
-        Legendre coefficients of u and v.
-    cov : ndarray, shape (2 K, 2 K), optional
-        Of the coefficients, u before v; None where the source gives no errors.
-    correlated : bool
-        False where the source gives a standard deviation of each monomial and no correlations.
-    draws : float
-        Effective number of draws that `cov` was estimated from; infinite where it is computed.
-    chip : int, optional
-        None where the source numbers no chips.
-    epoch : float, optional
-        Decimal years.
-    notes : tuple of str
-        What else a reader has to know.
-    """
-
-    name: str
+    name: str  # of the calibration, for messages
     basis: PolynomialBasis
-    unit: str
-    coefficients: Float
-    cov: Float | None = None
-    correlated: bool = True
-    draws: float = np.inf
-    chip: int | None = None
-    epoch: float | None = None
-    notes: tuple[str, ...] = ()
+    unit: str  # of u and v
+    coefficients: Float  # (2, K), Legendre, of u and v
+    cov: Float | None = None  # (2 K, 2 K), u before v; None without errors
+    correlated: bool = True  # False where monomials have sigmas alone
+    draws: float = np.inf  # effective number behind `cov`; infinite if computed
+    chip: int | None = None  # None where the source numbers no chips
+    epoch: float | None = None  # decimal years
+    notes: tuple[str, ...] = ()  # notes for the reader
 
     def __post_init__(self) -> None:
         known = [self.coefficients] if self.cov is None else [self.coefficients, self.cov]
@@ -114,7 +81,7 @@ class ChipMap:
 
     @property
     def errors(self) -> str:
-        """What is known of its errors: 'none', 'sigma' or 'covariance'."""
+        """Kind of its errors: 'none', 'sigma' or 'covariance'."""
         if self.cov is None:
             return "none"
         return "covariance" if self.correlated else "sigma"
@@ -152,24 +119,11 @@ class ChipMap:
         return self.slope([x], [y])[0]
 
     def pixels(self, w: Float) -> tuple[Float, Float]:
-        """Pixels whose positions are given, by Newton's method.
+        """Pixels (2, N) at positions (2, N) by Newton's method, and derivatives (N, 2, 2) there.
 
-        Parameters
-        ----------
-        w : ndarray, shape (2, N)
-            In `unit`.
-
-        Returns
-        -------
-        pixels : ndarray, shape (2, N)
-            Also beyond the edges of the chip; NaN where the iteration does not end.
-        slope : ndarray, shape (N, 2, 2)
-            d(u, v) / d(x, y) there.
-
-        Raises
-        ------
-        InputError
-            When the linear part at the reference pixel is singular.
+        The derivatives are d(u, v) / d(x, y).  Also beyond the edges of the chip; NaN where the
+        iteration does not converge.  InputError when the linear part at the reference pixel is
+        singular.
         """
         linear = self.linear
         if abs(np.linalg.det(linear)) <= SINGULAR * np.abs(linear).max() ** 2:
@@ -215,7 +169,7 @@ class ChipMap:
         return (phi @ self.coefficients.T).T, np.stack(along, axis=-1)
 
     def monomials(self) -> Monomials:
-        """The map in powers of offsets from the reference pixel."""
+        """Map in powers of offsets from the reference pixel."""
         values = self.basis.to_monomials(self.coefficients)
         cov = None
         if self.cov is not None:
@@ -224,7 +178,7 @@ class ChipMap:
         return Monomials(self.basis, values, cov)
 
     def padded(self, n_terms: int) -> tuple[Float, Float | None]:
-        """Coefficients (2, n) and covariance (2 n, 2 n) with zeros for terms that are not there."""
+        """Coefficients (2, n) and covariance (2 n, 2 n), zero for terms that are missing."""
         K = self.basis.n_terms
         coefficients = np.zeros((2, n_terms))
         coefficients[:, :K] = self.coefficients
@@ -235,7 +189,7 @@ class ChipMap:
         return coefficients, cov.reshape(2 * n_terms, 2 * n_terms)
 
     def transformed(self, linear: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> ChipMap:
-        """The map to linear (u, v) + shift, both taken as exact."""
+        """Map to linear (u, v) + shift, both taken as exact."""
         L = np.asarray(linear, float)
         coefficients = L @ self.coefficients
         coefficients[:, 0] += np.asarray(shift, float)  # the first basis function is 1
@@ -247,7 +201,7 @@ class ChipMap:
 
 
 def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:
-    """Effective number of draws behind a solution's covariance, and what has to be said of them."""
+    """Effective number of draws behind a solution's covariance, and notes on these."""
     convergence = getattr(solution, "convergence", None)
     if convergence is None:
         return np.inf, ()
@@ -263,28 +217,10 @@ def chip_map(
     epoch: float | None = None,
     exposure: int | str | None = None,
 ) -> ChipMap:
-    """A chip of a fit or a posterior.
+    """Map of a chip (the first by default) of a fit or a posterior at an epoch (decimal years).
 
-    Parameters
-    ----------
-    solution : Solution
-    name : str
-        What to call it.
-    chip : int, optional
-        Chip number; the first chip by default.
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-    exposure : int or str, optional
-        Code or name; without it there are no frames of exposures.
-
-    Returns
-    -------
-    ChipMap
-
-    Raises
-    ------
-    InputError
-        For an unknown chip or exposure, or a missing or infinite epoch.
+    Without an exposure, by code or name, there are no frames.  InputError for an unknown chip or
+    exposure, or a missing or infinite epoch.
     """
     model = solution.model
     if epoch is not None and not np.isfinite(epoch):
@@ -324,28 +260,14 @@ def fitted_map(
     epoch: float | None = None,
     notes: tuple[str, ...] = (),
 ) -> ChipMap:
-    """Whatever maps pixels to (u, v) by a polynomial.
+    """Map with the values of a function from pixels to (u, v) that is a polynomial.
 
-    Parameters
-    ----------
-    positions : callable
-        From FITS 1-based pixels x, y (N,) to u, v (N,): a polynomial of total order `order`.
-    name : str
-    order : int
-    size, reference_pixel : tuple of float
-        As in `PolynomialBasis`.
-    unit : str
-    monomial_cov : ndarray, shape (2 K, 2 K), optional
-        Covariance of the coefficients of (x - xref)^i (y - yref)^j, u before v.
-    correlated, chip, epoch, notes
-        As in `ChipMap`.
-
-    Returns
-    -------
-    ChipMap
+    `positions` takes FITS 1-based pixels x, y (N,) to u, v (N,), a polynomial of total order
+    `order`; `monomial_cov` (2 K, 2 K) is of the coefficients of (x - xref)^i (y - yref)^j, u before
+    v; other arguments as in `PolynomialBasis` and `ChipMap`.
     """
     basis = PolynomialBasis(order, size, reference_pixel)
-    # products of two terms have twice the order, for which this many nodes are exact
+    # products of two terms have twice the order, for which so many nodes are exact
     nodes, weights = legendre.leggauss(order + 1)
     X, Y = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
     (sx, sy), (nx, ny) = basis.half_size, size
@@ -365,19 +287,7 @@ def fitted_map(
 def position_moments(
     coefficients: Float, basis: PolynomialBasis, x: Float, y: Float
 ) -> tuple[Float, Float, Float]:
-    """Variances and covariance of (u, v) at pixels, from second moments of coefficients.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (2, K, 2, K)
-    basis : PolynomialBasis
-    x, y : ndarray, shape (N,)
-        FITS 1-based pixels.
-
-    Returns
-    -------
-    uu, vv, uv : ndarray, shape (N,)
-    """
+    """Variances and covariance (N,) of u, v at pixels, from second moments (2, K, 2, K)."""
     out = np.empty((3, x.size))
     for rows in point_blocks(x.size):
         phi = basis.evaluate(x[rows], y[rows])

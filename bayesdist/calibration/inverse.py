@@ -1,8 +1,8 @@
-"""Explicit inverses: polynomials from positions back to pixels, and what they leave.
+"""Explicit inverses: polynomials from positions back to pixels, and their closure errors.
 
     (U, V) = L^-1 (position - zero),    x = x0 + U + P(U, V),    y = y0 + V + Q(U, V)
 
-Newton's method on the forward polynomials needs no such thing; programs that cannot iterate, or
+Newton's method on the forward polynomials does not need them; programs that cannot iterate, or
 start their iterations there, do.  AP and BP of SIP are of this form, with L the CD matrix; so are
 INVERSE rows of an IDCTAB, with L = 1 and P(0, 0) = 0.
 """
@@ -27,34 +27,20 @@ Float = NDArray[np.float64]
 Terms = Mapping[tuple[int, int], float]
 Forward = Callable[[Float, Float], tuple[Float, Float]]
 
-# Points of each axis: of the fits, and of the check of what they leave.
+# Points of each axis: of the fits, and of the check of their closure.
 FIT_NODES, CHECK_NODES = 65, 257
 
 
 @dataclass(frozen=True, eq=False)
 class ExplicitInverse:
-    """Pixels of one chip as polynomials of positions.
+    """Pixels of one chip as polynomials of positions."""
 
-    Parameters
-    ----------
-    reference_pixel : tuple of float
-        (x0, y0), FITS 1-based.
-    x_terms, y_terms : mapping
-        From powers (p, q) of (U, V) to what is added to them, pixels.
-    zero : tuple of float
-        Position of the reference pixel.
-    linear : ndarray, shape (2, 2), optional
-        L; one without it.
-    jacobian : ndarray, shape (2 n, 2 K), optional
-        Derivatives of the terms, those of x first, by the coefficients of the map inverted.
-    """
-
-    reference_pixel: tuple[float, float]
-    x_terms: Terms
-    y_terms: Terms
-    zero: tuple[float, float] = (0.0, 0.0)
-    linear: Float | None = None
-    jacobian: Float | None = None
+    reference_pixel: tuple[float, float]  # (x0, y0), FITS 1-based
+    x_terms: Terms  # P by powers (p, q) of (U, V), pixels
+    y_terms: Terms  # Q
+    zero: tuple[float, float] = (0.0, 0.0)  # position of the reference pixel
+    linear: Float | None = None  # L (2, 2); 1 if None
+    jacobian: Float | None = None  # (2 n, 2 K), of the terms (x first) by the map's coefficients
 
     @property
     def order(self) -> int:
@@ -69,7 +55,7 @@ class ExplicitInverse:
         return self.reference_pixel[0] + U + x, self.reference_pixel[1] + V + y
 
     def misses(self, chip: ChipMap) -> tuple[float, float]:
-        """Largest and rms distance over a chip between pixels and what becomes of them, pixels."""
+        """Largest and rms distance over a chip of pixels from their images there and back."""
         x, y = detector_grid(chip.basis.size)
         back = self.pixels(*chip.at(x, y))
         far = np.hypot(back[0] - x, back[1] - y)
@@ -84,28 +70,11 @@ def fitted_inverse(
     constant: bool = True,
     linear: Float | None = None,
 ) -> ExplicitInverse:
-    """Fit the inverse of a map over the whole chip, with its derivatives.
+    """Inverse of a map, fitted over the whole chip, with its derivatives.
 
-    Parameters
-    ----------
-    chip : ChipMap
-    order : int, optional
-        One above that of the map by default, and at most 9.
-    nodes : int
-        Points of each axis.
-    constant : bool
-        Whether P and Q have constant terms.
-    linear : ndarray, shape (2, 2), optional
-        L; the derivatives at the reference pixel by default.
-
-    Returns
-    -------
-    ExplicitInverse
-
-    Raises
-    ------
-    InputError
-        For an order outside 1 to 9, or a chip that is folded onto itself.
+    The order is by default one above that of the map, and at most 9; `nodes` are the points of each
+    axis; P and Q have constant terms with `constant`; L is by default the derivatives at the
+    reference pixel.  InputError for an order outside 1 to 9, or a chip that is folded onto itself.
     """
     basis = chip.basis
     if order is None:
@@ -144,31 +113,12 @@ def fitted_inverse(
 def fit_inverse(
     forward: Forward, reference_pixel: tuple[float, float], size: tuple[float, float], order: int
 ) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], float]]:
-    """Terms P and Q of the inverse of a map from pixels to (U, V).
+    """Terms P and Q, by powers of (U, V), of the inverse of a map from pixels (x, y) to (U, V).
 
     Orthogonal polynomials over the bounding box of the detector's image carry the fit.  Its points
     are denser at the detector's edges (Chebyshev's extrema): that halves the worst error, which a
-    uniform grid leaves in the corners.
-
-    Parameters
-    ----------
-    forward : callable
-        Pixels (x, y) to corrected offsets (U, V).
-    reference_pixel : tuple of float
-    size : tuple of float
-        Columns and rows.
-    order : int
-        Total order of the inverse.
-
-    Returns
-    -------
-    x_terms, y_terms : dict
-        From powers (p, q) of U, V to the coefficient.
-
-    Raises
-    ------
-    InputError
-        When the map folds the detector onto itself, so that there is no inverse.
+    uniform grid leaves in the corners.  InputError when the map folds the detector onto itself, so
+    that there is no inverse.
     """
     x, y = detector_grid(size, FIT_NODES, chebyshev=True)
     U, V = forward(x, y)
@@ -180,21 +130,7 @@ def fit_inverse(
 def detector_grid(
     size: tuple[float, float], nodes: int = CHECK_NODES, *, chebyshev: bool = False
 ) -> tuple[Float, Float]:
-    """Grid over the pixel centres from corner to corner, flattened.
-
-    Parameters
-    ----------
-    size : tuple of float
-        Columns and rows.
-    nodes : int
-        Points of each axis.
-    chebyshev : bool
-        Crowd the points towards the edges as Chebyshev's extrema are.
-
-    Returns
-    -------
-    x, y : ndarray, shape (nodes^2,)
-    """
+    """Grid x, y (nodes^2,) over the pixel centres from corner to corner, even or Chebyshev's."""
     t = np.linspace(-1.0, 1.0, nodes)
     if chebyshev:
         t = np.sin(t * np.pi / 2)
@@ -223,7 +159,7 @@ class _Fit:
 
     basis: PolynomialBasis
     design: Float  # (N, K), or (N, K - 1) of functions that vanish at (0, 0)
-    at_zero: Float | None  # (K - 1,): what makes them vanish
+    at_zero: Float | None  # (K - 1,): constants that make them vanish
 
     @classmethod
     def of(cls, U: Float, V: Float, order: int, *, constant: bool) -> _Fit:

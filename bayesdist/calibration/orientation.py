@@ -1,4 +1,4 @@
-"""A calibration laid on another one, or on an aperture, with the error of that."""
+"""A calibration oriented by another one, or by an aperture, with the error of that."""
 
 from __future__ import annotations
 
@@ -21,36 +21,20 @@ __all__ = ["Aperture", "lay_on", "lay_on_aperture", "oriented"]
 Float = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-GRID = (33, 17)  # points on which the largest distance is looked for
+GRID = (33, 17)  # points on which the largest distance is sought
 
 
 @dataclass(frozen=True)
 class Aperture:
-    """Where an aperture lies, in the terms of the Science Instrument Aperture File.
+    """Position of an aperture, in the terms of the Science Instrument Aperture File."""
 
-    Parameters
-    ----------
-    name : str
-        As "JWFC2FIX".
-    v2_ref, v3_ref : float
-        V2Ref and V3Ref, arcseconds.
-    v3_idl_y_angle : float
-        V3IdlYAngle: of the ideal Y axis from V3 towards V2, degrees.
-    v_idl_parity : int
-        VIdlParity, 1 or -1.
-    reference_pixel : tuple of float
-        Pixel of the chip that lies at (V2Ref, V3Ref), FITS 1-based.
-    source : str
-        Where the numbers are from.
-    """
-
-    name: str
-    v2_ref: float
-    v3_ref: float
-    v3_idl_y_angle: float
-    v_idl_parity: int
-    reference_pixel: tuple[float, float]
-    source: str = "given as numbers"
+    name: str  # as "JWFC2FIX"
+    v2_ref: float  # V2Ref, arcsec
+    v3_ref: float  # V3Ref, arcsec
+    v3_idl_y_angle: float  # of the ideal Y axis from V3 towards V2, degrees
+    v_idl_parity: int  # 1 or -1
+    reference_pixel: tuple[float, float]  # of the chip, at (V2Ref, V3Ref), FITS 1-based
+    source: str = "given as numbers"  # of the numbers
 
 
 def lay_on(
@@ -63,50 +47,26 @@ def lay_on(
     scale_arcsec: float | None = None,
     scale_sigma: float = 0.0,
 ) -> Orientation:
-    """The similarity that lays a calibration on an existing one.
+    """Similarity from a calibration to an existing one in an aperture [arcsec], with its error.
 
     Shift, rotation and, for u, v in pixels, scale make the mean square distance between the two
-    maps smallest over the area of the chip.  A fit over the whole chip is used, not the linear
-    terms at the reference pixel: each pixel then counts alike, and a term that one calibration has
-    and the other has not, or a poorly measured fifth order, cannot tilt the whole.  Where the two
-    maps differ by a similarity only, both ways give the same.
+    maps of `chip` at `epoch` smallest over its area; the other chips follow.  A fit over the whole
+    chip is used, not the linear terms at the reference pixel: each pixel then counts alike, and a
+    term that one calibration has and the other has not, or a poorly measured fifth order, cannot
+    tilt the whole.  Where the two maps differ by a similarity only, both ways agree.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    reference : Calibration
-        In an aperture, arcseconds.
-    chip : int
-        The chip that is laid on its counterpart; the others follow.
-    epoch : float, optional
-        Decimal years at which the two are compared; needed by a model with time dependence.
-    reference_drift : bool
-        Whether the reference's time-dependent terms are applied at `epoch`.
-    scale_arcsec : float, optional
-        Arcseconds in one unit of u, v, held.  Without it the scale is fitted for u, v in pixels,
-        and is that of the unit for others.
-    scale_sigma : float
-        Standard deviation of a held scale, arcseconds in one unit of u, v.
+    `reference_drift` applies the reference's time-dependent terms.  A given `scale_arcsec`
+    (arcseconds in one unit of u, v, with error `scale_sigma`) is held; without it the scale is
+    fitted for u, v in pixels, and is that of the unit for others.
 
-    Returns
-    -------
-    Orientation
-
-    Raises
-    ------
-    InputError
-        For a chip that is not there, a chip of another size, a missing epoch, a drift of the
-        reference that cannot be evaluated, a scale that is not positive, or u, v mirrored against
-        x, y.
-    DegenerateError
-        When the calibration maps the chip to one point.
-
-    Notes
-    -----
-    What the fit leaves is a field of 2 K - 4 free coefficients (K terms of one axis).  The
+    The residuals of the fit are a field of 2 K - 4 free coefficients (K terms of one axis).  The
     four that it cannot see are given the mean variance of those it can: the reference may be as
-    wrong in its roll and scale as it is, on average, in any other single term.  White noise on the
-    same pixels would make them known far too well.
+    wrong in its roll and scale as it is, on average, in any other single term.  White noise on
+    these pixels would make them known far too well.
+
+    InputError for a chip that is missing or of another size, a missing epoch, a drift of the
+    reference that cannot be evaluated, a scale that is not positive, or u, v mirrored against x, y;
+    DegenerateError when the calibration maps the chip to one point.
     """
     _check_epoch(calibration, epoch)
     model = calibration.model
@@ -180,36 +140,16 @@ def lay_on_aperture(
     sigma_position: float,
     sigma_angle_deg: float,
 ) -> Orientation:
-    """The similarity that lays a calibration on an aperture.
+    """Similarity from a calibration to an aperture, with its error.
 
     The aperture's reference point goes to (V2Ref, V3Ref), and the detector's y axis there lies
-    along the ideal Y axis, which is at V3IdlYAngle from V3 towards V2.
+    along the ideal Y axis, which is at V3IdlYAngle from V3 towards V2.  `parity` is the sense of V2
+    and V3 against the axes of the aperture, `chip` that of its reference pixel; scale as for
+    `lay_on`, needed for u, v in pixels.  The errors of V2Ref and V3Ref [arcsec] and of V3IdlYAngle
+    [deg] are not stated by the aperture file.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    aperture : Aperture
-    parity : tuple of int
-        Sense of V2 and V3 against the axes of the aperture.
-    chip : int
-        The chip on which the aperture's reference pixel lies.
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-    scale_arcsec, scale_sigma : float
-        As in `lay_on`; needed for u, v in pixels.
-    sigma_position, sigma_angle_deg : float
-        Standard deviations of V2Ref and V3Ref [arcsec] and of V3IdlYAngle [deg].  The aperture file
-        does not state them.
-
-    Returns
-    -------
-    Orientation
-
-    Raises
-    ------
-    InputError
-        For a missing epoch or scale, a parity other than the aperture's, or u, v mirrored against
-        x, y.
+    InputError for a missing epoch or scale, a parity other than the aperture's, or u, v mirrored
+    against x, y.
     """
     _check_epoch(calibration, epoch)
     where = f"aperture {aperture.name}"
@@ -259,27 +199,12 @@ def lay_on_aperture(
 
 
 def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
-    """A calibration turned into the plane of an aperture.
+    """Calibration in the plane of an aperture, in arcseconds, with the error of the orientation.
 
     Every term of both axes is rotated together, those that depend on time as well: where (u, i, j)
-    drifts, (v, i, j) does after the turn, so that the model of the result has both.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        That on which the orientation rests, or that of another filter in the same system, which is
-        taken as independent of it.
-    orientation : Orientation
-
-    Returns
-    -------
-    Calibration
-        In arcseconds; its covariance holds the error of the orientation.
-
-    Raises
-    ------
-    InputError
-        For another unit than the orientation's.
+    drifts, (v, i, j) does after the turn, so that the model of the result has both.  The
+    calibration is that of the orientation, or of another filter in the same system, which is taken
+    as independent of it.  InputError for another unit than the orientation's.
     """
     solution, base, model = calibration.solution, orientation.base, calibration.model
     if model.unit != base.model.unit:
@@ -321,7 +246,7 @@ def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
 
 @dataclass(frozen=True, eq=False)
 class _Oriented(Derived):
-    """A solution in the plane of an aperture: each draw turned by a draw of the orientation."""
+    """Solution in the plane of an aperture: each draw turned by a draw of the orientation."""
 
     model: DistortionModel
     mean: Float
@@ -344,7 +269,7 @@ class _Oriented(Derived):
         return turned(self.source.model, theta, turn, shift)
 
 
-# -- what both ways share -------------------------------------------------------------------------
+# -- parts of both ways ---------------------------------------------------------------------------
 
 
 def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Complex, Complex]:
@@ -358,7 +283,7 @@ def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Comple
 
 
 def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
-    """Of a difference [arcsec] in Legendre coefficients, over the chip."""
+    """Rms and largest distance over the chip of a difference [arcsec] in Legendre coefficients."""
     x, y = (
         grid.ravel()
         for grid in np.meshgrid(
@@ -393,7 +318,7 @@ def _held_scale(unit: str, scale_arcsec: float | None) -> float | None:
 
 
 def _mirrored(where: str) -> InputError:
-    """The error for (u, v) that no rotation brings onto the axes of the aperture."""
+    """Error of (u, v) that no rotation brings onto the axes of the aperture."""
     return InputError(
         "u, v are mirrored against the detector's x, y",
         where=where,

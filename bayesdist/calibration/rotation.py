@@ -7,7 +7,7 @@ are w' = M w, and a distortion f = (A, B) becomes
 
 which is linear in the coefficients of both axes together.  At 90, 180 and 270 degrees every
 coefficient becomes one other one or its negative: the table of WSDC D-T033 ("WISE IOC Distortion
-Calibration"), Appendix A.  As there, a frame rotates by +90 degrees when u' = -v and v' = u.
+Calibration"), Appendix A. As there, a frame rotates by +90 degrees when u' = -v and v' = u.
 """
 
 from __future__ import annotations
@@ -29,29 +29,14 @@ __all__ = ["coefficient_map", "is_exact", "pixel_matrix", "rotated"]
 
 Float = NDArray[np.float64]
 
-# Exact, where cosines and sines are not.
+# Exact, as cosines and sines are not.
 _QUARTERS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
 
 
 def pixel_matrix(degrees: float, *, mirror: bool = False) -> Float:
-    """Matrix M of the pixel offsets: w' = M w.
+    """Matrix M (2, 2) of pixel offsets, w' = M w: a rotation from u towards v, after a mirror of u.
 
-    Parameters
-    ----------
-    degrees : float
-        Rotation from u towards v.
-    mirror : bool
-        Change the sign of u first.
-
-    Returns
-    -------
-    ndarray, shape (2, 2)
-        Whole numbers at multiples of 90 degrees.
-
-    Raises
-    ------
-    InputError
-        When the angle is no finite number.
+    Whole numbers at multiples of 90 degrees; InputError when the angle is no finite number.
     """
     if not np.isfinite(degrees):
         raise InputError(f"the angle is {degrees}", where="degrees", do="give a finite number")
@@ -65,25 +50,12 @@ def pixel_matrix(degrees: float, *, mirror: bool = False) -> Float:
 
 
 def coefficient_map(terms: Sequence[tuple[int, int]], matrix: ArrayLike) -> Float:
-    """What a change of the pixel frame does to the coefficients of (A, B).
+    """Matrix R (2 K, 2 K) from the coefficients of (A, B) to those in a changed pixel frame.
 
-    Parameters
-    ----------
-    terms : sequence of (int, int)
-        Powers (p, q) of u and v, length K: with each one all others of its total order.
-    matrix : array_like, shape (2, 2)
-        Orthogonal, from `pixel_matrix`.
-
-    Returns
-    -------
-    ndarray, shape (2 K, 2 K)
-        R: new coefficients are R c, with c those of A followed by those of B, each in the order
-        of `terms`; their covariance is R cov R^T.  A signed permutation at multiples of 90 degrees.
-
-    Raises
-    ------
-    InputError
-        When the terms of one total order are not all there, or the matrix is not orthogonal.
+    New coefficients are R c, with c those of A followed by those of B, each in the order of `terms`
+    (powers of u and v, complete in each total order); their covariance is R cov R^T. A signed
+    permutation at multiples of 90 degrees.  InputError when the terms of one total order are not
+    all there, or the matrix is not orthogonal.
     """
     M = np.asarray(matrix, float)
     if M.shape != (2, 2) or not np.allclose(M @ M.T, np.eye(2), atol=1e-12, rtol=0):
@@ -111,7 +83,7 @@ def coefficient_map(terms: Sequence[tuple[int, int]], matrix: ArrayLike) -> Floa
 
 
 def is_exact(M: Float) -> bool:
-    """Whether the axes become axes again."""
+    """True where the rotated axes lie along axes again."""
     return bool(np.all(M == np.round(M)))
 
 
@@ -122,31 +94,15 @@ def rotated(
     mirror: bool = False,
     origin: tuple[float, float] = (0.0, 0.0),
 ) -> Calibration:
-    """A calibration in rotated or mirrored pixels, with (u, v) rotated alike.
+    """Calibration in rotated or mirrored pixels, with (u, v) rotated alike.
 
         (u', v') = origin + M ((u, v) - origin)   at the pixel   w' = M w
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Without time dependence.
-    degrees : float
-        From x towards y, and from u towards v.
-    mirror : bool
-        Change the sign of x and u first.
-    origin : tuple of float
-        Point (u, v) that stays: in pixels of the detector, as WISE has them, its centre.
-
-    Returns
-    -------
-    Calibration
-        Every chip is the smallest box along the new axes that holds the rotated one, and its first
-        pixel is (1, 1) again: at multiples of 90 degrees the rotated image.
-
-    Raises
-    ------
-    InputError
-        For a model with time dependence, or an angle that is no finite number.
+    Degrees count from x towards y, and from u towards v, after a mirror of x and u.  The point
+    `origin` stays: in pixels of the detector, as WISE has them, its centre.  Every chip is the
+    smallest box along the new axes that holds the rotated one, and its first pixel is (1, 1) again:
+    at multiples of 90 degrees the rotated image.  InputError for a model with time dependence, or
+    an angle that is no finite number.
     """
     solution, model = calibration.solution, calibration.model
     if model.time is not None:
@@ -175,7 +131,7 @@ def rotated(
 
 
 def _turned_chip(chip: Chip, M: Float) -> Chip:
-    """The box along the new axes that holds the rotated chip, its first pixel at (1, 1)."""
+    """Box along the new axes that holds the rotated chip, its first pixel at (1, 1)."""
     low = 0.5 - np.array(chip.reference_pixel)
     high = low + np.array(chip.size)
     corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])]) @ M.T

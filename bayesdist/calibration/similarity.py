@@ -25,15 +25,9 @@ Complex = NDArray[np.complex128]
 def correlations(
     za: Complex, zb: Complex, basis: PolynomialBasis
 ) -> tuple[complex, complex, float]:
-    """Mean products of A with B as it is, of A with B mirrored, and of B with itself.
+    """Mean products, about mean positions, of A with B, of A with B mirrored, and of B with itself.
 
-    Each about its mean position.
-
-    Parameters
-    ----------
-    za, zb : ndarray of complex, shape (K,)
-        Coefficients of u + i v.
-    basis : PolynomialBasis
+    `za` and `zb` (K,) are coefficients of u + i v.
     """
     weight = term_squares(basis)[: basis.n_terms].copy()
     weight[0] = 0.0  # the shift takes the mean
@@ -45,19 +39,9 @@ def correlations(
 def turn_between(
     za: Complex, zb: Complex, basis: PolynomialBasis, name: str
 ) -> tuple[complex, bool]:
-    """Scale and rotation that bring B nearest to A, and whether B is mirrored first.
+    """Scale and rotation that bring B nearest to A, as one complex number; True if mirrored first.
 
-    Parameters
-    ----------
-    za, zb, basis
-        As of `correlations`.
-    name : str
-        Of B, for messages.
-
-    Raises
-    ------
-    InputError
-        When B maps the chip to one point.
+    InputError, with B's `name`, when B maps the chip to one point.
     """
     straight, flipped, norm = correlations(za, zb, basis)
     if norm == 0.0:
@@ -72,7 +56,7 @@ def as_real(z: Complex) -> Float:
 
 
 def similarity_fields(z: Complex) -> Float:
-    """What shift along u and v, scale and rotation do to positions, (2 K, 4)."""
+    """Derivatives (2 K, 4) of positions by shift along u and v, scale and rotation."""
     one = np.zeros_like(z)
     one[0] = 1.0
     offsets = z.copy()

@@ -1,12 +1,12 @@
-"""A polynomial to a tangent plane as one about another tangent point.
+"""A polynomial to a tangent plane, converted to one about another tangent point.
 
 Two gnomonic planes of one sky differ by a projective map: with the axes E of each as the rows of a
 matrix,
 
     (X, Y, W) = (xi, eta, 1) E_0 E_1^T,    (xi', eta') = (X, Y) / W
 
-A polynomial of (x, y) through it is none, but nearly: the order is raised until what is left is
-far below the errors of any centroid.
+The result for a polynomial of (x, y) is no polynomial, but nearly: the order is raised until the
+rest is far below the errors of any centroid.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.data.tangent import ARCSEC, plane_axes, sky_of_plane, tangent_plane
+from bayesdist.data.sky.tangent import ARCSEC, plane_axes, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import MAX_ORDER
@@ -33,22 +33,11 @@ _NODES = 33
 
 @dataclass(frozen=True, eq=False)
 class Reprojected:
-    """The polynomial of a chip to the plane that touches the sky at CRVAL.
+    """Polynomial of a chip to the plane that touches the sky at CRVAL."""
 
-    Parameters
-    ----------
-    poly : Monomials
-        About CRPIX, in the unit of the map; its constant is zero unless CRVAL lies where the
-        model has no pixel.
-    crval : tuple of float
-        Degrees.
-    offset : tuple of float
-        CRVAL on the model's own plane, in its unit.
-    """
-
-    poly: Monomials
-    crval: tuple[float, float]
-    offset: tuple[float, float]
+    poly: Monomials  # about CRPIX, in the map's unit; constant 0 if a pixel has CRVAL
+    crval: tuple[float, float]  # degrees
+    offset: tuple[float, float]  # CRVAL on the model's own plane, in its unit
 
 
 def reprojected(
@@ -58,30 +47,12 @@ def reprojected(
     crval: tuple[float, float] | None = None,
     lowest: int = 1,
 ) -> Reprojected:
-    """A chip's polynomial about the sky position of its reference pixel, or about a given one.
+    """Polynomial of a chip about the sky position of its reference pixel, or about a given CRVAL.
 
-    Parameters
-    ----------
-    chip : ChipMap
-        To the plane of the tangent point.
-    unit_arcsec : float
-        Its unit, arcseconds.
-    tangent_point : tuple of float
-        Degrees.
-    crval : tuple of float, optional
-        Degrees.  The reference pixel is then that at which the map has it.  Where the polynomial,
-        continued, has no such pixel, it stays and the constants are what they must be.
-    lowest : int
-        Order of the result at least.
-
-    Returns
-    -------
-    Reprojected
-
-    Raises
-    ------
-    InputError
-        For a CRVAL that is no position or 90 degrees or more from the field.
+    `tangent_point` (degrees) is of the plane of `chip`, whose unit has `unit_arcsec`; the result is
+    of order `lowest` at least.  With `crval` (degrees) the reference pixel is that at which the map
+    has it; where the polynomial, continued, has no such pixel, it stays and the constants follow.
+    InputError for a CRVAL that is no position or 90 degrees or more from the field.
     """
     unit = unit_arcsec / ARCSEC
     own, coefficients, poly = chip.basis, chip.coefficients, chip.monomials()
@@ -115,7 +86,7 @@ def reprojected(
             break
     values = basis.to_monomials(legendre.T)
     if crpix is not None and np.hypot(*values[:, 0]) > LEFT * pixel:
-        # beyond the chip, where the fit holds less well: what is written is to have its zero there
+        # beyond the chip, where the fit is less good: the result must have its zero there
         about = ChipMap(chip.name, basis, chip.unit, legendre.T)
         crpix = _pixel_of((0.0, 0.0), about, values[:, 1:3])
         basis = replace(basis, reference_pixel=crpix or own.reference_pixel)
@@ -135,7 +106,7 @@ def reprojected(
 def _given(
     crval: tuple[float, float], unit_arcsec: float, tangent_point: tuple[float, float]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """A position that the user gives, and where it lies on the model's plane."""
+    """Position that the user gives, and its image on the model's plane."""
     if not (np.isfinite(crval).all() and -90 <= crval[1] <= 90):
         raise InputError(
             f"crval is {crval}, no right ascension and declination in degrees",
@@ -155,7 +126,7 @@ def _given(
 
 
 def _pixel_of(at: tuple[float, float], chip: ChipMap, linear: Float) -> tuple[float, float] | None:
-    """The pixel of a position; None where the polynomial, continued so far, has none."""
+    """Pixel of a position; None where the polynomial, continued so far, has none."""
     pixel, slope = chip.pixels(np.array(at)[:, None])
     if not np.isfinite(pixel).all() or np.linalg.det(slope[0]) * np.linalg.det(linear) <= 0:
         return None  # beyond a fold of the polynomial, which no chip has

@@ -1,4 +1,4 @@
-"""Subarrays: pixels of a part of a chip, and those of the whole chip that a distortion is for.
+"""Subarrays: their pixels, and those of the whole chip that a distortion is for.
 
     image = LTM chip + LTV
 
@@ -33,21 +33,11 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Subarray:
-    """Where an image lies on its chip.
+    """Position of an image on its chip."""
 
-    Parameters
-    ----------
-    ltv : tuple of float
-        LTV1, LTV2: pixel of the image less that of the chip (0 for the whole chip).
-    ltm : tuple of float
-        LTM1_1, LTM2_2: pixels of the image in one of the chip; 0.5 for images binned 2 by 2.
-    size : tuple of int, optional
-        Columns and rows of the image.
-    """
-
-    ltv: tuple[float, float] = (0.0, 0.0)
-    ltm: tuple[float, float] = (1.0, 1.0)
-    size: tuple[int, int] | None = None
+    ltv: tuple[float, float] = (0.0, 0.0)  # LTV1, LTV2: pixel of the image less that of the chip
+    ltm: tuple[float, float] = (1.0, 1.0)  # LTM1_1, LTM2_2: image pixels per chip pixel
+    size: tuple[int, int] | None = None  # columns and rows of the image
 
     def __post_init__(self) -> None:
         if not (np.isfinite([*self.ltv, *self.ltm]).all() and min(self.ltm) > 0):
@@ -76,7 +66,7 @@ FULL = Subarray()
 
 
 def subarray_at_corner(x: float, y: float) -> Subarray:
-    """The subarray whose first pixel is pixel (x, y) of the chip, FITS 1-based."""
+    """Subarray whose first pixel is pixel (x, y) of the chip, FITS 1-based."""
     return Subarray((1.0 - x, 1.0 - y))
 
 
@@ -85,21 +75,10 @@ def subarray_of_centre(
     size: tuple[int, int],
     overscan: tuple[int, int] = (0, 0),
 ) -> Subarray:
-    """A subarray from CENTERA and SIZAXIS of a raw image.
+    """Subarray of a raw image from its CENTERA and SIZAXIS.
 
-    Parameters
-    ----------
-    centre : tuple of float
-        CENTERA1, CENTERA2: pixel size // 2 + 1 of the image, counted on the raw chip.
-    size : tuple of int
-        SIZAXIS1, SIZAXIS2.
-    overscan : tuple of int
-        Columns and rows of overscan in front of the chip's first pixel.
-
-    Returns
-    -------
-    Subarray
-        Of the raw image.
+    CENTERA1, CENTERA2 are the pixel size // 2 + 1 of the image, counted on the raw chip; `overscan`
+    is the columns and rows in front of the chip's first pixel.
     """
     corner = [c - n // 2 - o for c, n, o in zip(centre, size, overscan, strict=True)]
     return Subarray((1.0 - corner[0], 1.0 - corner[1]), size=size)
@@ -108,28 +87,12 @@ def subarray_of_centre(
 def subarray_of_header(
     header: fits.Header | Mapping[str, Any], size: tuple[float, float]
 ) -> Subarray:
-    """A subarray from the header of a calibrated image.
+    """Subarray of a calibrated image from the header of its extension.
 
-    Parameters
-    ----------
-    header : astropy.io.fits.Header
-        Of the image extension.
-    size : tuple of float
-        Columns and rows (XSIZE, YSIZE) that the distortion is defined for.
-
-    Returns
-    -------
-    Subarray
-
-    Raises
-    ------
-    InputError
-        Without LTV1 and LTV2, unless the image is as large as the chip.
-
-    Notes
-    -----
-    An image as large as XSIZE, YSIZE is the whole field of its distortion, whatever its LTV: so are
-    those behind a polariser, whose own rows are for less than the chip.
+    `size` is the columns and rows (XSIZE, YSIZE) that the distortion is defined for.  An image as
+    large as that is the whole field of its distortion, whatever its LTV: so are those behind a
+    polariser, whose own rows are for less than the chip.  InputError without LTV1 and LTV2, unless
+    the image is as large as the chip.
     """
     found = tuple(int(header.get(f"NAXIS{k}", 0)) for k in (1, 2))
     given = (found[0], found[1]) if min(found) > 1 else None
@@ -152,25 +115,10 @@ def subarray_of_header(
 def subarrays_of_image(
     headers: Iterable[fits.Header], sizes: Mapping[int, tuple[float, float]], name: str = "image"
 ) -> dict[int, Subarray]:
-    """Subarrays of all science extensions of an image, by chip number.
+    """Subarrays of all extensions SCI of a calibrated image, by chip number (CCDCHIP).
 
-    Parameters
-    ----------
-    headers : iterable of astropy.io.fits.Header
-        Of all HDUs of a calibrated image; those named SCI count, with CCDCHIP.
-    sizes : mapping of int to tuple of float
-        Columns and rows of each chip of the distortion.
-    name : str
-        Of the image, for messages.
-
-    Returns
-    -------
-    dict of int to Subarray
-
-    Raises
-    ------
-    InputError
-        When it has no such extension, or as `subarray_of_header`.
+    `sizes` is the columns and rows of each chip of the distortion.  InputError without such an
+    extension, or as for `subarray_of_header`.
     """
     out = {}
     for header in headers:

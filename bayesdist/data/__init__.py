@@ -1,116 +1,71 @@
-"""What comes in: matched positions, reference catalogues, and how these are matched.
+"""Input: matched positions, reference catalogues, and the matching of star lists with catalogues.
 
-`read_matches` is the way in, `read_rvb` that of WISE's pairs.  Behind them each kind of file has a
+`read_matches` reads any known kind of file, `read_rvb` WISE's pairs.  Each kind of file has a
 module of its own, and all of them end in a `MatchTable`, where units, errors and row numbers have
-been checked.  What outgrows the memory is Parquet: `open_matches` leaves it on disk and gives
-`PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such files.
+been checked.  Tables that are larger than the memory are Parquet: `open_matches` leaves them on
+disk and gives `PartitionedMatches`, whose pieces are MatchTables; `write_partitioned` makes such
+files.
 """
 
-from bayesdist.data.aberration import velocity_aberration
-from bayesdist.data.campaign import CampaignMatches, ExposureReport, match_campaign
-from bayesdist.data.catalog import ReferenceCatalog, catalog_from_table, read_catalog
-from bayesdist.data.exposure_log import Exposure, ExposureLog
-from bayesdist.data.exposures import exposure_of_headers, read_exposures, write_exposures
-from bayesdist.data.files import atomic_path, is_leftover, remove_leftovers, sha256_of
-from bayesdist.data.from_table import matches_from_table
-from bayesdist.data.hst1pass import Hst1passList, read_hst1pass, read_matchup
-from bayesdist.data.linear_map import LinearMap
-from bayesdist.data.magnitude_errors import MagnitudeErrors
-from bayesdist.data.matches import MatchTable
-from bayesdist.data.matching import Matching, match_table, match_to_catalog
-from bayesdist.data.motions import (
-    MotionErrorLine,
-    derive_motions,
-    motion_error_line,
-    select_motions,
-)
-from bayesdist.data.partitioned import PartitionedMatches, open_matches
-from bayesdist.data.patterns import find_similarity, pattern_index
-from bayesdist.data.pieces import PIECE, Piece
-from bayesdist.data.preparing import centroid_errors, neutralise_aberration, with_centroid_errors
-from bayesdist.data.readers import FORMATS, input_files, read_matches
-from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
-from bayesdist.data.rvb_accept import RadialLimit, accept_radial
-from bayesdist.data.rvb_linear import fit_transform, linear_moments
-from bayesdist.data.rvb_pairs import RvbPairs, bluest, colour_between
-from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
-from bayesdist.data.rvb_solutions import read_solutions
-from bayesdist.data.rvb_transform import RvbTransform, rereference, transformed
-from bayesdist.data.rvb_write import write_rvb
-from bayesdist.data.starlists import StarCuts, StarList, read_star_lists, star_list_of_hst1pass
-from bayesdist.data.tangent import mean_direction, tangent_plane
-from bayesdist.data.tolerance import SearchRadius, search_radius
-from bayesdist.data.units import UNITS
-from bayesdist.data.writing import write_partitioned
+from __future__ import annotations
 
-__all__ = [
-    "FORMATS",
-    "PIECE",
-    "UNITS",
-    "CampaignMatches",
-    "Exposure",
-    "ExposureLog",
-    "ExposureReport",
-    "Hst1passList",
-    "LinearMap",
-    "MagnitudeErrors",
-    "MatchTable",
-    "Matching",
-    "MotionErrorLine",
-    "PartitionedMatches",
-    "Piece",
-    "RadialLimit",
-    "ReferenceCatalog",
-    "RvbPairs",
-    "RvbSelection",
-    "RvbTransform",
-    "SearchRadius",
-    "SelectedPairs",
-    "StarCuts",
-    "StarList",
-    "accept_radial",
-    "atomic_path",
-    "bluest",
-    "catalog_from_table",
-    "centroid_errors",
-    "colour_between",
-    "derive_motions",
-    "exposure_of_headers",
-    "find_similarity",
-    "fit_transform",
-    "input_files",
-    "is_leftover",
-    "linear_moments",
-    "match_campaign",
-    "match_table",
-    "match_to_catalog",
-    "matches_from_table",
-    "mean_direction",
-    "motion_error_line",
-    "neutralise_aberration",
-    "open_matches",
-    "pattern_index",
-    "read_catalog",
-    "read_exposures",
-    "read_hst1pass",
-    "read_matches",
-    "read_matchup",
-    "read_rvb",
-    "read_solutions",
-    "read_star_lists",
-    "remove_leftovers",
-    "rereference",
-    "rvb_bands",
-    "search_radius",
-    "select_motions",
-    "sha256_of",
-    "star_list_of_hst1pass",
-    "stream_rvb",
-    "tangent_plane",
-    "transformed",
-    "velocity_aberration",
-    "with_centroid_errors",
-    "write_exposures",
-    "write_partitioned",
-    "write_rvb",
-]
+from typing import Any
+
+from bayesdist.lazy import lazy_name
+
+_HOMES = {
+    "bayesdist.data.catalog": ("ReferenceCatalog", "catalog_from_table", "read_catalog"),
+    "bayesdist.data.exposure_log": ("Exposure", "ExposureLog"),
+    "bayesdist.data.exposures": ("read_exposures", "write_exposures"),
+    "bayesdist.data.hst1pass": ("Hst1passList", "read_hst1pass", "read_matchup"),
+    "bayesdist.data.magnitude_errors": ("MagnitudeErrors",),
+    "bayesdist.data.matches": ("MatchTable",),
+    "bayesdist.data.matching.campaign": ("CampaignMatches", "match_campaign"),
+    "bayesdist.data.matching.linear_map": ("LinearMap",),
+    "bayesdist.data.matching.reports": ("ExposureReport",),
+    "bayesdist.data.matching.search_radius": ("SearchRadius", "search_radius"),
+    "bayesdist.data.matching.similarity": ("find_similarity", "pattern_index"),
+    "bayesdist.data.matching.table": ("Matching", "match_table", "match_to_catalog"),
+    "bayesdist.data.motions": (
+        "MotionErrorLine",
+        "derive_motions",
+        "motion_error_line",
+        "select_motions",
+    ),
+    "bayesdist.data.partitioned": ("PartitionedMatches", "open_matches"),
+    "bayesdist.data.pieces": ("PIECE", "Piece"),
+    "bayesdist.data.preparing": (
+        "centroid_errors",
+        "neutralise_aberration",
+        "with_centroid_errors",
+    ),
+    "bayesdist.data.reading.formats": ("FORMATS", "input_files"),
+    "bayesdist.data.reading.mission_formats": ("MatchFormat",),
+    "bayesdist.data.reading.options": ("ReadOptions",),
+    "bayesdist.data.reading.read": ("read_matches",),
+    "bayesdist.data.reading.table": ("matches_from_table",),
+    "bayesdist.data.rvb": ("read_rvb", "rvb_bands", "stream_rvb"),
+    "bayesdist.data.rvb_accept": ("RadialLimit",),
+    "bayesdist.data.rvb_pairs": ("RvbPairs",),
+    "bayesdist.data.rvb_select": ("RvbSelection", "SelectedPairs"),
+    "bayesdist.data.sky.earth": ("velocity_aberration",),
+    "bayesdist.data.sky.tangent": ("mean_direction", "tangent_plane"),
+    "bayesdist.data.starlists": (
+        "StarCuts",
+        "StarList",
+        "read_star_lists",
+        "star_list_of_hst1pass",
+    ),
+    "bayesdist.data.tables.units": ("UNITS",),
+    "bayesdist.data.write": ("write_partitioned",),
+}
+
+__all__ = sorted(name for names in _HOMES.values() for name in names)
+
+
+def __getattr__(name: str) -> Any:
+    return lazy_name(__name__, _HOMES, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

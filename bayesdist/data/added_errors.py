@@ -24,38 +24,19 @@ GROUPINGS = ("chip", "exposure", "filter")
 
 @dataclass(frozen=True, eq=False)
 class AddedErrors:
-    """Errors to be added in quadrature.
+    """Errors to be added in quadrature, by group; `other` is for stars of none of these groups."""
 
-    Parameters
-    ----------
-    by : str
-        'chip', 'exposure' or 'filter'; empty where all stars are of one group.
-    labels : tuple of str, length G
-        Numbers of the chips, or names; one empty text where all stars are of one group.
-    sigma : ndarray, shape (G, 2)
-        Added error along u and v, in their unit.
-    other : ndarray, shape (2,)
-        Of stars whose label is none of these: of an exposure that was held out, for one.
-    """
-
-    by: str
-    labels: tuple[str, ...]
-    sigma: Float
-    other: Float
+    by: str  # 'chip', 'exposure' or 'filter'; empty where all stars are of one group
+    labels: tuple[str, ...]  # length G: chip numbers or names; one empty text for one group
+    sigma: Float  # (G, 2), along u and v in their unit
+    other: Float  # (2,), of stars with another label, as of an exposure that was held out
 
     def times(self, factor: float) -> AddedErrors:
-        """The same, multiplied by a factor."""
+        """These errors multiplied by a factor."""
         return replace(self, sigma=factor * self.sigma, other=factor * self.other)
 
     def beside(self, matches: MatchTable, sigma_u: Float, sigma_v: Float) -> tuple[Float, Float]:
-        """Errors (N,) on u and v with these added.
-
-        Parameters
-        ----------
-        matches : MatchTable
-        sigma_u, sigma_v : ndarray, shape (N,)
-            Errors of its stars.
-        """
+        """Errors (N,) on u and v: those of the table's stars with these added in quadrature."""
         names, codes = group_codes(matches, self.by)
         row = {label: k for k, label in enumerate(self.labels)}
         of_name = np.array([row.get(name, len(row)) for name in names], np.int64)
@@ -64,19 +45,7 @@ class AddedErrors:
 
 
 def group_codes(matches: MatchTable, by: str) -> tuple[tuple[str, ...], Int]:
-    """Labels of the groups of a table, and the code (N,) of each star's.
-
-    Parameters
-    ----------
-    matches : MatchTable
-    by : str
-        As of `AddedErrors`.
-
-    Returns
-    -------
-    labels : tuple of str
-    codes : ndarray of int, shape (N,)
-    """
+    """Labels of the groups of a table by `AddedErrors.by`, and the code (N,) of each star's."""
     if not by:
         return ("",), np.zeros(len(matches), np.int64)
     names = {

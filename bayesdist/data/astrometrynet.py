@@ -1,18 +1,20 @@
-"""Correspondences of astrometry.net (`corr.fits`): detections beside index stars."""
+"""Correspondences of astrometry.net (`corr.fits`): detections with their index stars."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from astropy.table import Table
 
-from bayesdist.data.from_table import matches_from_table
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.usual_names import ALIASES
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.reading.table import matches_from_table
+from bayesdist.data.tables.names import ALIASES
 
 __all__ = ["COLUMNS", "is_astrometrynet", "matches_from_corr"]
 
-# the other quantities are left out: 'mag' there is one of the index, if it is there at all
+# the other quantities are left out: 'mag', if there is one, is the index star's
 COLUMNS = dict.fromkeys(ALIASES, "") | {
     "x": "field_x",
     "y": "field_y",
@@ -22,52 +24,24 @@ COLUMNS = dict.fromkeys(ALIASES, "") | {
 
 
 def is_astrometrynet(names: Iterable[str]) -> bool:
-    """Whether a table with these columns is a `corr.fits`."""
+    """True for a table with the columns of a `corr.fits`."""
     return {"field_x", "field_y", "index_ra", "index_dec"} <= set(names)
 
 
 def matches_from_corr(
     table: Table,
+    options: ReadOptions | None = None,
     *,
     source: str = "corr.fits",
-    tangent_point: tuple[float, float] | None = None,
     exposure_name: str | None = None,
-    epoch: float | str | None = None,
-    not_finite: str = "refuse",
 ) -> MatchTable:
-    """MatchTable from the columns of a `corr.fits`.
+    """MatchTable from the columns of a `corr.fits`; missing columns or values are refused.
 
-    field_x and field_y are FITS 1-based pixels; index_ra and index_dec come to the tangent plane in
-    seconds of arc.  Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive.
-    There are no errors.
-
-    Parameters
-    ----------
-    table : astropy Table
-    source : str, optional
-        File, for errors.
-    tangent_point : tuple of float, optional
-        RA and Dec in degrees; by default the mean direction of the stars.
-    exposure_name, epoch, not_finite
-        As `matches_from_table`.
-
-    Returns
-    -------
-    MatchTable
-
-    Raises
-    ------
-    InputError
-        For missing columns or values.
+    field_x and field_y are FITS 1-based pixels; index_ra and index_dec are projected to the tangent
+    plane in seconds of arc.  Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are
+    positive.  There are no errors.  The format fixes columns, origin and unit, so that `options`
+    must not.
     """
     columns = COLUMNS | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
-    return matches_from_table(
-        table,
-        columns,
-        source=source,
-        read_sigma=False,
-        tangent_point=tangent_point,
-        exposure_name=exposure_name,
-        epoch=epoch,
-        not_finite=not_finite,
-    )
+    options = replace(options or ReadOptions(), columns=columns, unit=None, sigma="by_magnitude")
+    return matches_from_table(table, options, source=source, exposure_name=exposure_name)

@@ -11,18 +11,17 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import is_on_sky, plane_unit, position_unit
-from bayesdist.data.from_table import with_sky_columns
-from bayesdist.data.missing import without_missing
-from bayesdist.data.naming import find_columns
-from bayesdist.data.parallax import parallax_factors
-from bayesdist.data.quantities import Quantities
-from bayesdist.data.sky import sky_columns
-from bayesdist.data.tables import read_table
-from bayesdist.data.tangent import mean_direction, tangent_jacobian, tangent_plane
-from bayesdist.data.units import check_unit, conversion
-from bayesdist.data.usual_names import ALIASES
-from bayesdist.data.values import SourceColumn, row_number
+from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
+from bayesdist.data.reading.table import with_sky_columns
+from bayesdist.data.sky.earth import parallax_factors
+from bayesdist.data.sky.positions import sky_columns
+from bayesdist.data.sky.tangent import onto_plane
+from bayesdist.data.tables.checks import check_values, one_length, refuse_half, without_missing
+from bayesdist.data.tables.column import SourceColumn, row_number
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import ALIASES, find_columns
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.units import check_unit, conversion
 from bayesdist.errors import InputError
 
 __all__ = ["ReferenceCatalog", "catalog_from_table", "read_catalog"]
@@ -63,7 +62,7 @@ class ReferenceCatalog:
     parallax, sigma_parallax : ndarray, optional
         In `unit`, of a catalogue with a tangent point; 0 where it is not known.
     notes : tuple of str
-        What was done to the file's stars, as clauses.
+        Treatment of the file's stars, as clauses.
 
     Raises
     ------
@@ -95,34 +94,17 @@ class ReferenceCatalog:
         n = np.size(self.u)
         if n == 0:
             raise InputError("holds no stars", where=self.source, do="give a catalogue with stars")
-        for pair in _PAIRS:
-            if (getattr(self, pair[0]) is None) != (getattr(self, pair[1]) is None):
-                raise InputError(
-                    f"has only one of {pair[0]!r} and {pair[1]!r}",
-                    where=self.source,
-                    do="give both or neither",
-                )
         names = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
-        for name in names:
-            if getattr(self, name) is None:
-                continue
-            values = np.ascontiguousarray(getattr(self, name), np.float64)
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        for pair, what in zip(_PAIRS, ("errors", "motions", "errors of motions"), strict=True):
+            refuse_half(pair, given, where=self.source, what=what)
+        for name, values in one_length(given, where=self.source).items():
             object.__setattr__(self, name, values)
-            if values.shape != (n,):
-                raise InputError(
-                    f"column {name!r} has shape {values.shape}, but 'u' has {n} rows",
-                    where=self.source,
-                    do="give columns of one length",
-                )
-            good = np.isfinite(values) & ((values >= 0) | (not name.startswith("sigma")))
-            if not good.all():
-                bad = int(np.argmin(good))
-                must = "finite and not negative" if name.startswith("sigma") else "finite"
-                raise InputError(
-                    f"value is {values[bad]:g}, and must be {must}",
-                    where=f"{self.source}, row {bad + 1}, column {name!r}",
-                    do="correct the row or drop it",
-                )
+        check_values(
+            {name: getattr(self, name) for name in given},
+            place=lambda row: f"{self.source}, row {row + 1}",
+            not_negative=[name for name in given if name.startswith("sigma")],
+        )
         star = np.ascontiguousarray(np.arange(n) if self.star is None else self.star, np.int64)
         object.__setattr__(self, "star", star)
         if star.shape != (n,) or star.min() < 0:
@@ -146,7 +128,7 @@ class ReferenceCatalog:
         return len(self.u)
 
     def select(self, which: NDArray[Any]) -> ReferenceCatalog:
-        """Some of the stars, by mask or indices."""
+        """Stars by mask or indices."""
         arrays = {
             name: getattr(self, name)[which]
             for name in ("u", "v", "mag", *(n for pair in _PAIRS for n in pair), *_PARALLAX)
@@ -157,13 +139,13 @@ class ReferenceCatalog:
         return replace(self, **arrays, star=self.star[which])
 
     def rescaled(self, factor: float, unit: str) -> ReferenceCatalog:
-        """The same in another unit, of which the present one is `factor`."""
+        """Catalogue in another unit, of which the present one is `factor`."""
         lengths = ("u", "v", *(name for pair in _PAIRS for name in pair), *_PARALLAX)
         known = {k: getattr(self, k) for k in lengths if getattr(self, k) is not None}
         return replace(self, **{k: factor * values for k, values in known.items()}, unit=unit)
 
     def at(self, epoch: float) -> ReferenceCatalog:
-        """The catalogue as it is at another epoch.
+        """Catalogue at another epoch.
 
             u(t) = u + pm (t - t0),   sigma(t)^2 = sigma^2 + sigma_pm^2 (t - t0)^2
 
@@ -207,7 +189,7 @@ class ReferenceCatalog:
         )
 
     def as_seen(self, epoch: float) -> ReferenceCatalog:
-        """The catalogue as the Earth sees it: that of `at`, displaced by the parallaxes.
+        """Catalogue as seen from the Earth: that of `at`, displaced by the parallaxes.
 
         Parameters
         ----------
@@ -227,7 +209,7 @@ class ReferenceCatalog:
         then = self.at(epoch)
         if self.parallax is None or self.tangent_point is None:
             return then
-        # those of the middle of the field stand for all of it
+        # factors of the middle of the field serve all of it
         east, north = parallax_factors(epoch, *self.tangent_point)[0]
         sigmas = {}
         if self.sigma_parallax is not None and then.sigma_u is not None:
@@ -246,7 +228,7 @@ class ReferenceCatalog:
         )
 
     def mirrored(self) -> ReferenceCatalog:
-        """The same with the sign of u changed, by which it leaves the tangent plane's own axes."""
+        """Catalogue with the sign of u changed, which takes it off the tangent plane's own axes."""
         return replace(
             self,
             u=-self.u,
@@ -279,7 +261,7 @@ _NAME_PAIRS = (("u", "v"), ("ra", "dec"), *_PAIRS)
 _ALSO = {"sigma_ra": "sigma_u", "sigma_dec": "sigma_v", "pm_ra": "pm_u", "pm_dec": "pm_v"}
 _ALSO |= {"sigma_pm_ra": "sigma_pm_u", "sigma_pm_dec": "sigma_pm_v", "catalogue_epoch": "epoch"}
 _MOTIONS = frozenset(("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"))
-_SPARED = frozenset(_PARALLAX)  # which a star may lack: it then has none that counts
+_SPARED = frozenset(_PARALLAX)  # a star may lack these: they are 0 then
 
 
 def read_catalog(
@@ -342,8 +324,8 @@ def catalog_from_table(
     source : str, optional
         File, for errors.
     unit : str, optional
-        Unit of u and v where the table does not say.  Errors and motions without a unit are in that
-        of u and v, per year; beside ra and dec they must have one, in the file or by their names
+        Unit of u and v where the table has none.  Errors and motions without a unit are in that
+        of u and v, per year; with ra and dec they must have one, in the file or by their names
         (those of the Gaia archive and of VizieR).
     epoch : float, optional
         Decimal year, where the table has no such column.
@@ -387,8 +369,9 @@ def catalog_from_table(
     quantities = Quantities(table, found, source, lambda index: row_number(int(rows[index])))
     column = quantities.__getitem__
     if on_sky:
-        plane_unit(unit, source=source)
-    base = "deg" if on_sky else position_unit((column("u"), column("v")), unit)
+        base = plane_unit(unit, source=source)
+    else:
+        base = position_unit((column("u"), column("v")), unit)
 
     def values(key: str, per_year: str = "") -> Float:
         own, where = column(key).unit, column(key).where
@@ -405,9 +388,7 @@ def catalog_from_table(
         return numbers * factor
 
     out: dict[str, Any] = {}
-    if on_sky:
-        out["u"], out["v"] = sky_columns(quantities)
-    else:
+    if not on_sky:
         out |= {key: values(key) for key in ("u", "v")}
     for pair in _PAIRS:
         if pair[0] in found:
@@ -421,36 +402,25 @@ def catalog_from_table(
         out["star"] = rows
     out["epoch"] = column("epoch").years() if "epoch" in found else epoch
     if on_sky:
-        out |= _on_plane(out, tangent_point, source)
-        base = "arcsec"
+        sigma, motion, sigma_motion = (
+            np.stack([out.pop(key) for key in pair]) if pair[0] in out else None for pair in _PAIRS
+        )
+        out |= onto_plane(
+            *sky_columns(quantities),
+            tangent_point,
+            sigma=sigma,
+            motion=motion,
+            sigma_motion=sigma_motion,
+            where=source,
+        )
     return ReferenceCatalog(**out, unit=base, source=source, notes=notes)
 
 
 def _identities(column: SourceColumn) -> Int:
-    """Codes of the stars, of which none stands twice."""
+    """Codes of the stars; a repeated one is refused."""
     star = column.integers()
     unique, first = np.unique(star, return_index=True)
     if len(unique) < len(star):
         again = int(np.setdiff1d(np.arange(len(star)), first)[0])
         raise column.fail(again, f"star {star[again]} stands twice")
     return star
-
-
-def _on_plane(
-    sky: Mapping[str, Any], point: tuple[float, float] | None, source: str
-) -> dict[str, Any]:
-    """Positions, motions and errors on the sky in degrees, brought to the plane in arcsec."""
-    ra, dec = sky["u"], sky["v"]
-    point = mean_direction(ra, dec) if point is None else point
-    u, v = tangent_plane(ra, dec, point, where=source)
-    J = 3600.0 * tangent_jacobian(ra, dec, point, where=source)
-    out: dict[str, Any] = {"u": u, "v": v, "tangent_point": (float(point[0]), float(point[1]))}
-    if "pm_u" in sky:
-        pm = np.stack([sky["pm_u"], sky["pm_v"]], axis=-1)
-        out["pm_u"], out["pm_v"] = np.einsum("nij,nj->in", J, pm)
-    for pair in (("sigma_u", "sigma_v"), ("sigma_pm_u", "sigma_pm_v")):
-        if pair[0] in sky:
-            variance = np.stack([sky[key] for key in pair], axis=-1) ** 2
-            out[pair[0]], out[pair[1]] = np.sqrt(np.einsum("nij,nj->in", J**2, variance))
-    out |= {key: 3600.0 * sky[key] for key in _PARALLAX if key in sky}
-    return out

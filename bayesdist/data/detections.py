@@ -1,4 +1,4 @@
-"""Detections of stars on many exposures, where nobody knows the stars' positions."""
+"""Detections of stars on many exposures, where the positions of the stars are not known."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.starlists import StarList
+from bayesdist.data.tables.checks import check_values, one_length
 from bayesdist.errors import InputError
 
 __all__ = ["NO_STAR", "Detections", "detections_of"]
@@ -22,42 +23,21 @@ NO_STAR = -1
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Raw positions of all exposures, arrays of length N unless said otherwise.
+    """Raw positions of all exposures, arrays of length N unless stated otherwise.
 
-    Parameters
-    ----------
-    x, y : ndarray
-        FITS 1-based pixels of the chip.
-    exposure : ndarray of int
-        Codes, from 0.
-    exposure_names : tuple of str, length E
-    chip : ndarray of int, optional
-        Chip numbers; 1 by default.
-    epoch : ndarray, shape (E,), optional
-        Decimal years.
-    sigma : ndarray, optional
-        Error of x and of y, pixels.
-    mag : ndarray, optional
-        Instrumental magnitudes.
-    star : ndarray of int, optional
-        Which detections are of one star; `NO_STAR` where it is not known.
-    source : str
-
-    Raises
-    ------
-    InputError
-        For no detections, unequal lengths, values that are not finite, or errors that are not
-        positive.
+    `star` groups the detections of one star by its code, with `NO_STAR` where it is not known;
+    `chip` is 1 by default.  Refused are no detections, unequal lengths, values that are not finite,
+    and errors that are not positive.
     """
 
-    x: Float
+    x: Float  # FITS 1-based pixels of the chip
     y: Float
-    exposure: Int
+    exposure: Int  # codes, from 0
     exposure_names: tuple[str, ...]
     chip: Int = None  # type: ignore[assignment]
-    epoch: Float | None = None
-    sigma: Float | None = None
-    mag: Float | None = None
+    epoch: Float | None = None  # (E,), decimal years
+    sigma: Float | None = None  # error of x and of y, pixels
+    mag: Float | None = None  # instrumental
     star: Int = None  # type: ignore[assignment]
     source: str = "detections"
 
@@ -69,38 +49,23 @@ class Detections:
             object.__setattr__(self, "chip", np.ones(n, np.int64))
         if self.star is None:
             object.__setattr__(self, "star", np.full(n, NO_STAR))
-        for name in ("x", "y", "sigma", "mag", "exposure", "chip", "star"):
-            values = getattr(self, name)
-            if values is None:
-                continue
-            kind = np.float64 if name in ("x", "y", "sigma", "mag") else np.int64
-            values = np.ascontiguousarray(values, kind)
+        names = ("x", "y", "sigma", "mag", "exposure", "chip", "star")
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        arrays = one_length(given, integers=("exposure", "chip", "star"), where=self.source)
+        for name, values in arrays.items():
             object.__setattr__(self, name, values)
-            if values.shape != (n,):
-                raise InputError(
-                    f"column {name!r} has shape {values.shape}, but 'x' has {n} rows",
-                    where=self.source,
-                    do="give columns of one length",
-                )
-            good = np.isfinite(values) if name != "sigma" else (values > 0) & np.isfinite(values)
-            if not good.all():
-                bad = int(np.argmin(good))
-                raise InputError(
-                    f"value is {values[bad]:g}",
-                    where=f"{self.source}, row {bad + 1}, column {name!r}",
-                    do="correct the row or drop it",
-                )
+        check_values(arrays, place=lambda row: f"{self.source}, row {row + 1}", positive=("sigma",))
 
     def __len__(self) -> int:
         return len(self.x)
 
     @property
     def n_stars(self) -> int:
-        """One more than the largest star code."""
+        """Largest star code plus one."""
         return int(self.star.max()) + 1
 
     def select(self, which: NDArray[Any]) -> Detections:
-        """Some of the detections, by mask or indices; the exposures stay."""
+        """Detections by mask or indices; the exposures stay."""
         names = ("x", "y", "exposure", "chip", "sigma", "mag", "star")
         return replace(
             self, **{k: getattr(self, k)[which] for k in names if getattr(self, k) is not None}
@@ -113,20 +78,9 @@ def detections_of(
     epoch: Sequence[float] | None = None,
     sigma: float | None = None,
 ) -> Detections:
-    """All detections of star lists, one list for each exposure.
+    """Detections of star lists, one for each exposure, with epochs (years) and one error (pixels).
 
-    Parameters
-    ----------
-    lists : sequence of StarList
-    epoch : sequence of float, optional
-        Decimal year of each.
-    sigma : float, optional
-        Error of all positions, pixels.
-
-    Raises
-    ------
-    InputError
-        As `Detections`, and for lists of which only some have magnitudes.
+    Refused where only some of the lists have magnitudes.
     """
     with_mag = [one.mag is not None for one in lists]
     if any(with_mag) and not all(with_mag):

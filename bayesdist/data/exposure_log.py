@@ -1,15 +1,15 @@
-"""What is known of each exposure beside its stars: epoch, filter, aberration, roll, target."""
+"""Each exposure's epoch, filter, aberration, roll and target."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.aberration import velocity_aberration
+from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.errors import InputError
 
 __all__ = ["NUMBERS", "Exposure", "ExposureLog"]
@@ -85,7 +85,7 @@ class ExposureLog:
     Raises
     ------
     InputError
-        For no exposures, or one that stands twice.
+        For no exposures, or a repeated one.
     """
 
     exposures: tuple[Exposure, ...]
@@ -116,13 +116,7 @@ class ExposureLog:
         return name in self._by_name
 
     def __getitem__(self, name: str) -> Exposure:
-        """The exposure of a name.
-
-        Raises
-        ------
-        InputError
-            When there is none.
-        """
+        """The exposure of a name; InputError where there is none."""
         try:
             return self._by_name[name]
         except KeyError:
@@ -218,16 +212,10 @@ class ExposureLog:
         found = (getattr(one, quantity) for one in self.exposures)
         return np.array([np.nan if value is None else value for value in found], float)
 
-    def with_aberration(
-        self, velocities_km_s: Mapping[str, tuple[float, float, float]] | None = None
-    ) -> ExposureLog:
-        """The same log with VAFACTOR computed where it is missing.
+    def with_aberration(self) -> ExposureLog:
+        """Log with VAFACTOR computed where it is missing.
 
-        Parameters
-        ----------
-        velocities_km_s : mapping of str to tuple of float, optional
-            Velocity of the telescope relative to the Earth for exposures by name.  Without it only
-            the motion of the Earth counts; the orbit of HST adds up to 2.5e-5.
+        Only the motion of the Earth counts; the orbit of HST adds up to 2.5e-5.
 
         Returns
         -------
@@ -238,7 +226,6 @@ class ExposureLog:
         InputError
             When an exposure has neither the factor nor a target.
         """
-        velocities = velocities_km_s or {}
         out = []
         for one in self.exposures:
             if one.vafactor is None:
@@ -248,8 +235,7 @@ class ExposureLog:
                         where=self.source,
                         do="add one of them to the log",
                     )
-                velocity = velocities.get(one.name, (0.0, 0.0, 0.0))
-                factor = velocity_aberration(one.epoch, one.ra, one.dec, velocity_km_s=velocity)
+                factor = velocity_aberration(one.epoch, one.ra, one.dec)
                 one = replace(one, vafactor=factor)
             out.append(one)
         return replace(self, exposures=tuple(out))

@@ -1,4 +1,4 @@
-"""Logs of exposures: read, written, and made from the headers of images."""
+"""Logs of exposures, read and written."""
 
 from __future__ import annotations
 
@@ -10,21 +10,19 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Column, MaskedColumn, Table
-from astropy.time import Time
 from numpy.typing import NDArray
 
 from bayesdist.data.exposure_log import NUMBERS, Exposure, ExposureLog
-from bayesdist.data.files import atomic_path
-from bayesdist.data.naming import find_columns
-from bayesdist.data.tables import read_table
-from bayesdist.data.units import conversion
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import find_columns
+from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 
 __all__ = [
     "Exposure",
     "ExposureLog",
-    "exposure_of_headers",
     "read_exposures",
     "write_exposures",
 ]
@@ -103,7 +101,7 @@ def read_exposures(
 
 
 def _missing(values: Any) -> NDArray[np.bool_]:
-    """Which values of a column are masked or not a number."""
+    """Boolean mask of the values of a column that are masked or NaN."""
     mask = np.array(np.broadcast_to(getattr(values, "mask", False), len(values)))
     if values.dtype.kind == "f":
         mask |= np.isnan(np.ma.filled(np.ma.asarray(values), np.nan))
@@ -173,57 +171,3 @@ def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
             table[one.name] = column if any(missing) else Column(column)
     with atomic_path(path) as temporary:
         table.write(temporary, format=_FORMATS[path.suffix.lower()])
-
-
-def exposure_of_headers(
-    primary: Mapping[str, Any], science: Mapping[str, Any] | None = None
-) -> Exposure:
-    """An exposure from the headers of an ACS `flt` or `flc` file.
-
-    Parameters
-    ----------
-    primary : mapping
-        Primary header: ROOTNAME, EXPSTART (MJD), EXPTIME, FILTER1, FILTER2, PA_V3, RA_TARG,
-        DEC_TARG.
-    science : mapping, optional
-        Header of a science extension: VAFACTOR.
-
-    Returns
-    -------
-    Exposure
-        At the middle of the exposure.  The filter is that of the two wheels which is not clear;
-        two are joined by '+'.
-
-    Raises
-    ------
-    InputError
-        When ROOTNAME or EXPSTART is missing.
-    """
-    for key in ("ROOTNAME", "EXPSTART"):
-        if key not in primary:
-            raise InputError(
-                f"the primary header has no {key}",
-                where=str(primary.get("ROOTNAME", "header")),
-                do="give the header of a calibrated exposure",
-            )
-    exptime = _number(primary, "EXPTIME")
-    middle = float(primary["EXPSTART"]) + 0.5 * (exptime or 0.0) / 86_400.0
-    wheels = (str(primary.get(key, "")).strip() for key in ("FILTER1", "FILTER2"))
-    return Exposure(
-        name=str(primary["ROOTNAME"]).strip().lower(),
-        epoch=float(Time(middle, format="mjd", scale="utc").decimalyear),
-        filter="+".join(one for one in wheels if one and not one.upper().startswith("CLEAR")),
-        exptime=exptime,
-        vafactor=_number(primary if science is None else science, "VAFACTOR"),
-        pa_v3=_number(primary, "PA_V3"),
-        ra=_number(primary, "RA_TARG"),
-        dec=_number(primary, "DEC_TARG"),
-    )
-
-
-def _number(header: Mapping[str, Any], key: str) -> float | None:
-    """A keyword's number, None where it has none."""
-    try:
-        return float(header[key])
-    except (KeyError, TypeError, ValueError):
-        return None

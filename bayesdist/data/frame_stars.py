@@ -1,4 +1,4 @@
-"""Positions in many frames, and pairs within a radius that depends on the place on the detector."""
+"""Stars of many frames, each with its error."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from bayesdist.data.pairs import mutual_pairs
+from bayesdist.data.tables.checks import check_values, one_length
 from bayesdist.errors import InputError
 
-__all__ = ["FrameStars", "pairs_in_frames"]
+__all__ = ["FrameStars"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -21,47 +20,23 @@ Int = NDArray[np.int64]
 class FrameStars:
     """Stars of many frames: detections on the detector, or reference stars in each frame's system.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (N,)
-        Detections: FITS 1-based pixels.  Reference stars: undistorted position in the frame.
-    sigma : ndarray, shape (N,)
-        Standard error on each axis, in the unit of the undistorted positions.
-    frame : ndarray of int, shape (N,)
-        Which frame; only stars of equal number are paired.
-
-    Raises
-    ------
-    InputError
-        For no stars, unequal lengths, values that are not finite, or errors that are not positive.
+    Refused are no stars, unequal lengths, values that are not finite, and errors that are not
+    positive.
     """
 
-    x: Float
+    x: Float  # (N,): FITS 1-based pixels, or undistorted positions in the frame
     y: Float
-    sigma: Float
-    frame: Int
+    sigma: Float  # (N,), per axis, in the unit of the undistorted positions
+    frame: Int  # (N,): only stars of equal number are paired
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "sigma", "frame"):
-            kind = np.int64 if name == "frame" else np.float64
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
-        n = self.x.shape
-        if n == (0,) or any(a.shape != n for a in (self.y, self.sigma, self.frame)) or len(n) != 1:
-            raise InputError(
-                "the columns of a list of stars are empty or differ in length",
-                where="x, y, sigma, frame",
-                do="give four columns of one length",
-            )
-        for name in ("x", "y", "sigma"):
-            values = getattr(self, name)
-            good = np.isfinite(values) & ((values > 0) if name == "sigma" else True)
-            if not good.all():
-                bad = int(np.argmin(good))
-                raise InputError(
-                    f"value is {values[bad]:g}",
-                    where=f"row {bad + 1}, column {name!r}",
-                    do="correct the row or drop it",
-                )
+        given = {name: getattr(self, name) for name in ("x", "y", "sigma", "frame")}
+        if not np.size(self.x):
+            raise InputError("a list holds no stars", where="column 'x'", do="give one with stars")
+        arrays = one_length(given, integers=("frame",), where="list of stars")
+        for name, values in arrays.items():
+            object.__setattr__(self, name, values)
+        check_values(arrays, place=lambda row: f"list of stars, row {row + 1}", positive=("sigma",))
 
     def __len__(self) -> int:
         return len(self.x)
@@ -70,32 +45,3 @@ class FrameStars:
     def points(self) -> Float:
         """Positions (N, 2)."""
         return np.column_stack([self.x, self.y])
-
-
-def pairs_in_frames(
-    position: Float, frame: Int, reference: FrameStars, radius: Float
-) -> tuple[Int, Int]:
-    """Pairs that are each other's nearest within their frame.
-
-    Parameters
-    ----------
-    position : ndarray, shape (N, 2)
-        Of the detections, corrected.
-    frame : ndarray of int, shape (N,)
-    reference : FrameStars
-    radius : ndarray, shape (N,)
-        Largest distance of the partner of each detection.
-
-    Returns
-    -------
-    index, reference_index : ndarray of int, shape (n_pairs,)
-        No index stands twice.
-    """
-    reach = float(radius.max())
-    # frames lie on top of each other, out of each other's reach
-    apart = 2.0 * reach
-    points = np.column_stack([position, apart * frame])
-    others = np.column_stack([reference.points, apart * reference.frame])
-    index, partner, distance = mutual_pairs(points, others, cKDTree(others), reach)
-    near = distance <= radius[index]
-    return index[near], partner[near]

@@ -1,7 +1,7 @@
 """Matches that are set aside before anything is fitted, to be predicted afterwards.
 
-Which ones is a matter of a star's own code, or of its place on the detector where it has none, and
-of a seed: neither the order of the rows nor the pieces in which they are read play a part.
+The choice depends on a star's own code, or on its position on the detector where it has none, and
+on a seed: neither on the order of the rows nor on the pieces in which they are read.
 """
 
 from __future__ import annotations
@@ -31,35 +31,23 @@ __all__ = [
 Bits = NDArray[np.uint64]
 Matches = MatchTable | PartitionedMatches
 
-HELD_OUT = "held out"  # the reason under which they are counted
+HELD_OUT = "held out"  # reason under which they are counted
 
 
 @dataclass(frozen=True)
 class SetAside:
-    """Which matches are set aside.
+    """Selection of the matches that are set aside: a fraction of the stars, and whole exposures."""
 
-    Parameters
-    ----------
-    fraction : float
-        Of the stars, from 0 to below 1.
-    exposures : tuple of str
-        Those that are set aside whole.
-    seed : int
-    """
-
-    fraction: float
+    fraction: float  # of the stars, in [0, 1)
     exposures: tuple[str, ...] = ()
     seed: int = 1
 
     def which(self, table: MatchTable) -> NDArray[np.bool_]:
-        """Mask (N,) of the matches that are set aside.
-
-        All matches of a star that has a code go together.
-        """
+        """Boolean mask (N,) of the matches that are set aside; those of a star go together."""
         if table.star is not None:
             keys = [table.star.view(np.uint64)]
         else:
-            # zero has two signs, and one place
+            # -0.0 and 0.0 are one position
             keys = [(a + 0.0).view(np.uint64) for a in (table.x, table.y)]
         bits = np.full(len(table), _mixed(np.array([self.seed], np.uint64))[0])
         for key in keys:
@@ -71,23 +59,15 @@ class SetAside:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Matches in two parts.
+    """Matches in two parts: to be fitted, and set aside."""
 
-    Parameters
-    ----------
-    kept : MatchTable or PartitionedMatches
-        What is fitted; exposures without stars among them are not named.
-    held : MatchTable or PartitionedMatches
-        What was set aside, with the names of all exposures.
-    """
-
-    kept: Matches
-    held: Matches
+    kept: Matches  # fitted; exposures without stars here are not named
+    held: Matches  # set aside, with the names of all exposures
 
 
 @dataclass(frozen=True, eq=False)
 class _ChosenPiece:
-    """The rows of a piece that are, or are not, set aside."""
+    """Rows of a piece that are, or are not, set aside."""
 
     piece: Piece
     aside: SetAside
@@ -107,26 +87,15 @@ class _ChosenPiece:
 
 @dataclass(frozen=True, eq=False)
 class ChosenMatches(PartitionedMatches):
-    """Matches on disk without those that are set aside, or these alone.
-
-    Parameters
-    ----------
-    origin : PartitionedMatches
-        All of them.
-    aside : SetAside
-    held : bool
-        Whether these are the ones that were set aside.
-    counts : tuple of int
-        Rows that each piece of the origin has here.
-    """
+    """Matches on disk without those that are set aside, or (`held`) these alone."""
 
     origin: PartitionedMatches | None = None
     aside: SetAside | None = None
     held: bool = False
-    counts: tuple[int, ...] = ()
+    counts: tuple[int, ...] = ()  # rows of each piece of the origin
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The rows in consecutive pieces: those of the origin that have any."""
+        """Pieces of the origin that have any of these rows."""
         assert self.origin is not None and self.aside is not None
         errors = {"errors": self.errors, "factor": self.factor, "added": self.added}
         pieces = replace(self.origin, **errors).pieces()
@@ -138,13 +107,7 @@ class ChosenMatches(PartitionedMatches):
 
 
 def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
-    """So many exposures, drawn by a seed, whatever their order.
-
-    Raises
-    ------
-    InputError
-        When none would be left.
-    """
+    """Names of `n` exposures drawn by a seed, whatever their order; refused where none is left."""
     if n >= len(names):
         raise InputError(
             f"{n} exposures are to be held out, and there are {len(names)}",
@@ -157,22 +120,9 @@ def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
 
 
 def split_matches(matches: Matches, aside: SetAside) -> Split:
-    """Set matches aside.
+    """Matches in two parts; those on disk are read once.
 
-    Parameters
-    ----------
-    matches : MatchTable or PartitionedMatches
-        The latter are gone through once.
-    aside : SetAside
-
-    Returns
-    -------
-    Split
-
-    Raises
-    ------
-    InputError
-        For an unknown exposure, and when nothing would be left, or nothing set aside.
+    Refused are an unknown exposure, nothing left to fit, and nothing set aside.
     """
     where = ", ".join(matches.sources)
     refuse_strangers(aside.exposures, matches.exposure_names, where)
@@ -218,12 +168,7 @@ def split_matches(matches: Matches, aside: SetAside) -> Split:
 
 
 def refuse_strangers(asked: Sequence[str], names: Sequence[str], where: str) -> None:
-    """Refuse exposures to be held out that there are not.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse names of exposures to be held out that are not among `names`."""
     for name in asked:
         if name not in names:
             raise InputError(
@@ -244,7 +189,7 @@ def _refuse_nothing(held: int, n: int, where: str) -> None:
 
 
 def _renamed(table: MatchTable, names: tuple[str, ...]) -> MatchTable:
-    """A table whose exposures are numbered by other names, which hold all of its own."""
+    """Table whose exposures are numbered by other names, which include all of its own."""
     if names == table.exposure_names:
         return table
     code = {name: k for k, name in enumerate(names)}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.tables import read_lines
+from bayesdist.data.tables.files import read_lines
 from bayesdist.errors import FormatError
 
 __all__ = ["Hst1passList", "is_hst1pass", "is_matchup", "read_hst1pass", "read_matchup"]
@@ -56,7 +56,7 @@ class Hst1passList:
     exptime: float | None
 
     def matches(self, *, name: str | None = None) -> MatchTable:
-        """Raw pixels beside the observatory's corrected positions.
+        """Matches of raw pixels with the observatory's corrected positions.
 
         The block under FILEOUT calls X, Y "dist-cor", but they are raw: the header's BDRY_xy and
         BDRY_uv rows give the corners of the chip in both systems.
@@ -98,12 +98,12 @@ class Hst1passList:
 
 
 def is_hst1pass(lines: list[str]) -> bool:
-    """Whether lines are those of an hst1pass list."""
+    """True for lines of an hst1pass list."""
     return any(line.startswith("#") and "FILEOUT:" in line for line in lines)
 
 
 def is_matchup(lines: list[str]) -> bool:
-    """Whether lines begin as a MATCHUP master or one of its calibrated forms does."""
+    """True for lines that begin as a MATCHUP master or one of its calibrated forms does."""
     head = lines[:5]
     return any(line.startswith("#") and "xbar" in line and "ysig" in line for line in head) or (
         bool(head) and {"x", "y", "m", "xe", "ye", "N_fnd"} <= set(head[0].split())

@@ -16,11 +16,11 @@ __all__ = ["MagnitudeErrors", "estimate", "no_magnitudes"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-_LEAST = 40  # stars in a bin
-_MOST = 25  # bins
-_FEWEST = 10  # stars in all, below which no scatter is worth the name
+_MIN_STARS_IN_BIN = 40
+_MAX_BINS = 25
+_MIN_STARS = 10  # stars in all, below which the scatter is unknown
 _CLIP = 4.0  # sigmas beyond which a star has no part in the scatter
-_NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
+MAD_TO_SIGMA = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 _SMALL_SAMPLE = 0.31  # relative bias of the median of |z| over n stars is +0.31 / n
 _LOG_VARIANCE = 1.36  # variance of ln(scatter) times n: the median of |z| is 37 % efficient
 _TURN = 9.0  # gain in chi-square that a rise towards the bright end must bring to be believed
@@ -71,7 +71,7 @@ class MagnitudeErrors:
 
 
 def no_magnitudes(where: str) -> InputError:
-    """The error for stars whose errors are to follow from magnitudes that they do not have."""
+    """Error of stars without magnitudes whose errors are to be estimated by magnitude."""
     return InputError(
         "holds no magnitudes, and errors by magnitude need them",
         where=where,
@@ -82,29 +82,17 @@ def no_magnitudes(where: str) -> InputError:
 def estimate(
     mag: ArrayLike, residual_u: ArrayLike, residual_v: ArrayLike, *, n_params: int = 0
 ) -> MagnitudeErrors:
-    """Robust scatter of residuals in bins of magnitude, smoothed.
+    """Robust scatter of residuals (N,) in bins of magnitude, smoothed.
 
-    The scatter of a bin is 1.4826 times the median absolute residual (about zero: an offset that
-    stars of one magnitude share is an error of theirs), over the stars within 4 sigma on both axes.
-    It is corrected for the size of the bin and for what the fit has taken up.  Bins hold about
-    equal numbers. The smoothed curve rises towards faint stars; it also rises towards the brightest
-    (saturated) ones where the data insist.
+    The scatter of a bin is 1.4826 times the median absolute residual (about zero: an offset common
+    to the stars of one magnitude is an error, too), over the stars within 4 sigma on both axes.
+    It is corrected for the size of the bin and for the freedom that the fit has used: `n_params` is
+    the number of parameters, both axes together, of a fit with weights 1 / sigma^2.  Bins hold
+    about equal numbers.  The smoothed curve rises towards faint stars, and towards the brightest
+    (saturated) ones where the data demand it.
 
-    Parameters
-    ----------
-    mag, residual_u, residual_v : array_like, shape (N,)
-    n_params : int, optional
-        Parameters of the fit, both axes together, that made the residuals with weights 1 / sigma^2.
-
-    Returns
-    -------
-    MagnitudeErrors
-
-    Raises
-    ------
-    InputError
-        For values that are not finite, fewer than 10 stars, no more residuals than parameters, or a
-        bin without scatter.
+    Refused are values that are not finite, fewer than 10 stars, no more residuals than parameters,
+    and a bin without scatter.
     """
     mag = np.asarray(mag, float)
     residuals = np.stack([np.asarray(residual_u, float), np.asarray(residual_v, float)])
@@ -113,9 +101,9 @@ def estimate(
         raise InputError(
             "a magnitude or a residual is not finite", where=where, do="drop such stars"
         )
-    if mag.size < _FEWEST:
+    if mag.size < _MIN_STARS:
         raise InputError(
-            f"{mag.size} stars are too few", where=where, do=f"give {_FEWEST}, or give errors"
+            f"{mag.size} stars are too few", where=where, do=f"give {_MIN_STARS}, or give errors"
         )
     if 2 * mag.size <= n_params:
         raise InputError(
@@ -148,13 +136,13 @@ def estimate(
 def _bins(mag: Float) -> list[Int]:
     """Indices of the stars of each bin; stars of one magnitude stay together."""
     order = np.argsort(mag, kind="stable")
-    count = int(np.clip(len(mag) // _LEAST, 1, _MOST))
+    count = int(np.clip(len(mag) // _MIN_STARS_IN_BIN, 1, _MAX_BINS))
     edges = np.linspace(0, len(mag), count + 1).astype(int)[1:-1]
     edges = np.unique(np.searchsorted(mag[order], mag[order][edges], side="left"))
     parts = [part for part in np.split(order, edges) if len(part)]
     out: list[Int] = []
     for part in parts:  # ties may have left a bin too small to stand alone
-        if out and min(len(part), len(out[-1])) < min(_LEAST, len(mag) // count):
+        if out and min(len(part), len(out[-1])) < min(_MIN_STARS_IN_BIN, len(mag) // count):
             out[-1] = np.concatenate([out[-1], part])
         else:
             out.append(part)
@@ -162,15 +150,15 @@ def _bins(mag: Float) -> list[Int]:
 
 
 def _scatter(residuals: Float) -> Float:
-    """Scatter (2,) of residuals (2, n), unmoved by stars far out."""
+    """Robust scatter (2,) of residuals (2, n)."""
     size = np.abs(residuals)
-    scale = _NORMAL * np.median(size, axis=1)
+    scale = MAD_TO_SIGMA * np.median(size, axis=1)
     for _ in range(20):
         # one membership for both axes, as in the outlier model
         near = (size <= _CLIP * scale[:, None]).all(axis=0)
         if not near.any():
             break
-        new = _NORMAL * np.median(size[:, near], axis=1)
+        new = MAD_TO_SIGMA * np.median(size[:, near], axis=1)
         if np.allclose(new, scale, rtol=1e-12, atol=0.0):
             break
         scale = new
@@ -194,7 +182,7 @@ def _with_lost_freedom(scatter: Float, n: Int, n_params: int) -> Float:
 
 
 def _smoothed(log_sigma: Float, n: Int) -> Float:
-    """Rising regression, or first falling and then rising where that is clearly better."""
+    """Isotonic regression, or falling then rising where chi-square is clearly better."""
     weights = n / _LOG_VARIANCE
 
     def chi2(curve: Float) -> float:

@@ -1,4 +1,4 @@
-"""MatchTable: detector pixels beside reference positions, one row for each matched star."""
+"""MatchTable: detector pixels with reference positions, one row for each matched star."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.added_errors import AddedErrors
-from bayesdist.data.duplicates import first_duplicate
+from bayesdist.data.labels import merged_codes, merged_counts, merged_optional
 from bayesdist.data.magnitude_errors import MagnitudeErrors, no_magnitudes
-from bayesdist.data.merging import merged_codes, merged_counts, merged_optional
-from bayesdist.data.missing import absent, counted
 from bayesdist.data.pieces import PIECE, Piece, TablePiece, even_edges, every_kth
-from bayesdist.data.units import check_unit, conversion, unit_of, without_unit
+from bayesdist.data.tables.checks import absent, check_values, counted, one_length, refuse_half
+from bayesdist.data.tables.repeated import first_duplicate
+from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
 
 __all__ = ["MatchTable"]
@@ -79,16 +79,16 @@ class MatchTable:
         RA and Dec in degrees of the plane that u, v lie on, where they were made from sky
         positions.
     u_nominal, v_nominal : ndarray, optional
-        Where an earlier solution put the star, in `unit`: both or neither.  The match was looked
+        Position by an earlier solution, in `unit`: both or neither.  The match was looked
         for within a circle about it.
     pm_u, pm_v, sigma_pm_u, sigma_pm_v : ndarray, optional
         Proper motion of the reference star in `unit` per year, and its standard errors, where the
-        catalogue gives them: both axes or neither.  u and v hold it already, if `notes` say that
-        they were moved.
+        catalogue gives them: both axes or neither.  u and v include it already where `notes` state
+        that they were moved.
     chip_names : tuple of str
         Names of the chips of `chip_numbers`, where the file has names in place of numbers.
     notes : tuple of str
-        What was done in reading, as clauses.
+        Treatment in reading, as clauses.
 
     Raises
     ------
@@ -136,7 +136,7 @@ class MatchTable:
 
     @classmethod
     def of_distinct_rows(cls, **columns: Any) -> MatchTable:
-        """A table of rows that are known to differ.
+        """Table of rows that are known to differ, made without a search for repeated rows.
 
         All is as in the constructor, but repeated rows are not looked for.
 
@@ -168,12 +168,12 @@ class MatchTable:
         return table
 
     def _with(self, *, distinct: bool = True, **changes: Any) -> MatchTable:
-        """The table with other columns."""
+        """Table with other columns."""
         columns = {one.name: getattr(self, one.name) for one in fields(self)} | changes
         return MatchTable.of_distinct_rows(**columns) if distinct else MatchTable(**columns)
 
     def _complete(self) -> None:
-        """Give what was left out its default, and every array its type."""
+        """Fill in the defaults, and give every array its type."""
         self._without_units()
         self._without_masks()
         n = np.size(self.x)
@@ -185,22 +185,15 @@ class MatchTable:
             if getattr(self, name) is None:
                 default = np.arange(n) if name == "row" else np.zeros(n, np.int64)
                 object.__setattr__(self, name, default)
-        for name in self._array_names():
-            kind = np.int64 if name in _INTEGERS else np.float64
-            # contiguous and in the machine's byte order, which FITS columns are not
-            values = np.ascontiguousarray(getattr(self, name), dtype=kind)
+        given = {name: getattr(self, name) for name in self._array_names()}
+        where = ", ".join(self.sources)
+        for name, values in one_length(given, integers=_INTEGERS, where=where).items():
             object.__setattr__(self, name, values)
-            if values.shape != (n,):
-                raise InputError(
-                    f"column {name!r} has shape {values.shape}, but 'x' has {n} rows",
-                    where=", ".join(self.sources),
-                    do="give columns of one length",
-                )
         object.__setattr__(self, "n_rows", n if self.n_rows is None else int(self.n_rows))
         object.__setattr__(self, "rejected", dict(self.rejected))
 
     def _without_units(self) -> None:
-        """Numbers in place of quantities."""
+        """Replace quantities by numbers in `unit`."""
         units = dict.fromkeys(("x", "y"), "pix") | dict.fromkeys(_MOTIONS, f"{self.unit} / yr")
         units |= {"epoch": "yr", "mag": "mag", "colour": "mag"}
         for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
@@ -212,7 +205,7 @@ class MatchTable:
             object.__setattr__(self, name, factor * without_unit(getattr(self, name)))
 
     def _without_masks(self) -> None:
-        """Rows with a masked value are left out and counted."""
+        """Leave out rows with a masked value, and count them."""
         names = list(self._array_names())
         masked = [name for name in names if hasattr(getattr(self, name), "mask")]
         n, shapes = np.size(self.x), {np.shape(getattr(self, name)) for name in names}
@@ -247,20 +240,9 @@ class MatchTable:
 
     def _check_values(self) -> None:
         check_unit(self.unit, where=", ".join(self.sources))
-        if (self.sigma_u is None) != (self.sigma_v is None):
-            missing = "sigma_u" if self.sigma_u is None else "sigma_v"
-            raise InputError(
-                f"column {missing!r} is missing beside its partner",
-                where=", ".join(self.sources),
-                do="give both errors or neither",
-            )
-        if (self.u_nominal is None) != (self.v_nominal is None):
-            missing = "u_nominal" if self.u_nominal is None else "v_nominal"
-            raise InputError(
-                f"column {missing!r} is missing beside its partner",
-                where=", ".join(self.sources),
-                do="give nominal positions in both axes or in none",
-            )
+        present, where = set(self._array_names()), ", ".join(self.sources)
+        refuse_half(_SIGMAS, present, where=where, what="errors")
+        refuse_half(_NOMINAL, present, where=where, what="nominal positions")
         names_of = {**_CODES, "source": "sources"}
         for name, labels in names_of.items():
             codes = getattr(self, name)
@@ -277,21 +259,9 @@ class MatchTable:
                 where=self._where(bad, "star"),
                 do="number the reference stars from 0",
             )
-        for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL):
-            values = getattr(self, name)
-            if values is None:
-                continue
-            good = np.isfinite(values)
-            if name in _SIGMAS:
-                good &= values > 0
-            if not good.all():
-                bad = int(np.argmin(good))
-                must = "finite and positive" if name in _SIGMAS else "finite"
-                raise InputError(
-                    f"value is {values[bad]:g}, and must be {must}",
-                    where=self._where(bad, name),
-                    do="correct the row or drop it",
-                )
+        numbers = {name: getattr(self, name) for name in (*_POSITIONS, *_SIGMAS, *_OPTIONAL)}
+        given = {name: values for name, values in numbers.items() if values is not None}
+        check_values(given, place=self._where, positive=_SIGMAS)
 
     def _check_duplicates(self) -> None:
         keys = [getattr(self, k) for k in (*_POSITIONS, *_CODES)]
@@ -311,22 +281,22 @@ class MatchTable:
 
     @property
     def has_sigma(self) -> bool:
-        """Whether the stars have errors."""
+        """True where the stars have errors."""
         return self.sigma_u is not None
 
     @property
     def has_epoch(self) -> bool:
-        """Whether the stars have epochs."""
+        """True where the stars have epochs."""
         return self.epoch is not None
 
     @property
     def has_mag(self) -> bool:
-        """Whether the stars have magnitudes."""
+        """True where the stars have magnitudes."""
         return self.mag is not None
 
     @property
     def has_nominal(self) -> bool:
-        """Whether the stars have nominal positions."""
+        """True where the stars have nominal positions."""
         return self.u_nominal is not None
 
     @property
@@ -340,7 +310,7 @@ class MatchTable:
         return np.asarray(self.chip_numbers, np.int64)[self.chip]
 
     def select(self, which: ArrayLike, *, reason: str | None = None) -> MatchTable:
-        """Some of the stars.
+        """Stars by mask or indices.
 
         Parameters
         ----------
@@ -357,13 +327,13 @@ class MatchTable:
         Raises
         ------
         InputError
-            When no star is left, or when an index stands twice.
+            When no star is left, or when an index is repeated.
         """
         which = np.asarray(which)
         if not which.size:  # an empty list has no integer type of its own
             which = which.astype(np.int64)
         index = np.arange(len(self))[which]
-        # rows of one table differ: only an index that stands twice repeats one
+        # rows of one table differ: only a repeated index repeats one
         distinct = which.dtype == bool or len(np.unique(index)) == len(index)
         picked = {name: getattr(self, name)[index] for name in self._array_names()}
         rejected = dict(self.rejected)
@@ -373,7 +343,7 @@ class MatchTable:
         return self._with(distinct=distinct, **picked, rejected=rejected)
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The rows in consecutive pieces of about equal size.
+        """Rows in consecutive pieces of about equal size.
 
         Returns
         -------
@@ -393,7 +363,7 @@ class MatchTable:
         Parameters
         ----------
         n : int
-            How many rows the sample may have; k is as small as this allows.
+            Largest number of rows of the sample; k is as small as this allows.
 
         Returns
         -------
@@ -409,7 +379,7 @@ class MatchTable:
         return self if k == 1 else self.select(np.arange(0, len(self), k))
 
     def with_sigma(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MatchTable:
-        """The same stars with other errors.
+        """These stars with other errors.
 
         Parameters
         ----------
@@ -427,7 +397,7 @@ class MatchTable:
         )
 
     def with_errors_times(self, factor: float) -> MatchTable:
-        """The same stars with all errors multiplied by a factor.
+        """These stars with all errors multiplied by a factor.
 
         Parameters
         ----------
@@ -442,7 +412,7 @@ class MatchTable:
         return self.with_sigma(factor * self.sigma_u, factor * self.sigma_v)
 
     def with_added_errors(self, added: AddedErrors) -> MatchTable:
-        """The same stars with errors added in quadrature.
+        """These stars with errors added in quadrature.
 
         Parameters
         ----------
@@ -457,7 +427,7 @@ class MatchTable:
         return self.with_sigma(*added.beside(self, self.sigma_u, self.sigma_v))
 
     def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> MatchTable:
-        """The same stars with errors by magnitude.
+        """These stars with errors by magnitude.
 
         Parameters
         ----------
@@ -478,7 +448,7 @@ class MatchTable:
 
     @staticmethod
     def concatenate(tables: Sequence[MatchTable]) -> MatchTable:
-        """All stars of several tables, in their order.
+        """Stars of several tables, in their order.
 
         Exposures, chips, filters and files of equal name become one.  Stars keep their codes, which
         must belong to one catalogue; the codes are left out when one of the tables has none.

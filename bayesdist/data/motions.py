@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.voting import mean_spacing
+from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
+from bayesdist.data.matching.voting import mean_spacing
 from bayesdist.errors import InputError
 
 __all__ = ["MotionErrorLine", "derive_motions", "motion_error_line", "select_motions"]
@@ -22,11 +23,11 @@ __all__ = ["MotionErrorLine", "derive_motions", "motion_error_line", "select_mot
 Float = NDArray[np.float64]
 Line: TypeAlias = "float | Callable[[Float], ArrayLike]"
 
-_IN_BIN = 200  # stars of a bin in magnitude
-_MOST = 40  # bins
-_ABOVE = 2.5  # scatters above the median, in the logarithm: 0.6 % of a log-normal distribution
-_NORMAL = 1.4826022185056018
-_FLOOR = 0.05  # scatter of ln(sigma) at least: errors all alike are no reason to reject the next
+_STARS_IN_BIN = 200  # stars of a bin in magnitude
+_MAX_BINS = 40
+# above the median, in the logarithm: 0.6 % of a log-normal distribution
+_MAX_SCATTERS_ABOVE = 2.5
+_MIN_SCATTER = 0.05  # of ln(sigma): among errors all alike a slightly larger one stays
 
 
 def derive_motions(
@@ -174,20 +175,22 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
             do="give them, or one largest error for all, or keep all stars "
             "(campaign.motions = 'all')",
         )
-    count = int(np.clip(len(catalog) // _IN_BIN, 1, _MOST))
+    count = int(np.clip(len(catalog) // _STARS_IN_BIN, 1, _MAX_BINS))
     parts = np.array_split(np.argsort(catalog.mag, kind="stable"), count)
     knots = []
     for part in parts:
         log = np.log(np.maximum(sigma[part], np.finfo(float).tiny))
         middle = float(np.median(log))
-        scatter = max(_NORMAL * float(np.median(np.abs(log - middle))), _FLOOR)
-        knots.append((float(np.median(catalog.mag[part])), np.exp(middle + _ABOVE * scatter)))
+        scatter = max(MAD_TO_SIGMA * float(np.median(np.abs(log - middle))), _MIN_SCATTER)
+        knots.append(
+            (float(np.median(catalog.mag[part])), np.exp(middle + _MAX_SCATTERS_ABOVE * scatter))
+        )
     mag, line = np.array(knots).T
     return MotionErrorLine(mag, line)
 
 
 def select_motions(catalog: ReferenceCatalog, max_sigma: Line | None = None) -> ReferenceCatalog:
-    """The stars with well measured proper motions (the red line of the report's Figure 3).
+    """Stars with well measured proper motions (the red line of the report's Figure 3).
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Matches that stay on disk: Parquet files, gone through piece by piece.
+"""Matches that stay on disk: Parquet files, streamed in pieces.
 
-What must be known of the whole is found by a scan, in the memory of one block: the names of
-exposures, chips and filters, the tangent point, and that no row is wrong or stands twice.
+A scan in the memory of one block finds what must be known of all rows: the names of exposures,
+chips and filters, the tangent point, and that no row is wrong or repeated.
 """
 
 from __future__ import annotations
@@ -19,15 +19,11 @@ from numpy.typing import NDArray
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.parquet_files import describe_part
 from bayesdist.data.parts import MatchPart, Whole, match_part, scan, tangent_point_of
 from bayesdist.data.pieces import PIECE, Piece, even_edges, every_kth
-from bayesdist.data.readers import (
-    check_sigma,
-    exposure_names,
-    input_files,
-    refuse_missing_errors,
-)
+from bayesdist.data.reading.formats import exposure_names, input_files
+from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
+from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 
 __all__ = ["PartPiece", "PartitionedMatches", "open_matches"]
@@ -45,45 +41,22 @@ _ARRAYS = (
 
 @dataclass(frozen=True, eq=False)
 class PartPiece:
-    """Some consecutive rows of partitioned matches.
-
-    Parameters
-    ----------
-    whole : Whole
-    parts : tuple of MatchPart
-        The files that the rows lie in.
-    segments : tuple of (int, int, int)
-        For each of them its code, the first row, and the row after the last.
-    errors : MagnitudeErrors or tuple of float, optional
-        Errors in place of those in the files.
-    factor : float
-        On all errors.
-    added : tuple of AddedErrors
-        Beside what the factor makes of them.
-    """
+    """Consecutive rows of partitioned matches."""
 
     whole: Whole
-    parts: tuple[MatchPart, ...]
-    segments: tuple[Segment, ...]
-    errors: Errors | None = None
-    factor: float = 1.0
-    added: tuple[AddedErrors, ...] = ()
+    parts: tuple[MatchPart, ...]  # files of the rows
+    segments: tuple[Segment, ...]  # for each file its code, the first row, the row after the last
+    errors: Errors | None = None  # in place of those in the files
+    factor: float = 1.0  # on all errors
+    added: tuple[AddedErrors, ...] = ()  # in quadrature, after the factor
 
     def __len__(self) -> int:
         return sum(stop - start for _, start, stop in self.segments)
 
     def read(self) -> MatchTable:
-        """The rows.
+        """Rows, with codes and sources by the names of the whole.
 
-        Returns
-        -------
-        MatchTable
-            Codes and sources refer to the names of the whole.
-
-        Raises
-        ------
-        InputError
-            When a file is damaged, gone, or not what it was when it was opened.
+        InputError when a file is damaged, gone, or not what it was when it was opened.
         """
         read = [self._segment(*both) for both in zip(self.parts, self.segments, strict=True)]
         arrays = {name: [one[name] for one in read] for name in read[0]}
@@ -118,7 +91,7 @@ class PartPiece:
 
 
 def _shared(whole: Whole, n_rows: int) -> dict[str, Any]:
-    """What a table of some rows has from the whole."""
+    """Attributes that a table of some rows takes from the whole."""
     names = ("unit", "exposure_names", "chip_numbers", "filter_names", "sources", "tangent_point")
     return {name: getattr(whole, name) for name in names} | {"n_rows": n_rows}
 
@@ -127,7 +100,7 @@ def _shared(whole: Whole, n_rows: int) -> dict[str, Any]:
 class PartitionedMatches:
     """Matched stars on disk, as `open_matches` finds them.
 
-    It offers what a MatchTable does but the columns, which are read piece by piece.
+    It offers all of a MatchTable but the columns, which are read piece by piece.
 
     Parameters
     ----------
@@ -140,7 +113,7 @@ class PartitionedMatches:
     factor : float
         On all errors.
     added : tuple of AddedErrors
-        Beside what the factor makes of them.
+        In quadrature, after the factor.
 
     Attributes
     ----------
@@ -214,31 +187,31 @@ class PartitionedMatches:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was found out about the files, as clauses."""
+        """Clauses on properties of the files."""
         return tuple(dict.fromkeys(note for part in self.parts for note in part.notes))
 
     @property
     def has_epoch(self) -> bool:
-        """Whether the stars have epochs."""
-        return "epoch" in self.parts[0].found or self.parts[0].epoch is not None
+        """True where the stars have epochs."""
+        return "epoch" in self.parts[0].found or self.parts[0].options.epoch is not None
 
     @property
     def has_mag(self) -> bool:
-        """Whether the stars have magnitudes."""
+        """True where the stars have magnitudes."""
         return "mag" in self.parts[0].found
 
     @property
     def has_sigma(self) -> bool:
-        """Whether the stars have errors."""
+        """True where the stars have errors."""
         return self.errors is not None or _has_errors(self.parts[0])
 
     @property
     def has_nominal(self) -> bool:
-        """Whether the stars have nominal positions."""
+        """True where the stars have nominal positions."""
         return "u_nominal" in self.parts[0].found
 
     def pieces(self) -> tuple[Piece, ...]:
-        """The rows in consecutive pieces.
+        """Rows in consecutive pieces.
 
         Row groups, and files, are joined up to `PIECE` rows; larger ones are split evenly.
 
@@ -277,7 +250,7 @@ class PartitionedMatches:
         Parameters
         ----------
         n : int
-            How many rows the sample may have; k is as small as this allows.
+            Largest number of rows of the sample; k is as small as this allows.
 
         Returns
         -------
@@ -305,7 +278,7 @@ class PartitionedMatches:
         return MatchTable.of_distinct_rows(**joined, **counts, **_shared(self.whole, self.n_rows))
 
     def with_errors_by_magnitude(self, errors: MagnitudeErrors) -> PartitionedMatches:
-        """The same stars with errors by magnitude.
+        """These stars with errors by magnitude.
 
         Parameters
         ----------
@@ -324,7 +297,7 @@ class PartitionedMatches:
         return replace(self, errors=errors, factor=1.0, added=())
 
     def with_errors_times(self, factor: float) -> PartitionedMatches:
-        """The same stars with all errors multiplied by a factor.
+        """These stars with all errors multiplied by a factor.
 
         Parameters
         ----------
@@ -338,7 +311,7 @@ class PartitionedMatches:
         return replace(self, factor=factor * self.factor, added=added)
 
     def with_added_errors(self, added: AddedErrors) -> PartitionedMatches:
-        """The same stars with errors added in quadrature.
+        """These stars with errors added in quadrature.
 
         Parameters
         ----------
@@ -351,7 +324,7 @@ class PartitionedMatches:
         return replace(self, added=(*self.added, added))
 
     def with_sigma(self, sigma_u: float, sigma_v: float) -> PartitionedMatches:
-        """The same stars with other errors.
+        """These stars with other errors.
 
         Parameters
         ----------
@@ -397,31 +370,20 @@ def _spans(group_rows: Sequence[int]) -> list[tuple[int, int]]:
     return out
 
 
-def open_matches(
-    path: PathLike | Sequence[PathLike],
-    *,
-    columns: Mapping[str, str] | None = None,
-    unit: str | None = None,
-    sigma: str | float = "columns",
-    pixel_origin: int | None = None,
-    tangent_point: tuple[float, float] | None = None,
-    epoch: float | str | None = None,
-    catalogue_epoch: float | None = None,
-    chips: Mapping[str, int] | None = None,
-) -> PartitionedMatches:
+def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> PartitionedMatches:
     """Matched star positions that stay on disk.
 
     Parameters
     ----------
     path : path-like or sequence of path-like
         Parquet: a file, a list of files, a pattern, or a folder of parts of one table.
-    columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips
-        As `read_matches`; a row with a missing value is refused.
+    **options
+        As `ReadOptions`; a row with a missing value, or one that is not finite, is refused.
 
     Returns
     -------
     PartitionedMatches
-        Its pieces hold what `read_matches` gives for these rows.
+        Its pieces are equal to `read_matches` of these rows.
 
     Raises
     ------
@@ -429,7 +391,13 @@ def open_matches(
         For all that is wrong with a file or an option, in one sentence.  All files must have the
         same quantities; one of them may be empty.
     """
-    check_sigma(sigma)
+    given = ReadOptions(**options)
+    if given.not_finite == "reject":
+        raise InputError(
+            "rows of tables on disk cannot be left out in reading",
+            where="data.not_finite",
+            do="write the table without them",
+        )
     files = input_files(path)
     for file in files:
         if file.suffix.lower() != ".parquet":
@@ -443,26 +411,18 @@ def open_matches(
     if not in_parts and len(files) > 1:
         names = exposure_names(files)
     parts = tuple(
-        match_part(
-            describe_part(file),
-            columns,
-            unit=unit,
-            read_sigma=sigma == "columns",
-            pixel_origin=pixel_origin,
-            tangent_point=tangent_point,
-            exposure_name=name,
-            epoch=epoch,
-            catalogue_epoch=catalogue_epoch,
-            chips=chips,
-        )
+        match_part(describe_part(file), given, exposure_name=name)
         for file, name in zip(files, names, strict=True)
     )
     _refuse_differences(parts)
     first = parts[0]
+    sigma = given.sigma
     refuse_missing_errors(sigma, _has_errors(first), "mag" in first.found, where=first.source)
-    if first.on_sky and tangent_point is None:
+    if first.on_sky and given.tangent_point is None:
         point = tangent_point_of(parts)
-        parts = tuple(replace(one, tangent_point=point) for one in parts)
+        parts = tuple(
+            replace(one, options=replace(one.options, tangent_point=point)) for one in parts
+        )
     errors = None if isinstance(sigma, str) else (float(sigma), float(sigma))
     return PartitionedMatches(scan(parts), parts, errors)
 

@@ -1,9 +1,9 @@
-"""Parquet files of matches as parts of one whole: what each holds, and what they share."""
+"""Parquet files of matches as parts of one whole: their content, and their common attributes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -11,62 +11,42 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import (
+from bayesdist.data.reading.columns import (
+    columns_read,
     match_columns,
-    needed_columns,
     nominal_columns,
     plane_unit,
     position_unit,
 )
-from bayesdist.data.duplicates import buckets_for, first_repetition
-from bayesdist.data.parquet_files import ParquetPart, RowBlock
-from bayesdist.data.quantities import Quantities
-from bayesdist.data.sky import sky_columns
-from bayesdist.data.tangent import direction_of, direction_sum
-from bayesdist.data.usual_names import origin_of
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.sky.positions import sky_columns
+from bayesdist.data.sky.tangent import direction_of, direction_sum
+from bayesdist.data.tables.checks import refuse_half
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.parquet import ParquetPart, RowBlock
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.repeated import buckets_for, first_repetition
 from bayesdist.errors import InputError
 
 __all__ = ["MatchPart", "Whole", "match_part", "scan", "tangent_point_of"]
 
 Int = NDArray[np.int64]
 
-_BLOCK = 2**18  # rows looked at together in a scan
+_BLOCK = 2**18  # rows scanned together
 _LABELS = {"exposure": "exposure_names", "chip": "chip_numbers", "filter": "filter_names"}
 _DEFAULTS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
 
 
 @dataclass(frozen=True, eq=False)
 class MatchPart:
-    """A Parquet file of matches, and how it is read.
-
-    Parameters
-    ----------
-    part : ParquetPart
-    found : mapping of str to str
-        Column of each quantity.
-    unit : str
-        Of u and v.
-    exposure_name : str or None
-        Name of the one exposure, where there is no column of them.
-    pixel_origin : int
-    tangent_point : tuple of float or None
-    epoch, catalogue_epoch, chips
-        As `matches_from_table`.
-    notes : tuple of str
-        What was found out about the file, as clauses.
-    """
+    """Parquet file of matches, and how it is read."""
 
     part: ParquetPart
-    found: Mapping[str, str]
-    unit: str
-    exposure_name: str | None
-    pixel_origin: int
-    tangent_point: tuple[float, float] | None
-    epoch: float | str | None = None
-    catalogue_epoch: float | None = None
-    chips: Mapping[str, int] | None = None
-    notes: tuple[str, ...] = ()
+    found: Mapping[str, str]  # column of each quantity
+    unit: str  # of u and v
+    exposure_name: str | None  # of the one exposure, where there is no column
+    options: ReadOptions  # with pixel origin, and tangent point once known
+    notes: tuple[str, ...] = ()  # findings on the file, as clauses
 
     @property
     def source(self) -> str:
@@ -75,7 +55,7 @@ class MatchPart:
 
     @property
     def on_sky(self) -> bool:
-        """Whether the reference positions are ra and dec."""
+        """True where the reference positions are ra and dec."""
         return "ra" in self.found
 
     def blocks(
@@ -88,37 +68,17 @@ class MatchPart:
     ) -> Iterator[dict[str, Any]]:
         """Arguments of MatchTable for rows `start` to `stop`, at most `size` rows at a time.
 
-        Parameters
-        ----------
-        start, stop, size
-            As `ParquetPart.blocks`.
-        without : sequence of str
-            Quantities to leave out.
-
-        Yields
-        ------
-        dict
-            As `match_columns` gives it, with codes into labels of the block's own.
-
-        Raises
-        ------
-        InputError
-            For what is wrong with a row, naming its row group.
+        As `match_columns`, without the quantities of `without`, with codes into labels of the
+        block's own.  InputError names the row group of a wrong row.
         """
         found = {key: name for key, name in self.found.items() if key not in without}
         encoded = {found[key] for key in _LABELS if key in found}
         encoded |= {found["epoch"]} & self.part.texts if "epoch" in found else set()
         columns = list(dict.fromkeys(found.values()))
+        # names of chips get numbers once all are known
+        options = replace(self.options, unit=self.unit, chips=self.options.chips or {})
         for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
-            out = match_columns(
-                self._quantities(block, found),
-                unit=self.unit,
-                pixel_origin=self.pixel_origin,
-                tangent_point=self.tangent_point,
-                epoch=self.epoch,
-                catalogue_epoch=self.catalogue_epoch,
-                chips=self.chips or {},  # names alone have no numbers before all are known
-            )
+            out = match_columns(self._quantities(block, found), options)
             for key, labels in _LABELS.items():
                 if key not in found:
                     own = self.exposure_name if key == "exposure" else None
@@ -141,86 +101,30 @@ class MatchPart:
 
 def match_part(
     part: ParquetPart,
-    columns: Mapping[str, str] | None,
+    options: ReadOptions,
     *,
-    unit: str | None,
-    read_sigma: bool,
-    pixel_origin: int | None,
-    tangent_point: tuple[float, float] | None,
     exposure_name: str | None,
-    epoch: float | str | None = None,
-    catalogue_epoch: float | None = None,
-    chips: Mapping[str, int] | None = None,
 ) -> MatchPart:
-    """What a file holds, by the names and units of its columns alone.
-
-    Parameters
-    ----------
-    part : ParquetPart
-    columns, unit, read_sigma, pixel_origin, tangent_point, exposure_name, epoch, catalogue_epoch
-    chips
-        As `matches_from_table`.
-
-    Returns
-    -------
-    MatchPart
-
-    Raises
-    ------
-    InputError
-        For missing columns and units.
-    """
+    """Layout of a file, by the names and units of its columns alone; missing ones are refused."""
     source = str(part.path)
-    found = needed_columns(part.colnames, columns, source=source, read_sigma=read_sigma)
+    found, options, notes = columns_read(part.colnames, {}, options, source=source)
     found.pop("flux", None)  # magnitudes of all rows or of none: that takes all of them
-    notes: tuple[str, ...] = ()
-    if pixel_origin is None:
-        pixel_origin, why = origin_of(found["x"], part.colnames, {})
-        notes = (f"the first pixel is taken as {pixel_origin}: {why}",) if why else ()
-    if "sigma_u" in found or "sigma_v" in found:
-        for key in ("sigma_u", "sigma_v"):
-            if key not in found:
-                raise InputError(
-                    f"column {key!r} is missing beside its partner",
-                    where=source,
-                    do="give both errors or neither",
-                )
-    nominal_columns(found, source=source, tangent_point=tangent_point)
+    refuse_half(("sigma_u", "sigma_v"), found, where=source, what="errors")
+    nominal_columns(found, source=source, tangent_point=options.tangent_point)
     if "ra" in found:
-        own = plane_unit(unit, source=source)
+        own = plane_unit(options.unit, source=source)
     else:
         u, v = (
             SourceColumn(Column([], unit=part.units.get(found[key])), source, found[key])
             for key in ("u", "v")
         )
-        own = position_unit((u, v), unit)
-    return MatchPart(
-        part,
-        found,
-        own,
-        exposure_name,
-        pixel_origin,
-        tangent_point,
-        epoch,
-        catalogue_epoch,
-        chips,
-        notes,
-    )
+        own = position_unit((u, v), options.unit)
+    return MatchPart(part, found, own, exposure_name, options, notes)
 
 
 @dataclass(frozen=True, eq=False)
 class Whole:
-    """What all parts share.
-
-    Parameters
-    ----------
-    unit : str
-    exposure_names, filter_names : tuple of str
-    chip_numbers : tuple of int
-    sources : tuple of str
-    n_rows : int
-    tangent_point : tuple of float or None
-    """
+    """Names, unit and tangent point common to all parts."""
 
     unit: str
     exposure_names: tuple[str, ...]
@@ -233,10 +137,7 @@ class Whole:
     def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
         """Codes of a block's exposures, chips or filters among those of the whole.
 
-        Raises
-        ------
-        InputError
-            For a label that was not there when the parts were scanned.
+        InputError for a label that was not there when the parts were scanned.
         """
         known = self._numbers[key]
         try:
@@ -274,10 +175,9 @@ def tangent_point_of(parts: Sequence[MatchPart]) -> tuple[float, float]:
 
 @dataclass(eq=False)
 class _Scan:
-    """The parts batch by batch, as `first_repetition` goes through them.
+    """Parts batch by batch, as `first_repetition` takes them.
 
-    All columns are read, so that whatever is wrong with a row comes out, and labels are numbered as
-    they appear.
+    All columns are read, so that any wrong row is found, and labels are numbered as they appear.
     """
 
     parts: Sequence[MatchPart]
@@ -299,21 +199,9 @@ class _Scan:
 
 
 def scan(parts: Sequence[MatchPart]) -> Whole:
-    """Go through all rows: labels are collected, and whatever is wrong is found.
+    """Names common to all parts, from a scan of all rows; any wrong or repeated row is refused.
 
-    Parameters
-    ----------
-    parts : sequence of MatchPart
-        With the same quantities and unit, and with a tangent point if they need one.
-
-    Returns
-    -------
-    Whole
-
-    Raises
-    ------
-    InputError
-        For what is wrong with a row, for a row that stands twice, for a damaged file.
+    The parts have the same quantities and unit, and a tangent point if they need one.
     """
     n_rows = sum(one.part.n_rows for one in parts)
     if n_rows == 0:
@@ -337,7 +225,7 @@ def scan(parts: Sequence[MatchPart]) -> Whole:
         filter_names=tuple(rows.numbers["filter"]),
         sources=tuple(one.source for one in parts),
         n_rows=n_rows,
-        tangent_point=parts[0].tangent_point,
+        tangent_point=parts[0].options.tangent_point,
     )
 
 

@@ -1,4 +1,4 @@
-"""Pieces of a table of matches: what is read, sent to a worker and worked on at a time."""
+"""Pieces of a table of matches: units of reading, of transfer to a worker and of computing."""
 
 from __future__ import annotations
 
@@ -18,23 +18,18 @@ PIECE = 2**20  # rows of a piece at most: as many as a row group of Parquet has 
 
 
 class Piece(Protocol):
-    """Some consecutive rows of a table of matches; can be pickled."""
+    """Consecutive rows of a table of matches; can be pickled."""
 
     def __len__(self) -> int:
         """Rows."""
 
     def read(self) -> MatchTable:
-        """The rows; their codes refer to the names of the whole table."""
+        """Rows, with codes by the names of the whole table."""
 
 
 @dataclass(frozen=True, eq=False)
 class TablePiece:
-    """A piece of a table in memory.
-
-    Parameters
-    ----------
-    table : MatchTable
-    """
+    """Piece of a table in memory."""
 
     table: MatchTable
 
@@ -42,23 +37,17 @@ class TablePiece:
         return len(self.table)
 
     def read(self) -> MatchTable:
-        """The rows."""
+        """Rows as a table."""
         return self.table
 
 
 def even_edges(n: int, most: int) -> list[int]:
-    """Where parts of about equal size, of at most `most` rows, begin and end: 0, ..., n."""
+    """Edges 0, ..., n of parts of about equal size, of at most `most` rows."""
     return np.linspace(0, n, -(-n // most) + 1).astype(int).tolist()
 
 
 def every_kth(n_rows: int, n: int) -> int:
-    """Step between the rows of a sample of at most `n` out of `n_rows` rows.
-
-    Raises
-    ------
-    InputError
-        For a sample of less than one row.
-    """
+    """Smallest k for which every k-th of `n_rows` rows makes no more than n."""
     if n < 1:
         raise InputError(f"a sample of {n} rows is asked for", do="ask for at least one")
     return max(1, -(-n_rows // n))

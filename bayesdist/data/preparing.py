@@ -1,4 +1,4 @@
-"""What matches need before the fit: the errors of the centroids, and a scale without aberration."""
+"""Preparation of matches for the fit: errors of the centroids, and a scale without aberration."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ __all__ = ["centroid_errors", "neutralise_aberration", "with_centroid_errors"]
 
 Float = NDArray[np.float64]
 
-LEAST_SHARE = 0.25  # of the total scatter that is the centroid's, whatever the catalogue quotes
+# of the total scatter that is the centroid's, whatever the catalogue quotes
+MIN_CENTROID_FRACTION = 0.25
 
 
 def with_centroid_errors(table: MatchTable, errors: MagnitudeErrors) -> MatchTable:
-    """Add the errors of the centroids to those of the catalogue, in quadrature.
+    """Matches with the errors of the centroids added to those of the catalogue in quadrature.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def with_centroid_errors(table: MatchTable, errors: MagnitudeErrors) -> MatchTab
 
 
 def centroid_errors(table: MatchTable, total: MagnitudeErrors) -> MagnitudeErrors:
-    """What the errors of the catalogue leave of the scatter of residuals.
+    """Errors of the centroids: scatter of the residuals less the errors of the catalogue.
 
     Parameters
     ----------
@@ -82,16 +83,16 @@ def centroid_errors(table: MatchTable, total: MagnitudeErrors) -> MagnitudeError
                 for k in range(len(total.mag))
             ]
         )
-        left.append(np.sqrt(np.maximum(sigma**2 - known**2, (LEAST_SHARE * sigma) ** 2)))
+        left.append(np.sqrt(np.maximum(sigma**2 - known**2, (MIN_CENTROID_FRACTION * sigma) ** 2)))
     return replace(total, sigma_u=left[0], sigma_v=left[1])
 
 
 def neutralise_aberration(
     table: MatchTable, log: ExposureLog, origin: tuple[float, float] = (0.0, 0.0)
 ) -> MatchTable:
-    """Catalogue positions as an aberration-free scale gives them.
+    """Matches with catalogue positions as an aberration-free scale gives them.
 
-    A true offset on the sky is VAFACTOR times what the aberration-free scale of the detector gives,
+    A true offset on the sky is VAFACTOR times that by the aberration-free scale of the detector,
     so that offsets from an origin, and their errors, are divided by it.  Another origin shifts all
     stars of an exposure alike.
 

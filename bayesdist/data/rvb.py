@@ -16,10 +16,9 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
-from bayesdist.data.columns import match_columns
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.quantities import Columns, Quantities
-from bayesdist.data.readers import check_sigma, refuse_missing_errors
+from bayesdist.data.reading.columns import match_columns
+from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
 from bayesdist.data.rvb_array import ArrayCheck
 from bayesdist.data.rvb_files import (
     ARRAY_SIZE,
@@ -30,7 +29,8 @@ from bayesdist.data.rvb_files import (
     open_rvb_files,
 )
 from bayesdist.data.rvb_pairs import RvbPairs, colour_of
-from bayesdist.data.values import Place, SourceColumn
+from bayesdist.data.tables.column import Place, SourceColumn
+from bayesdist.data.tables.quantities import Columns, Quantities
 from bayesdist.errors import InputError
 
 __all__ = ["chosen_band", "read_rvb", "rvb_bands", "stream_rvb"]
@@ -223,7 +223,7 @@ def _pairs(
         unread |= {"sigma_u", "sigma_v"}
     plain = {key: name for key, name in file.found.items() if key not in unread}
     quantities = Quantities(table, plain, file.source, place)
-    out = match_columns(quantities, unit=unit, pixel_origin=pixel_origin)
+    out = match_columns(quantities, ReadOptions(unit=unit, pixel_origin=pixel_origin))
     if "mjd" in file.found and "epoch" not in file.found:
         column = file.column(table, "mjd", place)
         out["epoch"] = SourceColumn(

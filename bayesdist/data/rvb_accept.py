@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 
-__all__ = ["CHI2", "OFFSET", "RadialLimit", "accept_radial", "radial_rows"]
+__all__ = ["CHI2", "OFFSET", "RadialLimit", "radial_rows"]
 
 Float = NDArray[np.float64]
 
@@ -72,15 +72,15 @@ class RadialLimit:
         return self.centre + (self.corner - self.centre) * share**self.power
 
 
-def accept_radial(
+def radial_rows(
     matches: MatchTable,
     size: tuple[float, float],
     *,
     offset: RadialLimit | None = None,
     chi2: RadialLimit | None = None,
     expected: ArrayLike | None = None,
-) -> MatchTable:
-    """Pairs whose reference position lies near enough to the expected one.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Boolean masks of the pairs whose reference position lies near enough to the expected one.
 
     Parameters
     ----------
@@ -91,42 +91,10 @@ def accept_radial(
     offset : RadialLimit, optional
         On the distance from the expected position, in pixels.
     chi2 : RadialLimit, optional
-        On the chi-square of both axes, with the quoted errors; a pair beyond both limits is counted
-        under the offset.
+        On the chi-square of both axes, with the quoted errors.
     expected : array_like, shape (N, 2), optional
         Where the reference stars should be, such as `DistortionModel.predict` of the previous
         iteration; by default where the detections are, which assumes no distortion.
-
-    Returns
-    -------
-    MatchTable
-        `rejected` counts the others by reason.
-
-    Raises
-    ------
-    InputError
-        For u, v in another unit, no limit at all, a chi-square limit without errors, and when no
-        pair is left.
-    """
-    near, likely = radial_rows(matches, size, offset=offset, chi2=chi2, expected=expected)
-    if not (near & likely).any():
-        raise InputError(
-            f"none of {len(matches)} pairs is within the radial limits",
-            where=", ".join(matches.sources),
-            do="widen the limits, or check that x, y and u, v are of one band",
-        )
-    return matches.select(near, reason=OFFSET).select(likely[near], reason=CHI2)
-
-
-def radial_rows(
-    matches: MatchTable,
-    size: tuple[float, float],
-    *,
-    offset: RadialLimit | None = None,
-    chi2: RadialLimit | None = None,
-    expected: ArrayLike | None = None,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which pairs are within the limits, as `accept_radial`.
 
     Returns
     -------
@@ -136,7 +104,8 @@ def radial_rows(
     Raises
     ------
     InputError
-        As `accept_radial`; pairs need not be left.
+        For u, v in another unit, a chi-square limit without errors, and expected positions of
+        another length.
     """
     where = ", ".join(matches.sources)
     if matches.unit != "pix":
@@ -145,8 +114,6 @@ def radial_rows(
             where=where,
             do="bring u, v to pixels of the array",
         )
-    if offset is None and chi2 is None:
-        raise InputError("no limit is given", do="give a limit on the offset or on chi-square")
     at = np.column_stack([matches.x, matches.y]) if expected is None else np.asarray(expected)
     if at.shape != (len(matches), 2):
         raise InputError(

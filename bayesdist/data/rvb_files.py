@@ -10,14 +10,13 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.data.naming import find_columns
-from bayesdist.data.parquet_files import ParquetPart, describe_part
 from bayesdist.data.pieces import PIECE
-from bayesdist.data.quantities import Columns
-from bayesdist.data.readers import input_files
-from bayesdist.data.tables import read_table
-from bayesdist.data.usual_names import BASIC
-from bayesdist.data.values import Place, SourceColumn, row_number
+from bayesdist.data.reading.formats import input_files
+from bayesdist.data.tables.column import Place, SourceColumn, row_number
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import BASIC, find_columns
+from bayesdist.data.tables.parquet import ParquetPart, describe_part
+from bayesdist.data.tables.quantities import Columns
 from bayesdist.errors import InputError
 
 __all__ = [

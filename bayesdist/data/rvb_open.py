@@ -6,13 +6,13 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from bayesdist.data.parquet_files import ParquetPart
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
 from bayesdist.data.rvb import chosen_band
 from bayesdist.data.rvb_array import ArrayCheck
 from bayesdist.data.rvb_files import MAGNITUDES, RvbFile, open_rvb_files
-from bayesdist.data.usual_names import ALIASES
-from bayesdist.data.values import Place
+from bayesdist.data.tables.column import Place
+from bayesdist.data.tables.names import ALIASES
+from bayesdist.data.tables.parquet import ParquetPart
 
 __all__ = ["open_rvb"]
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 
-__all__ = ["RvbPairs", "bluest", "bluest_rows", "colour_between", "colour_of", "colours_of"]
+__all__ = ["RvbPairs", "bluest_rows", "colour_of", "colours_of"]
 
 Float = NDArray[np.float64]
 
@@ -111,58 +111,6 @@ def colour_of(magnitudes: ArrayLike) -> Float:
     return np.where(detected.sum(axis=0) >= 2, colour, np.nan)
 
 
-def colour_between(pairs: RvbPairs, low: float, high: float) -> RvbPairs:
-    """Pairs with a colour from `low` to `high`, both included.
-
-    Parameters
-    ----------
-    pairs : RvbPairs
-    low, high : float
-        Magnitudes; -inf and inf demand a colour of any value.
-
-    Returns
-    -------
-    RvbPairs
-        The others are counted as 'no colour' and 'colour'.
-
-    Raises
-    ------
-    InputError
-        Without colours, for limits that are no range, and when no pair is left.
-    """
-    if not low <= high:
-        raise InputError(f"colours from {low:g} to {high:g} are asked for", do="give a range")
-    colour = colours_of(pairs)
-    known = ~np.isnan(colour)
-    return _kept(pairs, known, known & (colour >= low) & (colour <= high))
-
-
-def bluest(pairs: RvbPairs, n: int) -> RvbPairs:
-    """The pairs of smallest colour in each frame.
-
-    Parameters
-    ----------
-    pairs : RvbPairs
-        Whole frames: of a part of a frame these would be the bluest of the part.
-    n : int
-        How many of each frame at most; of equal colours the earlier row comes first.
-
-    Returns
-    -------
-    RvbPairs
-        In the order of the rows; the others are counted as 'no colour' and 'colour'.
-
-    Raises
-    ------
-    InputError
-        Without colours, for less than one, and when no pair is left.
-    """
-    if n < 1:
-        raise InputError(f"the {n} bluest of each frame are asked for", do="ask for one or more")
-    colour = colours_of(pairs)
-    return _kept(pairs, ~np.isnan(colour), bluest_rows(colour, pairs.matches.exposure, n))
-
-
 def bluest_rows(colour: Float, frame: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
     """Which rows (N,) are among the n of smallest colour of their frame; never one without."""
     order = np.lexsort((colour, frame))  # stable, NaN last within a frame
@@ -181,15 +129,3 @@ def colours_of(pairs: RvbPairs) -> Float:
             do="name mag_w1 and others in the option 'columns', or do not select by colour",
         )
     return pairs.colour
-
-
-def _kept(pairs: RvbPairs, known: NDArray[np.bool_], kept: NDArray[np.bool_]) -> RvbPairs:
-    """Pairs that are kept; those without a colour are counted by themselves."""
-    if not kept.any():
-        raise InputError(
-            f"no pair of {len(pairs)} is left by the selection by colour, "
-            f"{int((~known).sum())} have no colour",
-            where=", ".join(pairs.matches.sources),
-            do="widen the limits",
-        )
-    return pairs.select(known, reason=NO_COLOUR).select(kept[known], reason=COLOUR)

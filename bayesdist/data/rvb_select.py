@@ -1,7 +1,7 @@
 """Which RvB pairs are taken, piece by piece: what the selection drops is counted by reason.
 
-In memory or streamed, the same pairs pass: `colour_between`, `bluest` and `accept_radial`, one
-after the other.
+In memory or streamed, the same pairs pass: by the range of colours, then the bluest of each frame,
+then the radial limits.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class RvbSelection:
     bluest : int, optional
         Of each frame at most so many, those of the smallest colour.
     offset, chi2 : RadialLimit, optional
-        As `accept_radial`.
+        On the distance of the reference position from the detection, in pixels, and on its
+        chi-square with the quoted errors; a pair beyond both counts under the first.
 
     Raises
     ------

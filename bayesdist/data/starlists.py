@@ -1,4 +1,4 @@
-"""Star lists: the raw detections of an exposure, and which of them are good enough to match."""
+"""Star lists: raw detections of an exposure, and the cuts that select those to be matched."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.hst1pass import Hst1passList, is_hst1pass, read_hst1pass
-from bayesdist.data.naming import find_columns
-from bayesdist.data.readers import exposure_names, input_files
-from bayesdist.data.tables import TABLE_SUFFIXES, read_lines, read_table
-from bayesdist.data.usual_names import BASIC
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.reading.formats import exposure_names, input_files
+from bayesdist.data.tables.checks import check_values, counted, one_length
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import TABLE_SUFFIXES, read_lines, read_table
+from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.errors import FormatError, InputError
 
 __all__ = ["StarCuts", "StarList", "read_star_lists", "star_list_of_hst1pass"]
@@ -79,25 +79,12 @@ class StarList:
             object.__setattr__(self, "chip", np.ones(n, np.int64))
         if self.row is None:
             object.__setattr__(self, "row", np.arange(n))
-        for name in ("x", "y", "mag", "q", "chip", "row"):
-            if getattr(self, name) is None:
-                continue
-            kind = np.int64 if name in ("chip", "row") else np.float64
-            values = np.ascontiguousarray(getattr(self, name), kind)
+        names = ("x", "y", "mag", "q", "chip", "row")
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        arrays = one_length(given, integers=("chip", "row"), where=self._where)
+        for name, values in arrays.items():
             object.__setattr__(self, name, values)
-            if values.shape != (n,):
-                raise InputError(
-                    f"column {name!r} has shape {values.shape}, but 'x' has {n} rows",
-                    where=self._where,
-                    do="give columns of one length",
-                )
-            if not np.isfinite(values).all():
-                bad = int(np.argmin(np.isfinite(values)))
-                raise InputError(
-                    f"value is {values[bad]:g}, and must be finite",
-                    where=f"{self.source}, row {self.row[bad] + 1}, column {name!r}",
-                    do="correct the row or drop it",
-                )
+        check_values(arrays, place=lambda index: f"{self.source}, row {self.row[index] + 1}")
 
     @property
     def _where(self) -> str:
@@ -112,7 +99,7 @@ class StarList:
         return tuple(np.unique(self.chip).tolist())
 
     def select(self, which: NDArray[Any]) -> StarList:
-        """Some of the detections, by mask or indices."""
+        """Detections by mask or indices."""
         names = ("x", "y", "chip", "mag", "q", "row")
         return replace(
             self, **{k: getattr(self, k)[which] for k in names if getattr(self, k) is not None}
@@ -121,7 +108,7 @@ class StarList:
 
 @dataclass(frozen=True)
 class StarCuts:
-    """Which detections are good enough to be matched.
+    """Cuts that select the detections to be matched.
 
     Parameters
     ----------
@@ -147,7 +134,7 @@ class StarCuts:
             )
 
     def passed(self, stars: StarList) -> tuple[Bool, dict[str, int]]:
-        """Which detections pass, and why the others do not.
+        """Mask of the detections that pass, and counts of the others by reason.
 
         Parameters
         ----------
@@ -182,14 +169,7 @@ class StarCuts:
         if self.q_max is not None and stars.q is not None:
             limit = self.q_max(stars.mag) if callable(self.q_max) else self.q_max  # type: ignore[arg-type]
             reasons.append(("poor fit", stars.q > np.asarray(limit, float)))
-        good = np.ones(len(stars), bool)
-        rejected: dict[str, int] = {}
-        for name, fails in reasons:
-            count = int((good & fails).sum())
-            if count:
-                rejected[name] = count
-            good &= ~fails
-        return good, rejected
+        return counted(reasons, len(stars))
 
 
 def read_star_lists(
@@ -198,7 +178,7 @@ def read_star_lists(
     *,
     chip: int | None = None,
 ) -> tuple[StarList, ...]:
-    """Read raw detections.
+    """Raw detections of exposures, read from files.
 
     Parameters
     ----------
@@ -253,7 +233,7 @@ def read_star_lists(
 def _of_table(
     table: Table, columns: Mapping[str, str] | None, source: str, name: str, chip: int | None
 ) -> list[StarList]:
-    """The exposures of a table."""
+    """Star lists of the exposures of a table."""
     found = find_columns(table.colnames, columns, _LIST_ALIASES, source=source)
     for key in ("x", "y"):
         if key not in found:
@@ -298,14 +278,14 @@ def _of_table(
 
 
 def _mean(years: Float | None, rows: Any) -> float | None:
-    """Date of an exposure, of which every detection has it."""
+    """Mean epoch of an exposure's rows; None without epochs."""
     return None if years is None else float(years[rows].mean())
 
 
 def star_list_of_hst1pass(
     found: Hst1passList, *, exposure: str | None = None, chip: int = 1
 ) -> StarList:
-    """The raw detections of a list of hst1pass.
+    """Raw detections of a list of hst1pass.
 
     Parameters
     ----------

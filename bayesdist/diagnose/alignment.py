@@ -6,14 +6,13 @@ rotation and a scale if the calibration is right, and by a pattern if it is not.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.data.tangent import mean_direction, tangent_plane
+from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.errors import DegenerateError, InputError
 
 __all__ = ["Alignment", "PixelToSky", "alignment_residuals"]
@@ -63,25 +62,21 @@ class Alignment:
 
 
 def alignment_residuals(
-    wcs_a: PixelToSky | Mapping[int, PixelToSky],
-    wcs_b: PixelToSky | Mapping[int, PixelToSky],
+    wcs_a: PixelToSky,
+    wcs_b: PixelToSky,
     xy_a: ArrayLike,
     xy_b: ArrayLike,
     *,
-    chip_a: ArrayLike | None = None,
-    chip_b: ArrayLike | None = None,
     pixel_arcsec: float = 0.05,
 ) -> Alignment:
     """Fit shift, rotation and scale between the corrected positions of the same stars.
 
     Parameters
     ----------
-    wcs_a, wcs_b : WCS or mapping of int to WCS
-        Of each exposure; by chip number where there are several chips.
+    wcs_a, wcs_b : WCS
+        Of each exposure.
     xy_a, xy_b : array_like, shape (N, 2)
         FITS 1-based pixels of the same N stars.
-    chip_a, chip_b : array_like, shape (N,), optional
-        Chip numbers; needed with mappings.
     pixel_arcsec : float
         Arcseconds of the pixels in which the result is stated: those of the drizzled image.
 
@@ -93,14 +88,12 @@ def alignment_residuals(
     Raises
     ------
     InputError
-        For lists of different length, fewer than three stars, positions that are not finite, a
-        mapping without chips, or a chip without WCS.
+        For lists of different length, fewer than three stars, and positions that are not finite.
     DegenerateError
         When all stars of an exposure are at one place.
     """
     sky_a, sky_b = (
-        _sky(wcs, xy, chip, name)
-        for wcs, xy, chip, name in ((wcs_a, xy_a, chip_a, "a"), (wcs_b, xy_b, chip_b, "b"))
+        _sky(wcs, xy, name) for wcs, xy, name in ((wcs_a, xy_a, "a"), (wcs_b, xy_b, "b"))
     )
     if len(sky_a) != len(sky_b):
         raise InputError(
@@ -131,34 +124,11 @@ def alignment_residuals(
     )
 
 
-def _sky(
-    wcs: PixelToSky | Mapping[int, PixelToSky],
-    xy: ArrayLike,
-    chip: ArrayLike | None,
-    name: str,
-) -> Float:
+def _sky(wcs: PixelToSky, xy: ArrayLike, name: str) -> Float:
+    """Right ascension and declination (N, 2), degrees, of pixels (N, 2)."""
     xy = np.asarray(xy, float)
     if xy.ndim != 2 or xy.shape[1] != 2 or not np.isfinite(xy).all():
         raise InputError(
             "the pixels are no finite array (N, 2)", where=f"xy_{name}", do="give x and y of each"
         )
-    if not isinstance(wcs, Mapping):
-        return np.asarray(wcs.all_pix2world(xy, 1), float)
-    if chip is None:
-        raise InputError(
-            "there is a WCS for each chip and no chip numbers are given",
-            where=f"chip_{name}",
-            do="give one for each star",
-        )
-    chips = np.broadcast_to(np.asarray(chip), len(xy))
-    out = np.empty_like(xy)
-    for number in np.unique(chips):
-        if number not in wcs:
-            raise InputError(
-                f"there is no WCS of chip {number}",
-                where=f"wcs_{name}",
-                do=f"give it beside those of {', '.join(map(str, wcs))}",
-            )
-        rows = chips == number
-        out[rows] = wcs[number].all_pix2world(xy[rows], 1)
-    return out
+    return np.asarray(wcs.all_pix2world(xy, 1), float)

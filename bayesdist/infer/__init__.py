@@ -1,85 +1,54 @@
-"""From matches to knowledge: the linear fit, the outlier mixture, and its posterior."""
+"""Fits and posteriors of a distortion model: least squares, outlier mixture, sampling."""
 
-from bayesdist.infer.catalogue.by_magnitude import fit_by_magnitude
-from bayesdist.infer.catalogue.catalogue_shear import CatalogueShear, catalogue_shear
-from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance, with_star_errors
-from bayesdist.infer.density.memberships import Memberships, memberships, outlier_probability
-from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
-from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
-from bayesdist.infer.files.fit_file import load_fit, save_fit
-from bayesdist.infer.files.posterior_file import load_posterior, save_posterior
-from bayesdist.infer.linear import LinearFit, build_model, fit_linear, residuals
-from bayesdist.infer.nodes import (
-    TableFit,
-    TablePosterior,
-    binned_table,
-    field_table,
-    fit_with_tables,
-)
-from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.sampler.convergence import Convergence, Limits
-from bayesdist.infer.sampler.sample import sample
-from bayesdist.infer.stars.mixture import OutlierMixture
-from bayesdist.infer.stars.shards import Compute, Matches, Shards, load
-from bayesdist.infer.transforms import (
-    LinearTerms,
-    ReferenceGauge,
-    View,
-    in_exposure,
-    linear_terms,
-    lines,
-    reference_gauge,
-    segment,
-    without_frames,
-)
+from __future__ import annotations
 
-__all__ = [
-    "CatalogueShear",
-    "Compute",
-    "Convergence",
-    "ExposureSolutions",
-    "GaussianPriors",
-    "HierarchicalFit",
-    "Limits",
-    "LinearFit",
-    "LinearTerms",
-    "Matches",
-    "Memberships",
-    "OutlierMixture",
-    "Posterior",
-    "ReferenceGauge",
-    "SamplerInfo",
-    "Shards",
-    "StarCovariance",
-    "TableFit",
-    "TablePosterior",
-    "View",
-    "binned_table",
-    "build_model",
-    "catalogue_shear",
-    "field_table",
-    "fit_by_magnitude",
-    "fit_exposures",
-    "fit_hierarchical",
-    "fit_linear",
-    "fit_with_tables",
-    "held_in_reference",
-    "in_exposure",
-    "linear_terms",
-    "lines",
-    "load",
-    "load_fit",
-    "load_posterior",
-    "memberships",
-    "outlier_probability",
-    "reference_gauge",
-    "residuals",
-    "sample",
-    "save_fit",
-    "save_posterior",
-    "segment",
-    "star_covariance",
-    "with_star_errors",
-    "without_frames",
-]
+from typing import Any
+
+from bayesdist.lazy import lazy_name
+
+_HOMES = {
+    "bayesdist.infer.catalogue.by_magnitude": ("fit_by_magnitude",),
+    "bayesdist.infer.catalogue.star_errors": ("StarCovariance", "star_covariance"),
+    "bayesdist.infer.posterior.memberships": ("Memberships", "memberships"),
+    "bayesdist.infer.equations.priors": ("GaussianPriors",),
+    "bayesdist.infer.exposures.alone": ("ExposureSolutions", "fit_exposures"),
+    "bayesdist.infer.exposures.hierarchy": (
+        "HierarchicalFit",
+        "fit_hierarchical",
+        "held_in_reference",
+    ),
+    "bayesdist.infer.files": ("load_fit", "load_posterior", "save_fit", "save_posterior"),
+    "bayesdist.infer.linear": ("LinearFit", "Rejection", "build_model", "fit_linear", "residuals"),
+    "bayesdist.infer.nodes": (
+        "TableFit",
+        "TablePosterior",
+        "binned_table",
+        "field_table",
+        "fit_with_tables",
+    ),
+    "bayesdist.infer.posterior": ("Posterior", "SamplerInfo"),
+    "bayesdist.infer.convergence": ("Convergence", "Limits"),
+    "bayesdist.infer.sampler.sample": ("sample",),
+    "bayesdist.infer.stars.mixture": ("OutlierMixture",),
+    "bayesdist.infer.stars.shards": ("Compute", "Matches", "Shards", "load"),
+    "bayesdist.infer.transforms": (
+        "LinearTerms",
+        "ReferenceGauge",
+        "View",
+        "linear_terms",
+        "lines",
+        "reference_gauge",
+        "segment",
+        "without_frames",
+    ),
+}
+
+__all__ = sorted(name for names in _HOMES.values() for name in names)
+
+
+def __getattr__(name: str) -> Any:
+    return lazy_name(__name__, _HOMES, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

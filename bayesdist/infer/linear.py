@@ -1,66 +1,81 @@
-"""The weighted linear fit: two passes with rejection, frames relinearised, formal covariance.
+"""Weighted linear fit: two passes with rejection, relinearised frames, formal covariance.
 
-The procedure of the WISE programme gnDSTR (WSDC D-T033, section 3): fit, drop pairs whose residual
-chi-square or absolute residual is beyond a limit, fit again; optional extra weight towards the
-corners.
+The procedure of the WISE programme gnDSTR (WSDC D-T033, section 3): fit, drop matches whose
+residual chi-square or absolute residual is beyond a limit, fit again; optional extra weight towards
+the corners.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.equations.normal import NormalEquations, least_squares
+from bayesdist.infer.equations.gauss_newton import (
+    gauss_newton,
+    refuse_absorbed_drift,
+    starting_point,
+)
+from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.rank import check_coverage, require_full_rank
+from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
+from bayesdist.infer.transforms import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.model.frames import nearest_frame
 
-if TYPE_CHECKING:
-    from bayesdist.infer.posterior import Posterior
-
-__all__ = ["Clip", "LinearFit", "build_model", "fit_linear", "residuals"]
+__all__ = ["Clip", "LinearFit", "Rejection", "build_model", "fit_linear", "residuals"]
 
 Float = NDArray[np.float64]
 
-RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
-STALLED = 1e-4  # formal errors: steps that are smaller, and do not shrink, are rounding
-TURNS = 50  # of this iteration
-MEDIAN_STARS = 1_000_000  # stars that a median is taken of
+MEDIAN_STARS = 1_000_000  # largest number of stars whose median is taken
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Rejection limits and weights of a two-pass fit.
+
+    Parameters
+    ----------
+    clip_chi2 : float
+        Stars with a first-pass chi-square (both axes) above this are left out of the second pass.
+        Where the errors are too small as a whole, the limit is scaled by the median chi-square.
+    clip_abs : float or None
+        Stars with a first-pass residual above this many pixels are left out too.
+    radial_weight : float
+        Factor on the inverse variance in the corners, rising as the square of the radius.
+    """
+
+    clip_chi2: float = 25.0
+    clip_abs: float | None = 2.0
+    radial_weight: float = 1.0
+
+
+DEFAULT_REJECTION = Rejection()
+NO_REJECTION = Rejection(np.inf, None)
 
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """The rule by which the first pass leaves stars out: limits on its residuals.
+    """Limits on the residuals of the first pass, beyond which stars are left out of the second."""
 
-    Parameters
-    ----------
-    theta : ndarray, shape (D,)
-        Parameters of the first pass.
-    chi2_limit, abs_limit : float
-        In the unit of u, v; stars beyond either are left out.
-    """
-
-    theta: Float
+    theta: Float  # of the first pass
     chi2_limit: float
-    abs_limit: float
+    abs_limit: float  # in the unit of u, v
 
     def keeps(self, model: DistortionModel, matches: MatchTable) -> NDArray[np.bool_]:
-        """Which stars (N,) of a table stay."""
+        """Boolean mask (N,) of a table's stars within both limits."""
         stars, order = prepare(model, matches)
         return in_table_order(self.keeps_of(stars), order).astype(bool)
 
     def keeps_of(self, stars: Stars) -> NDArray[np.bool_]:
-        """Which of some stars (N,) stay, in their own order."""
+        """Boolean mask (N,) of prepared stars within both limits, in their own order."""
         residual = stars.residuals(self.theta)
         chi2 = residual[:, 0] ** 2 / stars.var_u + residual[:, 1] ** 2 / stars.var_v
         r2 = (residual**2).sum(axis=1)
@@ -79,20 +94,20 @@ class LinearFit:
     cov : ndarray, shape (D, D)
         Formal covariance; with extra corner weights the sandwich form, which stays a covariance.
     clip : Clip
-        What was left out of the second pass.
+        Limits beyond which stars were left out of the second pass.
     n_rows, n_used : int
-        All stars, and those of the second pass.
+        Number of all stars, and of the stars in the second pass.
     rms_u, rms_v : float
         Rms residuals of the stars used, in the unit of u, v.
     rms_rejected : float
         Rms residual, of both axes, of the stars left out; 0 where there are none.
     rejected : dict of str to int
-        Stars left out of the second pass, by reason.
+        Number of stars left out of the second pass, by reason.
     chi2 : float
         Of the stars used, with the quoted errors.
     dof : int
     condition : float
-        Of the normal matrix scaled to unit diagonal.
+        Condition number of the normal matrix scaled to unit diagonal.
     """
 
     model: DistortionModel
@@ -128,21 +143,16 @@ class LinearFit:
 
     @property
     def n_rejected(self) -> int:
-        """Stars left out of the second pass."""
+        """Number of stars left out of the second pass."""
         return self.n_rows - self.n_used
 
     def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
-        """Which stars (N,) of a table the second pass uses."""
+        """Boolean mask (N,) of a table's stars that the second pass uses."""
         return self.clip.keeps(self.model, matches)
 
     @cached_property
     def _root(self) -> Float:
-        scale = self.sigma
-        free = np.flatnonzero(scale > 0)  # what a gauge holds has no error
-        out = np.zeros_like(self.cov)
-        inner = self.cov[np.ix_(free, free)] / np.outer(scale[free], scale[free])
-        out[np.ix_(free, free)] = np.linalg.cholesky(inner) * scale[free, None]
-        return out
+        return scaled_cholesky(self.cov)  # parameters fixed by a gauge have no error
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors from the Gaussian with this mean and covariance.
@@ -170,7 +180,7 @@ def build_model(
     frames: str = "none",
     time: TimeDependence | None = None,
 ) -> DistortionModel:
-    """A model that fits a table: its chips, exposures and unit.
+    """Distortion model that fits a table: its chips, exposures and unit.
 
     Parameters
     ----------
@@ -234,9 +244,7 @@ def fit_linear(
     matches: Matches | Shards,
     model: DistortionModel,
     *,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
-    radial_weight: float = 1.0,
+    rejection: Rejection = DEFAULT_REJECTION,
     priors: GaussianPriors | None = None,
     compute: Compute | None = None,
 ) -> LinearFit:
@@ -247,13 +255,8 @@ def fit_linear(
     matches : MatchTable, PartitionedMatches or Shards
         With errors.
     model : DistortionModel
-    clip_chi2 : float
-        Stars with a first-pass chi-square (both axes) above this are left out of the second pass.
-        Where the errors are too small as a whole, the limit is scaled by the median chi-square.
-    clip_abs : float or None
-        Stars with a first-pass residual above this many pixels are left out too.
-    radial_weight : float
-        Factor on the inverse variance in the corners, rising as the square of the radius.
+    rejection : Rejection
+        Limits beyond which stars are left out, and extra weight in the corners.
     priors : GaussianPriors, optional
         Gaussian priors on named parameters.
     compute : Compute, optional
@@ -269,37 +272,27 @@ def fit_linear(
         When the data do not determine the model: see `check_coverage` and `require_full_rank`.
     """
     with opened(model, matches, compute) as shards:
-        return _fitted(
-            shards,
-            model,
-            clip_chi2=clip_chi2,
-            clip_abs=clip_abs,
-            radial_weight=radial_weight,
-            priors=priors or GaussianPriors.none(model),
-        )
+        return _fitted(shards, model, rejection, priors or GaussianPriors.none(model))
 
 
 def _fitted(
-    shards: Shards,
-    model: DistortionModel,
-    *,
-    clip_chi2: float,
-    clip_abs: float | None,
-    radial_weight: float,
-    priors: GaussianPriors,
+    shards: Shards, model: DistortionModel, rejection: Rejection, priors: GaussianPriors
 ) -> LinearFit:
+    radial_weight = rejection.radial_weight
     check_coverage(model, shards.survey, priors.n_informative)
     first = shards.sum(least_squares, None, None, np.inf, np.inf, radial_weight)
-    theta = _start(first, model, priors)
-    _refuse_absorbed_drift(first, theta, model, priors)
-    theta = _gauss_newton(first, theta, model, priors)
+    theta = starting_point(first, model, priors)
+    refuse_absorbed_drift(first, theta, model, priors)
+    theta = gauss_newton(first, theta, model, priors)
 
     every = max(1, len(shards) // MEDIAN_STARS)
     typical = float(np.median(np.concatenate(shards.sum(_some_chi2, theta, every))))
     clip = Clip(
         theta,
-        chi2_limit=clip_chi2 * max(1.0, typical / MEDIAN_CHI2_2),
-        abs_limit=np.inf if clip_abs is None else clip_abs * model.pixel_size(theta),
+        chi2_limit=rejection.clip_chi2 * max(1.0, typical / MEDIAN_CHI2_2),
+        abs_limit=np.inf
+        if rejection.clip_abs is None
+        else rejection.clip_abs * model.pixel_size(theta),
     )
     rule = (clip.theta, clip.chi2_limit, clip.abs_limit, radial_weight)
     second = shards.sum(least_squares, clip.theta, *rule)
@@ -312,7 +305,7 @@ def _fitted(
             do="check the match, the errors, and fit.clip_chi2 and fit.clip_abs",
         )
 
-    theta = _gauss_newton(second, theta, model, priors)
+    theta = gauss_newton(second, theta, model, priors)
     about = model.effective(theta, second.groups)
     matrix, _ = second.moved(about).assemble(model, theta)
     matrix = matrix + priors.matrix(model)
@@ -343,13 +336,13 @@ def _fitted(
 
 
 def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
-    """Chi-square of every so manieth star."""
+    """Chi-square of every n-th star, both axes."""
     residual = stars.residuals(theta)[::every]
     var = np.stack([stars.var_u[::every], stars.var_v[::every]], axis=1)
     return ((residual**2 / var).sum(axis=1),)
 
 
-def residuals(solution: LinearFit | Posterior, matches: MatchTable) -> Float:
+def residuals(solution: Solution, matches: MatchTable) -> Float:
     """Data minus the model at a solution's mean.
 
     Parameters
@@ -364,124 +357,3 @@ def residuals(solution: LinearFit | Posterior, matches: MatchTable) -> Float:
     """
     stars, order = prepare(solution.model, matches)
     return in_table_order(stars.residuals(solution.mean), order)
-
-
-def _start(first: NormalEquations, model: DistortionModel, priors: GaussianPriors) -> Float:
-    """Frames from linear maps of the exposures, then polynomials with the frames held."""
-    groups = first.groups
-    theta = np.zeros(model.n_params)
-    if model.n_frame:
-        _start_frames(first, theta, model)
-    held = first.moved(model.effective(theta, groups))
-    matrix, right = held.assemble(model, theta)
-    prior = priors.matrix(model)
-    n = model.n_distortion
-    theta[:n] = np.linalg.lstsq(
-        (matrix.border + prior.border)[:n, :n], (right + priors.pull(theta))[:n], rcond=1e-13
-    )[0]
-    return theta
-
-
-def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) -> None:
-    """Frames of `theta` from linear maps: of each exposure that shares a chip with a known one."""
-    groups, o = first.groups, np.asarray(model.origin)
-    affine = np.array([_affine(w, r) for w, r in zip(first.weight, first.right, strict=True)])
-    of_chip: dict[int, Float] = {}  # constant and linear coefficients of w, before the frame
-
-    def enter(e: int) -> None:
-        """Learn the chips of an exposure whose frame is known."""
-        M, d = model.frame(theta, e)
-        for g in np.flatnonzero(groups.exposure == e):
-            if int(groups.chip[g]) not in of_chip and np.isfinite(affine[g]).all():
-                back = np.linalg.solve(M, affine[g] - np.column_stack([o + d, np.zeros((2, 2))]))
-                back[:, 0] += o
-                of_chip[int(groups.chip[g])] = back
-
-    enter(0)
-    waiting = list(range(1, len(model.exposures)))
-    while waiting:
-        still = []
-        for e in waiting:
-            for g in np.flatnonzero(groups.exposure == e):
-                w = of_chip.get(int(groups.chip[g]))
-                if w is not None and np.isfinite(affine[g]).all():
-                    M = affine[g][:, 1:] @ np.linalg.inv(w[:, 1:])
-                    d = affine[g][:, 0] - o - M @ (w[:, 0] - o)
-                    frame = nearest_frame(model.frames, M, d)
-                    theta[model.frame_slice(e)][: len(frame)] = frame
-                    enter(e)
-                    break
-            else:
-                still.append(e)
-        if len(still) == len(waiting):
-            return
-        waiting = still
-
-
-def _refuse_absorbed_drift(
-    equations: NormalEquations,
-    theta: Float,
-    model: DistortionModel,
-    priors: GaussianPriors,
-) -> None:
-    """Refuse frames that absorb the drift of the linear terms.
-
-    With a curved polynomial such a degeneracy is not exact, and the fit would follow its valley to
-    numbers that mean nothing.  On the linear part of the model it is exact, and shows.
-    """
-    if model.time is None or not model.n_frame:
-        return
-    flat = np.zeros_like(theta)
-    for chip in model.chips:
-        for axis in (0, 1):
-            part = model.coefficient_slice(chip.number, axis)
-            flat[part][:3] = theta[part][:3]
-    matrix, _ = equations.assemble(model, flat)
-    require_full_rank(matrix + priors.matrix(model), model, equations.groups)
-
-
-def _affine(weight: Float, right: Float) -> Float:
-    """Constant and linear coefficients (2, 3) of one group by itself; NaN where undetermined."""
-    out = np.full((2, 3), np.nan)
-    for axis, pair in ((0, 0), (1, 2)):
-        W = weight[pair][:3, :3]
-        if np.linalg.matrix_rank(W, rtol=1e-10) == 3:
-            out[axis] = np.linalg.solve(W, right[axis][:3])
-    return out
-
-
-def _gauss_newton(
-    equations: NormalEquations,
-    theta: Float,
-    model: DistortionModel,
-    priors: GaussianPriors,
-) -> Float:
-    """Solve, moving the equations instead of passing over the data again."""
-    groups = equations.groups
-    prior = priors.matrix(model)
-    about = model.effective(theta, groups)
-    decrement = np.inf
-    for _ in range(TURNS):
-        matrix, right = equations.moved(about).assemble(model, theta)
-        matrix, pull = matrix + prior, right + priors.pull(theta)
-        try:
-            step = matrix.factor().solve(pull)
-        except np.linalg.LinAlgError:
-            require_full_rank(matrix, model, groups)
-            raise
-        theta = theta + step
-        before, about = about, model.effective(theta, groups)
-        moved = np.abs(about - before).sum(axis=2).max()
-        if moved < RELINEARISED * model.pixel_size(theta):
-            return theta
-        # off the area of the stars rounding moves high orders by more than that for ever: what
-        # counts is the step in formal errors, and without frames there is nothing but rounding
-        last, decrement = decrement, float(pull @ step)
-        if decrement >= last / 4 and (not model.n_frame or decrement < STALLED**2):
-            return theta
-    raise DegenerateError(
-        f"the exposure frames did not settle in {TURNS} iterations",
-        where="fit",
-        do="check that the exposures overlap and are not mirrored, lower model.order"
-        + ("" if model.frames == "affine" else ", or set model.frames = 'affine'"),
-    )

@@ -1,4 +1,4 @@
-"""Solutions seen otherwise: in the reference gauge, in one segment, in one exposure, term by term.
+"""Transformed solutions: in the reference gauge, in one segment, term by term.
 
 A view is a solution again: its draws are those of its source, transformed one by one, and its
 covariance is the source's through the exact Jacobian of that transformation at the mean.
@@ -24,7 +24,6 @@ __all__ = [
     "ReferenceGauge",
     "Solution",
     "View",
-    "in_exposure",
     "linear_terms",
     "lines",
     "reference_gauge",
@@ -54,13 +53,13 @@ class Solution(Protocol):
 
 
 def _root_of_diagonal(cov: Float) -> Float:
-    """Standard deviations; what a gauge fixes has a variance of zero but for rounding."""
+    """Standard deviations (D,), 0 where rounding leaves a fixed parameter's variance negative."""
     return np.sqrt(np.maximum(np.diag(cov), 0.0))
 
 
 @dataclass(frozen=True)
 class ReferenceGauge:
-    """What was done to (u, v) to bring one chip to the reference gauge.
+    """Rotation and shift that bring one chip to the reference gauge.
 
         (u', v') = R(rotation) ((u, v) - shift)
 
@@ -87,24 +86,24 @@ class ReferenceGauge:
 
 
 class Derived:
-    """What a solution made from another one tells of the sampler: the same as its source."""
+    """Base of solutions made from another one, whose sampler diagnostics they hand on."""
 
     source: Solution
 
     @property
     def convergence(self) -> Any:
-        """That of the posterior; what is made from a fit has none."""
+        """Convergence of the source posterior; None for a fit."""
         return self.source.convergence  # type: ignore[attr-defined]
 
     @property
     def approximation(self) -> str:
-        """That of the posterior; what is made from a fit has none."""
+        """Warning that the source posterior's draws are not exact; empty for a fit."""
         return str(self.source.approximation)  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, eq=False)
 class View(Derived):
-    """A solution made from another one.
+    """A solution transformed from another one.
 
     Parameters
     ----------
@@ -116,7 +115,7 @@ class View(Derived):
     transform : callable
         From parameters (..., D') of the source to (..., D).
     gauge : ReferenceGauge, optional
-        What `reference_gauge` did.
+        Rotation and shift applied by `reference_gauge`.
     """
 
     model: DistortionModel
@@ -148,9 +147,9 @@ class LinearTerms:
     Parameters
     ----------
     labels : tuple of str
-        'A_1' is the constant of u, 'A_2' its term in x, 'A_3' in y; ``B_...`` are those of v.  With
-        the chip's name before it where there are several chips; with '.alpha' and '.beta' behind
-        it for the value at the reference date and the rate.
+        'A_1' is the constant of u, 'A_2' its term in x, 'A_3' in y; ``B_...`` are those of v.  The
+        chip's name stands before it where there are several chips; '.alpha' (value at the reference
+        date) or '.beta' (rate) stands after it.
     values : ndarray, shape (k,)
         In the unit of u, v, per pixel, per year.
     cov : ndarray, shape (k, k)
@@ -166,7 +165,7 @@ class LinearTerms:
         return _root_of_diagonal(self.cov)
 
     def select(self, *labels: str) -> LinearTerms:
-        """Some of the terms, in the order asked for.
+        """Selected terms, in the order of the labels given.
 
         Raises
         ------
@@ -183,7 +182,7 @@ class LinearTerms:
 
 
 def _bare(model: DistortionModel) -> DistortionModel:
-    """The model of the polynomials alone; its parameters are the first ones of the other."""
+    """Model of the polynomials alone, whose parameters are the first ones of the full model."""
     return replace(
         model,
         frames="none",
@@ -198,7 +197,7 @@ def _bare(model: DistortionModel) -> DistortionModel:
 def _viewed(
     source: Solution, model: DistortionModel, transform: Callable[[Float], Float], jacobian: Float
 ) -> View:
-    """A view by a transformation with its Jacobian (D, n) by the source's first n parameters."""
+    """View by a transformation, given its Jacobian (D, n) by the source's first n parameters."""
     n = jacobian.shape[1]
     cov = jacobian @ np.asarray(source.cov, float)[:n, :n] @ jacobian.T
     mean = transform(np.asarray(source.mean, float))
@@ -222,49 +221,8 @@ def without_frames(solution: Solution) -> View:
     return _viewed(solution, _bare(solution.model), lambda theta: theta[..., :n], np.eye(n))
 
 
-def in_exposure(solution: Solution, exposure: int | str, *, epoch: float | None = None) -> View:
-    """The polynomials of all chips as one exposure saw them, its frame included.
-
-    Parameters
-    ----------
-    solution : Solution
-    exposure : int or str
-        Code or name.
-    epoch : float, optional
-        Its date, decimal years; needed by a model with time dependence.
-
-    Returns
-    -------
-    View
-        Without frames and without time dependence.
-
-    Raises
-    ------
-    InputError
-        For an unknown exposure or a missing epoch.
-    """
-    model = solution.model
-    new = replace(_bare(model), time=None)
-    groups = model.groups(
-        len(model.chips),
-        epoch=epoch if model.time is not None else None,
-        exposure=exposure,
-        chip=[chip.number for chip in model.chips],
-    )
-    order = groups.index  # the group of each chip
-
-    def transform(theta: Float) -> Float:
-        E = model.effective(theta, groups)[..., order, :, :]
-        return E.reshape(*theta.shape[:-1], new.n_params)
-
-    jacobian = np.zeros((len(model.chips), 2 * model.n_terms, model.n_params))
-    for g, (columns, d) in enumerate(model.effective_jacobian(solution.mean, groups)):
-        jacobian[groups.chip[g]][:, columns] = d.reshape(2 * model.n_terms, -1)
-    return _viewed(solution, new, transform, jacobian.reshape(new.n_params, -1))
-
-
 def segment(solution: Solution, s: int) -> View:
-    """One segment of the time dependence, as a model without breaks: what one IDCTAB holds.
+    """One segment of the time dependence, as a model without breaks, as one IDCTAB holds it.
 
     Parameters
     ----------
@@ -326,8 +284,8 @@ def reference_gauge(solution: Solution, chip: int = 2, *, epoch: float | None = 
     Returns
     -------
     View
-        Without frames; `gauge` says what was done.  A rotation makes a term drift on both axes that
-        drifted on one, so both are in the model of the view.
+        Without frames; `gauge` has the rotation and shift.  A rotation makes a term that drifted on
+        one axis drift on both, so both are in the model of the view.
 
     Raises
     ------
@@ -387,9 +345,9 @@ def linear_terms(
     Parameters
     ----------
     solution : Solution
-        Of which the polynomials are taken, without frames; see `in_exposure` for one exposure.
+        Only its polynomials are used, without frames.
     chip : int, optional
-        Chip number; all chips by default, and then their names stand before the labels.
+        Chip number; all chips by default, with their names before the labels.
     epoch : float, optional
         Decimal years; needed by a model with time dependence.
 
@@ -408,7 +366,7 @@ def linear_terms(
 
 
 def lines(solution: Solution, s: int = 0, *, chip: int | None = None) -> LinearTerms:
-    """The linear terms as lines in time: values at the reference date, and rates.
+    """Linear terms as lines in time: values at the reference date, and rates.
 
     Parameters
     ----------
@@ -447,7 +405,7 @@ def _linear(solution: Solution, labels: tuple[str, ...], jacobian: Float) -> Lin
 def _linear_jacobian(
     model: DistortionModel, chip: int | None, epoch: float | None
 ) -> tuple[tuple[str, ...], Float]:
-    """Labels (k,) and the matrix (k, n) by which the linear terms follow from the parameters."""
+    """Labels (k,) and the matrix (k, n) that maps the parameters to the linear terms."""
     bare = _bare(model)
     labels: list[str] = []
     rows = []

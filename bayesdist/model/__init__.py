@@ -1,9 +1,10 @@
 """The distortion as mathematics: bases, frames, time dependence, look-up tables, and the model."""
 
 from bayesdist.model.basis import PolynomialBasis, polynomial_terms
-from bayesdist.model.distortion import GAUGES, Chip, DistortionModel
+from bayesdist.model.distortion import DistortionModel
 from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS
 from bayesdist.model.grouping import Groups, merge_groups
+from bayesdist.model.layout import GAUGES, Chip
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.model.timedep import AXES, TimeDependence
 

@@ -49,13 +49,13 @@ def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
 
 
 def point_blocks(n: int) -> Iterator[slice]:
-    """Slices that cut n points into blocks whose basis values can be held at once."""
+    """Slices of n points into blocks whose basis values can be held at once."""
     for start in range(0, n, BLOCK):
         yield slice(start, min(start + BLOCK, n))
 
 
 def as_pair(values: Sequence[float]) -> tuple[float, float]:
-    """Two numbers of x and y, from whatever sequence holds them."""
+    """Numbers of x and y from any sequence of two."""
     a, b = values
     return float(a), float(b)
 
@@ -151,7 +151,7 @@ class PolynomialBasis:
 
     @property
     def half_size(self) -> tuple[float, float]:
-        """Half the detector's extent on x and y: what X = 1 is, in pixels from the centre."""
+        """Half the detector's extent on x and y: the length of X = 1, in pixels."""
         return self.size[0] / 2, self.size[1] / 2
 
     def scaled(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
@@ -188,7 +188,7 @@ class PolynomialBasis:
         return self.evaluate_scaled(*self.scaled(x, y))
 
     def evaluate_scaled(self, X: ArrayLike, Y: ArrayLike) -> Float:
-        """As `evaluate`, of positions that `scaled` has brought to [-1, 1].
+        """Values of all basis functions at positions that `scaled` has brought to [-1, 1].
 
         Parameters
         ----------

@@ -47,12 +47,12 @@ _NAMES: dict[str, tuple[str, ...]] = {
 
 FRAME_KINDS = tuple(_NAMES)
 
-RIGID = ("shift_u", "shift_v", "rotation")  # where the telescope pointed
-DEVIATIONS = ("scale", "shear_plus", "shear_cross")  # how the detector differed from its mean
+RIGID = ("shift_u", "shift_v", "rotation")  # pointing of the telescope
+DEVIATIONS = ("scale", "shear_plus", "shear_cross")  # deviations of the detector from its mean
 
 CHIP_DEVIATIONS = (*RIGID, *DEVIATIONS)  # of one chip against the reference chip
 
-# what scale, shear_plus and shear_cross are multiplied by
+# matrices that scale, shear_plus and shear_cross multiply
 _SHAPES = {
     "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
     "shear_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
@@ -76,7 +76,7 @@ def _rotation(angle: Float) -> Float:
 
 
 def _parts(kind: str, p: Float) -> tuple[Float, Float]:
-    """Rotation (..., 2, 2) and what stands behind it (..., 2, 2)."""
+    """Rotation (..., 2, 2), and the symmetric factor after it (..., 2, 2)."""
     names = frame_names(kind)
     behind = np.broadcast_to(np.eye(2), (*p.shape[:-1], 2, 2)).copy()
     for name, shape in _SHAPES.items():
@@ -87,20 +87,7 @@ def _parts(kind: str, p: Float) -> tuple[Float, Float]:
 
 
 def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
-    """Linear part and shift of T.
-
-    Parameters
-    ----------
-    kind : str
-        One of `FRAME_KINDS`.
-    p : array_like, shape (..., q)
-        Parameters, in the order of `frame_names`.
-
-    Returns
-    -------
-    M : ndarray, shape (..., 2, 2)
-    d : ndarray, shape (..., 2)
-    """
+    """Linear part M (..., 2, 2) and shift d (..., 2) of T, for parameters (..., q)."""
     p = np.asarray(p, float)
     if "rotation" in frame_names(kind):
         turn, behind = _parts(kind, p)
@@ -110,17 +97,7 @@ def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
 
 
 def frame_tangent(kind: str, p: ArrayLike) -> Float:
-    """Derivatives of M by each parameter after the two shifts.
-
-    Parameters
-    ----------
-    kind : str
-    p : array_like, shape (q,)
-
-    Returns
-    -------
-    ndarray, shape (q - 2, 2, 2), or (0, 2, 2) where there is none
-    """
+    """Derivatives (q - 2, 2, 2) of M by each parameter after the two shifts; else (0, 2, 2)."""
     names = frame_names(kind)[2:]
     if not names:
         return np.zeros((0, 2, 2))
@@ -130,19 +107,7 @@ def frame_tangent(kind: str, p: ArrayLike) -> Float:
 
 
 def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:
-    """The rotation in M, and its derivatives.
-
-    Parameters
-    ----------
-    kind : str
-    p : array_like, shape (..., q)
-
-    Returns
-    -------
-    R : ndarray, shape (..., 2, 2)
-    tangent : ndarray, shape (..., q - 2, 2, 2), or (..., 0, 2, 2) where there is none
-        By each parameter after the two shifts.
-    """
+    """Rotation R (..., 2, 2) in M, and its derivatives (..., q - 2, 2, 2) after the two shifts."""
     p = np.asarray(p, float)
     names = frame_names(kind)[2:]
     turn, _ = _parts(kind, p)
@@ -153,18 +118,9 @@ def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:
 
 
 def chip_matrix(p: ArrayLike) -> tuple[Float, Float]:
-    """What a chip's own deviations add.
+    """Matrix L (..., 2, 2) and shift d (..., 2) of a chip's deviations (..., 6), `CHIP_DEVIATIONS`.
 
-    Parameters
-    ----------
-    p : array_like, shape (..., 6)
-        In the order of `CHIP_DEVIATIONS`.
-
-    Returns
-    -------
-    L : ndarray, shape (..., 2, 2)
-        Linear in p: `chip_matrix` of the unit vectors is its derivative.
-    d : ndarray, shape (..., 2)
+    L is linear in p: `chip_matrix` of the unit vectors is its derivative.
     """
     p = np.asarray(p, float)
     L = np.zeros((*p.shape[:-1], 2, 2))
@@ -174,19 +130,7 @@ def chip_matrix(p: ArrayLike) -> tuple[Float, Float]:
 
 
 def nearest_frame(kind: str, M: ArrayLike, d: ArrayLike) -> Float:
-    """Parameters of the frame of a kind that is nearest to a general linear map.
-
-    Parameters
-    ----------
-    kind : str
-    M : array_like, shape (2, 2)
-    d : array_like, shape (2,)
-
-    Returns
-    -------
-    ndarray, shape (q,)
-        Nearest in the Frobenius norm of the matrices.
-    """
+    """Parameters (q,) of the frame of a kind nearest to a linear map, in the Frobenius norm."""
     M = np.asarray(M, float)
     # M z = a z + b conj(z) with z = u + i v; a is the similarity nearest to M
     a = complex(M[0, 0] + M[1, 1], M[1, 0] - M[0, 1]) / 2

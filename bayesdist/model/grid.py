@@ -1,4 +1,4 @@
-"""The detector grid on which everything spatial is given; arrays on it are indexed [iy, ix]."""
+"""Detector grid of all maps; arrays on it are indexed [iy, ix]."""
 
 from __future__ import annotations
 
@@ -7,7 +7,14 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
 
-__all__ = ["DEFAULT_GRID", "grid_pixels", "mesh", "outline_pixels", "position_of_largest"]
+__all__ = [
+    "DEFAULT_GRID",
+    "cell_index",
+    "grid_pixels",
+    "mesh",
+    "outline_pixels",
+    "position_of_largest",
+]
 
 Float = NDArray[np.float64]
 
@@ -15,25 +22,9 @@ DEFAULT_GRID = (33, 17)
 
 
 def grid_pixels(size: tuple[float, float], grid: tuple[int, int]) -> tuple[Float, Float]:
-    """Columns and rows of the grid.
+    """Columns (nx,) and rows (ny,) of the grid, FITS 1-based, evenly from pixel 1 to the size.
 
-    Parameters
-    ----------
-    size : tuple of float
-        Columns and rows of the detector.
-    grid : tuple of int
-        Points on x and y, at least 2 each.
-
-    Returns
-    -------
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        FITS 1-based pixels, evenly from pixel 1 to the detector's size, both ends.
-
-    Raises
-    ------
-    InputError
-        For a grid that is not two whole numbers of at least 2.
+    InputError for a grid that is not two whole numbers of at least 2.
     """
     if len(grid) != 2 or any(int(n) != n or n < 2 for n in grid):
         raise InputError(
@@ -46,9 +37,21 @@ def grid_pixels(size: tuple[float, float], grid: tuple[int, int]) -> tuple[Float
 
 
 def mesh(x: Float, y: Float) -> tuple[Float, Float]:
-    """Pixel of every grid point, (ny * nx,) each, in the order of a flattened [iy, ix] array."""
+    """Pixels (ny * nx,) of the grid points, x and y, in the order of a flattened [iy, ix] array."""
     X, Y = np.meshgrid(x, y)
     return X.ravel(), Y.ravel()
+
+
+def cell_index(X: Float, Y: Float, bins: tuple[int, int]) -> NDArray[np.int64]:
+    """Cell of each position (N,), counted along x first; X and Y run from -1 to 1 over the chip.
+
+    Positions beyond are in the outermost cells.
+    """
+    ix, iy = (
+        np.clip(((z + 1) * (0.5 * n)).astype(np.int64), 0, n - 1)
+        for z, n in zip((X, Y), bins, strict=True)
+    )
+    return np.asarray(iy * bins[0] + ix, np.int64)
 
 
 def outline_pixels(size: tuple[float, float]) -> tuple[Float, Float]:

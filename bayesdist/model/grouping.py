@@ -1,8 +1,8 @@
-"""Stars that share one set of effective coefficients.
+"""Stars with one set of effective coefficients in common.
 
 Within one chip, exposure and epoch the whole model -- polynomial, time dependence, frame -- is a
-single polynomial of the pixel position.  All that the data say about the parameters passes through
-these groups.
+single polynomial of the pixel position.  The data constrain the parameters through these groups
+alone.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Groups:
         return len(self.chip)
 
     def same(self, other: Groups) -> bool:
-        """Whether the groups mean the same, whoever their members are."""
+        """True where the groups are equal, apart from their members."""
         return all(
             np.array_equal(getattr(self, name), getattr(other, name))
             for name in ("chip", "exposure", "epoch")
@@ -57,20 +57,7 @@ class Groups:
 
 
 def group_by(chip: Int, exposure: Int, epoch: Float) -> Groups:
-    """Groups of equal chip, exposure and epoch.
-
-    Parameters
-    ----------
-    chip, exposure : ndarray of int, shape (N,)
-        Codes into the model's chips and exposures.
-    epoch : ndarray, shape (N,)
-        Decimal years, finite.
-
-    Returns
-    -------
-    Groups
-        In the order of chip, exposure, epoch.
-    """
+    """Groups of equal chip, exposure (codes) and epoch (decimal years) in that order, each (N,)."""
     # stars of one group mostly stand together: only the first star of each run is sorted
     heads = _starts_of_runs(chip, exposure, epoch)
     chip_of, exposure_of, epoch_of = chip[heads], exposure[heads], epoch[heads]
@@ -88,7 +75,7 @@ def group_by(chip: Int, exposure: Int, epoch: Float) -> Groups:
 
 
 def _starts_of_runs(*columns: Int | Float) -> Int:
-    """Where rows differ from the ones before them, the first row included."""
+    """Boolean mask of the rows that differ from the ones before them, the first row included."""
     starts = np.ones(len(columns[0]), bool)
     if len(starts):
         starts[1:] = np.logical_or.reduce([c[1:] != c[:-1] for c in columns])
@@ -96,7 +83,7 @@ def _starts_of_runs(*columns: Int | Float) -> Int:
 
 
 def merge_groups(a: Groups, b: Groups) -> tuple[Groups, Int, Int]:
-    """The groups of either, in the order in which `group_by` gives them.
+    """Groups of either, in the order in which `group_by` gives them.
 
     Parameters
     ----------
@@ -107,7 +94,7 @@ def merge_groups(a: Groups, b: Groups) -> tuple[Groups, Int, Int]:
     groups : Groups
         Without members.
     of_a, of_b : ndarray of int
-        Where the groups of `a` and of `b` stand in it.
+        Indices of the groups of `a` and of `b` in it.
     """
     union = group_by(
         np.concatenate([a.chip, b.chip]),

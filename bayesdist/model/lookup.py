@@ -1,10 +1,10 @@
 """Look-up tables: the part of the distortion that no polynomial follows.
 
 A table holds small shifts of the pixel at the nodes of a grid.  Between the nodes it is bilinear,
-beyond the outermost ones constant: exactly what astropy.wcs and the HST pipeline do with a
-D2IMFILE, so that a table means the same here and there.
+beyond the outermost ones constant: exactly as astropy.wcs and the HST pipeline use a D2IMFILE, so
+that a table has one meaning everywhere.
 
-    x' = x + D_chip(x, y)             detector table, the same for all filters
+    x' = x + D_chip(x, y)             detector table, common to all filters
     x'' = x' + F_chip,filter(x')      filter table, evaluated at the corrected pixel
 """
 
@@ -94,7 +94,7 @@ class LookupTable:
 
     @property
     def label(self) -> str:
-        """The table in words, for messages: chip and filter."""
+        """Chip and filter of the table in words, for messages."""
         return f"of chip {self.chip}" + (f", filter {self.filter}" if self.filter else "")
 
     @property
@@ -111,7 +111,7 @@ class LookupTable:
         return x, y
 
     def weights(self, x: ArrayLike, y: ArrayLike) -> tuple[Int, Float]:
-        """Which nodes a pixel is interpolated from, and with what weights.
+        """Nodes that a pixel is interpolated from, and their weights.
 
         Parameters
         ----------
@@ -192,7 +192,7 @@ class LookupTable:
         return out
 
     def _cell(self, pixel: ArrayLike, axis: int) -> tuple[Int, Float, NDArray[np.bool_]]:
-        """Lower node, fraction of the step above it, and whether the pixel is on the grid."""
+        """Lower node, fraction of the step above it, and a mask of the pixels on the grid."""
         pixel = np.atleast_1d(np.asarray(pixel, float))
         if not np.isfinite(pixel).all():
             raise InputError(
@@ -266,7 +266,7 @@ def corrected(
 
 
 def _refuse(bad: NDArray[np.bool_], array: Float, what: str, where: str, do: str) -> None:
-    """Name the first bad node."""
+    """Refuse a table with a bad node, naming the first."""
     if bad.any():
         axis, row, column = np.argwhere(bad)[0]
         raise InputError(

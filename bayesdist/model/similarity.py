@@ -4,7 +4,7 @@ With u + i v as one complex number the change is a multiplication and an additio
 
     u' + i v' = shift + turn (u + i v)
 
-It is linear in the polynomials of both axes together, and in what drifts of them.
+It is linear in the polynomials of both axes together, and in their drifting terms.
 """
 
 from __future__ import annotations
@@ -23,17 +23,9 @@ Float = NDArray[np.float64]
 
 
 def turned_model(model: DistortionModel) -> DistortionModel:
-    """The structure of a turned model: where a term of one axis drifts, that of the other does too.
+    """Structure of a turned model without frames: drifting terms come in pairs of both axes.
 
-    Parameters
-    ----------
-    model : DistortionModel
-        Without frames.
-
-    Returns
-    -------
-    DistortionModel
-        The terms that drifted come first, then their partners on the other axis.
+    The terms that drifted come first, then their partners on the other axis.
     """
     time = model.time
     if time is None:
@@ -44,23 +36,10 @@ def turned_model(model: DistortionModel) -> DistortionModel:
 
 
 def turned(model: DistortionModel, theta: ArrayLike, turn: ArrayLike, shift: ArrayLike) -> Float:
-    """Parameters of shift + turn (u + i v).
+    """Parameters (..., D') of `turned_model` for shift + turn (u + i v), from those (..., D).
 
-    Parameters
-    ----------
-    model : DistortionModel
-        Without frames.
-    theta : array_like, shape (..., D)
-        Parameters of `model`.
-    turn : array_like of complex, shape () or (...)
-        Its argument is the rotation from u towards v, its modulus the scale.
-    shift : array_like of complex, shape () or (...)
-        What is added to u (real part) and to v (imaginary part).
-
-    Returns
-    -------
-    ndarray, shape (..., D')
-        Parameters of `turned_model` of the model.
+    The argument of `turn` is the rotation from u towards v, its modulus the scale; `shift` is added
+    to u (real part) and to v (imaginary part).
     """
     theta = np.asarray(theta, float)
     turn = np.asarray(turn, complex)[..., None]

@@ -2,8 +2,8 @@
 
     C(t) = C + step_s + rate_s (t - t0_s)          for t in segment s; step_0 = 0
 
-as Equation 3 of ACS ISR 2015-06, where the segments are before and after Servicing Mission 4 and
-each has its own reference date.
+This is Equation 3 of ACS ISR 2015-06, where the segments are before and after Servicing Mission 4
+and each has its own reference date.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ AXES = ("u", "v")
 
 @dataclass(frozen=True)
 class TimeDependence:
-    """Which terms drift, from which reference dates, and where the drift may break.
+    """Drifting terms, their reference dates, and the dates at which the drift may break.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class TimeDependence:
         return tuple(names)
 
     def weights(self, epoch: ArrayLike) -> NDArray[np.float64]:
-        """What each parameter of a term adds to the coefficient at an epoch.
+        """Derivatives of a coefficient by each parameter of a drifting term, at an epoch.
 
         Parameters
         ----------

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
+
+from bayesdist.lazy import lazy_name
 
 _FORMATS = "bayesdist.products.formats"
 _HOMES = {
@@ -29,16 +30,13 @@ _HOMES = {
     "bayesdist.products.registry": ("describe", "lint", "open_document", "read_calibration"),
     "bayesdist.products.release": ("Period", "Release", "write_release"),
 }
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
-__all__ = sorted(_HOME_OF)
+__all__ = sorted(name for names in _HOMES.values() for name in names)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME_OF:
-        return getattr(import_module(_HOME_OF[name]), name)
-    raise AttributeError(f"module 'bayesdist.products' has no attribute {name!r}")
+    return lazy_name(__name__, _HOMES, name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME_OF})
+    return sorted({*globals(), *__all__})

@@ -1,4 +1,4 @@
-"""What is known beforehand of the detectors of ACS: sizes, zero points, scales, overscan.
+"""Published constants of the detectors of ACS: sizes, zero points, scales, overscan.
 
 Sizes, zero points at the centre of each chip and default output scales are those of section 4.1 of
 the ACS handbook; the overscan of raw images is that of the ACS instrument handbook.
@@ -16,30 +16,14 @@ __all__ = ["ACS", "Detector", "acs_detector"]
 
 @dataclass(frozen=True)
 class Detector:
-    """A detector of ACS.
+    """Detector of ACS."""
 
-    Parameters
-    ----------
-    name : str
-        WFC, HRC or SBC.
-    chips : tuple of int
-        Chip numbers, the one first to whose zero point output images are referred.
-    size : tuple of int
-        Columns and rows of each chip in calibrated images.
-    reference_pixel : tuple of float
-        Zero point (XREF, YREF) of the polynomials, FITS 1-based.
-    output_scale : float
-        Default size of a corrected pixel, arcseconds.
-    overscan : int
-        Columns of physical overscan to the left of the first column in raw images.
-    """
-
-    name: str
-    chips: tuple[int, ...]
-    size: tuple[int, int]
-    reference_pixel: tuple[float, float]
-    output_scale: float
-    overscan: int
+    name: str  # WFC, HRC or SBC
+    chips: tuple[int, ...]  # numbers; output images are referred to the zero point of the first
+    size: tuple[int, int]  # columns and rows of each chip in calibrated images
+    reference_pixel: tuple[float, float]  # zero point (XREF, YREF), FITS 1-based
+    output_scale: float  # default size of a corrected pixel, arcsec
+    overscan: int  # columns of physical overscan left of the first column in raw images
 
     @property
     def parity(self) -> tuple[int, int]:
@@ -58,13 +42,7 @@ ACS = {
 
 
 def acs_detector(name: str) -> Detector:
-    """A detector of ACS by its name.
-
-    Raises
-    ------
-    InputError
-        For a name that is none of WFC, HRC, SBC.
-    """
+    """Detector of ACS by its name: WFC, HRC or SBC; any other is refused."""
     try:
         return ACS[name.strip().upper()]
     except KeyError:

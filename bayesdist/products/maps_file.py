@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.assess import AreaMap, UncertaintyMap
 from bayesdist.assess.maps import RELATIVE
-from bayesdist.data import atomic_path
+from bayesdist.files import atomic_path
 
 __all__ = ["write_maps"]
 
@@ -26,25 +26,14 @@ def write_maps(
     converged: bool = True,
     notes: Sequence[str] = (),
 ) -> None:
-    """Write uncertainty maps of all chips of a detector.
+    """Write uncertainty maps of all chips of a detector as maps.fits, replaced atomically.
 
     Extensions LSQ_SIGMA_U, LSQ_SIGMA_V, LSQ_CORR hold the least-squares ones (outliers rejected),
     MIX_SIGMA_U, MIX_SIGMA_V, MIX_CORR those of the mixture posterior, REL_SIGMA_U and so on those
-    of its relative positions, whatever the gauge, where the gauge is a question; AREA and
-    AREA_SIGMA the relative pixel area.  Where there are several chips, the number of the chip
-    follows each name, as in MIX_SIGMA_U_2.  A linear WCS gives the detector pixel of each grid
-    point.
-
-    Parameters
-    ----------
-    path : path
-        Replaced atomically.
-    maps : sequence of UncertaintyMap
-    areas : sequence of AreaMap
-    converged : bool
-        Whether the posterior may be relied on; noted in the primary header.
-    notes : sequence of str
-        What else has to be said of the posterior there.
+    of its relative positions, whatever the gauge, where the gauge matters; AREA and AREA_SIGMA the
+    relative pixel area.  Where there are several chips, the number of the chip follows each name,
+    as in MIX_SIGMA_U_2.  A linear WCS gives the detector pixel of each grid point.  `converged` and
+    `notes` on the posterior go to the primary header.
     """
     hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU()]
     hdus[0].header["CREATOR"] = "bayesdist"
@@ -54,7 +43,7 @@ def write_maps(
             hdus[0].header["COMMENT"] = note
     chips = list(dict.fromkeys(m.chip for m in maps))
     ends = {chip: f"_{chip}" if len(chips) > 1 else "" for chip in chips}
-    for m in sorted(maps, key=lambda m: chips.index(m.chip)):  # which keeps the order within a chip
+    for m in sorted(maps, key=lambda m: chips.index(m.chip)):  # stable within a chip
         prefix = PREFIX[m.kind]
         for name, values, unit in (
             ("SIGMA_U", m.sigma_u, m.unit),

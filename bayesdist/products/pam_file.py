@@ -14,8 +14,8 @@ import numpy as np
 from astropy.io import fits
 
 from bayesdist.calibration.area import PixelAreaMap
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 
 __all__ = ["write_pam"]
 

@@ -1,4 +1,4 @@
-"""All formats, and what is done with a file whatever its format.
+"""All formats, and functions for a file of any of them.
 
 A format is a module of `bayesdist.products.formats`, or the module `format` of a folder there, that
 has a FORMAT: a new one is found by that alone.
@@ -39,7 +39,7 @@ __all__ = [
 
 @cache
 def all_formats() -> tuple[Format, ...]:
-    """Every format, in the order in which a file is tried against them."""
+    """Formats in the order in which a file is tried against them."""
     found = []
     for entry in pkgutil.iter_modules(formats.__path__):
         if entry.name == "common":
@@ -52,7 +52,7 @@ def all_formats() -> tuple[Format, ...]:
 
 
 def open_document(path: str | os.PathLike[str]) -> Document:
-    """What a file holds; its format is known by its content.
+    """Document of a file, whose format is recognized by its content.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def open_document(path: str | os.PathLike[str]) -> Document:
 
 
 def recognized(content: Content) -> Document:
-    """As `open_document`, of content in memory."""
+    """Document of content in memory; as `open_document`."""
     for one in all_formats():
         with readable(content.name):
             holds = one.parse(content)
@@ -95,7 +95,7 @@ def read_calibration(
     filter: str | None = None,
     size: tuple[float, float] | None = None,
 ) -> Calibration:
-    """The calibration of a file of any format.
+    """Calibration of a file of any format.
 
     Parameters
     ----------
@@ -117,17 +117,17 @@ def read_calibration(
 
 
 def describe(path: str | os.PathLike[str]) -> str:
-    """Readable text of what a file holds, with what is wrong in it; raises as `open_document`."""
+    """Text on the content of a file, with its findings; errors as for `open_document`."""
     return open_document(path).describe()
 
 
 def lint(path: str | os.PathLike[str]) -> tuple[Finding, ...]:
-    """What is wrong, or looks wrong, in a file; raises as `open_document`."""
+    """Findings in a file; errors as for `open_document`."""
     return open_document(path).lint()
 
 
 def product_settings() -> dict[str, type[FormatSettings]]:
-    """Settings of the formats that can be built, by key: what [products] may hold."""
+    """Settings of the formats that can be built, by key: the sections of [products]."""
     return {one.key: one.settings for one in all_formats() if one.settings is not None}
 
 
@@ -137,26 +137,7 @@ def build(
     settings: FormatSettings,
     options: BuildOptions = BuildOptions(),  # noqa: B008
 ) -> tuple[Built, ...]:
-    """Files of a format, built and not written.
-
-    Parameters
-    ----------
-    key : str
-        Of the format.
-    calibration : Calibration
-    settings : FormatSettings
-        Of that format.
-    options : BuildOptions
-
-    Returns
-    -------
-    tuple of Built
-
-    Raises
-    ------
-    InputError
-        For what the format cannot hold.
-    """
+    """Files of a format, built and not written; values that the format cannot hold are refused."""
     for one in all_formats():
         if one.key == key and one.build is not None:
             return one.build(calibration, settings, options)

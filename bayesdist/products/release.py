@@ -15,8 +15,8 @@ from typing import Any
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.orientation import oriented
 from bayesdist.calibration.plane import Orientation
-from bayesdist.data.files import made_folder
 from bayesdist.errors import InputError
+from bayesdist.files import made_folder
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.idctab.build import build_idctab
 from bayesdist.products.formats.idctab.drift import Loss, storable
@@ -32,7 +32,7 @@ Filter = str | tuple[str, ...]
 
 @dataclass(frozen=True)
 class Period:
-    """The years that one IDCTAB serves.
+    """Years that one IDCTAB serves.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Period:
 
 @dataclass(frozen=True)
 class Release:
-    """What was written.
+    """Files that were written, and drifts that they do not hold.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Release:
     npol : dict of str to Path
         By filter.
     lost : dict of str to tuple of Loss
-        By the name of the period: drifts that no file could store, with what they amount to.
+        By the name of the period: drifts that no file could store, with their size.
     """
 
     idctabs: dict[str, Path]
@@ -105,7 +105,7 @@ def write_release(
     folder : path-like
         Made where it is not there.
     name : str
-        What the names of all files begin with.
+        Beginning of the names of all files.
     calibrations : mapping of filter to Calibration
         Free of velocity aberration, with all segments, in the system of the orientation.  The
         first one's drift is stored, and must hold for the others (see `storable`).

@@ -1,1 +1,1 @@
-"""Figures and the report that a person reads: the only home of matplotlib and corner."""
+"""Figures and the report: the only room that uses matplotlib and corner."""

@@ -33,7 +33,7 @@ __all__ = [
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-CHANCE = 0.0455  # how often noise alone puts one axis beyond 2 sigma
+CHANCE = 0.0455  # probability that noise alone puts one axis beyond 2 sigma
 
 # -- grids ----------------------------------------------------------------------------------------
 
@@ -45,20 +45,10 @@ def spacing(x: Float, y: Float) -> float:
 
 
 def square_cells(x: Float, y: Float, every: int = 1) -> tuple[slice, slice]:
-    """Rows and columns of a grid whose points stand about as far apart on both axes.
+    """Rows and columns of a grid whose points are about as far apart on both axes.
 
-    Only steps that keep both ends are taken: the corners are where distortions are largest.
-
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-    every : int
-        Only every so manieth of these, for small panels.
-
-    Returns
-    -------
-    rows, columns : slice
+    Only steps that include both ends are taken: the corners are where distortions are largest.  For
+    small panels `every` is a further step.
     """
     steps = [(a[-1] - a[0]) / (len(a) - 1) for a in (y, x)]
     out = []
@@ -70,16 +60,9 @@ def square_cells(x: Float, y: Float, every: int = 1) -> tuple[slice, slice]:
 
 
 def significant_cells(binned: BinnedResiduals) -> Bool:
-    """Cells whose mean lies so far from zero as noise puts it with probability `CHANCE`.
+    """Boolean mask of the cells whose mean is as far from zero as noise puts it with `CHANCE`.
 
-    Parameters
-    ----------
-    binned : BinnedResiduals
-
-    Returns
-    -------
-    ndarray of bool
-        False where a standard error is unknown or zero.
+    False where a standard error is unknown or zero.
     """
     # the errors are those of as few stars as the cell has: the tails are nearly Fisher's
     beyond = 2.0 * f_distribution.isf(CHANCE, 2, np.maximum(binned.count - 1, 1))
@@ -93,36 +76,21 @@ def significant_cells(binned: BinnedResiduals) -> Bool:
 
 @dataclass(frozen=True, eq=False)
 class Arrows:
-    """Vectors of one chip as they are drawn.
+    """Vectors of one chip as they are drawn."""
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (N,)
-        Tails, in pixels.
-    du, dv : ndarray, shape (N,)
-        Vectors, in the unit of the map.
-    step : float
-        Between neighbouring vectors, in pixels.
-    clear : ndarray of bool, shape (N,), or None
-        Vectors that noise alone hardly makes; the others are pale, and all have a dot at their
-        tail.  None where noise is no question.
-    ring : tuple of float, or None
-        Position that is ringed: that of the largest vector.
-    """
-
-    x: Float
+    x: Float  # (N,), tails, pixels
     y: Float
-    du: Float
+    du: Float  # (N,), in the unit of the map
     dv: Float
-    step: float
-    clear: Bool | None = None
-    ring: tuple[float, float] | None = None
+    step: float  # between neighbouring vectors, pixels
+    clear: Bool | None = None  # (N,), hardly due to noise; others are pale; None without noise
+    ring: tuple[float, float] | None = None  # position of the largest vector, ringed
 
     @classmethod
     def of_grid(
         cls, x: Float, y: Float, du: Float, dv: Float, *, every: int = 1, clear: Bool | None = None
     ) -> Arrows:
-        """Vectors (ny, nx) of a grid that stand far enough apart, the largest of all ringed."""
+        """Vectors (ny, nx) of a grid that are far enough apart, the largest of all ringed."""
         rows, columns = square_cells(x, y, every)
         gx, gy = np.meshgrid(x[columns], y[rows])
         iy, ix = np.unravel_index(int(np.hypot(du, dv).argmax()), du.shape)
@@ -138,12 +106,12 @@ class Arrows:
 
     @classmethod
     def of_map(cls, vectors: VectorMap, every: int = 1) -> Arrows:
-        """A map of the distortion, along the axes of the detector in its pixels."""
+        """Vectors of the distortion, along the axes of the detector in its pixels."""
         return cls.of_grid(vectors.x, vectors.y, *vectors.on_detector, every=every)
 
     @classmethod
     def of_cells(cls, binned: BinnedResiduals, min_count: int = 1) -> Arrows:
-        """Mean residuals of the cells with so many stars; empty cells stay empty."""
+        """Mean residuals of the cells with at least so many stars; empty cells stay empty."""
         full = np.isfinite(binned.mean_u) & np.isfinite(binned.mean_v)
         full &= np.asarray(binned.count) >= min_count
         gx, gy = np.meshgrid(binned.x, binned.y)
@@ -162,7 +130,7 @@ class Arrows:
         return self.x.size if self.clear is None else int(self.clear.sum())
 
     def reach(self, magnification: float, size: tuple[float, float]) -> float:
-        """How far the vectors stand out beyond a chip of that size, in pixels."""
+        """Largest extent of the vectors beyond a chip of that size, in pixels."""
         over = [
             np.abs(a + magnification * d - (n + 1) / 2).max() - n / 2
             for a, d, n in ((self.x, self.du, size[0]), (self.y, self.dv, size[1]))
@@ -171,7 +139,7 @@ class Arrows:
 
 
 def magnification_of(step: float, length: float) -> float:
-    """Round factor that draws a length about a step long; 1 for one that is only rounding."""
+    """Round factor that draws a length about a step long; 1 for a length of rounding errors."""
     return nice_below(step / length) if length > 1e-10 * step else 1.0
 
 
@@ -188,24 +156,9 @@ def vector_map(
 ) -> None:
     """Draw vectors of each chip, all to one scale that a key states.
 
-    Parameters
-    ----------
-    panels : Panels
-        Framed: their limits are final.
-    chips : sequence of Arrows or None
-        None for a chip that has no vectors.
-    titles : sequence of str
-        Of each panel.
-    magnification : float
-        Pixels of the axes for one unit of the vectors.
-    key : float or sequence of float
-        Length that the arrow above each panel stands for, in `unit`.
-    unit : str
-        Of the vectors.
-    pad : float
-        Of the titles, in points: 17 and more put them above the key.
-    fine : bool
-        Whether arrows are finely drawn, for small panels.
+    `panels` are framed: their limits are final.  `magnification` is in pixels of the axes for one
+    unit of the vectors, `key` the length of the arrow above each panel in `unit`; titles are `pad`
+    points away, 17 and more to be above the key.  `fine` is for small panels.
     """
     keys: dict[Axes, float] = {}
     with figure_style():
@@ -314,20 +267,8 @@ def cross_map(
 ) -> None:
     """Draw errors as four vectors from each point, to all combinations of (±sigma_u, ±sigma_v).
 
-    Parameters
-    ----------
-    panels : Panels
-        Framed: their limits are final.
-    maps : sequence of UncertaintyMap
-        Those of the first chip, then those of the next.
-    titles : sequence of str
-        Of each panel.
-    magnification : float or sequence of float
-        Pixels of the axes for one unit of the errors.
-    key : float or sequence of float
-        Length that the arrow above each panel stands for.
-    every : int
-        As in `square_cells`.
+    `maps` are those of the first chip, then those of the next; `magnification` and `key` are for
+    all panels or for each, `every` is as in `square_cells`, and `panels` are framed.
     """
     places = [(column, ax) for several in panels.axes for column, ax in enumerate(several)]
     scales, keys = (np.broadcast_to(np.asarray(a, float), len(maps)) for a in (magnification, key))

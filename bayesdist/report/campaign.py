@@ -1,4 +1,4 @@
-"""What the report of a campaign is made from."""
+"""Input of the report of a campaign."""
 
 from __future__ import annotations
 
@@ -32,76 +32,37 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class CatalogStars:
-    """Errors of the catalogue, as quoted, and the limit above which its motions are not used.
+    """Errors of the catalogue, as quoted, and the limit above which its motions are not used."""
 
-    Parameters
-    ----------
-    mag : ndarray, shape (N,)
-        Instrumental.
-    sigma : ndarray, shape (N,), or None
-        Errors of the positions, hypot of both axes.
-    sigma_motion : ndarray, shape (N,), or None
-        Errors of the proper motions, the larger one of the axes.
-    limit : tuple of ndarray, or None
-        Magnitudes and largest errors of a motion that is used; None where all are.
-    unit : str
-    n_used : int
-        Stars that the selection leaves.
-    """
-
-    mag: Float
-    sigma: Float | None
-    sigma_motion: Float | None
-    limit: tuple[Float, Float] | None
+    mag: Float  # (N,), instrumental
+    sigma: Float | None  # (N,), of the positions, hypot of both axes
+    sigma_motion: Float | None  # (N,), of the proper motions, the larger axis
+    limit: tuple[Float, Float] | None  # magnitudes and largest errors used; None where all are
     unit: str
-    n_used: int
+    n_used: int  # stars that the selection leaves
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Quality of the detections, and the cuts.
+    """Quality of the detections, and the cuts."""
 
-    Parameters
-    ----------
-    mag, q : ndarray, shape (N,)
-        Of those that are drawn.
-    kept : ndarray of bool, shape (N,)
-        Whether they pass the cuts.
-    n_total, n_kept : int
-        Of all.
-    mag_cuts : tuple of float
-        Magnitudes beyond which detections are left out.
-    q_max : float or None
-    """
-
-    mag: Float
-    q: Float
-    kept: NDArray[np.bool_]
-    n_total: int
-    n_kept: int
-    mag_cuts: tuple[float, ...]
+    mag: Float  # (N,), of those that are drawn
+    q: Float  # (N,)
+    kept: NDArray[np.bool_]  # (N,), True where they pass the cuts
+    n_total: int  # of all
+    n_kept: int  # of all
+    mag_cuts: tuple[float, ...]  # magnitudes beyond which detections are left out
     q_max: float | None
 
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Where the exposures lie on the catalogue.
+    """Positions of the exposures on the catalogue."""
 
-    Parameters
-    ----------
-    u, v : ndarray, shape (N,)
-        Catalogue stars.
-    outlines : tuple of ndarray, each (M, 2)
-        Closed outline of each chip in each exposure.
-    epoch : ndarray
-        Of each outline.
-    unit : str
-    """
-
-    u: Float
+    u: Float  # (N,), catalogue stars
     v: Float
-    outlines: tuple[Float, ...]
-    epoch: Float
+    outlines: tuple[Float, ...]  # (M, 2), closed, of each chip in each exposure
+    epoch: Float  # of each outline
     unit: str
 
 
@@ -109,46 +70,26 @@ class Footprints:
 class ChipResiduals:
     """Residuals on one chip, without the look-up tables and, where there are any, with them.
 
-    Each time the polynomial is fitted, and a linear map of each exposure.
-
-    Parameters
-    ----------
-    chip : Chip
-    without : ndarray, shape (N, 2)
-    with_tables : ndarray, shape (N, 2), or None
-        The same pairs, data minus model, brought to the detector's axes: exposures are rolled, and
-        what belongs to the detector shows only along x and y.  Pixels.
-    binned_without : BinnedResiduals
-    binned_with : BinnedResiduals or None
-        Of the same cells.
+    Each time the polynomial is fitted, and a linear map of each exposure.  Residuals (N, 2) are of
+    the same matches, data minus model in pixels, brought to the detector's axes: exposures are
+    rolled, and what belongs to the detector shows only along x and y.
     """
 
     chip: Chip
     without: Float
     with_tables: Float | None
     binned_without: BinnedResiduals
-    binned_with: BinnedResiduals | None
+    binned_with: BinnedResiduals | None  # of the same cells
 
 
 @dataclass(frozen=True, eq=False)
 class LinearSeries:
-    """Linear terms of the exposures, each fitted by itself.
+    """Linear terms of the exposures, each fitted by itself."""
 
-    Parameters
-    ----------
-    exposures : Table
-        As series.ecsv.
-    drift : Table
-        As drift.ecsv.
-    vafactor, pa_v3 : ndarray, shape (E,)
-        PA_V3 in degrees, NaN where it is not known.
-    breaks : tuple of float
-    """
-
-    exposures: Table
-    drift: Table
-    vafactor: Float
-    pa_v3: Float
+    exposures: Table  # as series.ecsv
+    drift: Table  # as drift.ecsv
+    vafactor: Float  # (E,)
+    pa_v3: Float  # (E,), degrees, NaN where it is not known
     breaks: tuple[float, ...]
 
     @property
@@ -169,41 +110,24 @@ class LinearSeries:
 
     @property
     def outlying(self) -> NDArray[np.bool_]:
-        """Exposures that are more likely off the course than not."""
+        """Mask of the exposures that are more likely off the line than not."""
         return np.asarray(self.exposures["outlier_probability"], float) > 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class OverlapTest:
-    """Two exposures of the run laid on each other, through the old files and the new ones.
-
-    Parameters
-    ----------
-    names : tuple of str
-    epochs : tuple of float
-    pa_v3 : tuple of float
-        NaN where it is not known.
-    old, new : Alignment
-        Of the same stars: through the known distortion of the start, and through the solution.
-    binned_old, binned_new : BinnedResiduals
-        Over the area that both exposures see; axes (xi, eta), pixels.
-    corner : tuple of float
-        (xi, eta) of the area's corner, which the cells count from, pixels.
-    pixel_mas : float
-    with_motions : bool
-        Whether the catalogue's proper motions between the two epochs were taken out.
-    """
+    """Two exposures of the run aligned with each other, through the old files and the new ones."""
 
     names: tuple[str, str]
     epochs: tuple[float, float]
-    pa_v3: tuple[float, float]
-    old: Alignment
-    new: Alignment
-    binned_old: BinnedResiduals
+    pa_v3: tuple[float, float]  # NaN where it is not known
+    old: Alignment  # of the same stars, by the initial distortion
+    new: Alignment  # by the solution
+    binned_old: BinnedResiduals  # over the common area; axes (xi, eta), pixels
     binned_new: BinnedResiduals
-    corner: tuple[float, float]
+    corner: tuple[float, float]  # (xi, eta) of the area's corner, where cells begin, pixels
     pixel_mas: float
-    with_motions: bool
+    with_motions: bool  # True where proper motions between the epochs were removed
 
     @property
     def n_stars(self) -> int:
@@ -213,45 +137,16 @@ class OverlapTest:
 
 @dataclass(frozen=True, eq=False)
 class CampaignResults:
-    """What a campaign adds to a run.
+    """Results that a campaign adds to a run."""
 
-    Parameters
-    ----------
-    summary : mapping
-        As summary.json.
-    config : mapping
-        The resolved configuration.
-    filter : str
-    matching : Table
-        As matching.ecsv.
-    chips : tuple of Chip
-        In the order of the model.
-    unit : str
-        Of u and v.
-    catalog : CatalogStars or None
-    centroids : MagnitudeErrors or None
-        Errors of single detections, from the residuals.
-    detections : Detections or None
-    footprints : Footprints or None
-    residuals : tuple of ChipResiduals
-    tables : tuple of LookupTable
-    series : LinearSeries or None
-    overlap : OverlapTest or None
-    doubts : tuple of str
-    misfits : tuple of Misfit
-        Structure that the joint fit leaves in the residuals of each chip.
-    held : tuple of str
-        Parameters of which nothing is known but their prior.
-    """
-
-    summary: Mapping[str, Any]
-    config: Mapping[str, Any]
+    summary: Mapping[str, Any]  # as summary.json
+    config: Mapping[str, Any]  # resolved
     filter: str
-    matching: Table
-    chips: tuple[Chip, ...]
-    unit: str
+    matching: Table  # as matching.ecsv
+    chips: tuple[Chip, ...]  # in the order of the model
+    unit: str  # of u and v
     catalog: CatalogStars | None = None
-    centroids: MagnitudeErrors | None = None
+    centroids: MagnitudeErrors | None = None  # errors of single detections, from the residuals
     detections: Detections | None = None
     footprints: Footprints | None = None
     residuals: tuple[ChipResiduals, ...] = ()
@@ -259,11 +154,11 @@ class CampaignResults:
     series: LinearSeries | None = None
     overlap: OverlapTest | None = None
     doubts: tuple[str, ...] = ()
-    misfits: tuple[Misfit, ...] = ()
-    held: tuple[str, ...] = ()
+    misfits: tuple[Misfit, ...] = ()  # structure in each chip's residuals after the joint fit
+    held: tuple[str, ...] = ()  # parameters constrained by their prior alone
 
     def section(self, name: str) -> Mapping[str, Any]:
-        """A part of summary.json; empty where there is none."""
+        """Part of summary.json; empty where there is none."""
         found: Mapping[str, Any] = self.summary.get(name) or {}
         return found
 

@@ -1,4 +1,4 @@
-"""How two calibrations differ: over the detector, shaded by significance, and against time."""
+"""Difference of two calibrations: over the detector, shaded by significance, and against time."""
 
 from __future__ import annotations
 
@@ -35,16 +35,9 @@ _SHADES = LinearSegmentedColormap.from_list("significance", ["#FFFFFF", PALETTE[
 
 
 def gaussian_sigmas(chi2: Float) -> Float:
-    """Chi-square of two axes as the sigmas that one axis would pass as rarely.
+    """Sigmas of one axis that are as improbable as a chi-square of two axes.
 
-    Parameters
-    ----------
-    chi2 : ndarray
-
-    Returns
-    -------
-    ndarray, same shape
-        NaN stays NaN; not above 37, where probabilities underflow.
+    NaN stays NaN; not above 37, where probabilities underflow.
     """
     p = np.clip(chi_square.sf(chi2, 2), 1e-300, 1.0)
     return np.asarray(norm.isf(p / 2))
@@ -53,19 +46,9 @@ def gaussian_sigmas(chi2: Float) -> Float:
 def difference_vectors(
     found: Sequence[Comparison], *, names: tuple[str, str] = ("A", "B")
 ) -> Figure:
-    """Arrows of A minus B, over shades of how significant each is by itself.
+    """Arrows of A minus B, over shades of the significance of each by itself.
 
-    Parameters
-    ----------
-    found : sequence of Comparison
-        One for each chip: one above the other, drawn to the same scale.
-    names : tuple of str
-        What A and B are called.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Without shades where no covariance is known.
+    One chip is drawn above the other, on one scale; without shades where no covariance is known.
     """
     mosaic = Mosaic(
         tuple((float(c.x.max()), float(c.y.max())) for c in found),
@@ -106,21 +89,10 @@ def difference_vectors(
 
 
 def change_over_time(first: Float, gain: Float, dof: int, p_value: float | None) -> Figure:
-    """Chi-square that a change from each date on takes up.
+    """Figure of the chi-square gains of a change from each first date (P,), in decimal years.
 
-    Parameters
-    ----------
-    first : ndarray, shape (P,)
-        First date of each period, decimal years.
-    gain : ndarray, shape (P,)
-    dof : int
-        Degrees of freedom of a change.
-    p_value : float or None
-        Of the largest, the search over the dates accounted for.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
+    `dof` is that of a change, `p_value` that of the largest, the search over the dates accounted
+    for.
     """
     first, gain = np.asarray(first, float), np.asarray(gain, float)
     low, high = chi_square.ppf([0.025, 0.975], dof)

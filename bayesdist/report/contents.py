@@ -17,7 +17,7 @@ REPORT = Registry(
     (
         Section("status", "Status"),
         Section("holdout", "Held-out stars"),
-        # a campaign's matching says what its data are
+        # a campaign's matching describes its data
         Section("data", "Data", printed=lambda r: r.campaign is None),
         Section("campaign", "Campaign"),
         Section("campaign-matching", "Catalogue and matching", parent="campaign"),

@@ -1,4 +1,4 @@
-"""What a report is made from."""
+"""Input of the report of a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         UncertaintyMap,
         VectorMap,
     )
-    from bayesdist.assess.budget.detector import DetectorBudget
+    from bayesdist.assess.budget.budget import ErrorBudget
     from bayesdist.assess.budget.surface import BudgetSurface
     from bayesdist.assess.periods import TimeVariation
     from bayesdist.assess.requirements.validity import Horizon
@@ -44,78 +44,40 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Check:
-    """One criterion: what was found, against what.
+    """One criterion: the value found, and its limit."""
 
-    Parameters
-    ----------
-    name : str
-        What was checked, with its unit.
-    value : float or str
-        What was found.
-    limit : str
-        What is asked, in words; empty where nothing is.
-    level : str
-        'pass', 'warn', 'fail', or 'note' where nothing is asked.
-    """
-
-    name: str
+    name: str  # with the unit
     value: float | str
-    limit: str = ""
-    level: str = "note"
+    limit: str = ""  # in words; empty where there is none
+    level: str = "note"  # 'pass', 'warn', 'fail', or 'note' without a limit
 
 
 @dataclass(frozen=True)
 class Product:
-    """A file that the run wrote.
+    """File that the run wrote."""
 
-    Parameters
-    ----------
-    path : str
-        Relative to the run's folder.
-    what : str
-    checks : tuple of Check
-        What was verified on the file as written, its closure for one.
-    """
-
-    path: str
+    path: str  # relative to the run's folder
     what: str
-    checks: tuple[Check, ...] = ()
+    checks: tuple[Check, ...] = ()  # of the file as written, such as its closure
 
 
 @dataclass(frozen=True, eq=False)
 class ChipResults:
-    """What was assessed on one chip.
-
-    Parameters
-    ----------
-    chip : Chip
-    formal_map : UncertaintyMap
-        Of the least-squares fit.
-    posterior_map : UncertaintyMap or None
-    displacement : VectorMap
-        The distortion with its zeroth order suppressed.
-    non_linear : VectorMap
-    area : AreaMap
-    binned : BinnedResiduals
-    place : tuple of int
-        Row (0 on top) and column of the chip among the others.
-    relative_map : UncertaintyMap or None
-        Of the posterior's relative positions, where the gauge is a question.
-    """
+    """Results of the assessment of one chip."""
 
     chip: Chip
-    formal_map: UncertaintyMap
+    formal_map: UncertaintyMap  # of the least-squares fit
     posterior_map: UncertaintyMap | None
-    displacement: VectorMap
+    displacement: VectorMap  # distortion with its zeroth order suppressed
     non_linear: VectorMap
     area: AreaMap
     binned: BinnedResiduals
-    place: tuple[int, int] = (0, 0)
-    relative_map: UncertaintyMap | None = None
+    place: tuple[int, int] = (0, 0)  # row (0 on top) and column of the chip among the others
+    relative_map: UncertaintyMap | None = None  # of relative positions, where the gauge matters
 
     @property
     def maps(self) -> tuple[UncertaintyMap, ...]:
-        """The two uncertainty maps that are shown, or one where there is no other.
+        """Uncertainty maps that are shown: two, or one where there is no other.
 
         Least squares and posterior; or posterior and relative positions, where there are such.
         """
@@ -124,70 +86,34 @@ class ChipResults:
 
     @property
     def best_map(self) -> UncertaintyMap:
-        """That of the posterior where there is one."""
+        """Uncertainty map of the posterior where there is one, else of least squares."""
         return self.formal_map if self.posterior_map is None else self.posterior_map
 
 
 @dataclass(frozen=True, eq=False)
 class SelfcalResults:
-    """What a run without a catalogue adds.
+    """Results that a run without a catalogue adds."""
 
-    Parameters
-    ----------
-    words : str
-        In which gauge everything stands.
-    gauge : astropy.table.Table
-        As gauge.ecsv.
-    matching : astropy.table.Table
-        One row for each exposure.
-    stars : astropy.table.Table
-        As stars.ecsv.
-    outlines : tuple of ndarray, each (M, 2)
-        Closed outline of each chip in each exposure, on the sky.
-    held : tuple of str
-        Parameters that the gauge holds.
-    summary : mapping
-        As in summary.json.
-    """
-
-    words: str
-    gauge: Table
-    matching: Table
-    stars: Table
-    outlines: tuple[Float, ...]
-    held: tuple[str, ...]
-    summary: Mapping[str, Any]
+    words: str  # the gauge in words
+    gauge: Table  # as gauge.ecsv
+    matching: Table  # one row for each exposure
+    stars: Table  # as stars.ecsv
+    outlines: tuple[Float, ...]  # (M, 2), closed, of each chip in each exposure, on the sky
+    held: tuple[str, ...]  # parameters that the gauge holds
+    summary: Mapping[str, Any]  # as in summary.json
 
 
 @dataclass(frozen=True)
 class Words:
-    """Words of a report.
+    """Terminology of a report."""
 
-    Parameters
-    ----------
-    things : str
-        What is fitted, one row each.
-    all_things : str
-        These as they come into the fit.
-    false : str
-        Rows that are none of them.
-    chooser : str
-        What leaves out rows that are far off: the sampling does not.
-    fit : str
-        What the parameters are from before they are sampled.
-    holder : str
-        What holds parameters that the data say nothing of.
-    taken : str
-        What makes residuals smaller than errors, as a clause; empty where nothing does.
-    """
-
-    things: str
-    all_things: str
-    false: str
-    chooser: str
-    fit: str
-    holder: str
-    taken: str = ""
+    things: str  # name of the rows that are fitted
+    all_things: str  # name of these as they come into the fit
+    false: str  # name of false rows
+    chooser: str  # name of the rejection; sampling rejects nothing
+    fit: str  # name of the fit before sampling
+    holder: str  # name of the constraint on parameters that the data do not constrain
+    taken: str = ""  # clause on why residuals are smaller than errors; else empty
 
 
 MATCHED = Words(
@@ -213,81 +139,35 @@ DETECTED = Words(
 class ReportInput:
     """Results of a run, as the report shows them.
 
-    Parameters
-    ----------
-    name : str
-        What was calibrated: the title.
-    config : mapping
-        The resolved configuration.
-    stars : StarSample
-        All stars or, of very many, some: the only ones that are drawn one by one.
-    exposures : ExposureSums
-        Of all stars, at the least-squares fit.
-    fit : LinearFit
-    posterior : Posterior or None
-        None where nothing was sampled: the report then says that errors are formal ones only.
-    chips : tuple of ChipResults
-        In the order of the model's chips.
-    coefficients : astropy.table.Table
-        Legendre coefficients and all other parameters; columns name, chip, axis, i, j, value,
-        sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit.  Those of the
-        posterior may be missing or masked.
-    budget : DetectorBudget or None
-    surface : BudgetSurface or None
-        The same budget at every position and epoch, for the page to compute from.
-    margins : tuple of Margin
-    horizons : tuple of Horizon
-        Until when requirements are met; empty where nothing depends on time.
-    products : tuple of Product
-    warnings : tuple of str
-        Sentences that belong on top.
-    misfits : tuple of Misfit
-        Structure that the fit leaves in the residuals of each chip; a campaign's are among its own
-        results.
-    score_tests : tuple of ScoreTest
-        What the residuals were asked, and what they say.
-    magnitude_errors : MagnitudeErrors or None
-        Errors by magnitude, where the stars carried none.
-    added_errors : GroupedErrors or None
-        Errors beyond the quoted ones by groups of stars, where these were compared.
-    flagged : ndarray of int, shape (E,), or None
-        Stars of each exposure that are more likely false matches than not.
-    provenance : mapping
-        Versions, seed, hashes of the input, timings, command; mappings may be nested.
-    campaign : CampaignResults or None
-        What a run that began with star lists adds.
-    periods : TimeVariation or None
-        Models of several periods compared, where that was asked for.
-    held_out : HeldOutTruth or None
-        What stars say that were set aside before the fit, where there are any.
-    selfcal : SelfcalResults or None
-        What a run without a catalogue adds.
+    Columns of `coefficients`, Legendre coefficients and all other parameters: name, chip, axis, i,
+    j, value, sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit; those
+    of the posterior may be missing or masked.
     """
 
-    name: str
-    config: Mapping[str, Any]
-    stars: StarSample
-    exposures: ExposureSums
+    name: str  # of the calibration: the title
+    config: Mapping[str, Any]  # resolved
+    stars: StarSample  # all, or a sample of very many: those drawn one by one
+    exposures: ExposureSums  # of all stars, at the least-squares fit
     fit: LinearFit
-    posterior: Posterior | None
-    chips: tuple[ChipResults, ...]
+    posterior: Posterior | None  # None: errors are then called formal
+    chips: tuple[ChipResults, ...]  # in the order of the model's chips
     coefficients: Table
-    budget: DetectorBudget | None = None
-    surface: BudgetSurface | None = None
+    budget: ErrorBudget | None = None
+    surface: BudgetSurface | None = None  # budget at every position and epoch, for the page
     margins: tuple[Margin, ...] = ()
-    horizons: tuple[Horizon, ...] = ()
+    horizons: tuple[Horizon, ...] = ()  # validity periods; empty where nothing depends on time
     products: tuple[Product, ...] = ()
-    warnings: tuple[str, ...] = ()
-    misfits: tuple[Misfit, ...] = ()
-    score_tests: tuple[ScoreTest, ...] = ()
-    magnitude_errors: MagnitudeErrors | None = None
-    added_errors: GroupedErrors | None = None
-    flagged: NDArray[np.int64] | None = None
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    campaign: CampaignResults | None = None
-    periods: TimeVariation | None = None
-    held_out: HeldOutTruth | None = None
-    selfcal: SelfcalResults | None = None
+    warnings: tuple[str, ...] = ()  # sentences on top
+    misfits: tuple[Misfit, ...] = ()  # structure in each chip's residuals; not a campaign's
+    score_tests: tuple[ScoreTest, ...] = ()  # of the residuals
+    magnitude_errors: MagnitudeErrors | None = None  # where the stars had no errors
+    added_errors: GroupedErrors | None = None  # beyond the quoted ones, by groups
+    flagged: NDArray[np.int64] | None = None  # (E,), stars more likely false than not
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # nested
+    campaign: CampaignResults | None = None  # of a run on star lists
+    periods: TimeVariation | None = None  # models of several periods compared
+    held_out: HeldOutTruth | None = None  # stars set aside before the fit
+    selfcal: SelfcalResults | None = None  # of a run without a catalogue
 
     @property
     def unit(self) -> str:
@@ -296,7 +176,7 @@ class ReportInput:
 
     @property
     def words(self) -> Words:
-        """What things are called."""
+        """Terminology for the kind of run."""
         return MATCHED if self.selfcal is None else DETECTED
 
     @property
@@ -309,30 +189,30 @@ class ReportInput:
 
     @property
     def provisional(self) -> bool:
-        """Whether what the sampler gave must not be relied on."""
+        """True where the sampler's results must not be relied on."""
         return self.posterior is not None and not self.posterior.convergence.converged
 
     @property
     def solution(self) -> LinearFit | Posterior:
-        """The posterior where there is one, else the fit."""
+        """Posterior where there is one, else the fit."""
         return self.fit if self.posterior is None else self.posterior
 
     @property
     def mosaic(self) -> Mosaic:
-        """How the chips lie."""
+        """Arrangement of the chips."""
         return Mosaic.of_chips([c.chip for c in self.chips], [c.place for c in self.chips])
 
     @property
     def several(self) -> bool:
-        """Whether the detector has more than one chip."""
+        """True where the detector has more than one chip."""
         return len(self.chips) > 1
 
     def length(self, value: float) -> str:
-        """A length in the unit of u and v, and in mas where the size of a pixel is known."""
+        """Length in the unit of u and v, and in mas where the size of a pixel is known."""
         return with_mas(value, self.unit, self.scale_mas)
 
     def marked(self, text: str) -> str:
-        """A number that rests on the sampler, with a dagger where that did not converge."""
+        """Number that depends on the sampler, with a dagger where that did not converge."""
         return f"{text}\u202f†" if self.provisional and text != MISSING else text
 
     def on_chip(self, chip: Chip) -> str:
@@ -353,7 +233,7 @@ class ReportInput:
         return None if value is None else float(value)
 
     def setting(self, section: str, key: str, default: Any) -> Any:
-        """A value of the resolved configuration."""
+        """Value of the resolved configuration."""
         return self.config.get(section, {}).get(key, default)
 
     def sampled_mean(self, key: str) -> float:
@@ -364,6 +244,6 @@ class ReportInput:
 
 
 def campaign_of(r: ReportInput) -> CampaignResults:
-    """What a campaign adds, of a run that has it."""
+    """Results of the campaign, of a run that has one."""
     assert r.campaign is not None
     return r.campaign

@@ -1,4 +1,4 @@
-"""Corner plots: what draws of several quantities say of each pair of them."""
+"""Corner plots: joint distributions of each pair of several quantities, from draws."""
 
 from __future__ import annotations
 
@@ -21,18 +21,12 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-_LEVELS = tuple(1.0 - np.exp(-0.5 * np.array([1.0, 2.0]) ** 2))  # what 1 and 2 sigma hold in 2-D
+_LEVELS = tuple(1.0 - np.exp(-0.5 * np.array([1.0, 2.0]) ** 2))  # content of 1 and 2 sigma in 2-D
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Draws of one quantity.
-
-    Parameters
-    ----------
-    label, unit : str
-    draws : ndarray, shape (N,)
-    """
+    """Draws (N,) of one quantity."""
 
     label: str
     unit: str
@@ -40,18 +34,7 @@ class Column:
 
 
 def corner_figure(columns: Sequence[Column], *, formal: Float | None = None) -> Figure:
-    """Corner plot of draws, at 1 and 2 sigma.
-
-    Parameters
-    ----------
-    columns : sequence of Column
-    formal : ndarray, shape (n, n), optional
-        Covariance of a Gaussian about zero that is drawn over it.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Corner plot of draws, at 1 and 2 sigma, with a Gaussian about zero of a covariance (n, n)."""
     with warnings.catch_warnings():
         # corner imports arviz where it is installed, which then announces its own future
         warnings.simplefilter("ignore", FutureWarning)
@@ -116,7 +99,7 @@ def _ranges(draws: Float, formal: Float | None) -> Float:
 
 
 def _draw_gaussian(panels: NDArray[np.object_], cov: Float) -> None:
-    """The Gaussian of a covariance about zero, at 1 and 2 sigma, over a corner plot."""
+    """Draw the Gaussian of a covariance about zero, at 1 and 2 sigma, over a corner plot."""
     style = {"color": PALETTE["vermilion"], "lw": 1.1, "zorder": 6}
     turn = np.linspace(0.0, 2.0 * np.pi, 100)
     circle = np.stack([np.cos(turn), np.sin(turn)])

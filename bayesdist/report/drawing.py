@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from bayesdist.data.files import atomic_path, made_folder
+from bayesdist.files import atomic_path, made_folder
 from bayesdist.report.registry import Item, Plot, Registry
 from bayesdist.report.style import figure_style, plain_ticks
 
@@ -38,7 +38,7 @@ __all__ = [
 log = logging.getLogger("bayesdist")
 
 DPI = 150
-PAD = 0.05  # inches left around what is drawn
+PAD = 0.05  # inches around the drawing
 MIN_FIGURES_SHARED = 20  # fewer are drawn sooner than another process has started
 
 _received: list[Any] = []  # of a process that draws for another one
@@ -46,14 +46,7 @@ _received: list[Any] = []  # of a process that draws for another one
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure as files, with its words.
-
-    Parameters
-    ----------
-    png, pdf : bytes
-    title, text, alt : str
-        As of `Plot`.
-    """
+    """Figure as files, with the title, text and text alternative of its `Plot`."""
 
     png: bytes
     pdf: bytes
@@ -63,36 +56,17 @@ class Drawing:
 
 
 def render(plot: Plot) -> Drawing:
-    """A figure as PNG and as PDF, whose letters are letters; the same figure gives the same.
-
-    Parameters
-    ----------
-    plot : Plot
-
-    Returns
-    -------
-    Drawing
-    """
+    """Figure as PNG and as PDF with text as letters; equal figures give equal files."""
     canvas, box = _laid_out(plot.figure)
     files = _png(plot.figure, canvas, box), _pdf(plot.figure, box)
     return Drawing(*files, plot.title, plot.text, plot.alt)
 
 
 def draw_all(registry: Registry, results: Any, *, processes: int = 1) -> dict[str, Drawing]:
-    """All figures of a page, by name in its order, each made, drawn and let go.
+    """Figures of a page, by name in its order, each made, drawn and released.
 
-    Parameters
-    ----------
-    registry : Registry
-    results
-        What its functions are given.
-    processes : int
-        That draw.  More than one import the main module of this process anew: a script must guard
-        what it does by ``if __name__ == "__main__"``.
-
-    Returns
-    -------
-    dict of str to Drawing
+    More than one of `processes` import the main module of this process anew: a script must guard
+    its work by ``if __name__ == "__main__"``.
     """
     items = registry.items(results, "figure")
     if processes > 1 and len(items) >= MIN_FIGURES_SHARED:
@@ -112,7 +86,7 @@ def _drawn_together(items: Sequence[Item], results: Any, processes: int) -> dict
 
 
 def _receive(results: Any) -> None:
-    """Keep what the figures are made of: once for each process, as it may be large."""
+    """Store the input of the figures: once for each process, as it may be large."""
     _received.append(results)
 
 
@@ -121,12 +95,12 @@ def _drawn(item: Item) -> Drawing:
 
 
 def png_of(figure: Figure) -> bytes:
-    """A figure as PNG file of 256 colours: a third of the size, and no eye sees the difference."""
+    """PNG file of 256 colours of a figure: a third of the size, without a visible difference."""
     return _png(figure, *_laid_out(figure))
 
 
 def _laid_out(figure: Figure) -> tuple[FigureCanvasAgg, Bbox]:
-    """Draw a figure, once for all, and say what is drawn on: in inches, with room around it."""
+    """Area of a figure that is drawn on, in inches, with room around it, after its only layout."""
     with figure_style():  # mathematical text and ticks read the settings only when drawn
         plain_ticks(figure)
         figure.set_dpi(DPI)
@@ -138,7 +112,7 @@ def _laid_out(figure: Figure) -> tuple[FigureCanvasAgg, Bbox]:
 
 def _png(figure: Figure, canvas: FigureCanvasAgg, box: Bbox) -> bytes:
     page = Bbox.from_bounds(0, 0, *figure.get_size_inches())
-    if not (page.contains(*box.min) and page.contains(*box.max)):  # what is outside as well
+    if not (page.contains(*box.min) and page.contains(*box.max)):  # artists outside as well
         buffer = io.BytesIO()
         with figure_style():
             figure.savefig(buffer, format="png", dpi=DPI, bbox_inches=box)
@@ -161,13 +135,13 @@ def _pdf(figure: Figure, box: Bbox) -> bytes:
 
 
 def _settle(figure: Figure) -> None:
-    """Leave all where it lies; an engine, even 'none', would have each file drawn twice."""
+    """Fix all positions; an engine, even 'none', would have each file drawn twice."""
     with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         figure.set_layout_engine(None)
 
 
 def _cut(pixels: np.ndarray, box: Bbox) -> np.ndarray:
-    """The part (rows, columns, 3) of a canvas; rows run from the top."""
+    """Part (rows, columns, 3) of a canvas; rows run from the top."""
     height, width = pixels.shape[:2]
     left, right = np.clip(np.rint(DPI * box.intervalx).astype(int), 0, width)
     top, bottom = np.clip(height - np.rint(DPI * box.intervaly[::-1]).astype(int), 0, height)
@@ -175,22 +149,9 @@ def _cut(pixels: np.ndarray, box: Bbox) -> np.ndarray:
 
 
 def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Draw figures and write them as PNG files.
+    """Paths of figures, drawn and written as PNG files to a folder, which is made if need be.
 
-    Parameters
-    ----------
-    figures : mapping of str to matplotlib.figure.Figure
-    folder : path-like
-        Made where it does not exist.
-
-    Returns
-    -------
-    tuple of pathlib.Path
-
-    Raises
-    ------
-    InputError
-        When the folder cannot be made or a file cannot be written.
+    InputError when the folder cannot be made or a file cannot be written.
     """
     images = {name: png_of(figure) for name, figure in figures.items()}
     return _saved(images, "png", made_folder(folder))
@@ -199,22 +160,9 @@ def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) 
 def save_drawings(
     drawings: Mapping[str, Drawing], folder: str | os.PathLike[str]
 ) -> tuple[Path, ...]:
-    """Write figures as PNG and as PDF files.
+    """Paths of figures, written as PNG and as PDF files to a folder, which is made if need be.
 
-    Parameters
-    ----------
-    drawings : mapping of str to Drawing
-    folder : path-like
-        Made where it does not exist.
-
-    Returns
-    -------
-    tuple of pathlib.Path
-
-    Raises
-    ------
-    InputError
-        When the folder cannot be made or a file cannot be written.
+    InputError when the folder cannot be made or a file cannot be written.
     """
     made = made_folder(folder)
     return (

@@ -26,23 +26,12 @@ EMPTY = "#D9DEE3"  # of a cell without a value
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Values on a grid of one chip.
+    """Values on a grid of one chip."""
 
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        Points, or centres of cells, in pixels.
-    values : ndarray, shape (ny, nx)
-        In the unit that is shown.
-    ring : tuple of float, or None
-        Position that is ringed.
-    """
-
-    x: Float
-    y: Float
-    values: Float
-    ring: tuple[float, float] | None = None
+    x: Float  # (nx,), points, or centres of cells, pixels
+    y: Float  # (ny,)
+    values: Float  # (ny, nx), in the unit that is shown
+    ring: tuple[float, float] | None = None  # position that is ringed
 
 
 def contour_levels(values: ArrayLike, n: int = 10) -> Float:
@@ -68,23 +57,10 @@ def scalar_map(
 ) -> None:
     """Draw values of each map of each chip, smooth between levels or cell by cell.
 
-    Parameters
-    ----------
-    panels : Panels
-        Framed.
-    grids : sequence of Grid or None
-        Maps of the first chip, then those of the next; None where there are no values.
-    titles : sequence of str
-        Of each panel.
-    label : str
-        Of the colour bar, with the unit; without a label there is none.
-    levels : ndarray, optional
-        Contours are drawn at these; cells where it is not given.
-    norm : matplotlib.colors.Normalize, or a sequence of it, optional
-        Colours of the cells: one scale for all maps, or one and a colour bar for each.
-    cmap : str or matplotlib.colors.Colormap
-    labelled : bool
-        Whether contours carry their values.
+    `grids` are the maps of the first chip, then those of the next, over framed `panels`; `label` is
+    of the colour bar (none without it), with the unit; with `levels` contours are drawn, `labelled`
+    with their values, else cells; `norm` is one scale for all maps, or one and a colour bar for
+    each.
     """
     drawn: dict[Axes, QuadContourSet | AxesImage] = {}
     places = [(k, ax) for k, maps in enumerate(panels.axes) for ax in maps]
@@ -124,11 +100,11 @@ def scalar_map(
 def _contours(
     ax: Axes, grid: Grid, offset: tuple[float, float], levels: Float, *, labelled: bool
 ) -> QuadContourSet:
-    """Filled contours with lines between them, by a spline: what is drawn is a polynomial's."""
+    """Draw filled contours with lines between them, by a spline, as all maps are polynomials."""
     x, y, values = grid.x, grid.y, grid.values
     spline = RectBivariateSpline(y, x, values, kx=min(3, len(y) - 1), ky=min(3, len(x) - 1))
     fine_x, fine_y = (np.linspace(a[0], a[-1], 4 * len(a)) for a in (x, y))
-    # the spline may overshoot a little, and what is above the last level would stay white
+    # the spline may overshoot a little, and values above the last level would stay white
     fine = np.clip(spline(fine_y, fine_x), values.min(), values.max())
     at = fine_x + offset[0], fine_y + offset[1]
     filled = ax.contourf(*at, fine, levels, cmap=SEQUENTIAL)
@@ -143,7 +119,7 @@ def _contours(
 def _cells(
     ax: Axes, grid: Grid, offset: tuple[float, float], norm: Normalize | None, cmap: str | Colormap
 ) -> AxesImage:
-    """Cells of one colour each."""
+    """Draw cells of one colour each."""
     limits = ax.get_xlim(), ax.get_ylim()
     if not np.isfinite(grid.values).all():
         ax.set_facecolor(EMPTY)
@@ -165,7 +141,7 @@ def _cells(
 
 
 def _extend(grids: Sequence[Grid | None], norm: Normalize) -> str:
-    """On which sides of the colour bar values lie beyond it."""
+    """Sides of the colour bar beyond which there are values."""
     assert norm.vmin is not None and norm.vmax is not None
     values = np.concatenate([g.values[np.isfinite(g.values)] for g in grids if g is not None])
     below, above = (values < norm.vmin).any(), (values > norm.vmax).any()

@@ -20,41 +20,22 @@ MARKERS = "os^Dvp"
 
 @dataclass(frozen=True, eq=False)
 class FilterTerm:
-    """A linear term of one filter on one chip, without its drift.
-
-    Parameters
-    ----------
-    filter, chip : str
-    epoch, value, sigma : ndarray, shape (E,)
-        Of the exposures; values per pixel.
-    alpha, sigma_alpha : ndarray, shape (S,)
-        The released value of each segment at its reference date, and its error.
-    """
+    """Linear term of one filter on one chip, without its drift."""
 
     filter: str
     chip: str
-    epoch: Float
-    value: Float
+    epoch: Float  # (E,), of the exposures
+    value: Float  # (E,), per pixel
     sigma: Float
-    alpha: Float
+    alpha: Float  # (S,), released value of each segment at its reference date
     sigma_alpha: Float
 
 
 def filters_figure(term: str, courses: Sequence[FilterTerm], breaks: Sequence[float]) -> Figure:
-    """One panel for each chip: points are exposures, lines the released values.
+    """Figure with a panel for each chip: points are exposures, lines the released values.
 
-    Parameters
-    ----------
-    term : str
-        As 'A_2'.
-    courses : sequence of FilterTerm
-        Of all chips and filters, the reference filter first.
-    breaks : sequence of float
-        Dates between which the released values hold.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
+    `courses` are of all chips and filters, the reference filter first, for a term as 'A_2';
+    `breaks` are the dates between which the released values hold.
     """
     by_chip: Mapping[str, list[FilterTerm]] = {
         chip: [c for c in courses if c.chip == chip]

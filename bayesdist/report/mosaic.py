@@ -1,4 +1,4 @@
-"""How the chips of a detector lie beside and above each other."""
+"""Arrangement of the chips of a detector."""
 
 from __future__ import annotations
 
@@ -16,31 +16,21 @@ MAX_COLUMNS = 3  # of panels: more would be too narrow to be read
 
 @dataclass(frozen=True)
 class Mosaic:
-    """How the chips of a detector lie.
+    """Arrangement of the chips of a detector."""
 
-    Parameters
-    ----------
-    sizes : tuple of (float, float)
-        Columns and rows of each chip, in pixels.
-    names : tuple of str
-        Of each chip; panels of several chips carry them.
-    places : tuple of (int, int)
-        Row (0 on top) and column of each chip.
-    """
-
-    sizes: tuple[Size, ...]
-    names: tuple[str, ...] = ("",)
-    places: tuple[tuple[int, int], ...] = ((0, 0),)
+    sizes: tuple[Size, ...]  # columns and rows of each chip, pixels
+    names: tuple[str, ...] = ("",)  # shown where there are several chips
+    places: tuple[tuple[int, int], ...] = ((0, 0),)  # row (0 on top) and column of each chip
 
     @classmethod
     def of_chips(cls, chips: Sequence[Chip], places: Sequence[tuple[int, int]]) -> Mosaic:
-        """Chips of a model, which go by their names where there are several."""
+        """Arrangement of the chips of a model, with their names where there are several."""
         names = tuple(chip.name if len(chips) > 1 else "" for chip in chips)
         return cls(tuple(chip.size for chip in chips), names, tuple(places))
 
     @property
     def several(self) -> bool:
-        """Whether there is more than one chip."""
+        """True where there is more than one chip."""
         return len(self.sizes) > 1
 
     @property
@@ -50,12 +40,12 @@ class Mosaic:
 
     @property
     def longest_side(self) -> float:
-        """The longest side of a chip, in pixels."""
+        """Longest side of a chip, in pixels."""
         return max(self.largest)
 
     @property
     def legible_places(self) -> tuple[tuple[int, int], ...]:
-        """The places, or of a wide detector the chips row by row in fewer columns."""
+        """Rows and columns of the chips; those of a wide detector row by row in fewer columns."""
         if max(column for _, column in self.places) < MAX_COLUMNS:
             return self.places
         order = sorted(self.places)

@@ -1,4 +1,4 @@
-"""Numbers and lengths as a reader wants them: digits they deserve, readable units, never 'NaN'."""
+"""Numbers and lengths for readers: significant digits, readable units, never 'NaN'."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _MAX_DECIMALS = 10  # beyond this a fixed-point number is harder to read than a 
 
 
 def _finite(value: Any) -> float | None:
-    """The value as a float, or None for what is missing, masked, text or not finite."""
+    """Value as a float, or None if missing, masked, text or not finite."""
     if value is np.ma.masked:  # converts to NaN, with a warning
         return None
     try:
@@ -45,7 +45,7 @@ def _finite(value: Any) -> float | None:
 
 
 def _infinite(value: Any) -> str:
-    """What stands for a value that is no finite number: a diagnostic may well be infinite."""
+    """Text for a value that is no finite number: a diagnostic may well be infinite."""
     if value is np.ma.masked:
         return MISSING
     try:
@@ -61,18 +61,7 @@ def _power_of_ten(x: float, decimals: int, exponent: int) -> str:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """A number to some significant digits; powers of ten where it is very small or large.
-
-    Parameters
-    ----------
-    value : float or anything
-    digits : int
-
-    Returns
-    -------
-    str
-        `MISSING` for what is no number.
-    """
+    """Number to some significant digits; powers of ten where very small or large; or `MISSING`."""
     x = _finite(value)
     if x is None:
         return _infinite(value)
@@ -85,16 +74,9 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def rounded(value: Any, sigma: Any) -> str:
-    """A number to the second significant digit of its standard deviation.
+    """Number to the second significant digit of its standard deviation.
 
-    Parameters
-    ----------
-    value, sigma : float or anything
-
-    Returns
-    -------
-    str
-        `MISSING` for what is not a finite number; five digits where sigma is none or zero.
+    `MISSING` for what is not a finite number; five digits where sigma is none or zero.
     """
     x, s = _finite(value), _finite(sigma)
     if x is None:
@@ -110,7 +92,7 @@ def rounded(value: Any, sigma: Any) -> str:
 
 
 def interval(low: Any, high: Any, sigma: Any) -> str:
-    """An interval, each end to the second digit of a standard deviation."""
+    """Interval, each end to the second digit of a standard deviation."""
     if _finite(low) is None or _finite(high) is None:
         return MISSING
     return f"{rounded(low, sigma)} to {rounded(high, sigma)}"
@@ -129,7 +111,7 @@ def percent(value: Any, digits: int = 3) -> str:
 
 
 def probability(p: Any) -> str:
-    """A probability of chance with its sign; below what a double tells from zero, a bound."""
+    """Probability of chance with its sign; a bound where a double cannot tell it from zero."""
     x = _finite(p)
     if x is not None and 0 <= x < _LEAST_P:
         return f"p < 10{str(round(math.log10(_LEAST_P))).translate(_SUPERSCRIPTS)}"
@@ -137,7 +119,7 @@ def probability(p: Any) -> str:
 
 
 def broken_name(name: str, width: int = 10) -> str:
-    """A long name of a parameter on several lines, broken after its points."""
+    """Long name of a parameter on several lines, broken after its points."""
     lines = [""]
     for part in name.replace(".", ".\0").split("\0"):
         if lines[-1] and len(lines[-1]) + len(part) > width:
@@ -159,38 +141,21 @@ _LADDERS: dict[str, tuple[tuple[float, str], ...]] = {
 
 @dataclass(frozen=True)
 class Scale:
-    """A unit for display.
-
-    Parameters
-    ----------
-    factor : float
-        What a number in the native unit is multiplied by.
-    unit : str
-        Name of the unit after that, for a label.
-    """
+    """Unit for display, and the factor that numbers in the native unit are multiplied by."""
 
     factor: float
     unit: str
 
     def text(self, value: float, digits: int = 3) -> str:
-        """A number in the native unit as text in this one."""
+        """Text in this unit of a number in the native unit."""
         times = "\u202f×\u202f" if self.unit.startswith("10") else "\u202f"
         return f"{value * self.factor:.{digits}g}{times}{self.unit}".replace("-", "−")
 
 
 def display_scale(unit: str, values: ArrayLike) -> Scale:
-    """Unit in which the largest of some values needs few zeros.
+    """Unit in which the largest of some finite values needs few zeros.
 
-    Parameters
-    ----------
-    unit : str
-        Native unit, or one per year ("pix/yr"); one that is not known is kept as it is.
-    values : array_like
-        In the native unit; what is not finite does not count.
-
-    Returns
-    -------
-    Scale
+    The native unit may be one per year ("pix/yr"); an unknown one is kept as it is.
     """
     base, _, rate = unit.partition("/")
     steps = ladder(base)
@@ -215,22 +180,9 @@ def ladder(unit: str) -> tuple[tuple[float, str], ...]:
 
 
 def with_mas(value: float, unit: str, scale_mas: float | None, digits: int = 3) -> str:
-    """A length with its unit, and in mas beside it where the size of a pixel is known.
+    """Length with its unit, and in mas where the size of a pixel is known.
 
-    Parameters
-    ----------
-    value : float
-        In `unit`.
-    unit : str
-    scale_mas : float or None
-        Size of a pixel in mas.
-    digits : int
-        Significant digits.
-
-    Returns
-    -------
-    str
-        As in ``"0.00930 pix (25.6 mas)"``; a dash where the value is not finite.
+    An example is ``"0.00930 pix (25.6 mas)"``; a dash where the value is not finite.
     """
     if not np.isfinite(value):
         return MISSING
@@ -246,18 +198,5 @@ def with_mas(value: float, unit: str, scale_mas: float | None, digits: int = 3) 
 
 
 def size_of(value: float, unit: str = "pix", digits: int = 3) -> str:
-    """A length in the unit that needs few zeros.
-
-    Parameters
-    ----------
-    value : float
-        In `unit`.
-    unit : str
-    digits : int
-        Significant digits.
-
-    Returns
-    -------
-    str
-    """
+    """Length in the unit that needs few zeros."""
     return display_scale(unit, value).text(value, digits)

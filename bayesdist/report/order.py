@@ -1,4 +1,4 @@
-"""Orders of the polynomial: what surfaces leave in bins, and what is said of held-out stars."""
+"""Orders of the polynomial: surfaces in binned residuals, and predictions of held-out stars."""
 
 from __future__ import annotations
 
@@ -18,20 +18,11 @@ if TYPE_CHECKING:
 __all__ = ["order_comparison"]
 
 _NEAR = 10.0  # log density within which the right-hand axis is linear
-_APART = 0.12  # of an order, by which markers of one order stand beside each other
+_APART = 0.12  # of an order, by which markers of one order are apart
 
 
 def order_comparison(found: OrderSelection) -> Figure:
-    """Surfaces on the left, stars and regions that are held out on the right.
-
-    Parameters
-    ----------
-    found : OrderSelection
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Figure with surfaces on the left, held-out stars and regions on the right."""
     with figure_style():
         fig = new_figure(WIDTH, 3.1)
         left, right = fig.subplots(1, 2)

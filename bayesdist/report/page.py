@@ -21,69 +21,32 @@ __all__ = ["Part", "Picture", "parts_of", "picture_of", "template"]
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure as a page holds it.
-
-    Parameters
-    ----------
-    name : str
-    data : str
-        The PNG file, base64.
-    width : float
-        Inches, at which its letters have the size they were set in.
-    words : Drawing
-        Title, text and what stands in place of the picture.
-    printed : bool
-        Whether it is on paper.
-    """
+    """Figure as a page holds it."""
 
     name: str
-    data: str
-    width: float
-    words: Drawing
-    printed: bool = True
+    data: str  # PNG file, base64
+    width: float  # inches, at which its letters have the size they were set in
+    words: Drawing  # title, text and text alternative
+    printed: bool = True  # True where it is on paper
 
 
 @dataclass(frozen=True)
 class Part:
-    """A section with what it holds.
-
-    Parameters
-    ----------
-    name, title : str
-    tables : tuple of TextTable
-    pictures : tuple of Picture
-    parts : tuple of Part
-        Sections within it.
-    empty : str
-        What stands in place of tables; empty where there are some.
-    printed : bool
-        Whether it is on paper.
-    """
+    """Section with its content."""
 
     name: str
     title: str
     tables: tuple[TextTable, ...]
     pictures: tuple[Picture, ...]
-    parts: tuple[Part, ...] = ()
-    empty: str = ""
-    printed: bool = True
+    parts: tuple[Part, ...] = ()  # sections within it
+    empty: str = ""  # text in place of tables; empty where there are some
+    printed: bool = True  # True where it is on paper
 
 
 def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) -> tuple[Part, ...]:
-    """The sections of a page that hold something, or say why they do not.
+    """Sections of a page that have content, or a reason for having none, in the registry's order.
 
-    Parameters
-    ----------
-    registry : Registry
-    results
-        What its functions are given.
-    drawings : mapping of str to Drawing
-        Of its figures, by name; figures that are not among them are left out.
-
-    Returns
-    -------
-    tuple of Part
-        In the order of the registry, those within others in these.
+    Figures that are not among `drawings` are left out.
     """
     tables: dict[str, list[TextTable]] = {}
     for item in registry.items(results, "table"):
@@ -123,14 +86,14 @@ def _several(made: TextTable | Iterable[TextTable] | None) -> Iterable[TextTable
 
 
 def picture_of(name: str, drawing: Drawing, *, printed: bool = True) -> Picture:
-    """A figure as it lies in a page."""
+    """Figure as a page holds it."""
     (pixels,) = struct.unpack(">I", drawing.png[16:20])  # width, in the first chunk of a PNG file
     data = base64.b64encode(drawing.png).decode("ascii")
     return Picture(name, data, pixels / DPI, drawing, printed)
 
 
 def template(name: str) -> jinja2.Template:
-    """A template by its file name; what it needs and is not given is an error."""
+    """Template by its file name; a variable that it needs and is not given is an error."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("bayesdist.report"),
         autoescape=".html" in name,
@@ -145,25 +108,25 @@ def template(name: str) -> jinja2.Template:
     return environment.get_template(name)
 
 
-# what Markdown would take for its own, in words of ours or of a user's file
+# characters with a meaning in Markdown, in our text or in that of a user's file
 _SPECIAL = str.maketrans(
     {"|": "\\|", "*": "\\*", "`": "\\`", "[": "\\[", "<": "&lt;", "&": "&amp;", "\n": " "}
 )
 
 
 def _typeset(value: object) -> object:
-    """Sentences are written for terminals too, where +- stands for the sign."""
+    """Text for the page: sentences are written for terminals too, where +- stands for the sign."""
     return value.replace(" +- ", " ± ") if isinstance(value, str) else value
 
 
 def _markdown(value: object) -> str:
-    """Words as a line of Markdown that shows them as they are."""
+    """Line of Markdown that shows the text as it is."""
     if isinstance(value, Level):
         return {"pass": "pass", "warn": "**warn**", "fail": "**FAIL**", "note": MISSING}[value]
     return str(value).translate(_SPECIAL)
 
 
 def _css(value: object) -> Markup:
-    """Words as a string of a style sheet: what is no plain letter by its number and a space."""
+    """String of a style sheet: all but plain letters by number and a space."""
     plain = "".join(c if c.isalnum() or c in " .,:" else f"\\{ord(c):x} " for c in str(value))
     return Markup(f'"{plain}"')

@@ -1,4 +1,4 @@
-"""Where chips stand in a figure: each in a panel of its own, or all together as one array."""
+"""Panels of a figure: one for each chip, or one for all of them as one array."""
 
 from __future__ import annotations
 
@@ -17,20 +17,11 @@ __all__ = ["ArrayPanels", "ChipPanels", "OneArray", "Panels", "chip_axes"]
 Size = tuple[float, float]
 
 TALLEST_PANEL = 8.0  # inches
-WIDE = 0.7  # rows over columns below which a chip is wide: its maps stand above each other
+WIDE = 0.7  # rows over columns below which a chip is wide: its maps are one above the other
 
 
 class Panels:
-    """Axes of a figure by chip and by map of that chip.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-    axes : list of list of matplotlib.axes.Axes
-        For each chip those of its maps.
-    names : sequence of str
-        What titles begin with; empty where there is one chip.
-    """
+    """Axes of a figure by chip and by map; titles begin with the chip's name where there is one."""
 
     def __init__(self, figure: Figure, axes: list[list[Axes]], names: Sequence[str]) -> None:
         self.figure, self.axes, self.names = figure, axes, tuple(names)
@@ -41,24 +32,18 @@ class Panels:
         return list(dict.fromkeys(ax for maps in self.axes for ax in maps))
 
     def offset(self, chip: int) -> tuple[float, float]:
-        """What is added to pixels of a chip, counted from 0, in its axes."""
+        """Offset of a chip's pixels, counted from 0, in its axes."""
         return 0.0, 0.0
 
     def title(self, chip: int, text: str, joined: str = ": ") -> str:
-        """A panel's title, which names the chip where there are several."""
+        """Title of a panel, with the name of the chip where there are several."""
         return f"{self.names[chip]}{joined}{text}" if self.names[chip] else text
 
 
 class ChipPanels(Panels):
-    """One panel for each map of each chip, placed as the chips lie, all at one scale.
+    """One panel for each of one or two maps of each chip, arranged as the chips, all on one scale.
 
-    Parameters
-    ----------
-    mosaic : Mosaic
-    maps : int
-        Maps of the same chip: one or two.
-    colorbar : bool
-        Whether room for one shared colour bar is needed.
+    `colorbar` leaves room for one common colour bar.
     """
 
     def __init__(self, mosaic: Mosaic, maps: int = 1, *, colorbar: bool = False) -> None:
@@ -66,7 +51,7 @@ class ChipPanels(Panels):
         columns = 1 + max(place[1] for place in mosaic.legible_places)
         rows = 1 + max(place[0] for place in mosaic.legible_places)
         aspect = mosaic.largest[1] / mosaic.largest[0]
-        # maps of a chip stand beside each other; of a wide detector, or chip, above each other
+        # maps of a chip are side by side; of a wide detector, or chip, one above the other
         beside = columns == 1 if mosaic.several else aspect >= WIDE
         down, across = (rows, maps) if beside else (maps * rows, columns)
         width = WIDTH if across > 1 or aspect < WIDE else 0.66 * WIDTH
@@ -98,16 +83,10 @@ class ChipPanels(Panels):
 
 
 class ArrayPanels(Panels):
-    """Panels of several arrays beside each other, equally wide, each in its own pixels.
+    """Panels of several arrays, equally wide, each in its own pixels, in so many columns at most.
 
-    Parameters
-    ----------
-    sizes : mapping of str to (float, float)
-        Columns and rows of each array, by its name.
-    columns : int
-        Panels beside each other, at most.
-    colorbar : bool
-        Whether room for one shared colour bar is needed.
+    `sizes` are columns and rows by the array's name; `colorbar` leaves room for one common colour
+    bar.
     """
 
     def __init__(
@@ -141,18 +120,10 @@ class ArrayPanels(Panels):
 
 
 class OneArray(Panels):
-    """All chips in one panel, as one array.
+    """One panel for all chips, as one array.
 
-    Parameters
-    ----------
-    sizes : mapping of int to (float, float)
-        Columns and rows, by chip number.
-    offsets : mapping of int to (float, float)
-        What is added to the pixels of each chip.
-    margin : float
-        Room beyond the array, in pixels.
-    colorbar : bool
-        Whether room for a colour bar is needed.
+    `sizes` are columns and rows by chip number, `offsets` are added to the pixels of each chip,
+    `margin` is the room beyond the array in pixels; `colorbar` leaves room for a colour bar.
     """
 
     def __init__(
@@ -179,11 +150,11 @@ class OneArray(Panels):
         super().__init__(figure, [[ax]] * len(sizes), [""] * len(sizes))
 
     def offset(self, chip: int) -> tuple[float, float]:
-        """What is added to pixels of a chip, counted from 0, in the array."""
+        """Offset of a chip's pixels, counted from 0, in the array."""
         return self._offsets[chip]
 
     def _outline(self, ax: Axes, sizes: Mapping[int, Size]) -> None:
-        """Edges of all chips; those of one column are named at the right."""
+        """Draw the edges of all chips; those of one column are named at the right."""
         shift = max(abs(px) for px, _ in self._offsets)
         named = len(sizes) > 1 and shift < 0.5 * min(size[0] for size in sizes.values())
         for (number, (nx, ny)), (px, py) in zip(sizes.items(), self._offsets, strict=True):
@@ -198,13 +169,7 @@ class OneArray(Panels):
 def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:
     """Make axes a map of a chip: x to the right, y up, pixels square, outline drawn.
 
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-    size : tuple of float
-        Columns and rows, in pixels.
-    margin : float
-        Room beyond the outline, in pixels.
+    `margin` is the room beyond the outline, in pixels.
     """
     nx, ny = size
     ax.set_aspect("equal")
@@ -218,7 +183,7 @@ def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:
 
 
 def _label_edges(ax: Axes) -> None:
-    """Label axes that stand at the edge because there is no chip beyond them."""
+    """Label axes that are at the edge because there is no chip beyond them."""
     spec = ax.get_subplotspec()
     assert spec is not None
     others = [o.get_subplotspec() for o in ax.figure.axes if o is not ax]

@@ -1,4 +1,4 @@
-"""Dither patterns side by side: where exposures lie, and how well the position is known then."""
+"""Dither patterns side by side: the exposures, and the uncertainty of positions with them."""
 
 from __future__ import annotations
 
@@ -30,16 +30,7 @@ FIRST = PALETTE["vermilion"]
 
 
 def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
-    """Footprints on one scale, and beside them the radial uncertainty in one colour scale.
-
-    Parameters
-    ----------
-    found : sequence of PlannedPattern
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Footprints on one scale, each with its radial uncertainty on one colour scale."""
     bounded = [one.radii(kind) for one in found for kind in SHOWN if one.maps[kind] is not None]
     values = np.concatenate(bounded)
     norm = LogNorm(max(values.min(), 1e-4 * values.max()), values.max() * (1 + 1e-9))
@@ -99,7 +90,7 @@ def _footprint(
 
 
 def _map(ax: Axes, one: PlannedPattern, kind: str, norm: LogNorm, last: bool) -> list[QuadMesh]:
-    """The chips where they lie in the first exposure; words where errors are unbounded."""
+    """Draw the chips where they are in the first exposure; words where errors are unbounded."""
     model, theta, maps = one.solution.model, one.solution.mean, one.maps[kind]
     outlines = [
         model.predict(theta, *outline_pixels(c.size), exposure=0, chip=c.number)

@@ -1,4 +1,4 @@
-"""What a page shows: each figure, table and data set with its words and when it applies."""
+"""Registry of a page: each figure, table and data set with its words and its condition."""
 
 from __future__ import annotations
 
@@ -18,92 +18,48 @@ When = Callable[[Any], bool]
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """A figure and its words.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-    title : str
-    text : str
-        What to see.
-    alt : str
-        What the picture shows, for those who cannot see it.
-    """
+    """Figure and its words."""
 
     figure: Figure
     title: str
-    text: str
-    alt: str
+    text: str  # explanation
+    alt: str  # text alternative to the picture
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a page.
-
-    Parameters
-    ----------
-    name : str
-    title : str or callable
-        A callable is given the results.
-    empty : str
-        What stands in place of the section's tables where there are none; a section without it is
-        left out where nothing in it applies.
-    parent : str
-        Section that it is a part of.
-    printed : bool or callable
-        Whether it is on paper.
-    """
+    """Section of a page; title and `printed` (on paper) may be functions of the results."""
 
     name: str
     title: str | Callable[[Any], str]
-    empty: str = ""
-    parent: str = ""
+    empty: str = ""  # text in place of missing tables; a section without it is left out
+    parent: str = ""  # section that it is a part of
     printed: bool | When = True
 
     def title_of(self, results: Any) -> str:
-        """The title in the page of some results."""
+        """Title in the page of some results."""
         return self.title if isinstance(self.title, str) else self.title(results)
 
     def is_printed(self, results: Any) -> bool:
-        """Whether the section is on paper."""
+        """True where the section is on paper."""
         return self.printed(results) if callable(self.printed) else self.printed
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure, a table or data of a page.
+    """Figure, table or data of a page; `each` gives name and argument of each of many figures."""
 
-    Parameters
-    ----------
-    name : str
-        Of the function that makes it; of a figure, the name of its files, too.
-    section : str
-        Data belong to none.
-    kind : {'figure', 'table', 'data'}
-    make : callable
-        Given the results, and what `each` says; a figure is a `Plot`, a table a `TextTable`, a
-        sequence of them, or None, data are what JSON can hold.
-    needs : tuple of str
-        Attributes of the results that must be there: neither None nor empty.
-    when : callable, optional
-        Condition that no attribute states.
-    each : callable, optional
-        Of the results: name and argument of every figure that the function makes.
-    printed : bool, callable or 'first'
-        Whether the figure is on paper, or the first of several.
-    """
-
-    name: str
-    section: str
+    name: str  # of the function; of a figure also that of its files
+    section: str  # data belong to none
     kind: Kind
-    make: Callable[..., Any]
-    needs: tuple[str, ...] = ()
-    when: When | None = None
+    make: Callable[..., Any]  # of the results and an item of `each`: Plot, TextTable(s) or data
+    needs: tuple[str, ...] = ()  # attributes of the results that must be neither None nor empty
+    when: When | None = None  # condition that no attribute states
     each: Callable[[Any], Mapping[str, Any]] | None = None
-    printed: bool | When | Literal["first"] = False
+    printed: bool | When | Literal["first"] = False  # on paper, or 'first'
 
     def applies(self, results: Any) -> bool:
-        """Whether it can be made of these results."""
+        """True where it can be made of these results."""
         if not all(_present(results, path) for path in self.needs):
             return False
         return self.when is None or self.when(results)
@@ -111,17 +67,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Item:
-    """An entry as it stands in the page of some results.
-
-    Parameters
-    ----------
-    name : str
-    section : str
-    make : callable
-    arguments : tuple
-        What the function is given beside the results.
-    printed : bool
-    """
+    """Entry in the page of some results; its function gets the results and `arguments`."""
 
     name: str
     section: str
@@ -130,19 +76,12 @@ class Item:
     printed: bool = False
 
     def made(self, results: Any) -> Any:
-        """The figure, table or data."""
+        """Figure, table or data made of the results."""
         return self.make(results, *self.arguments)
 
 
 class Registry:
-    """Everything that one kind of page can show.
-
-    Parameters
-    ----------
-    name : str
-    sections : sequence of Section
-        In the order of the page.
-    """
+    """Figures, tables and data that one kind of page can show, in sections in the page's order."""
 
     def __init__(self, name: str, sections: Sequence[Section]) -> None:
         self.name, self.sections = name, tuple(sections)
@@ -185,23 +124,12 @@ class Registry:
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """All entries, in the order of sections, then of registration."""
+        """Entries in the order of sections, then of registration."""
         order = ["", *(section.name for section in self.sections)]
         return tuple(sorted(self._entries, key=lambda entry: order.index(entry.section)))
 
     def items(self, results: Any, kind: Kind) -> tuple[Item, ...]:
-        """What can be made of some results, in the order of the page.
-
-        Parameters
-        ----------
-        results
-            What the functions are given.
-        kind : {'figure', 'table', 'data'}
-
-        Returns
-        -------
-        tuple of Item
-        """
+        """Items that can be made of some results, in the order of the page."""
         out = []
         for entry in self.entries:
             if entry.kind != kind or not entry.applies(results):
@@ -217,7 +145,7 @@ class Registry:
 
 
 def _present(results: Any, path: str) -> bool:
-    """Whether an attribute, or one of an attribute, is there."""
+    """True where an attribute, or one of an attribute, is neither None nor empty."""
     value = reduce(
         lambda of, name: None if of is None else getattr(of, name), path.split("."), results
     )

@@ -1,4 +1,4 @@
-"""The report of a run: its page, and the same as Markdown."""
+"""Report of a run: its page, and its Markdown form."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from bayesdist.data.files import atomic_path
+from bayesdist.files import atomic_path
 from bayesdist.report.context import ReportInput
 from bayesdist.report.drawing import Drawing, draw_all
 from bayesdist.report.page import Part, parts_of, template
@@ -42,35 +42,14 @@ _PRINT_WORDS = (
 
 
 def draw_report(r: ReportInput, *, processes: int = 1) -> dict[str, Drawing]:
-    """All figures of the report of a run as files, by name, in its order.
-
-    Parameters
-    ----------
-    r : ReportInput
-    processes : int
-        As of `draw_all`.
-
-    Returns
-    -------
-    dict of str to Drawing
-    """
+    """Figures of the report of a run as files, by name, in its order."""
     return draw_all(REPORT, r, processes=processes)
 
 
 def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
-    """The report as a page.
+    """Report as a whole HTML document that needs no other file.
 
-    Parameters
-    ----------
-    r : ReportInput
-    drawings : mapping of str to Drawing
-        As of `draw_report`.
-
-    Returns
-    -------
-    str
-        A whole HTML document that needs no other file.  Its script computes from numbers in the
-        page; whoever does without sees all tables and figures.
+    Its script computes from numbers in the page; without scripts all tables and figures are shown.
     """
     data = {item.name: _embedded(item.made(r)) for item in REPORT.items(r, "data")}
     return template("report.html.jinja").render(
@@ -89,37 +68,16 @@ def _embedded(data: Any) -> Markup:
 
 
 def render_markdown(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
-    """The same tables, figures and words as Markdown; figures are links into figures/.
-
-    Parameters
-    ----------
-    r, drawings
-        As in `render_report`.
-
-    Returns
-    -------
-    str
-    """
+    """Report with all tables, figures and words as Markdown; figures are links into figures/."""
     return template("report.md.jinja").render(**_contents(r, drawings))
 
 
 def write_report(
     path: str | os.PathLike[str], r: ReportInput, drawings: Mapping[str, Drawing]
 ) -> None:
-    """Write the report, and beside it the same as Markdown.
+    """Write the report, and its Markdown form with .md for .html.
 
-    Parameters
-    ----------
-    path : path-like
-        Of the page; the other file has its name with .md for .html.
-    r : ReportInput
-    drawings : mapping of str to Drawing
-        As of `draw_report`.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be written.
+    InputError when the file cannot be written.
     """
     texts = {
         Path(path): render_report(r, drawings),
@@ -131,7 +89,7 @@ def write_report(
 
 
 def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]:
-    """What both forms of the report show."""
+    """Content of both forms of the report."""
     parts = parts_of(REPORT, r, drawings)
     status = next(part for part in parts if part.name == "status")
     others: list[Part] = [part for part in parts if part is not status]

@@ -1,4 +1,4 @@
-"""The look of every figure: one palette, one width, plain numbers at ticks.
+"""Style of every figure: one palette, one width, plain numbers at ticks.
 
 Figures are made by objects, never through pyplot, and the caller's rcParams are left alone.
 """
@@ -56,7 +56,7 @@ LEVEL_COLORS = {
 }
 SEQUENTIAL = "cividis"
 INK = "#1F2A37"
-PALE = "#A9B4C0"  # what noise alone may have made, and stars in the background
+PALE = "#A9B4C0"  # vectors that may be noise alone, and stars in the background
 OUTLINE = "#9AA5B1"  # of chips, and lines at zero
 GUIDE = "#E3E8ED"  # lines of a grid behind data
 HYPER_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
@@ -95,25 +95,13 @@ _RC = {
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """The style, while the block runs; the caller's settings come back after it."""
+    """Context with the style; the caller's settings come back after it."""
     with matplotlib.rc_context(_RC):
         yield
 
 
 def new_figure(width: float, height: float, *, layout: str = "constrained") -> Figure:
-    """Empty figure that belongs to no window and to no pyplot state.
-
-    Parameters
-    ----------
-    width, height : float
-        Inches.
-    layout : str
-        Layout engine of matplotlib.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Empty figure (inches) that belongs to no window and to no pyplot state."""
     fig = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(fig)
     return fig
@@ -135,7 +123,7 @@ _RAISED = str.maketrans("0123456789-−", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁻")
 
 
 class _Powers(LogFormatterSciNotation):
-    """Powers of ten in raised digits."""
+    """Formatter of powers of ten in raised digits."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         text = super().__call__(x, pos)
@@ -144,7 +132,7 @@ class _Powers(LogFormatterSciNotation):
 
 
 class _Plain(ScalarFormatter):
-    """Decimal numbers, a power of ten that they share in raised digits."""
+    """Formatter of decimal numbers with a common power of ten in raised digits."""
 
     def get_offset(self) -> str:
         text = super().get_offset()
@@ -160,7 +148,7 @@ def _signs(text: str) -> str:
 
 
 def plain_ticks(figure: Figure) -> None:
-    """Give every axis that has matplotlib's own numbers such without mathematical text."""
+    """Replace matplotlib's own formatters on every axis by those without mathematical text."""
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             for now, put in (

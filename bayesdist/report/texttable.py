@@ -9,63 +9,39 @@ from pathlib import PurePath
 
 __all__ = ["MAX_ROWS", "Level", "TextTable", "further", "listing", "short_paths"]
 
-_FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room beside it
+_FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room next to it
 MAX_ROWS = 60  # of frames and exposures; hundreds of them belong in the files
 
 
 class Level(str):
-    """A cell that says how a check came out: 'pass', 'warn', 'fail', or 'note'."""
+    """Outcome of a check as a cell: 'pass', 'warn', 'fail', or 'note'."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of text.
-
-    Parameters
-    ----------
-    caption : str
-    columns : tuple of str
-        Headings, with units; empty strings for a plain list of names and values.
-    rows : tuple of tuple of str
-        A cell may be a `Level`.
-    words : tuple of int
-        Columns that hold words; the others hold numbers.
-    note : str
-        Below the table.
-    detail : bool
-        Whether the page leaves the table out when it is printed.
-    on_paper : tuple of int
-        Columns that are printed; all of them where it is empty.
-    leading : int
-        Rows that are printed, the first so many; 0 for all of them.
-    stacked : tuple of int
-        Columns that stand first where a narrow screen shows each row as a block; where it is empty
-        the table stays one.  Tables of checks are always shown so.
-    grouped : bool
-        Whether the first column is the heading of the rows that share it.
-    """
+    """Table of text."""
 
     caption: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    words: tuple[int, ...] = (0,)
-    note: str = ""
-    detail: bool = False
-    on_paper: tuple[int, ...] = ()
-    leading: int = 0
-    stacked: tuple[int, ...] = ()
-    grouped: bool = False
+    columns: tuple[str, ...]  # headings, with units; empty for a list of names and values
+    rows: tuple[tuple[str, ...], ...]  # a cell may be a `Level`
+    words: tuple[int, ...] = (0,)  # columns of words; the others are numbers
+    note: str = ""  # below the table
+    detail: bool = False  # True where it is not printed
+    on_paper: tuple[int, ...] = ()  # columns that are printed; empty: all
+    leading: int = 0  # first rows that are printed; 0: all
+    stacked: tuple[int, ...] = ()  # first columns of a row's block on a narrow screen; empty: none
+    grouped: bool = False  # True where the first column is the heading of rows
 
     @property
     def of_checks(self) -> bool:
-        """Whether rows say how checks came out."""
+        """True where rows are outcomes of checks."""
         return any(isinstance(cell, Level) for row in self.rows for cell in row)
 
     @property
     def groups(self) -> tuple[tuple[str, tuple[tuple[str, ...], ...]], ...]:
-        """Rows by the heading that they share, without it; under '' where there is none."""
+        """Rows by their common heading, without it; under '' where there is none."""
         if not self.grouped:
             return (("", self.rows),)
         by_heading = groupby(self.rows, key=lambda row: row[0])
@@ -73,7 +49,7 @@ class TextTable:
 
     @property
     def is_small(self) -> bool:
-        """Whether another table has room beside it on paper."""
+        """True where another table has room next to it on paper."""
         rows = self.rows[: self.leading or None]
         widths = (max(map(len, column)) for column in zip(self.columns, *rows, strict=True))
         return len(rows) <= _FEW_ROWS and sum(widths) <= _FEW_LETTERS
@@ -87,14 +63,14 @@ def listing(
     detail: bool = False,
     leading: int = 0,
 ) -> TextTable:
-    """A plain list of names and values."""
+    """Plain list of names and values."""
     rows = tuple(pairs.items())
     words = (0, 1)
     return TextTable(caption, ("", ""), rows, words, note, detail=detail, leading=leading)
 
 
 def further(n: int) -> str:
-    """How many of n rows the page leaves to the files; empty where it shows all."""
+    """Words on how many of n rows only the files have; empty where the page shows all."""
     return "" if n <= MAX_ROWS else f"{n - MAX_ROWS} more rows are in the run's tables."
 
 

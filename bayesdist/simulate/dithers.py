@@ -1,4 +1,4 @@
-"""A dense field seen in dithered exposures, for self-calibration: detections of known truth."""
+"""Dense field seen in dithered exposures, for self-calibration: detections of known truth."""
 
 from __future__ import annotations
 
@@ -30,35 +30,22 @@ Int = NDArray[np.int64]
 
 MOST_STEPS = 30
 CLOSE = 1e-9  # pixels
-OUTSIDE = 0.1  # of the detector's size, beyond which no star is looked for
+OUTSIDE = 0.1  # of the detector's size: no star is sought beyond
 
 
 @dataclass(frozen=True, eq=False)
 class DitheredField:
-    """Detections and what is true of them.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-        True parameters.
-    detections : Detections
-        `star` holds the true star of each, `NO_STAR` for those that are of none.
-    sky : ndarray, shape (S, 2)
-        True positions on the sky of the first exposure.
-    false : ndarray of bool, shape (N,)
-        Detections that are of no star, or displaced by more than their errors.
-    """
+    """Detections and their truth."""
 
     model: DistortionModel
-    theta: Float
-    detections: Detections
-    sky: Float
-    false: Bool
+    theta: Float  # (D,)
+    detections: Detections  # with the true star, or `NO_STAR`
+    sky: Float  # (S, 2), on the sky of the first exposure
+    false: Bool  # (N,), of no star, or displaced by more than the errors
 
     @property
     def unlabelled(self) -> Detections:
-        """The detections as an observer has them."""
+        """Detections as an observer has them."""
         return replace(self.detections, star=np.full(len(self.detections), NO_STAR))
 
 
@@ -67,14 +54,8 @@ def smooth_distortion(
 ) -> Float:
     """Coefficients (chips, 2, K) of a distortion, falling with the order.
 
-    Parameters
-    ----------
-    order : int
-    chips : sequence of Chip
-        Side by side along y, a gap of fifty pixels between them.
-    size_pix : float
-        Of the quadratic terms at the edge.
-    rng : numpy.random.Generator
+    The chips are side by side along y, with a gap of fifty pixels; `size_pix` is the size of the
+    quadratic terms at the edge.
     """
     model = DistortionModel(order, tuple(chips))
     out = flat_coefficients(order, chips)
@@ -96,31 +77,11 @@ def dither_pattern(
     least: float = 5.0,
     largest: float = 0.75,
 ) -> tuple[Float, Float]:
-    """Offsets that sample all scales from a few pixels to a part of the detector.
+    """Offsets (n, 2) in pixels and rolls (n,) in radians that sample all scales, the first being 0.
 
-    As the program that calibrated ACS (ACS handbook, 4.1.1): the lengths are spread evenly in
-    their logarithm, the directions at random.
-
-    Parameters
-    ----------
-    n : int
-        Exposures; the first one has no offset.
-    size : tuple of float
-        Of the detector, pixels.
-    rolls_deg : sequence of float
-        Roll angles, taken in turn.
-    rng : numpy.random.Generator
-    least : float
-        Pixels.
-    largest : float
-        Part of the detector's smaller side.
-
-    Returns
-    -------
-    offsets : ndarray, shape (n, 2)
-        Pixels.
-    rolls : ndarray, shape (n,)
-        Radians, relative to the first one.
+    As the program that calibrated ACS (ACS handbook, 4.1.1): the lengths are spread evenly in their
+    logarithm, from `least` pixels to `largest` times the detector's smaller side, the directions at
+    random; the roll angles are taken in turn.
     """
     length = np.exp(rng.uniform(np.log(least), np.log(largest * min(size)), n))
     angle = rng.uniform(0, 2 * np.pi, n)
@@ -145,34 +106,14 @@ def simulate_dithers(
     reach: float = 1.0,
     epochs: Sequence[float] | None = None,
 ) -> DitheredField:
-    """Detections of stars spread evenly over all that the exposures see.
+    """Detections of stars spread evenly over the area of all exposures.
 
-    Parameters
-    ----------
-    chips : sequence of Chip
-    coefficients : ndarray, shape (chips, 2, K)
-        Legendre coefficients, in pixels.
-    offsets, rolls
-        Of the exposures, as `dither_pattern` gives them.
-    n_stars : int
-    rng : numpy.random.Generator
-    frames : str
-    sigma : float or tuple of float
-        Error on one axis, pixels: one for all, or the smallest and largest, spread evenly in
-        their logarithm over the stars; the magnitudes go with them.
-    disturbed : float
-        Share of detections that lie anywhere within `reach` of their star.
-    spurious : float
-        Share of detections that are of no star, anywhere on the detector.
-    reach : float
-        Pixels.
-    epochs : sequence of float, optional
-        Decimal years of the exposures.
-
-    Raises
-    ------
-    InputError
-        When no star falls on the detector.
+    `coefficients` (chips, 2, K) are Legendre's, in pixels, `offsets` and `rolls` as from
+    `dither_pattern`.  `sigma` is the error on one axis in pixels: one for all, or the smallest and
+    largest, spread evenly in their logarithm over the stars; the magnitudes go with them.
+    `disturbed` is the fraction of detections anywhere within `reach` pixels of their star,
+    `spurious` that of detections of no star, anywhere on the detector.  InputError when no star
+    falls on the detector.
     """
     model, theta = dithered_model(chips, coefficients, offsets, rolls, frames=frames)
     low_corner, high_corner = sky_seen(model, theta)
@@ -219,13 +160,7 @@ def dithered_model(
     *,
     frames: str = "shift_rotation",
 ) -> tuple[DistortionModel, Float]:
-    """A model of dithered exposures, and its true parameters (D,).
-
-    Parameters
-    ----------
-    chips, coefficients, offsets, rolls, frames
-        As `simulate_dithers`.
-    """
+    """Model of dithered exposures and its true parameters (D,); arguments of `simulate_dithers`."""
     order = int((np.sqrt(8 * coefficients.shape[2] + 1) - 3) / 2)
     centre = coefficients[:, :, 0].mean(axis=0)
     model = DistortionModel(
@@ -259,21 +194,7 @@ def sky_seen(model: DistortionModel, theta: Float) -> tuple[Float, Float]:
 def stars_on_detector(
     model: DistortionModel, theta: Float, sky: Float
 ) -> tuple[Float, Float, Int, Int, Int]:
-    """Where the stars fall in all exposures.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-    sky : ndarray, shape (S, 2)
-
-    Returns
-    -------
-    x, y : ndarray, shape (N,)
-        FITS 1-based pixels.
-    exposure, chip, star : ndarray of int, shape (N,)
-        Code of the exposure, number of the chip, row of `sky`.
-    """
+    """Pixels x, y (N,) of the stars in all exposures; exposures, chip numbers, rows of `sky`."""
     columns = []
     for e in range(len(model.exposures)):
         for chip in model.chips:
@@ -287,22 +208,9 @@ def stars_on_detector(
 def pixels_of(
     model: DistortionModel, theta: Float, sky: Float, exposure: int, chip: Chip
 ) -> tuple[Float, Float, Bool]:
-    """Where stars lie on a chip, by Newton's method, and which of them it sees.
+    """Pixels x, y (S,) of stars on a chip by Newton's method, and a mask (S,) of those it sees.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-    sky : ndarray, shape (S, 2)
-    exposure : int
-        Code.
-    chip : Chip
-
-    Returns
-    -------
-    x, y : ndarray, shape (S,)
-        FITS 1-based pixels; meaningless where the star is not seen.
-    seen : ndarray of bool, shape (S,)
+    Pixels of stars that it does not see are meaningless.
     """
     basis = model.basis(chip.number)
     groups = model.groups(1, exposure=exposure, chip=chip.number)
@@ -319,7 +227,7 @@ def pixels_of(
         dy = (by_x[:, 0] * miss[:, 1] - by_x[:, 1] * miss[:, 0]) / det
         x[near] += dx
         y[near] += dy
-        # a polynomial says nothing far from the detector
+        # a polynomial is meaningless far from the detector
         inside = (np.abs(x[near] - nx / 2) < (0.5 + OUTSIDE) * nx) & (
             np.abs(y[near] - ny / 2) < (0.5 + OUTSIDE) * ny
         )

@@ -1,4 +1,4 @@
-"""Matched stars of a given distortion: what a calibration would have measured."""
+"""Simulated matches of a given distortion, as a calibration would have measured them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _AT_ONCE, _STEP = 65_536, 8192
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a simulation was made from.
+    """Truth of a simulation.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Truth:
     outlier_scale : float
         Standard deviation of false matches on each axis, or the radius of the match circle.
     false : ndarray of bool, shape (N,)
-        Which rows are false matches.
+        True for false matches.
     """
 
     model: DistortionModel
@@ -142,10 +142,10 @@ def _positions(
     exposure: NDArray[np.int64],
     chip: NDArray[np.int64],
 ) -> Float:
-    """Where stars (N,) are seen, (N, 2)."""
+    """Positions (N, 2) at which stars (N,) are seen."""
     n = len(x)
     # in steps that stay in the cache, 15 times faster at a million stars; small tables in one, for
-    # the order in which BLAS adds depends on the length, and a seed is to give what it always gave
+    # the order in which BLAS adds depends on the length, and a seed must go on giving its numbers
     step = n if n <= _AT_ONCE else _STEP
     out = np.empty((n, 2))
     for a in range(0, n, step):

@@ -1,4 +1,4 @@
-"""Dither patterns: where exposures are pointed, and how they are rolled."""
+"""Dither patterns: pointings and rolls of exposures."""
 
 from __future__ import annotations
 
@@ -17,26 +17,17 @@ __all__ = ["DitherPattern", "flat_coefficients", "grid_offsets", "rolls_in_turn"
 
 Float = NDArray[np.float64]
 
-GAP = 50.0  # pixels between chips whose places nobody gave
+GAP = 50.0  # pixels between chips without a given position
 ONE_LINE = 0.02  # of the spread along the offsets, below which that across them counts as none
 
 
 @dataclass(frozen=True, eq=False)
 class DitherPattern:
-    """Pointings and rolls of some exposures.
-
-    Parameters
-    ----------
-    name : str
-    offsets : ndarray, shape (E, 2)
-        Of the detector's middle against the first exposure, pixels along the first one's axes.
-    rolls : ndarray, shape (E,)
-        Against the first exposure, radians.
-    """
+    """Pointings and rolls of some exposures, relative to the first."""
 
     name: str
-    offsets: Float
-    rolls: Float
+    offsets: Float  # (E, 2), of the detector's middle, pixels along the first one's axes
+    rolls: Float  # (E,), radians
 
     def __len__(self) -> int:
         return len(self.offsets)
@@ -48,21 +39,13 @@ class DitherPattern:
 
     @property
     def along_one_line(self) -> bool:
-        """Whether the pointings differ, and along one line only."""
+        """True where the pointings differ, and along one line only."""
         spread = np.linalg.svd(self.offsets - self.offsets.mean(axis=0), compute_uv=False)
         return bool(spread[0] > 0 and spread[1:].max(initial=0.0) < ONE_LINE * spread[0])
 
 
 def grid_offsets(n: tuple[int, int], step: tuple[float, float]) -> Float:
-    """Offsets (n_x n_y, 2) of a regular grid, row by row from zero.
-
-    Parameters
-    ----------
-    n : tuple of int
-        Points along x and y.
-    step : tuple of float
-        Pixels.
-    """
+    """Offsets (n_x n_y, 2) of a regular grid, row by row from zero; `step` is in pixels."""
     x, y = np.meshgrid(np.arange(n[0]) * step[0], np.arange(n[1]) * step[1])
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
@@ -70,17 +53,10 @@ def grid_offsets(n: tuple[int, int], step: tuple[float, float]) -> Float:
 def rolls_in_turn(n: int, n_offsets: int, rolls: Sequence[float]) -> Float:
     """Rolls (n,) of exposures that go round some offsets: every offset meets every roll.
 
-    Parameters
-    ----------
-    n : int
-        Exposures.
-    n_offsets : int
-        After which offsets are the same again.
-    rolls : sequence of float
-        Taken in turn.
+    Offsets repeat after `n_offsets` exposures, `rolls` are taken in turn.
     """
     k = np.arange(n)
-    # where both would come round together, the rolls go one further
+    # where both would repeat together, the rolls go one further
     return np.asarray(rolls, float)[(k + k // lcm(n_offsets, len(rolls))) % len(rolls)]
 
 
@@ -89,13 +65,8 @@ def flat_coefficients(
 ) -> Float:
     """Legendre coefficients (chips, 2, K) of chips without distortion.
 
-    Parameters
-    ----------
-    order : int
-    chips : sequence of Chip
-    places : sequence of (float, float), optional
-        Where the chips' reference pixels lie, in pixels; one above the other by default, the first
-        one below, fifty pixels between them.
+    `places` are the positions of the chips' reference pixels, in pixels; by default one above the
+    other, the first one below, fifty pixels between them.
     """
     model = DistortionModel(order, tuple(chips))
     out, above = np.zeros((len(chips), 2, model.n_terms)), 0.0

@@ -16,6 +16,7 @@ from bayesdist.app.session import Session
 from bayesdist.app.sessions import own_stages, rehearse_run, session_of
 from bayesdist.app.stages import run_stage
 from bayesdist.app.stages.assess import run_assess
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
@@ -153,18 +154,18 @@ def table_errors(session: CampaignSession, truth: CampaignTruth) -> np.ndarray:
 
         follows = np.linalg.lstsq(basis.evaluate(*fine), left(*fine))[0]
         error = left(*grid) - basis.evaluate(*grid) @ follows
-        nodes, between = (
-            local[name].sigma[chip.number].reshape(-1, 2) for name in ("look-up tables", BETWEEN)
+        domain = EvaluationDomain.of_chips(
+            session.posterior.model,
+            session.config.assess.grid,
+            chips=(chip.number,),
+            epoch=session.epoch,
         )
+        nodes, between = (local[name].sigma(domain) for name in ("look-up tables", BETWEEN))
         out.append(np.stack([error, nodes, np.hypot(nodes, between)], axis=1))
     return np.array(out)
 
 
 def stated_sigma(session: Session) -> np.ndarray:
     """Standard deviations (N, 2) of all terms of the budget together, over the same grid."""
-    return np.concatenate(
-        [
-            np.column_stack([chip.total_u.ravel(), chip.total_v.ravel()])
-            for chip in budget_of(session).chips
-        ]
-    )
+    total = budget_of(session).total
+    return np.column_stack([total.u, total.v])

@@ -6,15 +6,11 @@ BAYESDIST_ADVERSARIAL names, as `python -m tests.adversarial` writes it.
 
 from __future__ import annotations
 
-import json
-import os
-from pathlib import Path
-
 import pytest
 
 from . import KINDS
 from .goals import MOST_FALSE_MET, row_of, rows_of, table_of
-from .measure import measured
+from .measure import results_of
 
 pytestmark = pytest.mark.slow
 
@@ -50,12 +46,9 @@ TOO_LITTLE = {
 
 @pytest.fixture(scope="module")
 def results(full):
-    if not full:
-        return [measured(name, seed) for name, n in REDUCED.items() for seed in range(n)]
-    kept = os.environ.get("BAYESDIST_ADVERSARIAL")
-    found = json.loads(Path(kept).read_text()) if kept else {}
-    wanted = [(name, seed) for name in KINDS for seed in range(SEEDS)]
-    return [found.get(f"{name}/{seed}") or measured(name, seed) for name, seed in wanted]
+    if full:
+        return results_of((name, seed) for name in KINDS for seed in range(SEEDS))
+    return results_of((name, seed) for name, n in REDUCED.items() for seed in range(n))
 
 
 def test_nothing_is_met_where_the_truth_misses(results, capsys):

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from tests.app.support import cli, good, one_sentence, refused, snapshot, summary_of
 
 CONFIG = "campaign_f606w.toml"
@@ -101,13 +101,13 @@ class Campaign:
     def matched(self) -> dict:
         """Section 'matching' of the summary after the first stage."""
         run = self.begun()
-        good("match", run, "-q")
+        good("stage", "match", run, "-q")
         return summary_of(run)["matching"]
 
     def unmatched(self, *words: str) -> str:
         """The first stage stops with one sentence; nothing is there that looks like a result."""
         run = self.begun()
-        result = cli("match", run, "-q")
+        result = cli("stage", "match", run, "-q")
         assert result.code == 1, result.err
         one_sentence(result.err, *words)
         assert {p.name for p in run.iterdir()} == {"config.toml", "run.json", "bayesdist.log"}

@@ -332,5 +332,5 @@ LAYOUTS = (
     Layout("savetxt.dat", commented_header, {"x": "x", "ra": "RA"}),
     Layout("sexagesimal.csv", sexagesimal, {"ra": "ra"}),
     Layout("own_names.csv", own_names, {"x": "col_px"},
-           options=("--columns", "x=col_px", "y=row_px", "ra=lon", "dec=lat", "mag=m")),
+           options=("--columns", "x=col_px,y=row_px,ra=lon,dec=lat,mag=m")),
 )  # fmt: skip

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from astropy.table import Table
 
 from bayesdist.data.rvb_files import ARRAY_SIZE
-from bayesdist.simulate import wise_solution
+from bayesdist.missions.wise.simulate import wise_solution
 from tests.app.support import write_config
 
 SIGMA = 0.1

@@ -41,10 +41,7 @@ def cli(*arguments: object) -> Result:
     """Run a command in this process."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            code = main([str(a) for a in arguments])
-        except SystemExit as stop:  # argparse: usage, --help, --version
-            code = int(stop.code or 0)
+        code = main([str(a) for a in arguments])
     return Result(code, out.getvalue(), err.getvalue())
 
 
@@ -60,7 +57,7 @@ def process(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "bayesdist", *map(str, arguments)],
         cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), *sys.path])},
         capture_output=True,
         text=True,
         check=False,
@@ -210,7 +207,7 @@ def begin_stagewise(folder: Path, config: Path, *stages: str) -> Path:
         text = text.replace(f'"{name}"', toml(str(config.parent / name)))
     (folder / "config.toml").write_text(text, encoding="utf-8")
     for stage in stages:
-        good(stage, folder)
+        good("stage", stage, folder)
     return folder
 
 

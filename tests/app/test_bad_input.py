@@ -316,9 +316,9 @@ def test_input_that_changed_since_the_run_began(begun, tmp_path, stars):
     words = ["stars.ecsv", "changed", "restore it"]
     refused(tmp_path, "run", begun / "config.toml", "-o", begun, "--resume", words=words)
     for stage in ("sample", "assess", "report"):
-        refused(tmp_path, stage, begun, words=words)
+        refused(tmp_path, "stage", stage, begun, words=words)
     (tmp_path / "job" / "stars.ecsv").unlink()
-    refused(tmp_path, "sample", begun, words=["stars.ecsv", "cannot be read"])
+    refused(tmp_path, "stage", "sample", begun, words=["stars.ecsv", "cannot be read"])
 
 
 def test_a_configuration_that_was_edited_in_the_run(begun, tmp_path):
@@ -326,22 +326,28 @@ def test_a_configuration_that_was_edited_in_the_run(begun, tmp_path):
     path = begun / "config.toml"
     text = path.read_text()
     path.write_text(text + "# a comment is no change\n")
-    good("fit", begun)
+    good("stage", "fit", begun)
     for old, new in (("[9, 7]", "[33, 17]"), ("target_ess = 100", "target_ess = 400")):
         assert old in text
         path.write_text(text.replace(old, new))
-        refused(tmp_path, "sample", begun, words=["config.toml", "edited", "restore it"])
+        refused(tmp_path, "stage", "sample", begun, words=["config.toml", "edited", "restore it"])
 
 
 def test_stages_out_of_order(begun, tmp_path):
     (tmp_path / "req.toml").write_text('[[requirement]]\nname="r"\nstatistic="p95"\nlimit=1\n')
     for stage in ("assess", "export", "report"):
-        refused(tmp_path, stage, begun, words=["needs stage 'sample'", "bayesdist sample"])
+        refused(
+            tmp_path,
+            "stage",
+            stage,
+            begun,
+            words=["needs stage 'sample'", "bayesdist stage sample"],
+        )
     # neither of these is a stage itself
     refused(tmp_path, "plan", begun, words=[": 'plan' needs stage 'sample'"])
     refused(tmp_path, "budget", begun, "--at", 1, 1, words=[": 'budget' needs stage 'sample'"])
     refused(
-        tmp_path, "validate", begun, "--requirements", tmp_path / "req.toml", words=["'sample'"]
+        tmp_path, "requirements", begun, "--requirements", tmp_path / "req.toml", words=["'sample'"]
     )
 
 
@@ -352,35 +358,35 @@ def test_a_stage_before_the_first(job, tmp_path):
     text = job.read_text().replace('"stars.ecsv"', f'"{job.parent / "stars.ecsv"}"')
     (folder / "config.toml").write_text(text)
     for stage in ("sample", "assess", "export", "report"):
-        refused(tmp_path, stage, folder, words=["needs stage 'fit'"])
+        refused(tmp_path, "stage", stage, folder, words=["needs stage 'fit'"])
     (folder / "config.toml").write_text(text.replace("order = 2", "order = 9"))
     stars = Table.read(job.parent / "stars.ecsv")[:50]
     stars.write(job.parent / "stars.ecsv", overwrite=True)
-    refused(tmp_path, "fit", folder, words=["110 parameters"])
+    refused(tmp_path, "stage", "fit", folder, words=["110 parameters"])
 
 
 @pytest.mark.parametrize("stage", ["fit", "sample", "assess", "export", "report"])
 def test_a_stage_of_what_is_no_run(tmp_path, stage):
     (tmp_path / "empty").mkdir()
     for path in (tmp_path / "empty", tmp_path / "none"):
-        refused(tmp_path, stage, path, words=[path.name, "bayesdist run"])
+        refused(tmp_path, "stage", stage, path, words=[path.name, "bayesdist run"])
 
 
 def test_damaged_files_of_a_run(begun, tmp_path):
     (begun / "run.json").write_text('{"schema": 1, "config"')
-    refused(tmp_path, "sample", begun, words=["run.json"])
+    refused(tmp_path, "stage", "sample", begun, words=["run.json"])
     refused(tmp_path, "run", begun / "config.toml", "-o", begun, "--resume", words=["run.json"])
 
 
 def test_a_damaged_fit(begun, tmp_path):
     (begun / "fit.nc").write_bytes(b"no netCDF" * 100)
-    result = cli("sample", begun, "-q")
+    result = cli("stage", "sample", begun, "-q")
     assert result.code == 1
     assert result.err.count("\n") == 1 and "fit.nc" in result.err
     (begun / "fit.nc").unlink()
-    result = cli("sample", begun, "-q")
+    result = cli("stage", "sample", begun, "-q")
     assert result.code == 1
-    one_sentence(result.err, "fit.nc", "bayesdist fit")
+    one_sentence(result.err, "fit.nc", "bayesdist stage fit")
 
 
 # -- requirements and inspection ------------------------------------------------------------------
@@ -404,7 +410,7 @@ def test_validate_with_a_wrong_file(finished, tmp_path, text, words):
     path = tmp_path / "req.toml"
     if text is not None:
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    refused(finished.path, "validate", finished.path, "--requirements", path, words=words)
+    refused(finished.path, "requirements", finished.path, "--requirements", path, words=words)
 
 
 @pytest.mark.parametrize("text", ["", "\n# nothing yet\n", "\ufeff"])
@@ -431,7 +437,7 @@ def test_what_is_no_run_points_to_the_run_within(tmp_path):
 def test_validate_of_what_is_no_run(tmp_path):
     path = tmp_path / "req.toml"
     path.write_text('[[requirement]]\nname = "r"\nstatistic = "p95"\nlimit = 1\n')
-    refused(tmp_path, "validate", tmp_path, "--requirements", path, words=["is no run"])
+    refused(tmp_path, "requirements", tmp_path, "--requirements", path, words=["is no run"])
 
 
 @pytest.mark.parametrize(
@@ -508,8 +514,10 @@ def test_simulate_and_demo_refuse(tmp_path):
         ["run", "c.toml", "-o", "r", "--resume", "--force"],
         ["run", "c.toml", "-o", "r", "--seed", "-1"],
         ["run", "c.toml", "-o", "r", "--seed", "one"],
-        ["sample", "r", "--force"],
-        ["validate", "r"],
+        ["stage", "sample", "r", "--force"],
+        ["stage", "fit", "r", "--strict"],
+        ["stage", "fitt", "r"],
+        ["requirements", "r"],
         ["simulate", "galaxy", "-o", "d"],
         ["inspect"],
     ],
@@ -518,8 +526,19 @@ def test_usage_errors_exit_2(tmp_path, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
     result = cli(*arguments)
     assert result.code == 2
-    assert result.err.startswith("usage: bayesdist") and "Traceback" not in result.err
+    assert result.err.startswith("Usage: bayesdist") and "Traceback" not in result.err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("validate", "requirements"), ("order", "select-order"), ("fit", "stage fit"),
+     ("bands", "wise bands"), ("pam", "hst pam")],
+)  # fmt: skip
+def test_an_old_name_is_refused_with_the_new_one(old, new):
+    result = cli(old, "x")
+    assert result.code == 2
+    one_sentence(result.err, repr(old), f"bayesdist {new}")
 
 
 # -- names and a process of its own ---------------------------------------------------------------
@@ -553,7 +572,7 @@ def test_the_same_from_a_shell(tmp_path, stars):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["job", "job2"]
 
     done = process("run", cwd=tmp_path)
-    assert done.returncode == 2 and done.stderr.startswith("usage")
+    assert done.returncode == 2 and done.stderr.startswith("Usage")
 
 
 # -- frames of the exposures ----------------------------------------------------------------------

@@ -181,7 +181,7 @@ def test_a_part_that_is_damaged_between_two_stages(job, tmp_path):
     """The hash of the input is looked at first; the run stays as it was."""
     run = begin_stagewise_here(job, tmp_path)
     _flip(job.parent / "stars" / "b.parquet", 6, 3)
-    refused(tmp_path, "sample", run, words=["b.parquet", "changed since the run began"])
+    refused(tmp_path, "stage", "sample", run, words=["b.parquet", "changed since the run began"])
 
 
 def test_a_part_that_is_damaged_while_it_is_read(job, tmp_path, monkeypatch):
@@ -222,14 +222,14 @@ def test_a_part_that_vanishes_before_it_is_written_about(job, tmp_path, monkeypa
 
     monkeypatch.setattr("bayesdist.data.partitioned.PIECE", PART)
     monkeypatch.setattr(star_files, "_write_part", vanish)
-    result = cli("sample", run, "-q")
+    result = cli("stage", "sample", run, "-q")
     assert result.code == 1
     one_sentence(result.err, "b.parquet", "does not exist")
     assert [p.name for p in (run / "stars").iterdir()] == ["part-00000.parquet"]
     assert "sample" not in (run / "run.json").read_text().split('"stages"')[1]
     monkeypatch.setattr(star_files, "_write_part", real)
     shutil.move(kept, path)
-    good("sample", run)
+    good("stage", "sample", run)
     parts = [pq.read_table(p) for p in sorted((run / "stars").iterdir())]
     assert sum(map(len, parts)) == N
 

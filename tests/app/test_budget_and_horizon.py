@@ -146,7 +146,7 @@ def test_the_horizon_is_said_written_and_drawn(run):
         req.write_text(
             f'[[requirement]]\nname = "edge"\nstatistic = "max"\nlimit = 0.02\nepoch = {epoch}\n'
         )
-        out = cli("validate", run, "--requirements", req, "-q")
+        out = cli("requirements", run, "--requirements", req, "-q")
         assert out.code == (0 if verdict == "met" else 4)
         assert verdict in out.out
 
@@ -156,8 +156,8 @@ def test_a_plan_says_what_more_exposures_do_not_make_smaller(run):
     req.write_text(
         '[[requirement]]\nname = "late"\nstatistic = "max"\nlimit = 0.02\nepoch = 2025.0\n'
     )
-    cli("validate", run, "--requirements", req, "-q")
-    text = good("plan", run, "--epochs", 2009.0, 2013.0, 2020.0).out
+    cli("requirements", run, "--requirements", req, "-q")
+    text = good("plan", run, "--epochs", "2009,2013,2020").out
     # a bend of the drift is no smaller for more exposures of one date
     still = "4096 exposures would still miss the limit"
     assert f"at 2020.00: {still}" in text and f"at 2013.00: {still}" in text
@@ -200,9 +200,9 @@ def test_errors_larger_than_the_residuals_are_told_by_assess(run, tmp_path, monk
     folder = too_large(run, tmp_path / "run").parent
     with monkeypatch.context() as patch:
         patch.setattr("bayesdist.app.stages._check_residuals", lambda *_: None)
-        good("fit", folder, "-q")
+        good("stage", "fit", folder, "-q")
     for stage in ("sample", "assess"):
-        good(stage, folder, "-q")
+        good("stage", stage, folder, "-q")
     [told] = [
         w for w in json.loads((folder / "summary.json").read_text())["warnings"] if "'catal" in w
     ]

@@ -9,14 +9,14 @@ from astropy.table import Table
 from bayesdist.app.campaign import series
 from bayesdist.app.campaign.table_file import read_tables
 from bayesdist.data import read_exposures, read_matches
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid
 from bayesdist.infer.nodes.sums import interpolation
 from bayesdist.infer.transforms import reference_gauge, segment, without_frames
+from bayesdist.missions.acs.simulate import read_acs
 from bayesdist.model import corrected
 from bayesdist.products import read_d2im, read_idctab
-from bayesdist.simulate.acs import read_acs
 from tests.app.support import cli, good, one_sentence, snapshot, summary_of
 
 # ACS ISR 2015-06, Tables 1 to 3: chip, segment (RDATE 2004.5, 2012.5), alpha, beta
@@ -147,8 +147,8 @@ def test_each_period_has_its_table_and_both_are_the_model(run):
 def test_a_stage_can_be_run_again(run):
     of_these_stages = ("matching", "tables", "scatter", "fit")
     before = {key: summary_of(run)[key] for key in of_these_stages}
-    good("match", run, "-q")
-    good("fit", run, "-q")
+    good("stage", "match", run, "-q")
+    good("stage", "fit", run, "-q")
     assert {key: summary_of(run)[key] for key in of_these_stages} == before
 
 

@@ -15,7 +15,7 @@ from bayesdist.app.campaign.soundness import frames_not_set, shear_doubts
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
 from bayesdist.data import MatchTable
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import fit_linear, load_fit
 from bayesdist.model import Chip, DistortionModel
@@ -130,7 +130,7 @@ def test_an_exposure_with_one_chip_serves_for_that_one(campaign, folder, name, m
     row = rows[rows["exposure"] == name][0]
     assert row[f"chip {missing}"] == 0 < row[f"chip {3 - missing}"]
     assert row["completeness"] > 0.9  # of the chip that is there
-    good("fit", run, "-q")
+    good("stage", "fit", run, "-q")
     fit = load_fit(run / "fit.nc")
     assert set(fit.model.exposures) == set(rows["exposure"])
     assert np.isfinite(fit.mean).all() and np.isfinite(fit.cov).all()
@@ -319,8 +319,8 @@ def test_pixels_that_count_from_elsewhere_give_the_same_positions(campaign, fold
     fits_ = []
     for one in (other, campaign):
         run = one.begun()
-        good("match", run, "-q")
-        good("fit", run, "-q")
+        good("stage", "match", run, "-q")
+        good("stage", "fit", run, "-q")
         fits_.append(load_fit(run / "fit.nc"))
     x, y = np.random.default_rng(1).uniform((1, 1), (4096, 2048), (300, 2)).T
     where = {"chip": 1, "epoch": np.full(300, 2011.0), "exposure": np.full(300, 5)}
@@ -408,7 +408,7 @@ def test_a_catalogue_without_motions_that_stars_outrun(campaign):
     """Over twelve years 0.01 px/yr are far more than centroids."""
     names = ["pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"]
     campaign.catalog(lambda t: t.remove_columns(names)).matched()
-    result = cli("fit", campaign.path.parent / "run", "-q")
+    result = cli("stage", "fit", campaign.path.parent / "run", "-q")
     assert result.code == 1
     words = ["catalog.ecsv: has no proper motions", "11.6 years", "scatter by", "pm_u and pm_v"]
     one_sentence(result.err, *words)
@@ -531,7 +531,7 @@ def test_a_chip_that_lies_elsewhere_in_one_exposure_is_named(campaign):
 @pytest.mark.parametrize("what", ["list", "log", "catalogue", "start", "another list"])
 def test_resuming_after_the_input_changed(campaign, what):
     run = campaign.begun()
-    good("match", run, "-q")
+    good("stage", "match", run, "-q")
     path = campaign.path
     if what == "list":
         campaign.lists(lambda t: t[::2], ONE)
@@ -546,15 +546,15 @@ def test_resuming_after_the_input_changed(campaign, what):
     words = ["changed since the run began", "--force"]
     config = run / "config.toml"
     refused(path.parent, "run", config, "-o", run, "--resume", words=words)
-    refused(path.parent, "fit", run, words=words)
+    refused(path.parent, "stage", "fit", run, words=words)
 
 
 def test_resuming_after_a_list_was_removed(campaign):
     run = campaign.begun()
-    good("match", run, "-q")
+    good("stage", "match", run, "-q")
     (campaign.path / "lists" / f"{ONE}.parquet").unlink()
     words = [f"{ONE}.parquet", "changed since the run began"]
-    refused(campaign.path.parent, "fit", run, words=words)
+    refused(campaign.path.parent, "stage", "fit", run, words=words)
 
 
 # -- to the end -----------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.assess import _assess_holdout
 from bayesdist.data import read_matches
-from bayesdist.data.tables import read_table
+from bayesdist.data.tables.files import read_table
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 
 N, LATER = 14, 3  # exposures, and how many of them the release does not see
@@ -24,7 +24,7 @@ HOLDOUT = "[holdout]\nfraction = 0.2\nexposures = 2\n"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign") / "acs"
-    options = ("--exposures", N, "--stars", 5000, "--seed", 11, "--smooth", "-q")
+    options = ("--exposures", N, "--stars", 5000, "--seed", 11, "--no-tables", "-q")
     good("simulate", "acs", "-o", folder, *options)
     return folder
 
@@ -68,7 +68,7 @@ def begin(folder: Path, run: Path, names: list[str], *, holdout: str = "", drift
 def run(folder):
     run = begin(folder, folder.parent / "release", parts(folder)[0], holdout=HOLDOUT)
     for stage in ("match", "fit", "sample"):
-        good(stage, run, "-q")
+        good("stage", stage, run, "-q")
     session = CampaignSession(RunDirectory.open(run))
     _assess_holdout(session)
     session.close()
@@ -79,7 +79,7 @@ def run(folder):
 def later(folder):
     """The run of the later exposures, of which the first stage is done."""
     later = begin(folder, folder.parent / "later", parts(folder)[1], drift=False)
-    good("match", later, "-q")
+    good("stage", "match", later, "-q")
     return later
 
 
@@ -120,7 +120,7 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path) -> None:
     stars["x"] = stars["x"] + 0.3 * ((stars["x"] - 2048) / 2048) ** 2
     stars.write(path, overwrite=True)
     new = begin(bent, tmp_path / "run", parts(folder)[0], holdout=HOLDOUT)
-    good("match", new, "-q")
+    good("stage", "match", new, "-q")
     # the fit has not seen it: it is that of the good run
     shutil.copytree(new / "pairs", tmp_path / "other" / "pairs")
     for one in run.iterdir():
@@ -173,7 +173,7 @@ def test_what_cannot_be_held_out_or_monitored_is_refused(run, folder, tmp_path) 
         ("fraction = 0.001", "holdout.fraction"),
     ):
         bad = begin(folder, tmp_path / word, names, holdout=f"[holdout]\n{holdout}\n")
-        result = cli("match", bad, "-q")
+        result = cli("stage", "match", bad, "-q")
         assert result.code == 1
         one_sentence(result.err, word)
     alone = tmp_path / "alone"

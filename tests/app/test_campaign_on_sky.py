@@ -206,7 +206,7 @@ def staged(config: Path, *stages: str) -> Path:
     run.mkdir()
     (run / "config.toml").write_text(in_place(config), encoding="utf-8")
     for stage in stages:
-        good(stage, run, "-q")
+        good("stage", stage, run, "-q")
     return run
 
 
@@ -288,7 +288,7 @@ def test_a_parity_that_is_given_is_the_only_one(tmp_path):
     folder = config.parent / "run"
     folder.mkdir()
     (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
-    result = cli("match", folder, "-q")
+    result = cli("stage", "match", folder, "-q")
     assert result.code == 1
     one_sentence(result.err, "its mirror image does match", "campaign.parity = 'direct'")
 
@@ -304,7 +304,7 @@ def test_another_field_is_refused_in_both_parities(tmp_path):
     folder = config.parent / "run"
     folder.mkdir()
     (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
-    result = cli("match", folder, "-q")
+    result = cli("stage", "match", folder, "-q")
     assert result.code == 1
     one_sentence(result.err, "does not match", "the mirror image does not match either")
     assert "parity" not in result.err  # both were tried
@@ -376,7 +376,7 @@ def test_a_catalogue_without_units_gets_its_unit_from_the_configuration(tmp_path
     folder = config.parent / "run"
     folder.mkdir()
     (folder / "config.toml").write_text(in_place(config), encoding="utf-8")
-    result = cli("match", folder, "-q")
+    result = cli("stage", "match", folder, "-q")
     assert result.code == 1
     one_sentence(result.err, "its mirror image does match", "campaign.parity = 'mirrored'")
     config = write(tmp_path / "all", -1, change=on_a_plane(unit), unit=unit, parity="mirrored")

@@ -18,6 +18,7 @@ from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.release import _require_alike
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
@@ -25,13 +26,13 @@ from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.series import Series
 from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, without_frames
+from bayesdist.missions.acs.simulate import acs_solution, making, read_acs, simulate_acs
 from bayesdist.model import LookupTable, TimeDependence, corrected
 from bayesdist.products import (
     read_d2im,
     read_idctab,
     read_lookup_file,
 )
-from bayesdist.simulate.acs import acs_solution, making, read_acs, simulate_acs
 from tests.app.support import cli, good, one_sentence, snapshot
 from tests.infer.small_campaign import Truth
 from tests.products.acs_offline import Pointing, to_sky
@@ -51,10 +52,8 @@ INPUTS = ("catalog.parquet", "exposures.ecsv", "start_idc.fits", "lists", "run_f
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("filters") / "acs"
-    good(
-        *("simulate", "acs", "-o", folder, "--exposures", 14, "--other", 8, "--stars", 6000),
-        *("--filters", "F606W,F814W", "--seed", 5, "-q"),
-    )
+    options = ("--exposures", 14, "--secondary-exposures", 8, "--stars", 6000, "--seed", 5, "-q")
+    good("simulate", "acs", "-o", folder, "--filters", "F606W,F814W", *options)
     return folder
 
 
@@ -74,7 +73,7 @@ def calibrated(run, text: str, *stages: str):
     run.mkdir()
     (run / "config.toml").write_text(text, encoding="utf-8")
     for stage in stages:
-        good(stage, run, "-q")
+        good("stage", stage, run, "-q")
     return run
 
 
@@ -126,7 +125,10 @@ def test_the_error_of_the_held_tables_stays_in_the_budget(sessions):
             *(np.linspace(1, n, m) for n, m in zip(chip.size, (33, 17), strict=True))
         )
         held = held_sigma(other.tables, x.ravel(), y.ravel(), chip=chip.number)
-        sigma = term.sigma[chip.number].reshape(-1, 2)
+        domain = EvaluationDomain.of_chips(
+            other.posterior.model, (33, 17), chips=(chip.number,), epoch=other.epoch
+        )
+        sigma = term.sigma(domain)
         # a pixel is 1 px of (u, v) but for some per cent of scale
         assert (sigma > 0.9 * held).all() and (held > 0).all()
 
@@ -273,7 +275,7 @@ def test_stwcs_sees_our_model_and_the_true_sky(
         D = model.jacobian(turned.mean, x, y, epoch=epoch, chip=chip)
         D = D - model.jacobian(turned.mean, 2048.0, 1024.0, **middle)
         variance = 1e6 * np.einsum("nap,pq,naq->n", D, turned.cov, D, optimize=True)
-        tables = 50.0**2 * (term.sigma[chip] ** 2).sum(axis=2).mean()
+        tables = 50.0**2 * (term.tables[chip].values ** 2).sum(axis=0).mean()
         unresolved = 50.0**2 * (beyond_nodes(truth.tables, chip, filter) ** 2).sum(axis=1).mean()
         stated = np.sqrt(variance.mean() + tables + unresolved)
         assert 0.4 * stated < np.sqrt((away**2).mean()) < 1.4 * stated
@@ -377,8 +379,8 @@ def test_a_run_that_has_not_converged(runs, tmp_path, monkeypatch):
         return replace(posterior, convergence=poor)
 
     monkeypatch.setattr(bayesdist.app.session, "load_posterior", doubtful)
-    refused(tmp_path, runs["F606W"], words=["R-hat 1.3", "--force"])
-    good("release", runs["F606W"], "-o", tmp_path / "out", "--force", "-q")
+    refused(tmp_path, runs["F606W"], words=["R-hat 1.3", "--allow-unconverged"])
+    good("release", runs["F606W"], "-o", tmp_path / "out", "--allow-unconverged", "-q")
     for path in sorted((tmp_path / "out").glob("*.fits")):
         header = read_lookup_file(path).header if "d2i" in path.name else read_idctab(path).header
         assert "NOT CONVERGED" in " ".join(map(str, header["HISTORY"]))

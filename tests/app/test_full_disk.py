@@ -110,7 +110,7 @@ def test_while_the_posterior_is_written(job, undisturbed, disk, no_report):
     shutil.copytree(undisturbed, path, ignore=shutil.ignore_patterns("posterior.nc"))
     before = snapshot(path)
     disk.leave(300_000)  # room for notes, not for the draws
-    _refused("sample", path, words=("posterior.nc",))
+    _refused("stage", "sample", path, words=("posterior.nc",))
     after = snapshot(path)
     assert {k: v for k, v in after.items() if k.startswith("chain-")} == {
         k: v for k, v in before.items() if k.startswith("chain-")

@@ -104,7 +104,7 @@ def test_parts_of_a_table_are_not_exposures_but_files_are(arcsec):
         assert "2 exposure(s)" in good("check", config).out
     # a part that comes later is a change of the input
     whole[:1].write(folder / "parts" / "c.parquet")
-    result = cli("assess", other)
+    result = cli("stage", "assess", other)
     assert result.code == 1 and "c.parquet" in result.err and "changed" in result.err
 
 
@@ -288,8 +288,8 @@ def test_errors_by_magnitude(tmp_path):
     true = quoted(np.asarray(errors["mag"]))[0]
     np.testing.assert_allclose(errors["sigma_u"], true, rtol=0.25)
     np.testing.assert_allclose(errors["sigma_v"], true, rtol=0.25)
-    good("sample", run)
-    good("assess", run)
+    good("stage", "sample", run)
+    good("stage", "assess", run)
     posterior = load_posterior(run)
     assert posterior.n_stars == n
     assert 0.01 < posterior.n_flagged / n < 0.03

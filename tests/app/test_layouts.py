@@ -92,7 +92,7 @@ def test_init_names_integer_columns_that_may_be_chips(tmp_path):
     assert 'column amplifier has 4 values; if these are chips, add chip = "amplifier"' in text
     assert "column flags" not in text and "column number" not in text
     good("init", tmp_path / "b.toml", "--matches", tmp_path / "s.csv", "--columns",
-         "chip=amplifier", "mag=", "--size", 2048, 1024)  # fmt: skip
+         "chip=amplifier,mag=", "--size", 2048, 1024)  # fmt: skip
     config = tomllib.loads((tmp_path / "b.toml").read_text())
     assert config["data"]["columns"]["chip"] == "amplifier"
     assert config["data"]["columns"]["mag"] == ""
@@ -164,7 +164,7 @@ def test_a_run_tells_in_its_log_that_positions_were_moved(tmp_path):
     run.mkdir()
     text = config.read_text().replace('"gaia.csv"', f'"{tmp_path / "gaia.csv"}"')
     (run / "config.toml").write_text(text)
-    good("fit", run)
+    good("stage", "fit", run)
     log = (run / "bayesdist.log").read_text()
     assert "positions of 2016.00 were moved to 2006.10" in log
     assert "go with the proper motions" not in log

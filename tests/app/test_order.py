@@ -1,4 +1,4 @@
-"""`bayesdist order`: the order that the data were made with, from whatever a run would read."""
+"""`bayesdist select-order`: the order that the data were made with, from what a run would read."""
 
 from __future__ import annotations
 
@@ -28,7 +28,15 @@ def job(tmp_path_factory):
     folder = tmp_path_factory.mktemp("order")
     config = write_job(folder, as_table(matches), model={"order": 3})
     result = good(
-        "order", config, "--orders", 1, 4, "-o", folder / "o.ecsv", "--figure", folder / "o.png"
+        "select-order",
+        config,
+        "--orders",
+        1,
+        4,
+        "-o",
+        folder / "o.ecsv",
+        "--figure",
+        folder / "o.png",
     )
     return matches, folder, config, result
 
@@ -78,7 +86,7 @@ def test_the_configured_order_does_not_matter(job, tmp_path):
     matches, folder, _, _ = job
     table = Table.read(folder / "o.ecsv")
     config = write_job(tmp_path, as_table(matches), model={"order": 1}, fit={"radial_weight": 10.0})
-    good("order", config, "--orders", 1, 4, "-o", tmp_path / "o.ecsv")
+    good("select-order", config, "--orders", 1, 4, "-o", tmp_path / "o.ecsv")
     again = Table.read(tmp_path / "o.ecsv")
     for name in table.colnames:
         np.testing.assert_array_equal(table[name], again[name])
@@ -90,7 +98,7 @@ def test_files_on_disk_give_the_same(job, tmp_path, monkeypatch):
     parts = [matches.select(np.arange(a, b)) for a, b in ((0, 7000), (7000, 20_000))]
     write_partitioned(parts, tmp_path / "stars")
     config = write_config(tmp_path / "config.toml", data={"matches": "stars"})
-    good("order", config, "--orders", 1, 4, "-o", tmp_path / "o.ecsv")
+    good("select-order", config, "--orders", 1, 4, "-o", tmp_path / "o.ecsv")
     table, again = Table.read(folder / "o.ecsv"), Table.read(tmp_path / "o.ecsv")
     for name in ("rms_u", "rms_v", "F", "stars", "regions"):
         np.testing.assert_allclose(table[name], again[name], rtol=1e-6)
@@ -105,7 +113,7 @@ def test_errors_by_magnitude_are_found_on_the_way(tmp_path):
         tmp_path, table, data={"matches": "stars.ecsv", "sigma": "by_magnitude"},
         model={"order": 1},
     )  # fmt: skip
-    good("order", config, "--orders", 1, 4, "-o", tmp_path / "o.ecsv")
+    good("select-order", config, "--orders", 1, 4, "-o", tmp_path / "o.ecsv")
     out = Table.read(tmp_path / "o.ecsv")
     assert out.meta["order"] == 2
     # scatter of the highest order, which describes the pairs: errors are right as they are
@@ -120,7 +128,7 @@ def test_an_order_that_cannot_be_fitted_is_a_row_that_says_so(tmp_path):
     table = Table({"x": x, "y": y, "u": u, "v": v, "su": np.full(50, 0.1), "sv": np.full(50, 0.1)})
     table["u"].unit = table["v"].unit = table["su"].unit = table["sv"].unit = "pix"
     config = write_job(tmp_path, table, model={"order": 2})
-    out = good("order", config, "--orders", 1, 9, "-o", tmp_path / "o.ecsv").out
+    out = good("select-order", config, "--orders", 1, 9, "-o", tmp_path / "o.ecsv").out
     assert "order 9 is not fitted: " in out and "50 stars give 100 numbers" in out
     found = Table.read(tmp_path / "o.ecsv")
     assert list(found["order"]) == list(range(1, 10)) and found["terms"][-1] == 55
@@ -130,10 +138,25 @@ def test_an_order_that_cannot_be_fitted_is_a_row_that_says_so(tmp_path):
 
 def test_wrong_requests_are_refused(job, tmp_path):
     _, folder, config, _ = job
-    refused(folder, "order", config, "-o", folder / "o.ecsv", words=("this file exists", "--force"))
-    refused(folder, "order", config, "--figure", folder / "o.png", words=("o.png",))
+    refused(
+        folder,
+        "select-order",
+        config,
+        "-o",
+        folder / "o.ecsv",
+        words=("this file exists", "--force"),
+    )
+    refused(folder, "select-order", config, "--figure", folder / "o.png", words=("o.png",))
     for low, high in ((3, 3), (5, 3), (0, 4), (3, 10)):
-        refused(folder, "order", config, "--orders", low, high, words=(f"go from {low} to {high}",))
+        refused(
+            folder,
+            "select-order",
+            config,
+            "--orders",
+            low,
+            high,
+            words=(f"go from {low} to {high}",),
+        )
     frames = write_job(tmp_path, model={"order": 2, "frames": "shift"})
-    refused(tmp_path, "order", frames, words=("one chip, without frames",))
-    refused(tmp_path, "order", tmp_path / "none.toml", words=("none.toml",))
+    refused(tmp_path, "select-order", frames, words=("one chip, without frames",))
+    refused(tmp_path, "select-order", tmp_path / "none.toml", words=("none.toml",))

@@ -227,7 +227,7 @@ def test_the_report_shows_it(moved, tmp_path):
     assert (run / "figures" / "period_differences.png").exists()
     # the stage by itself reads the pairs again, and says the same
     shutil.copytree(run, tmp_path / "again")
-    good("report", tmp_path / "again")
+    good("stage", "report", tmp_path / "again")
     again = lxml_html.parse(tmp_path / "again" / "report.html").getroot()
     assert again.get_element_by_id("periods").text_content() == text
 
@@ -358,7 +358,7 @@ def test_a_period_with_too_few_pairs_is_named(tmp_path, kept, words):
     matches = matches.select(np.setdiff1d(np.arange(3000), few))
     config = job(tmp_path / "input", matches)
     run = begin_stagewise(tmp_path / "run", config, "fit", "sample")
-    result = cli("assess", run, "-q")
+    result = cli("stage", "assess", run, "-q")
     assert result.code == 1
     one_sentence(result.err, *words)
     assert not (run / "periods.ecsv").exists()

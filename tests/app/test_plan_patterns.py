@@ -1,4 +1,4 @@
-"""`bayesdist plan PATTERNS.toml`: the files it writes, what it refuses, and its documentation."""
+"""`bayesdist plan-dither`: the files it writes, what it refuses, and its documentation."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def job(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plan")
     file = folder / "patterns.toml"
     file.write_text(SMALL, encoding="utf-8")
-    return file, folder / "out", good("plan", file, "-o", folder / "out").out
+    return file, folder / "out", good("plan-dither", file, "-o", folder / "out").out
 
 
 def _constant(text):
@@ -94,10 +94,10 @@ def test_files_say_the_same_as_the_screen(job):
 
 def test_the_same_seed_gives_the_same_plan(job, tmp_path):
     file, _, printed = job
-    assert good("plan", file).out == printed
+    assert good("plan-dither", file).out == printed
     other = tmp_path / "other.toml"
     other.write_text(SMALL.replace("[stars]", "[stars]\nseed = 2"), "utf-8")
-    assert good("plan", other).out != printed
+    assert good("plan-dither", other).out != printed
 
 
 def test_generated_patterns_are_what_the_file_says(tmp_path):
@@ -165,13 +165,13 @@ def test_wrong_input_is_said_in_one_sentence(old, new, words, tmp_path):
     assert old in SMALL
     file = tmp_path / "patterns.toml"
     file.write_text(SMALL.replace(old, new), encoding="utf-8")
-    refused(tmp_path, "plan", file, "-o", tmp_path / "out", words=words)
+    refused(tmp_path, "plan-dither", file, "-o", tmp_path / "out", words=words)
 
 
 def test_no_pattern_at_all(tmp_path):
     file = tmp_path / "patterns.toml"
     file.write_text(SMALL.partition("[[pattern]]")[0], encoding="utf-8")
-    refused(tmp_path, "plan", file, words=["there is no pattern", "[[pattern]]"])
+    refused(tmp_path, "plan-dither", file, words=["there is no pattern", "[[pattern]]"])
 
 
 def test_chips_have_places_all_or_none(tmp_path):
@@ -185,7 +185,7 @@ def test_chips_have_places_all_or_none(tmp_path):
         file.write_text(start[0] + chips + start[1] + start[2], encoding="utf-8")
 
     write("", "place = [600, 0]")
-    refused(tmp_path, "plan", file, words=["some [[chip]] blocks have a place"])
+    refused(tmp_path, "plan-dither", file, words=["some [[chip]] blocks have a place"])
     write("place = [0, 0]", "place = [600, 0]")
     camera = load_plan(file).camera()
     assert camera.side == pytest.approx(512, abs=1)
@@ -193,12 +193,11 @@ def test_chips_have_places_all_or_none(tmp_path):
     assert load_plan(file).camera().side == pytest.approx(512, abs=1)
 
 
-def test_options_of_the_other_plan_are_refused(job, tmp_path):
+def test_what_cannot_be_planned_is_refused(job, tmp_path):
     file, out, _ = job
-    refused(tmp_path, "plan", file, "--epochs", 2010.0, words=["--epochs", "patterns.toml"])
-    refused(tmp_path, "plan", tmp_path, "-o", tmp_path / "x", words=["leave -o out"])
-    refused(out, "plan", file, "-o", out, words=["holds other files"])
-    refused(tmp_path, "plan", tmp_path / "none.toml", words=["cannot be read"])
+    refused(tmp_path, "plan", file, words=["not a run", "bayesdist plan-dither"])
+    refused(out, "plan-dither", file, "-o", out, words=["holds other files"])
+    refused(tmp_path, "plan-dither", tmp_path / "none.toml", words=["cannot be read"])
 
 
 def test_the_page_documents_every_key_and_its_example_is_sound(tmp_path):

@@ -115,11 +115,11 @@ def test_the_inverse_row_is_what_astropy_leaves(run):
 def test_forward_it_is_exact_at_its_own_date_and_lacks_the_drift_at_others(run, session):
     row = rows_of(run)["sip.hdr, forward"]
     assert row["radial"] < 1e-10
-    [term] = [t for t in products_of(session) if t.name == "sip.hdr, forward"]
+    [term] = [t for t in products_of(session) if t.row.name == "sip.hdr, forward"]
     x, y = np.array([1.0, 300.0, 512.0]), np.array([200.0, 7.0, 256.0])
     solution = session.solution
     at = [solution.model.predict(solution.mean, x, y, epoch=t) for t in (2008.0, 2016.5)]
-    np.testing.assert_allclose(term.at(x, y, 1, 2016.5), at[0] - at[1], atol=1e-10)
+    np.testing.assert_allclose(term.shift(x, y, 1, 2016.5), at[0] - at[1], atol=1e-10)
     assert np.abs(at[0] - at[1]).max() > 0.02
     text = good("budget", run, "--at", 512, 256, "--epoch", 2016.5).out
     assert "sip.hdr, forward" in text and "in no total" in text

@@ -42,7 +42,7 @@ def run(tmp_path_factory):
 def validated(run, text, code):
     path = run.parent / "req.toml"
     path.write_text(text)
-    assert main(["validate", str(run), "--requirements", str(path), "-q"]) == code
+    assert main(["requirements", str(run), "--requirements", str(path), "-q"]) == code
     return json.loads((run / "summary.json").read_text())["margins"]
 
 
@@ -71,7 +71,7 @@ def test_scopes_are_judged_and_kept(run, capsys):
 
 def test_the_report_judges_them_again_as_they_were_asked(run):
     before = validated(run, SCOPED, 4)
-    assert main(["report", str(run), "-q"]) == 0
+    assert main(["stage", "report", str(run), "-q"]) == 0
     text = (run / "report.html").read_text()
     assert "between two positions up to 200 px apart" in text
     assert "fell from" in text or "no term can do it alone" in text
@@ -93,7 +93,7 @@ def test_scopes_that_cannot_be_judged_are_refused_in_one_sentence(run, line, mes
     before = (run / "margins.ecsv").read_bytes()
     path = run.parent / "bad.toml"
     path.write_text(text)
-    assert main(["validate", str(run), "--requirements", str(path), "-q"]) == 1
+    assert main(["requirements", str(run), "--requirements", str(path), "-q"]) == 1
     said = capsys.readouterr().err
     assert message in said and f"{path}: requirement 'r'" in said
     assert said.count("\n") == 1

@@ -28,7 +28,7 @@ from bayesdist.app.stages.report import title_of
 from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
-from bayesdist.infer import load_fit, load_posterior, outlier_probability, residuals
+from bayesdist.infer import load_fit, load_posterior, memberships, residuals
 from tests.app.support import (
     SIZE,
     begin_stagewise,
@@ -186,7 +186,7 @@ def test_the_summary_counts_what_there_is(finished, posterior, matches):
     r = residuals(fit, matches)[used, 0]
     assert s["fit"]["rms_u"] == pytest.approx(np.sqrt(np.mean(r**2)))
     assert s["outliers"]["fraction"]["mean"] == pytest.approx(posterior.hyper["f"].mean())
-    flagged = outlier_probability(posterior, matches) > 0.5
+    flagged = memberships(posterior, matches).outlier_probability > 0.5
     assert s["outliers"]["n_flagged"] == posterior.n_flagged == flagged.sum()
     assert s["sampler"]["converged"] is True
 
@@ -200,7 +200,7 @@ def test_the_posterior_finds_the_truth(finished, posterior, matches):
         chi2 += ((values.mean() - getattr(finished.truth, true)) / values.std()) ** 2
     assert chi2 < 45.0
     false = finished.truth.false
-    flagged = outlier_probability(posterior, matches) > 0.5
+    flagged = memberships(posterior, matches).outlier_probability > 0.5
     assert (flagged & false).sum() > 0.7 * false.sum()  # those within 2 sigma look like true ones
     assert (flagged & ~false).sum() <= 2
 
@@ -392,16 +392,16 @@ def test_a_stage_after_a_run_by_relative_paths(tmp_path, monkeypatch):
     text = config.read_text().replace('"stars.ecsv"', '"../stars.ecsv"')
     (run / "config.toml").write_text(text)
     monkeypatch.chdir(config.parent)
-    good("fit", "run")
+    good("stage", "fit", "run")
     monkeypatch.chdir("/")
-    good("sample", run)
+    good("stage", "sample", run)
 
 
 def test_each_stage_by_itself_gives_the_same_numbers(copy, posterior):
     before, tables = summary_of(copy), _tables(copy)
     maps = fits.getdata(copy / "maps.fits", "MIX_CORR")
     for stage in ("fit", "sample", "assess", "export"):
-        good(stage, copy)
+        good("stage", stage, copy)
         after = summary_of(copy)
         for section in ("data", "fit", "outliers", "map", "budget", "margins", "products"):
             assert after[section] == before[section], (stage, section)
@@ -415,7 +415,7 @@ def test_each_stage_by_itself_gives_the_same_numbers(copy, posterior):
 def test_without_its_checkpoints_it_samples_the_same_again(copy, posterior):
     for path in copy.glob("chain-*.h5"):
         path.unlink()
-    good("sample", copy)
+    good("stage", "sample", copy)
     again = load_posterior(copy)
     np.testing.assert_array_equal(again.theta, posterior.theta)
     np.testing.assert_array_equal(again.log_prob, posterior.log_prob)
@@ -515,8 +515,8 @@ def test_max_steps_is_a_total(unconverged, finished):
     result = cli("run", config, "-o", run, "--resume", "--strict")
     assert result.code == 3
     assert load_posterior(run).sampler.steps == 20
-    assert cli("sample", run, "--strict").code == 3
-    assert cli("sample", run).code == 0
+    assert cli("stage", "sample", run, "--strict").code == 3
+    assert cli("stage", "sample", run).code == 0
     assert load_posterior(run).sampler.steps == 20
 
 
@@ -554,7 +554,7 @@ def test_figures_are_listed_once_they_are_there(copy, monkeypatch):
 
     monkeypatch.setattr("bayesdist.report.drawing.save_drawings", full)
     before = summary_of(copy)["figures"]
-    assert cli("report", copy).code == 1
+    assert cli("stage", "report", copy).code == 1
     assert summary_of(copy)["figures"] == before
     for name in before:
         assert (copy / "figures" / name).exists()
@@ -572,12 +572,12 @@ def test_validate_replaces_the_margins(copy, tmp_path):
     loose = {"name": "new", "statistic": "u_rms", "limit": 0.5, "probability": 0.9}
     tight = {"name": "tight", "statistic": "v_max", "limit": 1e-5}
     before = summary_of(copy)
-    result = cli("validate", copy, "--requirements", _requirements(tmp_path / "a.toml", loose))
+    result = cli("requirements", copy, "--requirements", _requirements(tmp_path / "a.toml", loose))
     assert result.code == 0 and "new" in result.out
     assert [m["name"] for m in summary_of(copy)["margins"]] == ["new"]
     assert list(Table.read(copy / "margins.ecsv")["name"]) == ["new"]
     both = _requirements(tmp_path / "b.toml", loose, tight)
-    result = cli("validate", copy, "--requirements", both)
+    result = cli("requirements", copy, "--requirements", both)
     assert result.code == 4 and "tight: missed" in result.out and result.err == ""
     after = summary_of(copy)
     assert [m["verdict"] for m in after["margins"]] == ["met", "missed"]
@@ -590,20 +590,19 @@ def test_a_report_of_earlier_margins_is_told_and_renewed(copy, finished, tmp_pat
     """It is not done any more, so that --resume makes it anew as well as `report`."""
     blocks = tomllib.loads(finished.config.read_text(encoding="utf-8"))["requirement"]
     again = _requirements(tmp_path / "same.toml", *blocks)
-    assert "renew it" not in cli("validate", copy, "--requirements", again).out
+    assert "renew it" not in cli("requirements", copy, "--requirements", again).out
     assert "report" in json.loads((copy / "run.json").read_text())["stages"]
     new = {"name": "brand new", "statistic": "u_rms", "limit": 0.5, "region": "inner 80 %"}
     path = _requirements(tmp_path / "new.toml", new)
     for _ in range(2):
-        result = cli("validate", copy, "--requirements", path)
-        line = (
-            f"{copy / 'report.html'} shows earlier margins; renew it by 'bayesdist report {copy}'"
-        )
+        result = cli("requirements", copy, "--requirements", path)
+        renew = f"renew it by 'bayesdist stage report {copy}'"
+        line = f"{copy / 'report.html'} shows earlier margins; {renew}"
         assert result.code == 0 and result.out.splitlines()[-1] == line
         assert "over the inner 80 %" in result.out
     good("run", finished.config, "-o", copy, "--resume")
     assert "brand new" in (copy / "report.html").read_text(encoding="utf-8")
-    assert "renew it" not in cli("validate", copy, "--requirements", path).out
+    assert "renew it" not in cli("requirements", copy, "--requirements", path).out
 
 
 def test_dates_that_change_nothing_are_told(tmp_path, finished):
@@ -619,10 +618,12 @@ def test_dates_that_change_nothing_are_told(tmp_path, finished):
     run = begin_stagewise(tmp_path / "run", config, "fit", "sample", "assess")
     assert (run / "bayesdist.log").read_text().count(told) == 1
     req = _requirements(tmp_path / "req.toml", dated)
-    out = good("validate", run, "--requirements", req).out
+    out = good("requirements", run, "--requirements", req).out
     assert f"WARNING: {req}: {told} (of requirement 'dated')" in out.splitlines()
     undated = {key: value for key, value in dated.items() if key != "epoch"}
-    out = good("validate", run, "--requirements", _requirements(tmp_path / "b.toml", undated)).out
+    out = good(
+        "requirements", run, "--requirements", _requirements(tmp_path / "b.toml", undated)
+    ).out
     assert told not in out
     drift = {"epoch0": 2004.0, "terms": [["u", 1, 0]]}
     config = write_config(config, assess=assess, requirement=[dated], **{"model.tdd": drift})
@@ -633,7 +634,7 @@ def test_validate_of_an_unconverged_run_is_not_met(unconverged, tmp_path):
     loose = {"name": "new", "statistic": "rms", "limit": 100.0}
     run = shutil.copytree(unconverged[0], tmp_path / "run")
     path = _requirements(tmp_path / "a.toml", loose)
-    result = cli("validate", run, "--requirements", path)
+    result = cli("requirements", run, "--requirements", path)
     assert result.code == 4 and "undecided" in result.out
 
 

@@ -12,8 +12,9 @@ import pytest
 from astropy.table import Table, vstack
 
 from bayesdist.app import matches
-from bayesdist.data import RvbTransform, open_matches, read_rvb
+from bayesdist.data import open_matches, read_rvb
 from bayesdist.infer import load_fit
+from bayesdist.missions.wise.rvb.transform import RvbTransform
 from tests.app.rvb_jobs import DETECTORS, rvb_job, rvb_pairs, write_rvb_table
 from tests.app.support import cli, good, refused, snapshot, summary_of
 
@@ -77,7 +78,7 @@ def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("bayesdist.app.rvb.stream_rvb", None)
         for stage in STAGES:
-            good(stage, run)
+            good("stage", stage, run)
     assert summary_of(run)["data"] == summary["data"]
     good("run", rvb_job(tmp_path / "other", table, **options), "-o", tmp_path / "memory")
     fits = [load_fit(path / "fit.nc") for path in (run, tmp_path / "memory")]
@@ -103,7 +104,7 @@ def test_half_a_set_that_a_killed_run_left_is_not_trusted(tmp_path):
     # nor is a folder touched that holds something else
     (run / "pairs" / "mine.txt").touch()
     (run / "run.json").write_text(json.dumps(record))
-    result = cli("fit", run)
+    result = cli("stage", "fit", run)
     assert result.code == 1 and "remove this folder" in result.err
     assert not list(tmp_path.glob(".bayesdist-*"))
 
@@ -160,12 +161,12 @@ def test_a_table_with_bands_of_others_is_no_rvb(tmp_path):
     assert "format" not in tomllib.loads((tmp_path / "c.toml").read_text())["data"]
 
 
-# -- bayesdist rvb --------------------------------------------------------------------------------
+# -- bayesdist wise rvb ---------------------------------------------------------------------------
 
 
 def test_transform_moves_the_reference_positions(tmp_path):
     path = write_rvb_table(rvb_pairs(), tmp_path / "pairs.tbl")
-    good("rvb", "transform", path, "-o", tmp_path / "out", "--dx", 0.5, "--dy", -0.25,
+    good("wise", "rvb", "transform", path, "-o", tmp_path / "out", "--dx", 0.5, "--dy", -0.25,
          "--rotation", 0.02, "--scale-x", 1e-4, "--scale-y", -2e-4)  # fmt: skip
     old, new = read_rvb(path), read_rvb(tmp_path / "out")
     turn = np.radians(0.02)
@@ -178,6 +179,20 @@ def test_transform_moves_the_reference_positions(tmp_path):
     # what it writes is calibrated
     config = rvb_job(tmp_path / "job", rvb_pairs(), data={"matches": str(tmp_path / "out")})
     good("check", config)
+
+
+def test_a_fitted_transformation_leaves_nothing_linear(tmp_path):
+    path = write_rvb_table(rvb_pairs(false=0.0), tmp_path / "pairs.tbl")
+    shown = good("wise", "rvb", "transform", path, "-o", tmp_path / "out", "--fit")
+    assert "fitted: shift_u" in shown.out
+    new = read_rvb(tmp_path / "out").matches
+    # what is left of offsets, scales and rotation, and what pairs with such errors leave of it
+    for offset in (new.u - new.x, new.v - new.y):
+        slopes = np.linalg.lstsq(np.stack([np.ones(len(new)), new.x - 254.5, new.y - 254.5], 1),
+                                 offset, rcond=None)[0]  # fmt: skip
+        assert abs(slopes[0]) < 1e-2 and (np.abs(slopes[1:]) < 2e-4).all()
+    refused(tmp_path, "wise", "rvb", "transform", path, "-o", tmp_path / "again", "--fit",
+            "--dx", 1, words=["given, and one is to be fitted"])  # fmt: skip
 
 
 def test_rereference_undoes_what_free_solutions_took_up(tmp_path):
@@ -196,13 +211,14 @@ def test_rereference_undoes_what_free_solutions_took_up(tmp_path):
     for name, one in (("from", free), ("to", fixed)):
         write_rvb_table(one, tmp_path / f"{name}.tbl")
     solutions = ("--from", tmp_path / "from.tbl", "--to", tmp_path / "to.tbl")
-    good("rvb", "rereference", path, *solutions, "-o", tmp_path / "out", "--band", "W4")
+    good("wise", "rvb", "rereference", path, *solutions, "-o", tmp_path / "out", "--band", "W4")
     found, expected = read_rvb(tmp_path / "out").matches, read_rvb(truth).matches
     np.testing.assert_allclose([found.u, found.v], [expected.u, expected.v], rtol=0, atol=1e-7)
     shutil.rmtree(tmp_path / "out")
     write_rvb_table(free[1:], tmp_path / "some.tbl")
-    refused(tmp_path, "rvb", "rereference", path, "--from", tmp_path / "some.tbl", *solutions[2:],
-            "-o", tmp_path / "out", words=["'00a'", "no solution with free scales"])  # fmt: skip
+    refused(tmp_path, "wise", "rvb", "rereference", path, "--from", tmp_path / "some.tbl",
+            *solutions[2:], "-o", tmp_path / "out",
+            words=["'00a'", "no solution with free scales"])  # fmt: skip
 
 
 def test_wrong_commands_write_nothing(tmp_path):
@@ -210,17 +226,17 @@ def test_wrong_commands_write_nothing(tmp_path):
         vstack([rvb_pairs(), rvb_pairs(300, "W1", seed=2)]), tmp_path / "pairs.tbl"
     )
     out = ("-o", tmp_path / "out")
-    begin = ("rvb", "transform", path, *out)
+    begin = ("wise", "rvb", "transform", path, *out)
     refused(tmp_path, *begin, "--band", "W4", words=["no transformation is asked for"])
     refused(tmp_path, *begin, "--dx", 1, words=["several bands: W1 (300 pairs), W4 (600 pairs)"])
     refused(tmp_path, *begin, "--dx", 1, "--band", "W2", words=["holds no W2"])
     refused(tmp_path, *begin, "--dx", "nan", "--band", "W4", words=["shift_u", "nan"])
-    refused(tmp_path, *begin, "--dx", 1, "--column", "u", words=["--column", "KEY=NAME"])
-    refused(tmp_path, *begin, "--dx", 1, "--column", "w=u", words=["'w'", "no quantity"])
-    refused(tmp_path, "rvb", "transform", tmp_path / "none.tbl", *out, "--dx", 1,
+    refused(tmp_path, *begin, "--dx", 1, "--columns", "u", words=["--columns", "KEY=NAME"])
+    refused(tmp_path, *begin, "--dx", 1, "--columns", "w=u", words=["'w'", "no quantity"])
+    refused(tmp_path, "wise", "rvb", "transform", tmp_path / "none.tbl", *out, "--dx", 1,
             words=["none.tbl"])  # fmt: skip
     folder = write_rvb_table(rvb_pairs(), tmp_path / "set" / "a.parquet").parent
-    refused(tmp_path, "rvb", "transform", folder, "-o", folder / "out", "--dx", 1,
+    refused(tmp_path, "wise", "rvb", "transform", folder, "-o", folder / "out", "--dx", 1,
             words=["inside the folder of its input"])  # fmt: skip
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").touch()

@@ -198,7 +198,7 @@ def test_pairs_in_the_centre_say_nothing_of_the_corners(tmp_path):
     # nor does `validate` with the same requirement
     path = tmp_path / "req.toml"
     path.write_text('[[requirement]]\nname = "r"\nstatistic = "rms"\nlimit = 9.0\n')
-    result = cli("validate", tmp_path / "run", "--requirements", path)
+    result = cli("requirements", tmp_path / "run", "--requirements", path)
     assert result.code == 4 and "extrapolated" in result.out
 
 

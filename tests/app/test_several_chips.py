@@ -256,13 +256,13 @@ def test_validate_keeps_the_chip_and_the_report_takes_it_up(run, tmp_path):
     none = dict.fromkeys(("data", "detector", "model", "sampler", "assess"))
     write_config(path, **none, requirement=[REQUIREMENTS[3] | {"limit": 5.0}])
     try:
-        good("validate", run, "--requirements", path)
+        good("requirements", run, "--requirements", path)
         (margin,) = summary_of(run)["margins"]
         assert (margin["chip"], margin["verdict"]) == (1, "met")
         assert list(Table.read(run / "margins.ecsv")["chip"]) == ["1"]
         write_config(path, **none, requirement=[REQUIREMENTS[3] | {"chip": 3}])
         refused(
-            tmp_path, "validate", run, "--requirements", path, words=["chip 3", "upper", "2, 1"]
+            tmp_path, "requirements", run, "--requirements", path, words=["chip 3", "upper", "2, 1"]
         )
     finally:
         (run / "summary.json").write_bytes(before[0])

@@ -9,7 +9,7 @@ import pytest
 from lxml import html as lxml_html
 from scipy import stats
 
-from bayesdist.infer import fit_linear, load_fit, load_posterior
+from bayesdist.infer import Rejection, fit_linear, load_fit, load_posterior
 from bayesdist.infer.skew import skew_of
 from bayesdist.report.sections.run.fit import fit_tables
 from tests.app.support import (
@@ -116,7 +116,7 @@ def test_the_error_is_that_of_repeated_experiments(weight):
     pulls = []
     for seed in range(150):
         matches, _ = simulated(200, seed=seed, fraction=0.0, jitter=0.0)
-        fit = fit_linear(matches, model, clip_chi2=1e9, clip_abs=None, radial_weight=weight)
+        fit = fit_linear(matches, model, rejection=Rejection(1e9, None, weight))
         skew = skew_of(fit)
         pulls.append((skew.value - angle(model, theta)) / skew.sigma)
     low, high = stats.chi2(150).ppf([5e-4, 1 - 5e-4])

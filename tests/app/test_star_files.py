@@ -14,7 +14,7 @@ from scipy.stats import norm
 from bayesdist.app import star_files
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.data import pieces, read_matches
-from bayesdist.data.tables import parquet_units
+from bayesdist.data.tables.files import parquet_units
 from bayesdist.infer import load_fit, load_posterior
 from tests.app.support import begin_stagewise, good, snapshot, summary_of, write_job
 
@@ -120,6 +120,6 @@ def test_the_stage_writes_them_again(finished, tmp_path):
     path = begin_stagewise(tmp_path / "run", finished.config, "fit", "sample")
     before = snapshot(path / "stars")
     shutil.rmtree(path / "stars")
-    good("sample", path)
+    good("stage", "sample", path)
     assert snapshot(path / "stars") == before
     assert summary_of(path)["outliers"]["n_flagged"] > 0

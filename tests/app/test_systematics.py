@@ -15,10 +15,10 @@ from bayesdist.app.campaign.systematics import (
     catalogue_terms,
     with_shared_stars,
 )
-from bayesdist.assess.terms.field_terms import CATALOGUE as POSITIONS
-from bayesdist.assess.terms.field_terms import MOTIONS
+from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
+from bayesdist.assess.terms.parameters import MOTIONS
 from bayesdist.data import MatchTable, ReferenceCatalog
-from bayesdist.infer import Posterior, fit_linear
+from bayesdist.infer import Posterior, Rejection, fit_linear
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import Chip, DistortionModel
 
@@ -53,7 +53,7 @@ def catalog():
 
 @pytest.fixture(scope="module")
 def fit(matches):
-    return fit_linear(matches, MODEL, clip_chi2=1e9, clip_abs=None)
+    return fit_linear(matches, MODEL, rejection=Rejection(1e9, None))
 
 
 def posterior_of(fit, n=1000, wider=1.0, seed=1):

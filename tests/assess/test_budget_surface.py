@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
+from bayesdist.assess.budget.budget import place_budget
 from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.budget.place import place_budget
-from bayesdist.assess.budget.surface import budget_surface
-from bayesdist.assess.drawn import position_errors
-from bayesdist.assess.terms.fields import MODEL
-from bayesdist.assess.terms.parameters import LinearTerm
+from bayesdist.assess.budget.surface import JOINT, budget_surface
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.grid import grid_pixels, mesh
@@ -31,9 +30,9 @@ def drawn(solution_of, *, time=TIME, frames="none", exposures=("a",), aligned=Fa
             k = model.basis(chip.number).terms.index(c)
             mean[model.coefficient_slice(chip.number, axis)][k] = half
     solution = solution_of(model, mean, root @ root.T)
-    fields = (LinearTerm("aberration", "scale", 1e-4, solution),) if time is TIME else ()
-    what = {"grid": GRID, "n_draws": 300, "fields": fields, "aligned": aligned}
-    errors = position_errors(solution, rng=np.random.default_rng(2), **what)
+    terms = (ScaleError("aberration", "scale", 1e-4, solution),) if time is TIME else ()
+    what = {"grid": GRID, "n_draws": 300, "terms": terms, "aligned": aligned}
+    errors = error_model(solution, terms, aligned=aligned).drawn(300, np.random.default_rng(2))
     return solution, errors, what
 
 
@@ -56,49 +55,49 @@ def variance(surface, part, chip, x, y, epoch, origin=None):
 @pytest.mark.parametrize("epoch", [2002.0, 2006.7, 2009.39999, 2009.4, 2013.3, 2020.0])
 def test_any_place_at_any_epoch_has_its_budget(solution_of, epoch):
     _, errors, _ = drawn(solution_of)
-    surface = budget_surface(errors, years=(2002.0, 2020.0))
+    surface = budget_surface(errors, GRID, years=(2002.0, 2020.0))
     assert [len(s.nodes) for s in surface.spans] == [3, 3]
     x, y = np.array([1.0, 33.5, 201.0]), np.array([101.0, 7.25, 50.0])
     for chip in (1, 2):
         truth = place_budget(errors, x, y, chip=chip, epoch=epoch)
-        for term in truth.terms:
-            part = MODEL if term.name == "total" else term.name
+        for term in truth.every:
+            part = JOINT if term.name == "total" else term.name
             found = variance(surface, part, chip, x, y, epoch)
             np.testing.assert_allclose(found[:, 0], term.u**2, rtol=1e-7)
             np.testing.assert_allclose(found[:, 1], term.v**2, rtol=1e-7)
-        between = place_budget(errors, x, y, chip=chip, epoch=epoch, relative=True).terms[-1]
-        found = variance(surface, MODEL, chip, x[1:], y[1:], epoch, origin=(x[:1], y[:1]))
+        between = place_budget(errors, x, y, chip=chip, epoch=epoch, relative=True).total
+        found = variance(surface, JOINT, chip, x[1:], y[1:], epoch, origin=(x[:1], y[:1]))
         np.testing.assert_allclose(found[:, 0], between.u**2, rtol=1e-7)
 
 
 def test_over_the_grid_it_is_the_budget_of_the_detector(solution_of):
     solution, errors, what = drawn(solution_of, frames="shift", exposures=("a", "b", "c"))
     budget = detector_budget(solution, epoch=2012.0, rng=np.random.default_rng(2), **what)
-    surface = budget_surface(errors, epoch=2012.0, years=(2002.0, 2020.0))
-    assert set(surface.parts) == {t.name for t in budget.chips[0].terms}
+    surface = budget_surface(errors, GRID, epoch=2012.0, years=(2002.0, 2020.0))
+    assert {row.name for row in surface.parts} == {t.name for t in budget.terms}
     x, y = mesh(*grid_pixels(SIZE, GRID))
     for row in budget.rows():
-        part = MODEL if row["name"] == "total" else row["name"]
+        part = JOINT if row["name"] == "total" else row["name"]
         mean = np.mean([variance(surface, part, c, x, y, 2012.0) for c in (1, 2)], axis=(0, 1))
         np.testing.assert_allclose(np.sqrt(mean), [row["u"], row["v"]], rtol=1e-7, atol=1e-9)
 
 
 def test_what_does_not_depend_on_time_is_kept_once(solution_of):
     _, errors, _ = drawn(solution_of)
-    for span in budget_surface(errors, years=(2002.0, 2020.0)).spans:
+    for span in budget_surface(errors, GRID, years=(2002.0, 2020.0)).spans:
         kept = {part: len(m) for part, m in span.moments[1].items()}
-        assert kept == {"coefficients": 1, "time dependence": 3, "aberration": 1, MODEL: 3}
+        assert kept == {"coefficients": 1, "time dependence": 3, "aberration": 1, JOINT: 3}
     _, still, _ = drawn(solution_of, time=None)
-    (span,) = budget_surface(still).spans
+    (span,) = budget_surface(still, GRID).spans
     assert span.nodes == () and {len(m) for m in span.moments[2].values()} == {1}
 
 
 def test_alignment_hardly_depends_on_the_drift(solution_of):
     """What a rotation takes up follows the drifting positions: quadratic to first order only."""
     _, errors, _ = drawn(solution_of, aligned=True)
-    surface = budget_surface(errors, years=(2002.0, 2020.0))
-    truth = place_budget(errors, [10.0], [90.0], chip=1, epoch=2004.1).terms[-1]
-    found = variance(surface, MODEL, 1, [10.0], [90.0], 2004.1)
+    surface = budget_surface(errors, GRID, years=(2002.0, 2020.0))
+    truth = place_budget(errors, [10.0], [90.0], chip=1, epoch=2004.1).total
+    found = variance(surface, JOINT, 1, [10.0], [90.0], 2004.1)
     assert found[0] == pytest.approx([truth.u[0] ** 2, truth.v[0] ** 2], rel=1e-3)
 
 
@@ -106,4 +105,4 @@ def test_alignment_hardly_depends_on_the_drift(solution_of):
 def test_a_drift_needs_years_that_rise(solution_of, years):
     _, errors, _ = drawn(solution_of)
     with pytest.raises(InputError, match="years"):
-        budget_surface(errors, years=years)
+        budget_surface(errors, GRID, years=years)

@@ -16,7 +16,7 @@ from bayesdist.assess.comparison.gap import gap_difference, pair_of_chips
 from bayesdist.assess.comparison.sentences import gap_lines, gap_verdict
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import InputError
-from bayesdist.infer import fit_linear, save_fit
+from bayesdist.infer import Rejection, fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import idctab_from_solution, write_idctab
 from bayesdist.simulate import simulate_matches
@@ -59,7 +59,7 @@ def drawn(model, theta, seed, n=600, sigma=2e-3):
     matches, _ = simulate_matches(
         model, theta, n, rng=np.random.default_rng(seed), sigma=sigma, fraction=0.0
     )
-    return fit_linear(matches, model, clip_chi2=np.inf, clip_abs=np.inf)
+    return fit_linear(matches, model, rejection=Rejection(np.inf, np.inf))
 
 
 def pair(fit, name="fit"):

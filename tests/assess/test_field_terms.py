@@ -7,15 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.assess import LocalTerm, Requirement, UserTerm, check_requirements, error_fields
+from bayesdist.assess import LocalErrors, Requirement, UserTerm, check_requirements
 from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.terms.field_terms import MOTIONS, CatalogueTerm, ExposureScatter
-from bayesdist.assess.terms.fields import MODEL, draw_errors
-from bayesdist.assess.terms.parameters import LinearTerm
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.parameters import (
+    MOTIONS,
+    CatalogueErrors,
+    ExposureVariation,
+    ScaleError,
+)
 from bayesdist.assess.terms.rigid import without_rigid
+from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from tests.infer.small_campaign import campaign_model, campaign_truth
+
+from .drawn_fields import JOINT, drawn_fields, fields_at
 
 N = 8000
 TOLERANCE = 5 / np.sqrt(2 * N)  # five standard errors of a standard deviation
@@ -34,12 +41,20 @@ def scattering(*, apart=False, own=None):
 
 
 def scatter_of(model, mean, **tau):
-    return ExposureScatter(model, mean, tuple(tau), np.array([list(tau.values())]))
+    return ExposureVariation(model, mean, tuple(tau), np.array([list(tau.values())]))
+
+
+def draw_errors(solution, n, rng, *, terms=(), aligned=False):
+    return error_model(solution, terms, aligned=aligned).drawn(n, rng)
+
+
+def holding(solution, without, *catalogue):
+    """Errors of a solution that hold those of the catalogue, shown beside another one's rows."""
+    return SolutionErrors(solution, without, catalogue)
 
 
 def sigmas(draws, chip, epoch=2006.0):
-    (found,) = draws.at({chip: (X, Y)}, epoch=epoch)
-    return found
+    return fields_at(draws, X, Y, chip=chip, epoch=epoch)
 
 
 # -- the catalogue --------------------------------------------------------------------------------
@@ -51,14 +66,15 @@ def shared(rich):
     size = np.sqrt(np.diag(rich.cov))
     a = rng(11).normal(size=rich.cov.shape)
     a[:, 0] = 20.0  # an error that all parameters share
-    return rich, CatalogueTerm(rich, size[:, None] * (a @ a.T / len(a)) * size)
+    cov = size[:, None] * (a @ a.T / len(a)) * size
+    return rich, CatalogueErrors(rich.model, rich.mean, cov)
 
 
 @pytest.mark.parametrize("chip", [1, 2])
 def test_the_row_of_the_catalogue_is_its_covariance_seen_through_the_model(shared, chip):
     """J C J^T at every point, by the Jacobian of positions."""
     solution, term = shared
-    draws = draw_errors(solution, N, rng(), fields=[term])
+    draws = draw_errors(solution, N, rng(), terms=[holding(solution, solution, term)])
     for epoch in (2003.0, 2013.0):
         found = np.stack(sigmas(draws, chip, epoch).sigma(term.name), axis=1)
         J = solution.model.jacobian(solution.mean, X, Y, epoch=epoch, chip=chip)
@@ -69,7 +85,7 @@ def test_the_row_of_the_catalogue_is_its_covariance_seen_through_the_model(share
 def test_one_draw_of_the_catalogue_serves_both_chips_and_all_epochs(shared):
     """Covariance between chips and epochs, J1 C J2^T, not only of each by itself."""
     solution, term = shared
-    draws = draw_errors(solution, N, rng(), fields=[term])
+    draws = draw_errors(solution, N, rng(), terms=[holding(solution, solution, term)])
     places = [(1, 2003.0), (2, 2013.0)]
     fields = [sigmas(draws, *place).field(term.name)[:, 7, 0] for place in places]
     J = [
@@ -88,9 +104,8 @@ def test_what_the_solution_holds_already_is_shown_and_not_added(shared):
     solution, term = shared
     wide = replace(solution, cov=9 * solution.cov)
     options = {"epoch": 2006.5, "grid": (3, 2), "aligned": True, "n_draws": N}
-    shown = {
-        r["name"]: r for r in detector_budget(wide, fields=[term], rng=rng(), **options).rows()
-    }
+    beside = [holding(wide, solution, term)]
+    shown = {r["name"]: r for r in detector_budget(wide, terms=beside, rng=rng(), **options).rows()}
     alone = {r["name"]: r for r in detector_budget(wide, rng=rng(), **options).rows()}
     inner = {r["name"]: r for r in detector_budget(solution, rng=rng(), **options).rows()}
     assert set(shown) == {*alone, term.name}
@@ -99,13 +114,6 @@ def test_what_the_solution_holds_already_is_shown_and_not_added(shared):
         for row in ("coefficients", "time dependence"):
             assert shown[row][name] == pytest.approx(inner[row][name], rel=2 * TOLERANCE)
             assert shown[row][name] < 0.4 * alone[row][name]
-
-
-def test_terms_that_the_solution_holds_name_one_solution_without_them(shared):
-    solution, term = shared
-    other = replace(term, without=replace(solution), name="other")
-    with pytest.raises(InputError, match="2 field terms are among the errors of the solution"):
-        error_fields(solution, X, Y, fields=[term, other], epoch=2003.0, rng=rng())
 
 
 def test_the_parts_of_the_catalogue_make_its_row(shared):
@@ -117,25 +125,35 @@ def test_the_parts_of_the_catalogue_make_its_row(shared):
         replace(whole, covariance=(1 - share) * whole.covariance),
     ]
     options = {"epoch": 2003.0, "n_draws": N}
-    both = error_fields(solution, X, Y, fields=parts, rng=rng(), **options)
+    both, one = (
+        drawn_fields(solution, X, Y, terms=[holding(solution, solution, *c)], rng=rng(), **options)
+        for c in (parts, [whole])
+    )
     assert set(both.parts) >= {MOTIONS, whole.name}
-    one = error_fields(solution, X, Y, fields=[whole], rng=rng(), **options)
     summed = sum(np.square(both.sigma(p.name)) for p in parts)
     np.testing.assert_allclose(np.sqrt(summed), one.sigma(whole.name), rtol=2 * TOLERANCE)
-    np.testing.assert_allclose(both.sigma(MODEL), one.sigma(MODEL), rtol=1e-12)
+    np.testing.assert_allclose(both.sigma(JOINT), one.sigma(JOINT), rtol=1e-12)
 
 
-def test_a_part_of_another_term_is_shown_and_not_added(shared):
-    solution, _ = shared
-    scale = LinearTerm("aberration", "scale", 1e-4, solution, part_of="exposure scatter")
-    options = {"epoch": 2003.0, "n_draws": 200}
-    alone = error_fields(solution, X, Y, rng=rng(), **options)
-    beside = error_fields(solution, X, Y, fields=[scale], rng=rng(), **options)
-    np.testing.assert_array_equal(beside.sigma(MODEL), alone.sigma(MODEL))
-    assert np.max(beside.sigma("aberration")) > np.max(alone.sigma(MODEL))
-    free = replace(scale, part_of="")
-    added = error_fields(solution, X, Y, fields=[free], rng=rng(), **options)
-    assert np.max(added.sigma(MODEL)) > np.max(alone.sigma(MODEL))
+def test_aberration_is_a_part_of_the_scatter_and_not_added(solution_of):
+    model, theta = scattering()
+    solution = solution_of(model, theta)
+    aberration = ScaleError("aberration", "scale", 2e-6, solution, in_total=False)
+    alone = scatter_of(model, theta, **TAU)
+    beside = replace(alone, aberration=aberration)
+    options = {"epoch": 2006.0, "n_draws": 200}
+    one, both = (
+        drawn_fields(solution, X, Y, terms=[t], rng=rng(), **options) for t in (alone, beside)
+    )
+    np.testing.assert_array_equal(both.sigma(JOINT), one.sigma(JOINT))
+    assert 0 < np.max(both.sigma("aberration")) < np.max(one.sigma(JOINT))
+    # without it, scatter is smaller by its share
+    errors = both.drawn.errors(both.domain, {"aberration": 0.0})(slice(0, 200), np.zeros(1))
+    left = np.square(one.sigma(JOINT)) - np.square(both.sigma("aberration"))
+    np.testing.assert_allclose(np.mean(errors**2, axis=0).T, left, rtol=1e-9)
+    free = replace(aberration, in_total=True)
+    added = drawn_fields(solution, X, Y, terms=[alone, free], rng=rng(), **options)
+    assert np.max(added.sigma(JOINT)) > np.max(one.sigma(JOINT))
 
 
 # -- a new exposure -------------------------------------------------------------------------------
@@ -149,7 +167,7 @@ def test_scatter_at_a_pixel_is_known_in_closed_form(chip, solution_of):
     """
     model, theta = scattering()
     term = scatter_of(model, theta, **TAU)
-    draws = draw_errors(solution_of(model, theta), N, rng(), fields=[term])
+    draws = draw_errors(solution_of(model, theta), N, rng(), terms=[term])
     found = np.stack(sigmas(draws, chip).sigma(term.name), axis=1)
     d = model.predict(theta, X, Y, chip=chip, epoch=2006.0) - model.origin
     along = TAU["scale"] ** 2 + TAU["shear_plus"] ** 2
@@ -161,7 +179,7 @@ def test_a_chip_that_scatters_by_itself_errs_alone(solution_of):
     own = {"WFC1.shift_v": 0.01, "WFC1.rotation": 2e-6, "WFC1.scale": 4e-6}
     model, theta = scattering(apart=True, own=(0.0,) * 6)
     term = scatter_of(model, theta, **own)
-    draws = draw_errors(solution_of(model, theta), N, rng(), fields=[term])
+    draws = draw_errors(solution_of(model, theta), N, rng(), terms=[term])
     first, second = (np.stack(sigmas(draws, c).sigma(term.name), axis=1) for c in (1, 2))
     np.testing.assert_array_equal(second, 0.0)
     at = [model.predict(theta, *p, chip=1, epoch=2006.0) for p in ((X, Y), (2048.0, 1024.0))]
@@ -174,8 +192,8 @@ def test_the_scatter_of_each_draw_is_a_draw_of_tau(solution_of):
     """Fourth moments tell a mixture from one scatter: 3 <tau^4> against 3 <tau^2>^2."""
     model, theta = scattering()
     tau = np.array([[1e-6], [9e-6]])
-    term = ExposureScatter(model, theta, ("scale",), tau)
-    draws = draw_errors(solution_of(model, theta), N, rng(), fields=[term])
+    term = ExposureVariation(model, theta, ("scale",), tau)
+    draws = draw_errors(solution_of(model, theta), N, rng(), terms=[term])
     u = sigmas(draws, 1).field(term.name)[:, 0, 0]
     mean_square, fourth = (tau**2).mean(), (tau**4).mean()
     assert (u**4).mean() / (u**2).mean() ** 2 == pytest.approx(
@@ -187,7 +205,7 @@ def test_scatter_adds_to_the_total_in_quadrature(solution_of):
     model, theta = scattering()
     a = 1e-5 * rng(4).normal(size=(len(theta), len(theta)))
     solution, term = solution_of(model, theta, a @ a.T), scatter_of(model, theta, **TAU)
-    draws = draw_errors(solution, N, rng(), fields=[term], aligned=True)
+    draws = draw_errors(solution, N, rng(), terms=[term], aligned=True)
     found = sigmas(draws, 2)
     alone = sigmas(draw_errors(solution, N, rng(), aligned=True), 2)
     parts = np.hypot(alone.sigma("model"), found.sigma(term.name))
@@ -200,7 +218,7 @@ def test_kinds_that_no_exposure_has_are_refused(rich):
     with pytest.raises(InputError, match="exposures have no deviation 'focus'"):
         scatter_of(model, theta, focus=1e-6)
     with pytest.raises(InputError, match=r"scatter has shape \(5, 2\) for 1 kinds"):
-        ExposureScatter(model, theta, ("scale",), np.ones((5, 2)))
+        ExposureVariation(model, theta, ("scale",), np.ones((5, 2)))
 
 
 def test_in_gauge_held_a_star_may_lie_in_the_first_exposure(solution_of):
@@ -209,7 +227,7 @@ def test_in_gauge_held_a_star_may_lie_in_the_first_exposure(solution_of):
     cov = np.zeros((len(theta), len(theta)))
     k = model.names.index("j001.scale")
     cov[k, k] = 1e-12
-    found = error_fields(solution_of(model, theta, cov), X, Y, epoch=2006.0, n_draws=N, rng=rng())
+    found = drawn_fields(solution_of(model, theta, cov), X, Y, epoch=2006.0, n_draws=N, rng=rng())
     errs = np.abs(found.field("exposure frame")).max(axis=(1, 2)) > 1e-9
     assert errs.mean() == pytest.approx(0.25, abs=5 * np.sqrt(0.25 * 0.75 / N))
     np.testing.assert_allclose(found.field("model"), found.field("exposure frame"), atol=1e-12)
@@ -267,7 +285,7 @@ def test_after_that_the_gauge_does_not_matter(solution_of):
     for chip in (1, 2):
         plain, aligned = (
             [
-                np.hypot(*error_fields(v, X, Y, aligned=al, rng=rng(), **where).sigma("model"))
+                np.hypot(*drawn_fields(v, X, Y, aligned=al, rng=rng(), **where).sigma("model"))
                 for v in views
             ]
             for al in (False, True)
@@ -287,7 +305,7 @@ def test_scatter_does_not_know_about_which_point_it_acts(solution_of):
                 solution_of(m, theta),
                 500,
                 rng(),
-                fields=[scatter_of(m, theta, **TAU)],
+                terms=[scatter_of(m, theta, **TAU)],
                 aligned=True,
             ),
             1,
@@ -302,7 +320,7 @@ def test_a_chip_of_its_own_is_aligned_with_all_of_them(solution_of):
     model, theta = scattering(apart=True, own=(0.0,) * 6)
     term = scatter_of(model, theta, **{"WFC1.shift_v": 0.02})
     req = [Requirement(f"{c}", "v_mean", 1.0, chip=c) for c in (1, 2)]
-    options = {"fields": [term], "aligned": True, "epoch": 2006.0, "grid": (9, 5), "n_draws": 2000}
+    options = {"terms": [term], "aligned": True, "epoch": 2006.0, "grid": (9, 5), "n_draws": 2000}
     one, two = check_requirements(solution_of(model, theta), req, rng=rng(), **options)
     for m in (one, two):
         assert np.sqrt(np.mean(m.draws**2)) == pytest.approx(0.01, rel=5 / np.sqrt(2 * 2000))
@@ -318,12 +336,13 @@ def test_budget_and_requirements_agree(solution_of):
     source = solution_of(model, theta, a @ a.T)
     solution = solution_of(model, theta, 2 * a @ a.T)
     options = {
-        "fields": [CatalogueTerm(source, a @ a.T), scatter_of(model, theta, **TAU)],
         "terms": [
+            holding(solution, source, CatalogueErrors(model, theta, a @ a.T)),
+            scatter_of(model, theta, **TAU),
             UserTerm("offset", "systematic", 0.004, 0.003),
             UserTerm("centroids", "random", 0.01, 0.02),
+            LocalErrors.on_grid("tables", {c: np.full((4, 5, 2), 0.01) for c in (1, 2)}, model),
         ],
-        "local": [LocalTerm("tables", {c: np.full((4, 5, 2), 0.01) for c in (1, 2)})],
         "aligned": True,
         "grid": (5, 4),
         "epoch": 2006.0,
@@ -334,7 +353,7 @@ def test_budget_and_requirements_agree(solution_of):
     total = detector_budget(solution, rng=rng(6), **options).rows()[-1]
     for margin, name in zip(margins, ("radial", "u", "v"), strict=True):
         assert np.mean(margin.draws**2) == pytest.approx(total[name] ** 2, rel=0.06)
-    for_one = check_requirements(
-        solution, req[:1], rng=rng(5), **(options | {"fields": options["fields"][:1]})
-    )
-    assert np.mean(for_one[0].draws ** 2) < 0.8 * np.mean(margins[0].draws ** 2)
+    terms = [options["terms"][0], *options["terms"][2:]]
+    without = options | {"terms": terms}
+    (for_one,) = check_requirements(solution, req[:1], rng=rng(5), **without)
+    assert np.mean(for_one.draws**2) < 0.8 * np.mean(margins[0].draws ** 2)

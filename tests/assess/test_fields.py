@@ -1,16 +1,18 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess import error_fields, uncertainty_map
+from bayesdist.assess import uncertainty_map
 from bayesdist.errors import InputError
-from bayesdist.model import Chip, DistortionModel, TimeDependence, basis
+from bayesdist.model import Chip, DistortionModel, TimeDependence
+
+from .drawn_fields import drawn_fields
 
 X, Y = (a.ravel() for a in np.meshgrid(np.linspace(1, 4096, 5), np.linspace(1, 2048, 4)))
 PARTS = ("coefficients", "time dependence", "exposure frame")
 
 
 def fields_of(s, n_draws=300, seed=1, **where):
-    return error_fields(s, X, Y, n_draws=n_draws, rng=np.random.default_rng(seed), **where)
+    return drawn_fields(s, X, Y, n_draws=n_draws, rng=np.random.default_rng(seed), **where)
 
 
 @pytest.mark.parametrize("chip", [1, 2])
@@ -112,10 +114,9 @@ def test_drift_grows_from_its_reference_date_and_the_coefficients_stay(rich):
     )
 
 
-def test_some_draws_and_blocks_of_points_are_the_same_field(rich, monkeypatch):
+def test_some_draws_are_those_of_the_same_field(rich):
     f = fields_of(rich, epoch=2003.0)
     whole = f.field("model")
-    monkeypatch.setattr(basis, "BLOCK", 3)
     np.testing.assert_allclose(f.field("model", slice(10, 25)), whole[10:25], rtol=1e-12)
 
 

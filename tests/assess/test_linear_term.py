@@ -3,7 +3,7 @@ import pytest
 
 from bayesdist.assess import error_budget
 from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.terms.parameters import LinearTerm
+from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 
@@ -30,20 +30,20 @@ def solution_with_positions(solution_of, chips):
 def test_an_error_of_scale_or_rotation_grows_with_the_distance(solution_of, kind):
     chips = (Chip(2, "B", SIZE, (501.0, 251.0)), Chip(1, "A", SIZE, (501.0, 251.0)))
     solution = solution_with_positions(solution_of, chips)
-    term = LinearTerm("aberration", kind, 1e-5, solution)
+    term = ScaleError("aberration", kind, 1e-5, solution)
     budget = detector_budget(
-        solution, fields=[term], grid=(5, 3), n_draws=DRAWS, rng=np.random.default_rng(1)
+        solution, terms=[term], grid=(5, 3), n_draws=DRAWS, rng=np.random.default_rng(1)
     )
     for k, one in enumerate(budget.chips):
         [found] = [t for t in one.terms if t.name == "aberration"]
-        dx, dy = np.meshgrid(one.x - 501.0, one.y - 251.0 + 600.0 * k)
+        dx, dy = one.x - 501.0, one.y - 251.0 + 600.0 * k
         expected = 1e-5 * SCALE * np.abs([dx, dy] if kind == "scale" else [dy, dx])
         noise = 5 / np.sqrt(2 * DRAWS)
         assert found.u == pytest.approx(expected[0], rel=noise, abs=1e-15)
         assert found.v == pytest.approx(expected[1], rel=noise, abs=1e-15)
         assert found.source == "given by the user"
         # the solution itself has no error here
-        assert one.total_u == pytest.approx(found.u, abs=1e-15)
+        assert one.total.u == pytest.approx(found.u, abs=1e-15)
 
 
 def test_the_error_of_a_drawn_term_is_that_of_its_draws(solution_of):
@@ -51,7 +51,7 @@ def test_the_error_of_a_drawn_term_is_that_of_its_draws(solution_of):
     rows = [
         error_budget(
             solution,
-            fields=[LinearTerm("aberration", "scale", 1e-5, solution, "a paper")],
+            terms=[ScaleError("aberration", "scale", 1e-5, solution, "a paper")],
             grid=(3, 3),
             n_draws=200,
             rng=np.random.default_rng(seed),
@@ -71,4 +71,4 @@ def test_the_error_of_a_drawn_term_is_that_of_its_draws(solution_of):
 def test_what_is_no_such_term_is_refused(solution_of, kind, sigma, message):
     solution = solution_with_positions(solution_of, (Chip(1, "A", SIZE, (501.0, 251.0)),))
     with pytest.raises(InputError, match=message):
-        LinearTerm("aberration", kind, sigma, solution)
+        ScaleError("aberration", kind, sigma, solution)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess.drawn import Judged, position_errors
-from bayesdist.assess.requirements.regions import WHOLE
-from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.infer import fit_linear
 from tests.infer.support import UNCLIPPED, simulated
@@ -21,11 +21,11 @@ def drawn(squares: dict[int, MeanSquare], sigma: float = 1.0):
     """Errors of a chip whose only term of weight is a local one."""
     model, matches, _ = simulated(1, 400, order=1, sigma=1e-6)
     fit = fit_linear(matches, model, **UNCLIPPED)
-    term = LocalTerm("left out", {1: np.full((*SHAPE, 2), sigma)}, squares=squares)
-    errors = position_errors(
-        fit, local=[term], grid=SHAPE, n_draws=DRAWS, rng=np.random.default_rng(1)
-    )
-    return lambda names: errors.statistics(Judged(model.chips, None, WHOLE), names)
+    values = {1: np.full((*SHAPE, 2), sigma)}
+    term = LocalErrors.on_grid("left out", values, model, squares=squares)
+    errors = error_model(fit, [term]).drawn(DRAWS, np.random.default_rng(1))
+    domain = EvaluationDomain.of_chips(model, SHAPE)
+    return lambda names: errors.statistics(domain, names)
 
 
 @pytest.mark.parametrize("error", [None, 0.1, 0.2])

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm, error_budget
-from bayesdist.assess.budget.place import place_budget
-from bayesdist.assess.drawn import position_errors
-from bayesdist.assess.terms.given import LocalTerm
+from bayesdist.assess.budget.budget import place_budget
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.given import Centroids
+from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.errors import InputError
@@ -17,21 +18,15 @@ DRAWS = 20_000
 NOISE = 5 / np.sqrt(2 * DRAWS)
 
 
-def errors_of(solution_of, *, sigma=(0.03, 0.02), **options):
+def errors_of(solution_of, *, sigma=(0.03, 0.02), terms=()):
     """Errors of the shift and the scale of u."""
     cov = np.zeros((6, 6))
     cov[0, 0], cov[1, 1] = np.square(sigma)
-    return position_errors(
-        solution_of(MODEL, cov=cov),
-        grid=(3, 3),
-        n_draws=DRAWS,
-        rng=np.random.default_rng(1),
-        **options,
-    )
+    return error_model(solution_of(MODEL, cov=cov), terms).drawn(DRAWS, np.random.default_rng(1))
 
 
 def named(budget):
-    return {t.name: t for t in budget.terms}
+    return {t.name: t for t in budget.every}
 
 
 TERMS = [
@@ -43,25 +38,24 @@ TERMS = [
 def test_at_the_points_of_a_grid_it_is_the_budget_of_the_grid(solution_of):
     errors = errors_of(solution_of, terms=TERMS)
     whole = error_budget(
-        errors.fields.whole.solution,
+        errors.solution,
         terms=TERMS,
         grid=(3, 3),
         n_draws=DRAWS,
         rng=np.random.default_rng(1),
     )
-    x, y = (a.ravel() for a in np.meshgrid(whole.x, whole.y))
-    found = named(place_budget(errors, x, y, chip=1))
+    found = named(place_budget(errors, whole.x, whole.y, chip=1))
     for term in whole.terms:
-        assert found[term.name].u == pytest.approx(term.u.ravel(), rel=1e-9)
+        assert found[term.name].u == pytest.approx(term.u, rel=1e-9)
         assert found[term.name].source == term.source
-    assert found["total"].u == pytest.approx(whole.total_u.ravel(), rel=1e-9)
-    assert found["total"].v == pytest.approx(whole.total_v.ravel(), rel=1e-9)
+    assert found["total"].u == pytest.approx(whole.total.u, rel=1e-9)
+    assert found["total"].v == pytest.approx(whole.total.v, rel=1e-9)
 
 
 def test_between_two_positions_what_they_share_drops_out(solution_of):
     one = np.array([1])
     centroid = MagnitudeErrors(np.array([-12.0]), 0.04 * one, 0.05 * one, one, one, one)
-    errors = errors_of(solution_of, terms=TERMS, centroid=centroid)
+    errors = errors_of(solution_of, terms=[*TERMS, Centroids(centroid)])
     found = place_budget(
         errors, [1.0, 101.0, 26.0], [41.0, 41.0, 41.0], chip=1, magnitude=-12.0, relative=True
     )
@@ -81,8 +75,8 @@ def test_local_terms_are_interpolated_and_counted_twice_in_a_difference(solution
     values = np.zeros((3, 3, 2))
     values[..., 0] = [[0.0, 0.1, 0.2]]  # grows with x
     square = MeanSquare(np.array([0.02, 0.0]), np.array([0.004, 0.0]))
-    local = [LocalTerm("tables", {1: values}, squares={1: square})]
-    errors = errors_of(solution_of, sigma=(0.0, 0.0), local=local)
+    local = [LocalErrors.on_grid("tables", {1: values}, MODEL, squares={1: square})]
+    errors = errors_of(solution_of, sigma=(0.0, 0.0), terms=local)
     single = named(place_budget(errors, [26.0, 101.0], [10.0, 70.0], chip=1))
     assert single["tables"].u == pytest.approx([0.05, 0.2])
     assert single["tables"].relative_error == pytest.approx(0.1, rel=1e-4)  # hardly cut

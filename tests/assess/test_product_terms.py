@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from bayesdist.assess.budget.budget import place_budget, with_product
 from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.budget.place import place_budget
 from bayesdist.assess.budget.surface import budget_surface
-from bayesdist.assess.drawn import position_errors
-from bayesdist.assess.terms.product_terms import PRODUCT, ProductTerm, with_product
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.forms import PRODUCT, Known, Row
 from bayesdist.model import Chip, DistortionModel
 
 SIZE, GRID = (201.0, 101.0), (9, 5)
@@ -24,7 +24,7 @@ def off(x, y, chip, epoch):
     return np.stack([sign * 1e-3 * (x - 101.0), np.full(len(x), -0.05)], axis=-1)
 
 
-TERM = ProductTerm("a.hdr, forward", "a.hdr", "forward", off, "measured in this run: a.hdr")
+TERM = Known(Row("a.hdr, forward", PRODUCT, "measured in this run: a.hdr", in_total=False), off)
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def solution(solution_of):
 def budgets(solution):
     what = {"grid": GRID, "n_draws": 500}
     return (
-        detector_budget(solution, rng=np.random.default_rng(1), products=p, **what)
+        detector_budget(solution, rng=np.random.default_rng(1), terms=p, **what)
         for p in ((), (TERM,))
     )
 
@@ -61,14 +61,16 @@ def test_who_uses_the_file_has_both(solution):
 
 
 def test_at_a_place_it_is_the_field_and_between_two_the_difference(solution):
-    errors = position_errors(solution, grid=GRID, n_draws=100, rng=np.random.default_rng(3))
+    def errors(terms):
+        return error_model(solution, terms).drawn(100, np.random.default_rng(3))
+
     x, y = [11.0, 151.0], [20.0, 90.0]
-    single = place_budget(errors, x, y, chip=2, products=(TERM,)).terms
-    alone = place_budget(errors, x, y, chip=2).terms
+    single = place_budget(errors((TERM,)), x, y, chip=2).every
+    alone = place_budget(errors(()), x, y, chip=2).every
     np.testing.assert_allclose(single[-2].u, [0.09, 0.05])
     np.testing.assert_allclose(single[-2].v, 0.05)
     np.testing.assert_array_equal(single[-1].u, alone[-1].u)
-    between = place_budget(errors, x, y, chip=2, relative=True, products=(TERM,)).terms
+    between = place_budget(errors((TERM,)), x, y, chip=2, relative=True).every
     np.testing.assert_allclose(between[-2].u, [0.14])
     np.testing.assert_allclose(between[-2].v, 0.0)
 
@@ -76,8 +78,8 @@ def test_at_a_place_it_is_the_field_and_between_two_the_difference(solution):
 def test_the_page_carries_it(solution):
     from bayesdist.report.sections.explorer import _product
 
-    errors = position_errors(solution, grid=GRID, n_draws=100, rng=np.random.default_rng(3))
-    surface = budget_surface(errors, products=(TERM,))
+    errors = error_model(solution, (TERM,)).drawn(100, np.random.default_rng(3))
+    surface = budget_surface(errors, GRID)
     carried = json.loads(json.dumps(_product(*surface.products)))
     [span] = carried["spans"]
     [[u, v]] = span["2"]  # one node of time

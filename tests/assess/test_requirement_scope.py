@@ -6,10 +6,11 @@ from scipy import stats
 from scipy.spatial.distance import pdist
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
-from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.validity import horizon_of
 from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.statistics import extent
+from bayesdist.assess.terms.given import Centroids
 from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
@@ -155,16 +156,16 @@ def test_epochs_are_refused_where_nothing_depends_on_time(solution_of):
 def drifting_errors(solution_of, sigma, n_draws=4000):
     [rate, _] = [n for n in DRIFTING.names if n.startswith("tdd.u_1_0.rate")]
     solution = with_sigma(solution_of, DRIFTING, **{rate: sigma})
-    return position_errors(solution, grid=(5, 5), n_draws=n_draws, rng=np.random.default_rng(2))
+    return error_model(solution).drawn(n_draws, np.random.default_rng(2))
 
 
 def test_the_horizon_is_where_a_growing_error_passes_the_limit(solution_of):
     model = DistortionModel(1, (CHIP,), time=TimeDependence((("u", 1, 0),), (2010.0,)))
     [rate] = [n for n in model.names if n.startswith("tdd.u_1_0.rate")]
     solution = with_sigma(solution_of, model, **{rate: S / EDGE})
-    errors = position_errors(solution, grid=(5, 5), n_draws=4000, rng=np.random.default_rng(2))
+    errors = error_model(solution).drawn(4000, np.random.default_rng(2))
     r = Requirement("edge", "max", 0.2, probability=0.9)
-    found = horizon_of(errors, r, np.arange(2010.5, 2020.0, 0.25))
+    found = horizon_of(errors, r, np.arange(2010.5, 2020.0, 0.25), grid=(5, 5))
     # sigma at the edge is S years; met with probability 0.9 where 1.645 sigma is the limit
     date = 2010.0 + 0.2 / (S * stats.norm.ppf(0.95))
     early, late = found.interval
@@ -186,9 +187,7 @@ def test_a_horizon_may_lie_beyond_and_may_have_passed(solution_of):
     missed = horizon_of(errors, Requirement("edge", "max", 1e-12), [2012.0, 2013.0])
     assert missed.date == 2012.0
     with pytest.raises(InputError, match="does not depend on time"):
-        still = position_errors(
-            solution_of(FLAT), grid=(5, 5), n_draws=10, rng=np.random.default_rng(1)
-        )
+        still = error_model(solution_of(FLAT)).drawn(10, np.random.default_rng(1))
         horizon_of(still, r, [2012.0, 2013.0])
 
 
@@ -198,7 +197,9 @@ def test_a_horizon_may_lie_beyond_and_may_have_passed(solution_of):
 def test_the_centroid_of_a_star_counts_where_a_magnitude_is_named(solution_of):
     one = np.array([1])
     errors = MagnitudeErrors(np.array([-12.0]), S * one, S * one, one, S * one, S * one)
-    m = margin_of(solution_of(FLAT), Requirement("r", "rms", 1.0, magnitude=-12.0), centroid=errors)
+    m = margin_of(
+        solution_of(FLAT), Requirement("r", "rms", 1.0, magnitude=-12.0), terms=[Centroids(errors)]
+    )
     assert m.value == pytest.approx(np.sqrt(2) * S, rel=0.01)
     with pytest.raises(InputError, match="magnitude -12 is not known"):
         margin_of(solution_of(FLAT), Requirement("r", "rms", 1.0, magnitude=-12.0))

@@ -7,13 +7,15 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.terms.field_terms import CatalogueTerm, ExposureScatter
-from bayesdist.assess.terms.fields import draw_errors
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.parameters import CatalogueErrors, ExposureVariation
+from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.infer import fit_linear
-from bayesdist.infer.catalogue.star_errors import with_star_errors
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
-from tests.infer.small_campaign import campaign, campaign_truth, shared_stars
+from tests.infer.small_campaign import campaign, campaign_truth, shared_stars, with_star_errors
 from tests.infer.support import UNCLIPPED
+
+from .drawn_fields import fields_at
 
 NUMBERS = (1, 2)
 
@@ -44,14 +46,16 @@ def test_the_budget_is_the_scatter_over_catalogues():
     fit = fit_linear(matches, model, **UNCLIPPED)
     stars = shared.covariance(fit)
     options = {"aligned": True, "grid": (9, 5), "n_draws": 4000}
-    solution, term = with_star_errors(fit, stars), CatalogueTerm(fit, stars.total)
-    budget = detector_budget(solution, fields=[term], rng=np.random.default_rng(1), **options)
+    solution = with_star_errors(fit, stars)
+    term = CatalogueErrors(fit.model, fit.mean, stars.total)
+    terms = [SolutionErrors(solution, fit, (term,))]
+    budget = detector_budget(solution, terms=terms, rng=np.random.default_rng(1), **options)
     rows = {row["name"]: row for row in budget.rows()}
     naive = detector_budget(fit, rng=np.random.default_rng(1), **options).rows()[-1]
 
     # points of the budget, and behind them stars that cover the chips evenly
     pixels = [
-        (budget.chips[0].x, budget.chips[0].y),
+        budget.chips[0].axes,
         ((np.arange(32) + 0.5) * 128, (np.arange(16) + 0.5) * 128),
     ]
     points, cover = (np.stack(np.meshgrid(*xy)).reshape(2, -1) for xy in pixels)
@@ -92,11 +96,10 @@ def test_positions_in_exposures_that_no_fit_has_seen(full):
     for seed in range(n_truths):
         model, matches, theta = campaign(100 + seed, 20, 150, order=2, time=False)
         fit = fit_hierarchical(matches, model, n_tau=64)
-        term = ExposureScatter(model, fit.mean, fit.scatter.kinds, fit.tau_draws)
+        term = ExposureVariation(model, fit.mean, fit.scatter.kinds, fit.tau_draws)
         chip, x, y = evenly(150, rng)
-        drawn = draw_errors(fit, 1000, rng, fields=[term], aligned=True)
-        points = {c: (x[chip == c], y[chip == c]) for c in NUMBERS}
-        fields = drawn.at(points)
+        drawn = error_model(fit, [term], aligned=True).drawn(1000, rng)
+        fields = [fields_at(drawn, x[chip == c], y[chip == c], chip=c) for c in NUMBERS]
         sigma = np.concatenate([np.stack(f.sigma("model"), axis=1) for f in fields])
         alone = np.concatenate([np.stack(f.sigma("coefficients"), axis=1) for f in fields])
         predicted = model.predict(fit.mean, x, y, chip=chip)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bayesdist.data.files import atomic_path
+from bayesdist.files import atomic_path
 from tests.benchmarks import budget, dithers, likelihood, linear, samplers, scaling, scamp, wise
 from tests.benchmarks.figure import draw_scaling
 from tests.benchmarks.machine import describe

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.drawn import position_errors
+from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.validity import horizon_of
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.benchmarks.timing import median, say
@@ -81,9 +81,9 @@ def run(sizes: Sizes) -> dict[str, Any]:
             detector_budget(solution, epoch=epoch, rng=np.random.default_rng(1), **what)
 
     def followed(statistic: str) -> None:
-        errors = position_errors(solution, rng=np.random.default_rng(1), **what)
+        errors = error_model(solution, what["terms"]).drawn(sizes.draws, np.random.default_rng(1))
         asked = Requirement("r", statistic, 0.1, "pix", probability=0.95)
-        horizon_of(errors, asked, epochs)
+        horizon_of(errors, asked, epochs, grid=sizes.grid)
 
     rows = [{"what": "budget by term", "seconds": median(budgets)}]
     for name in STATISTICS:

@@ -109,7 +109,7 @@ def _library_and_lstsq(n: int, order: int) -> dict[str, Any]:
         "n_stars": n,
         "fit_linear_s": median(lambda: bd.fit_linear(m, model), 5),
         "fit_linear_unclipped_s": median(
-            lambda: bd.fit_linear(m, model, clip_chi2=np.inf, clip_abs=None), 5
+            lambda: bd.fit_linear(m, model, rejection=bd.Rejection(np.inf, None)), 5
         ),
         "design_s": median(lambda: legendre_design(m.x, m.y, order), 5),
         "lstsq_s": median(lambda: np.linalg.lstsq(design, data), 5),
@@ -134,7 +134,7 @@ def _beside(found: dict[str, Any] | None, limit: float) -> dict[str, Any]:
 def _difference(problem: Any, design: np.ndarray) -> float:
     """Largest difference of coefficients from lstsq with the same weights, in formal sigmas."""
     m, K = problem.matches, design.shape[1]
-    fit = bd.fit_linear(m, problem.model, clip_chi2=np.inf, clip_abs=None)
+    fit = bd.fit_linear(m, problem.model, rejection=bd.Rejection(np.inf, None))
     theirs = [
         np.linalg.lstsq(design / s[:, None], value / s)[0]
         for value, s in ((m.u, m.sigma_u), (m.v, m.sigma_v))

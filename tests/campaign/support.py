@@ -18,15 +18,16 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.data import MatchTable
-from bayesdist.infer.catalogue.star_errors import star_covariance, with_star_errors
+from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
-from bayesdist.infer.recoloured import Recoloured
+from bayesdist.infer.posterior.recoloured import Recoloured
 from bayesdist.infer.series import Series
+from bayesdist.missions.acs.simulate import AcsCampaign, acs_model, read_acs
+from bayesdist.missions.acs.simulate.pointings import OWN
 from bayesdist.model import LookupTable
-from bayesdist.simulate.acs import AcsCampaign, acs_model, read_acs
-from bayesdist.simulate.acs.pointings import OWN
 from tests.app.support import good
+from tests.infer.small_campaign import with_star_errors
 
 FILTER = "F606W"
 TERMS = ("A_2", "B_3", "B_2")  # Tables 1, 2, 3
@@ -147,13 +148,14 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
 
 def _simulate(setting: Setting, seed: int, folder: Path) -> None:
     with ExitStack() as stack:
+        simulate = "bayesdist.missions.acs.simulate"
         if setting.pattern == "matern":
-            making = "bayesdist.simulate.acs.making."
+            making = f"{simulate}.making."
             stack.enter_context(mock.patch(making + "detector_tables", _random_field))
             stack.enter_context(mock.patch(making + "filter_tables", lambda *_: ()))
-        stack.enter_context(mock.patch("bayesdist.simulate.acs.pointings.OWN", setting.own))
+        stack.enter_context(mock.patch(f"{simulate}.pointings.OWN", setting.own))
         options = ["--exposures", setting.exposures, "--stars", setting.stars, "--seed", seed]
-        options += ["--smooth"] if setting.pattern == "none" else []
+        options += ["--no-tables"] if setting.pattern == "none" else []
         good("simulate", "acs", "-o", folder, *options, "-q")
     config = folder / f"campaign_{FILTER.lower()}.toml"
     text = config.read_text(encoding="utf-8")

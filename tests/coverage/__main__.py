@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bayesdist.data import atomic_path
+from bayesdist.files import atomic_path
 from bayesdist.report.style import figure_style
 
 from .campaigns import KINDS

@@ -12,11 +12,14 @@ import numpy as np
 from scipy.stats import norm
 
 from bayesdist.app.judging import errors_of
-from bayesdist.assess.budget.budget import TOTAL
-from bayesdist.assess.budget.place import place_budget
-from bayesdist.assess.drawn import CENTROID, PositionErrors
+from bayesdist.assess.budget.budget import TOTAL, place_budget
+from bayesdist.assess.budget.surface import JOINT as MODEL
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.correlated import STRUCTURE_IN_FIT
-from bayesdist.assess.terms.fields import COEFFICIENTS, MODEL, TIME_DEPENDENCE
+from bayesdist.assess.terms.forms import PolynomialField
+from bayesdist.assess.terms.given import CENTROID
+from bayesdist.assess.terms.solution import COEFFICIENTS, TIME_DEPENDENCE
 from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.model import DistortionModel
 
@@ -132,13 +135,13 @@ def _together(n: int) -> list[slice]:
     return [slice(k, k + step) for k in range(0, n, step)]
 
 
-def _said(errors: PositionErrors, x, y, epoch, mag) -> dict[str, np.ndarray]:
+def _said(errors: DrawnErrors, x, y, epoch, mag) -> dict[str, np.ndarray]:
     """Standard deviations (N, 2) by term."""
     out: dict[str, list] = {}
     for rows in _together(x.size):
         when = None if epoch is None else float(epoch[rows][0])
         place = {"chip": 1, "epoch": when, "magnitude": float(mag[rows][0])}
-        for one in place_budget(errors, x[rows], y[rows], **place).terms:
+        for one in place_budget(errors, x[rows], y[rows], **place).every:
             out.setdefault(one.name, []).append(np.column_stack([one.u, one.v]))
     said = {name: np.concatenate(parts) for name, parts in out.items()}
     said[PLACE_TOTAL] = np.sqrt(said[TOTAL] ** 2 - said[CENTROID] ** 2)
@@ -149,7 +152,7 @@ def _said(errors: PositionErrors, x, y, epoch, mag) -> dict[str, np.ndarray]:
 
 
 def _drawn(
-    errors: PositionErrors,
+    errors: DrawnErrors,
     discrepancy: Discrepancy,
     x,
     y,
@@ -161,9 +164,17 @@ def _drawn(
     parts: dict[str, list] = {}
     for rows in _together(x.size):
         when = None if epoch is None else float(epoch[rows][0])
-        (fields,) = errors.fields.at({1: (x[rows], y[rows])}, epoch=when)
-        for part in fields.parts:
-            parts.setdefault(part, []).append(fields.field(part))
+        domain = EvaluationDomain.at_pixels(errors.solution.model, 1, x[rows], y[rows], epoch=when)
+        every = slice(0, errors.n_draws)
+        joint = 0.0
+        for field in errors.at(domain):
+            for part in getattr(field, "parts", (field,)):
+                if isinstance(part, PolynomialField):
+                    parts.setdefault(part.rows[0].name, []).append(part.errors(every))
+            for one in getattr(field, "summed", (field,)):
+                if isinstance(one, PolynomialField):
+                    joint = joint + one.errors(every)
+        parts.setdefault(MODEL, []).append(joint)
     out = {part: np.concatenate(found, axis=1) for part, found in parts.items()}
     out[COEFFICIENTS] = out[COEFFICIENTS] + out.pop(STRUCTURE_IN_FIT)
     shape = out[MODEL].shape

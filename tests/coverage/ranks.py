@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesdist.app.judging import errors_of, margins_of
 from bayesdist.assess import Requirement
-from bayesdist.assess.drawn import Judged
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.infer import OutlierMixture
 from bayesdist.infer.discrepancy import DiscrepancyPriors
@@ -25,6 +25,7 @@ from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial import fields
 from tests.adversarial.measure import GRID, assessed
 from tests.adversarial.truth import SIGMA, Truth, mapped, order_config, pixels
+from tests.infer.support import draw_prior
 
 from .places import one_thread
 
@@ -86,7 +87,7 @@ def from_priors(seed: int) -> tuple[Truth, fields.Field]:
     polynomial = fields.distortion(rng, ORDER)
     true_map = mapped(polynomial, structure(rng))
     hyper = OutlierMixture("gaussian").bind(SIGMA)
-    drawn = {k: float(v[0]) for k, v in hyper.values(hyper.draw_prior(1, rng)).items()}
+    drawn = {k: float(v[0]) for k, v in hyper.values(draw_prior(hyper, 1, rng)).items()}
     x, y = pixels(rng, STARS)
     uv, false = true_map(x, y, None), rng.uniform(size=STARS) < drawn["f"]
     core = np.hypot(SIGMA, drawn["j"])
@@ -119,7 +120,7 @@ def ranks(seed: int) -> dict[str, float]:
         }
         x, y = mesh(*grid_pixels(model.chips[0].size, GRID))
         error = truth.true_map(x, y, None) - model.predict(mean, x, y)
-        drawn = errors._errors(Judged(model.chips, None, "whole"), {})(slice(0, n), np.zeros(1))
+        drawn = errors.errors(EvaluationDomain.of_chips(model, GRID))(slice(0, n), np.zeros(1))
         for i, j in AT:
             k = j * GRID[0] + i
             for axis, name in enumerate("uv"):

@@ -20,8 +20,8 @@ import pytest
 from scipy.stats import binom
 
 from bayesdist.assess.budget.budget import TOTAL
-from bayesdist.assess.drawn import CENTROID
-from bayesdist.assess.terms.fields import COEFFICIENTS, TIME_DEPENDENCE
+from bayesdist.assess.terms.given import CENTROID
+from bayesdist.assess.terms.solution import COEFFICIENTS, TIME_DEPENDENCE
 
 from .campaigns import KINDS
 from .places import PLACE_TOTAL

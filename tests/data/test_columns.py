@@ -6,7 +6,7 @@ import pytest
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 
-from bayesdist.data import matches_from_table, tangent_plane
+from bayesdist.data import ReadOptions, matches_from_table, tangent_plane
 from bayesdist.errors import InputError
 
 
@@ -16,8 +16,8 @@ def stars(n=6, **more):
 
 
 def read(table, columns=None, **options):
-    options = {"source": "stars.ecsv", "unit": "pix", **options}
-    return matches_from_table(table, columns, **options)
+    options = ReadOptions(columns, **{"unit": "pix", **options})
+    return matches_from_table(table, options, source="stars.ecsv")
 
 
 def test_usual_names_in_any_case():

@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from bayesdist.data.detections import NO_STAR
-from bayesdist.data.friends import FINE, friends_of_friends
+from bayesdist.data.matching.friends import FINE, friends_of_friends
 
 
 @pytest.mark.parametrize("seed", range(5))

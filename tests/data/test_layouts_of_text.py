@@ -10,10 +10,10 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from bayesdist.data import matches_from_table, open_matches, read_matches
-from bayesdist.data.chip_labels import numbered
-from bayesdist.data.text_tables import is_text_table
-from bayesdist.data.usual_names import ALIASES
+from bayesdist.data import ReadOptions, matches_from_table, open_matches, read_matches
+from bayesdist.data.reading.chips import numbered
+from bayesdist.data.tables.names import ALIASES
+from bayesdist.data.tables.text import is_text_table
 from bayesdist.errors import InputError
 
 
@@ -92,8 +92,8 @@ def test_chips_by_name_keep_one_numbering(tmp_path):
     m = read_matches(tmp_path / "?.csv", sigma=1.0, unit="pix", chips=given)
     assert m.chip_numbers == (4, 7, 9) and m.chip_names == ("S10", "S2", "N1")
     with pytest.raises(InputError, match=r"column 'detpos': chip 'S10' is none of S2; add a"):
-        matches_from_table(a, unit="pix", chips={"S2": 1})
-    texts = matches_from_table(stars(ccd=["3"] * 3 + ["12"] * 3), unit="pix")
+        matches_from_table(a, ReadOptions(unit="pix", chips={"S2": 1}))
+    texts = matches_from_table(stars(ccd=["3"] * 3 + ["12"] * 3), ReadOptions(unit="pix"))
     assert texts.chip_numbers == (3, 12) and texts.chip_names == ()
 
 
@@ -127,20 +127,20 @@ def test_pixels_that_count_from_zero_are_noticed(names, more, header, origin):
     for name in more:
         t[name] = 1.0
     t.meta = header
-    m = matches_from_table(t, unit="pix")
+    m = matches_from_table(t, ReadOptions(unit="pix"))
     assert (m.x == t[names[0]] + 1 - origin).all() and (m.y == t[names[1]] + 1 - origin).all()
     assert any("first pixel is taken as 0" in note for note in m.notes) == (origin == 0)
     # what is said wins
-    assert (matches_from_table(t, unit="pix", pixel_origin=1).x == t[names[0]]).all()
+    assert (matches_from_table(t, ReadOptions(unit="pix", pixel_origin=1)).x == t[names[0]]).all()
 
 
 def test_names_of_a_pair_go_together():
     t = stars(X_IMAGE=np.ones(6), y_image=np.ones(6))
     t.rename_column("x", "XWIN_IMAGE")  # without its partner
-    m = matches_from_table(t, {"y": "y"}, unit="pix")
+    m = matches_from_table(t, ReadOptions({"y": "y"}, unit="pix"))
     assert (m.x == t["XWIN_IMAGE"]).all()
     t.remove_column("y")
-    m = matches_from_table(t[:1], unit="pix")
+    m = matches_from_table(t[:1], ReadOptions(unit="pix"))
     assert m.x.tolist() == [1.0] and m.y.tolist() == [1.0]
 
 

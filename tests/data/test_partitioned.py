@@ -17,10 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bayesdist.data import MagnitudeErrors, MatchTable, open_matches, pieces, read_matches
-from bayesdist.data import duplicates as duplicates_module
 from bayesdist.data.added_errors import AddedErrors
 from bayesdist.data.partitioned import PartPiece
-from bayesdist.data.writing import write_partitioned
+from bayesdist.data.tables import repeated as duplicates_module
+from bayesdist.data.write import write_partitioned
 from bayesdist.errors import FormatError, InputError
 
 ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour")
@@ -272,7 +272,7 @@ def test_any_sizes_of_row_groups_pieces_and_batches(tmp_path_factory, groups, pi
             writer.write_table(table)
         writer.close()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesdist.data.parquet_files._BATCH", batch)
+        patch.setattr("bayesdist.data.tables.parquet._BATCH", batch)
         patch.setattr("bayesdist.data.parts._BLOCK", piece + 3)
         assert_same(folder, monkeypatch=patch, piece=piece, unit="pix")
 
@@ -578,12 +578,13 @@ def test_nothing_half_written_stays(rng, tmp_path):
 MEASURE = """
 import json, sys
 import numpy as np, pyarrow as pa
-from bayesdist.data import duplicates, open_matches, partitioned, parts
+from bayesdist.data import open_matches, partitioned, parts
+from bayesdist.data.tables import repeated
 
 def peak():
     return int(next(s for s in open("/proc/self/status") if s.startswith("VmHWM")).split()[1])
 
-partitioned.PIECE, parts._BLOCK, duplicates.HELD = 100_000, 50_000, 400_000
+partitioned.PIECE, parts._BLOCK, repeated.HELD = 100_000, 50_000, 400_000
 open_matches(sys.argv[1])  # what is loaded once
 before = peak()
 opened = open_matches(sys.argv[2])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.data import read_matchup
-from bayesdist.data.patterns import find_similarity, pattern_index
+from bayesdist.data.matching.similarity import find_similarity, pattern_index
 from bayesdist.errors import InputError
 from tests.data.sky import frame, positions
 

@@ -13,8 +13,9 @@ from astropy.time import Time
 
 from bayesdist.data import MatchTable, open_matches, rvb_files, write_partitioned
 from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
-from bayesdist.data.rvb_accept import RadialLimit, accept_radial
-from bayesdist.data.rvb_pairs import RvbPairs, bluest, colour_between, colour_of
+from bayesdist.data.rvb_accept import RadialLimit, radial_rows
+from bayesdist.data.rvb_pairs import RvbPairs, colour_of
+from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
 from bayesdist.errors import InputError
 
 SIZE = (1016.0, 1016.0)
@@ -203,35 +204,31 @@ def pairs_with(colour, frame) -> RvbPairs:
     return RvbPairs(matches, np.asarray(colour, float))
 
 
+def taken(pairs: RvbPairs, **limits) -> MatchTable:
+    return SelectedPairs(lambda: [pairs], RvbSelection(**limits), SIZE).table()
+
+
 def test_selection_by_colour_against_a_loop_over_the_frames(rng):
     colour = np.where(rng.uniform(size=200) < 0.2, np.nan, np.round(rng.normal(0.3, 0.5, 200), 1))
     frame = rng.integers(3, size=200)
     pairs = pairs_with(colour, frame)
-    kept = bluest(pairs, 20)
+    kept = taken(pairs, bluest=20)
     expected = []
     for f in range(3):
         known = [k for k in range(200) if frame[k] == f and not np.isnan(colour[k])]
         expected += sorted(known, key=lambda k: colour[k])[:20]
-    assert kept.matches.row.tolist() == sorted(expected)
-    np.testing.assert_array_equal(kept.colour, colour[sorted(expected)])
-    between = colour_between(pairs, -0.2, 0.5)
+    assert kept.row.tolist() == sorted(expected)
+    between = taken(pairs, colour=(-0.2, 0.5))
     inside = [k for k in range(200) if -0.2 <= colour[k] <= 0.5]
-    assert between.matches.row.tolist() == inside
-    for one in (kept, between):
-        assert one.matches.rejected["no colour"] == np.isnan(colour).sum()
-        assert sum(one.matches.rejected.values()) + len(one) == 200
-
-
-def test_selection_by_colour_refuses_what_leaves_nothing():
-    pairs = pairs_with([0.1, np.nan, 0.3], [0, 0, 1])
-    with pytest.raises(InputError, match=r"no pair of 3 is left .* 1 have no colour"):
-        colour_between(pairs, 5.0, 6.0)
-    with pytest.raises(InputError, match="colours from 1 to 0"):
-        colour_between(pairs, 1.0, 0.0)
-    with pytest.raises(InputError, match="hence no colours"):
-        bluest(RvbPairs(pairs.matches), 3)
-    with pytest.raises(InputError, match="the 0 bluest"):
-        bluest(pairs, 0)
+    assert between.row.tolist() == inside
+    both = taken(pairs, colour=(-0.2, 0.5), bluest=20)
+    first = []
+    for f in range(3):
+        first += sorted((k for k in inside if frame[k] == f), key=lambda k: colour[k])[:20]
+    assert both.row.tolist() == sorted(first)
+    for one in (kept, between, both):
+        assert one.rejected["no colour"] == np.isnan(colour).sum()
+        assert sum(one.rejected.values()) + len(one) == 200
 
 
 def test_the_radial_limit_at_centre_edge_and_corner():
@@ -248,7 +245,7 @@ def test_false_matches_pass_in_proportion_to_the_area_within_the_limit(rng):
     x, y = rng.uniform(0.5, 1016.5, (2, n))
     r, phi = 4.0 * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
     matches = MatchTable(x, y, x + r * np.cos(phi), y + r * np.sin(phi))
-    kept = accept_radial(matches, SIZE, offset=RadialLimit(0.5, 3.0))
+    kept = taken(RvbPairs(matches), offset=RadialLimit(0.5, 3.0))
     # <(a + b s)^2> over a square, s = r^2 / r_corner^2: <s> = 1/3, <s^2> = 7/45
     share = (0.5**2 + 2 * 0.5 * 2.5 / 3 + 2.5**2 * 7 / 45) / 16
     assert abs(len(kept) / n - share) < 4 * np.sqrt(share * (1 - share) / n)
@@ -264,14 +261,14 @@ def test_limits_are_judged_about_the_expected_positions(rng):
     matches = MatchTable(x, y, u, v, sigma_u=np.full(n, 0.1), sigma_v=np.full(n, 0.1))
     tight = RadialLimit(0.6, 0.6)
     # undistorted, what is beyond 0.6 px is lost towards the edges; expected, nothing is
-    lost = accept_radial(matches, SIZE, offset=tight)
+    lost = taken(RvbPairs(matches), offset=tight)
     assert np.abs(lost.x - 508.5).max() < np.sqrt((0.6 + 0.5) / 3e-6) and len(lost) < 0.95 * n
-    assert len(accept_radial(matches, SIZE, offset=tight, expected=distorted)) == n
     # chi-square of two axes: exp(-q / 2) lies beyond q
-    kept = accept_radial(matches, SIZE, chi2=RadialLimit(4.0, 4.0), expected=distorted)
-    beyond = kept.rejected["chi-square beyond the radial limit"]
-    assert abs(beyond / n - np.exp(-2)) < 4 * np.sqrt(np.exp(-2) / n)
-    both = accept_radial(matches, SIZE, offset=tight, chi2=RadialLimit(4.0, 4.0))
+    limit = RadialLimit(4.0, 4.0)
+    near, likely = radial_rows(matches, SIZE, offset=tight, chi2=limit, expected=distorted)
+    assert near.all()
+    assert abs((~likely).mean() - np.exp(-2)) < 4 * np.sqrt(np.exp(-2) / n)
+    both = taken(RvbPairs(matches), offset=tight, chi2=limit)
     assert sum(both.rejected.values()) + len(both) == n
     assert both.rejected["offset beyond the radial limit"] == n - len(lost)
 
@@ -279,15 +276,15 @@ def test_limits_are_judged_about_the_expected_positions(rng):
 def test_acceptance_refuses_what_it_cannot_judge():
     one = np.array([1.0, 2.0])
     matches = MatchTable(one, one, one + 5, one)
-    with pytest.raises(InputError, match="none of 2 pairs is within"):
-        accept_radial(matches, SIZE, offset=RadialLimit(1.0, 2.0))
+    beyond = r"no pair of 2 is left .*: offset beyond the radial limit \(2\)"
+    with pytest.raises(InputError, match=beyond):
+        taken(RvbPairs(matches), offset=RadialLimit(1.0, 2.0))
     with pytest.raises(InputError, match="needs errors"):
-        accept_radial(matches, SIZE, chi2=RadialLimit(1.0, 2.0))
-    with pytest.raises(InputError, match="no limit is given"):
-        accept_radial(matches, SIZE)
+        taken(RvbPairs(matches), chi2=RadialLimit(1.0, 2.0))
+    in_mas = RvbPairs(MatchTable(one, one, one, one, unit="mas"))
     with pytest.raises(InputError, match="u, v are in mas"):
-        accept_radial(MatchTable(one, one, one, one, unit="mas"), SIZE, offset=RadialLimit(1, 2))
+        taken(in_mas, offset=RadialLimit(1, 2))
     with pytest.raises(InputError, match=r"shape \(3, 2\) for 2 pairs"):
-        accept_radial(matches, SIZE, offset=RadialLimit(1, 2), expected=np.zeros((3, 2)))
+        radial_rows(matches, SIZE, offset=RadialLimit(1, 2), expected=np.zeros((3, 2)))
     with pytest.raises(InputError, match="corner is -1"):
         RadialLimit(1.0, -1.0)

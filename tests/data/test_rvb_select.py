@@ -12,17 +12,14 @@ from bayesdist.data import (
     RvbPairs,
     RvbSelection,
     SelectedPairs,
-    accept_radial,
-    bluest,
-    colour_between,
     read_rvb,
     rvb_files,
     rvb_open,
     stream_rvb,
-    write_rvb,
 )
 from bayesdist.data.rvb_open import open_rvb
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.rvb.write import write_rvb
 from tests.data.test_rvb import assert_same, rvb_table, write
 
 SIZE = (1016.0, 1016.0)
@@ -60,11 +57,10 @@ def cut(pairs: RvbPairs, size: int) -> list[RvbPairs]:
 def test_pieces_pass_as_the_whole_does(rng, size):
     pairs = pairs_of(rng)
     limit, chi2 = RadialLimit(0.8, 2.5), RadialLimit(6.0, 12.0)
-    expected = bluest(colour_between(pairs, -0.3, 0.6), 40)
-    whole = accept_radial(expected.matches, SIZE, offset=limit, chi2=chi2)
+    selection = RvbSelection((-0.3, 0.6), 40, limit, chi2)
+    whole = SelectedPairs(lambda: [pairs], selection, SIZE).table()
     pieces = cut(pairs, size)
-    found = SelectedPairs(lambda: pieces, RvbSelection((-0.3, 0.6), 40, limit, chi2), SIZE)
-    table = found.table()
+    table = SelectedPairs(lambda: pieces, selection, SIZE).table()
     np.testing.assert_array_equal(table.row, whole.row)
     assert table.rejected == whole.rejected and table.n_rows == 400
     assert len(table) + sum(table.rejected.values()) == 400

@@ -8,7 +8,7 @@ from astropy.coordinates import get_body_barycentric
 from astropy.table import MaskedColumn, Table
 from astropy.time import Time
 
-from bayesdist.data import matches_from_table, read_catalog, tangent_plane
+from bayesdist.data import ReadOptions, matches_from_table, read_catalog, tangent_plane
 from bayesdist.errors import InputError
 
 POINT = (83.0, -66.0)  # near the pole of the ecliptic: parallaxes on both axes
@@ -30,7 +30,7 @@ def catalogue(n=40, seed=1, **more):
 
 
 def read(t, **options):
-    return matches_from_table(t, source="gaia.csv", tangent_point=POINT, **options)
+    return matches_from_table(t, ReadOptions(tangent_point=POINT, **options), source="gaia.csv")
 
 
 def directions(t):

@@ -15,7 +15,7 @@ from bayesdist.diagnose.score.projection import projection_of
 from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.result import Outcome
 from bayesdist.diagnose.score.sample import scored_sample
-from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
+from bayesdist.infer import GaussianPriors, LinearFit, Rejection, fit_linear
 from bayesdist.model import DistortionModel, TimeDependence
 
 from ..infer.support import TWO_CHIPS, columns_of, exposures, table, truth_of
@@ -118,7 +118,7 @@ class Dated:
         return np.where(matches.chip[:, None] == 1, moved, 0.0)
 
     def solve(self, model: DistortionModel, matches: MatchTable) -> LinearFit:
-        return fit_linear(matches, model, clip_abs=None)
+        return fit_linear(matches, model, rejection=Rejection(clip_abs=None))
 
     def of_time(self, seed: int) -> dict[str, Outcome]:
         """The two tests alone, in a fraction of the time."""

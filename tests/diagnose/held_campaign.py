@@ -14,7 +14,7 @@ from bayesdist.data.holdout import SetAside, Split, split_matches
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
 from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
-from bayesdist.infer import OutlierMixture, load
+from bayesdist.infer import OutlierMixture, Rejection, load
 from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
 from bayesdist.infer.density.grid import build_proposal
@@ -126,7 +126,7 @@ def solved(
     assert isinstance(kept, MatchTable) and isinstance(held, MatchTable)
     model = replace(one.model, exposures=kept.exposure_names)
     joint = fit_hierarchical(
-        kept, model, clip_chi2=25.0 if mixture else np.inf, clip_abs=None, n_tau=64
+        kept, model, rejection=Rejection(25.0 if mixture else np.inf, None), n_tau=64
     )
     mean, cov, extra = joint.mean, joint.cov, {}
     if mixture:

@@ -11,7 +11,7 @@ from scipy import stats
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose import ScoreTest, score_tests
-from bayesdist.infer import LinearFit, Posterior, fit_linear
+from bayesdist.infer import LinearFit, Posterior, Rejection, fit_linear
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches
 
@@ -88,7 +88,7 @@ class Scene:
     def solve(self, model: DistortionModel, table: MatchTable) -> LinearFit | Posterior:
         if self.mixture:
             return mode_of(table, model)[0]
-        return fit_linear(table, model, clip_abs=None)
+        return fit_linear(table, model, rejection=Rejection(clip_abs=None))
 
     def tests(self, seed: int, **options) -> dict[str, ScoreTest]:
         model, table = self.data(seed)

@@ -23,8 +23,8 @@ from bayesdist.diagnose.holdout.predictive import (
 )
 from bayesdist.diagnose.holdout.spread import SpreadMoments, sum_tails
 from bayesdist.diagnose.holdout.sums import _beyond
-from bayesdist.diagnose.holdout.tests import holm
 from bayesdist.diagnose.holdout.validation import DOUBTFUL, held_out_truth
+from bayesdist.diagnose.significance import holm
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target

@@ -19,7 +19,7 @@ from bayesdist.infer import (
     OutlierMixture,
     fit_linear,
     load,
-    outlier_probability,
+    memberships,
     residuals,
     sample,
 )
@@ -168,7 +168,7 @@ def test_the_task_and_what_it_returns_travel(several):
 def test_stars_flagged_are_those_that_are_flagged_one_by_one(several, monkeypatch):
     table, fit = several
     posterior = sample(fit, table, outliers=OutlierMixture(), target_ess=50, target_rhat=1.1)
-    flagged = outlier_probability(posterior, table) > 0.5
+    flagged = memberships(posterior, table).outlier_probability > 0.5
     expected = [(flagged & (table.exposure == k)).sum() for k in range(3)]
     monkeypatch.setattr("bayesdist.data.matches.PIECE", 700)
     found = flagged_by_exposure(load(fit.model, table), posterior)

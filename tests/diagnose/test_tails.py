@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.diagnose import score_tests
-from bayesdist.infer import fit_linear
+from bayesdist.infer import Rejection, fit_linear
 
 from ..infer.support import residual_of
 from .support import SIGMA, Scene, by_name, student, unequal
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def cut(scene: Scene, seed: int, sigmas: float, *, square: bool = False, soft: float = 0.0):
     """Tests of data that were matched within so many sigmas of a first solution."""
     model, table = scene.data(seed)
-    r = residual_of(model, fit_linear(table, model, clip_abs=None).mean, table)
+    r = residual_of(model, fit_linear(table, model, rejection=Rejection(clip_abs=None)).mean, table)
     r = r + soft * SIGMA * np.random.default_rng(seed).standard_normal(r.shape)
     inside = np.abs(r).max(axis=1) if square else np.hypot(*r.T)
     table = table.select(inside < sigmas * SIGMA)
@@ -53,7 +53,7 @@ def test_a_few_matches_beyond_an_edge_do_not_hide_it():
     u = table.u.copy()
     u[:2] += 8 * SIGMA
     table = table._with(u=u)
-    found = truncation(table, fit_linear(table, fit.model, clip_abs=None))
+    found = truncation(table, fit_linear(table, fit.model, rejection=Rejection(clip_abs=None)))
     assert found.significant
 
 
@@ -69,7 +69,7 @@ def test_errors_quoted_too_large_are_not_taken_for_a_cut():
     """Chi-square is far below one in both."""
     table, fit = Scene(3000, 2).fitted(1)
     table = table.with_sigma(1.5 * SIGMA, 1.5 * SIGMA)
-    fit = fit_linear(table, fit.model, clip_abs=None)
+    fit = fit_linear(table, fit.model, rejection=Rejection(clip_abs=None))
     assert fit.chi2 / fit.dof < 0.5
     found = truncation(table, fit)
     assert not found.significant and found.p_value > 0.05

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.infer import OutlierMixture, fit_linear, sample
+from bayesdist.infer import OutlierMixture, Rejection, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 from tests.seeds import over
+
+from .support import draw_prior
 
 LEVELS = (0.683, 0.954)
 SIZE = (1016.0, 1016.0)
@@ -69,7 +71,7 @@ def ranks_of(seed: int) -> dict[str, float]:
     n = 300
     sigma = _errors(n, rng)
     hyper = OutlierMixture().bind(float(np.median(np.concatenate(sigma))))
-    true = {k: float(v) for k, v in hyper.values(hyper.draw_prior(1, rng)[0]).items()}
+    true = {k: float(v) for k, v in hyper.values(draw_prior(hyper, 1, rng)[0]).items()}
     matches, _ = simulate_matches(
         model,
         theta,
@@ -81,7 +83,7 @@ def ranks_of(seed: int) -> dict[str, float]:
         outlier_scale=true["s_out"],
     )
     # no rejection by absolute size: s_out from its prior may be hundreds of pixels
-    fit = fit_linear(matches, model, clip_abs=None)
+    fit = fit_linear(matches, model, rejection=Rejection(clip_abs=None))
     posterior = sample(fit, matches, seed=seed, target_ess=800)
     out = {"converged": float(posterior.convergence.converged)}
     for key, values in posterior.hyper.items():

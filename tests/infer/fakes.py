@@ -11,11 +11,10 @@ from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
-from bayesdist.infer.sampler.blocks import Walkers
-from bayesdist.infer.sampler.ensembles import Ensembles
+from bayesdist.infer.sampler.checkpoints import Walkers
+from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
 from bayesdist.infer.sampler.lookahead import Page
 from bayesdist.infer.sampler.move_schedule import Plan, Stretch
-from bayesdist.infer.sampler.whitening import Whitening
 
 
 class FakeTarget:

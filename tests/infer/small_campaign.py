@@ -10,7 +10,8 @@ import numpy as np
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import LinearFit
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
-from bayesdist.infer.transforms import lines
+from bayesdist.infer.posterior.recoloured import Recoloured
+from bayesdist.infer.transforms import lines, without_frames
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import CHIP_DEVIATIONS
 from bayesdist.simulate import simulate_matches
@@ -223,6 +224,19 @@ class Truth:
 
     def draws(self, n, rng):
         return np.tile(self.mean, (n, 1))
+
+
+def with_star_errors(solution, stars: StarCovariance) -> Recoloured:
+    """A solution whose covariance and draws know that a star has one error."""
+    return Recoloured(solution, np.asarray(solution.cov) + stars.extra)
+
+
+def seen_by(exposure: str, epoch: float | None, model: DistortionModel, theta: np.ndarray) -> Truth:
+    """The polynomials of all chips as one exposure sees them: without frames and without time."""
+    chips = [chip.number for chip in model.chips]
+    groups = model.groups(len(chips), epoch=epoch, exposure=exposure, chip=chips)
+    bare = replace(without_frames(Truth(model, theta)).model, time=None)
+    return Truth(bare, model.effective(theta, groups)[groups.index].ravel())
 
 
 def true_lines(model: DistortionModel, theta: np.ndarray):

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy.special import logit
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer import (
@@ -15,11 +16,13 @@ from bayesdist.infer import (
     LinearFit,
     OutlierMixture,
     Posterior,
+    Rejection,
     SamplerInfo,
     fit_linear,
     load,
 )
 from bayesdist.infer.density.target import Target
+from bayesdist.infer.stars.mixture import OUTLIER_SHAPE, T_DOF, Hyper
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches
@@ -33,7 +36,7 @@ MIXTURES = {
     "uniform": (OutlierMixture("uniform", match_radius=2.0), [np.log(0.02), -3.0]),
     "none": (OutlierMixture("none"), [np.log(0.02)]),
 }
-UNCLIPPED = {"clip_chi2": np.inf, "clip_abs": None}
+UNCLIPPED = {"rejection": Rejection(np.inf, None)}
 
 
 def legendre_design(order: int, x, y, size=SIZE) -> np.ndarray:
@@ -165,3 +168,19 @@ def numerical_gradient(function, point: np.ndarray, step) -> np.ndarray:
 
 def pieces(n: int, cuts: list[int]) -> list[np.ndarray]:
     return [np.arange(a, b) for a, b in pairwise([0, *cuts, n])]
+
+
+def draw_prior(hyper: Hyper, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Points (n, n_hyper) from the prior of a mixture, for simulation-based calibration."""
+    columns: list[np.ndarray] = []
+    for name in hyper.mixture.hyper:
+        if name == "f":
+            f = rng.beta(*hyper.mixture.fraction_prior, size=n)
+            columns.append(logit(np.clip(f, 1e-300, 1 - 1e-16)))
+        elif name == "j":
+            columns.append(np.log(hyper._jitter_scale * np.abs(rng.standard_t(T_DOF, size=n))))
+        else:
+            unit = rng.gamma(OUTLIER_SHAPE, size=n)  # w^2 is the rate over this
+            rate = hyper._outlier_rate(np.column_stack(columns))
+            columns.append(0.5 * np.log(rate / unit))
+    return np.column_stack(columns) if columns else np.zeros((n, 0))

@@ -14,16 +14,16 @@ import xarray as xr
 from bayesdist.errors import FormatError, InputError
 from bayesdist.infer import (
     OutlierMixture,
+    Rejection,
+    files,
     fit_linear,
     load_fit,
     load_posterior,
     memberships,
-    outlier_probability,
     sample,
     save_fit,
     save_posterior,
 )
-from bayesdist.infer.files import posterior_file
 from bayesdist.model import TimeDependence
 
 from .support import TWO_CHIPS, simulated
@@ -117,7 +117,7 @@ def test_xarray_opens_it(written):
         constants = tree["constant_data"]
         np.testing.assert_array_equal(constants["sigma_u"], matches.sigma_u)
         np.testing.assert_array_equal(constants["chip"], matches.chip_number)
-        p = outlier_probability(posterior, matches)
+        p = memberships(posterior, matches).outlier_probability
         np.testing.assert_array_equal(constants["outlier_probability"], p)
         assert constants.attrs["unit"] == "pix"
         assert json.loads(tree.attrs["provenance"]) == {"seed": 8, "inputs": ["a.ecsv"]}
@@ -151,12 +151,12 @@ def test_what_is_said_of_each_star_is_the_mean_over_some_draws(written):
 
 def test_large_runs_leave_out_star_times_draw_and_then_the_stars(written, monkeypatch, tmp_path):
     posterior, matches, _ = written
-    monkeypatch.setattr(posterior_file, "LARGEST", posterior.log_prob.size * len(matches) * 8 - 1)
+    monkeypatch.setattr(files, "LARGEST", posterior.log_prob.size * len(matches) * 8 - 1)
     save_posterior(posterior, matches, tmp_path / "big.nc")
     draws = {"posterior", "sample_stats", "diagnostics"}
     with xr.open_datatree(tmp_path / "big.nc", engine="h5netcdf") as tree:
         assert set(tree.children) == draws | {"observed_data", "constant_data"}
-    monkeypatch.setattr(posterior_file, "MOST_STARS", len(matches) - 1)
+    monkeypatch.setattr(files, "MOST_STARS", len(matches) - 1)
     save_posterior(posterior, matches, tmp_path / "larger.nc")
     save_posterior(posterior, None, tmp_path / "none.nc")
     for name in ("larger.nc", "none.nc"):
@@ -225,7 +225,9 @@ NUMBERS = (
 )
 
 
-@pytest.mark.parametrize("options", [{}, {"clip_abs": None}], ids=["clipped", "no absolute limit"])
+@pytest.mark.parametrize(
+    "options", [{}, {"rejection": Rejection(clip_abs=None)}], ids=["clipped", "no absolute limit"]
+)
 def test_fit_round_trip(campaign, tmp_path, options):
     still, matches, _ = campaign
     fit = fit_linear(matches, still, **options)

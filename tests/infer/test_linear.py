@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, build_model, fit_linear, residuals
+from bayesdist.infer import GaussianPriors, Rejection, build_model, fit_linear, residuals
 from bayesdist.model import FRAME_KINDS, DistortionModel, TimeDependence
 
 from .support import (
@@ -158,7 +158,7 @@ def test_two_passes_reject_by_reason_and_refit_the_rest():
     v[20] -= 30.0
     u[[30, 40]] += 5.0
     bad = table(matches.x, matches.y, u, v)
-    fit = fit_linear(bad, model, clip_chi2=25.0, clip_abs=2.0)
+    fit = fit_linear(bad, model, rejection=Rejection(25.0, 2.0))
     used = fit.uses(bad)
     np.testing.assert_array_equal(np.flatnonzero(~used), [10, 20, 30, 40])
     assert fit.rejected == {"chi-square": 1, "absolute residual": 3}
@@ -182,7 +182,7 @@ def test_the_absolute_limit_counts_in_pixels_whatever_the_unit():
     mas = table(
         matches.x, matches.y, (matches.u + bad) * scale, matches.v * scale, sigma=50.0, unit="mas"
     )
-    fit = fit_linear(mas, DistortionModel(2, (CHIP,), unit="mas"), clip_chi2=np.inf, clip_abs=2.0)
+    fit = fit_linear(mas, DistortionModel(2, (CHIP,), unit="mas"), rejection=Rejection(np.inf, 2.0))
     np.testing.assert_array_equal(np.flatnonzero(~fit.uses(mas)), [3])
 
 
@@ -200,7 +200,7 @@ def test_wrong_errors_as_a_whole_are_refused():
     x, y = rng.uniform(1, 800, (2, 200))
     scrambled = table(x, y, rng.uniform(0, 1000, 200), rng.uniform(0, 1000, 200))
     with pytest.raises(InputError, match="rejection limits"):
-        fit_linear(scrambled, DistortionModel(2, (CHIP,)), clip_abs=2.0)
+        fit_linear(scrambled, DistortionModel(2, (CHIP,)), rejection=Rejection(clip_abs=2.0))
 
 
 def corner_weights(matches, factor):
@@ -211,7 +211,7 @@ def corner_weights(matches, factor):
 def test_corner_weights_give_the_sandwich_covariance():
     """Closed form of a weighted mean whose weights are not the inverse variances."""
     model, matches, _ = simulated(9, 300, order=2)
-    fit = fit_linear(matches, model, radial_weight=4.0, **UNCLIPPED)
+    fit = fit_linear(matches, model, rejection=Rejection(np.inf, None, 4.0))
     A = legendre_design(2, matches.x, matches.y)
     w = corner_weights(matches, 4.0) / 0.05**2
     gain = np.linalg.solve(A.T @ (w[:, None] * A), A.T * w)
@@ -231,7 +231,7 @@ def test_corner_weights_with_frames_and_priors_give_the_sandwich_covariance():
         24, 300, frames="affine", n_exposures=3, sigma=uneven_sigma(rng, 300), fraction=0.03
     )
     priors = GaussianPriors.of(model, {"u_2_0": (0.5, 0.002), "e3.shift_u": (0.0, 5.0)})
-    fit = fit_linear(matches, model, radial_weight=4.0, priors=priors)
+    fit = fit_linear(matches, model, rejection=Rejection(radial_weight=4.0), priors=priors)
     used = fit.uses(matches)
     assert 0 < (~used).sum() < 30
     J = model.jacobian(fit.mean, matches.x, matches.y, exposure=matches.exposure)[used]
@@ -260,7 +260,7 @@ def test_who_is_used_is_decided_by_the_first_pass():
     model, matches, _ = simulated(
         25, 600, frames="shift", n_exposures=2, sigma=uneven_sigma(rng, 600), fraction=0.1
     )
-    fit = fit_linear(matches, model, clip_chi2=20.0, clip_abs=1.5)
+    fit = fit_linear(matches, model, rejection=Rejection(20.0, 1.5))
     first = fit_linear(matches, model, **UNCLIPPED)
     # the first pass clips nothing
     np.testing.assert_allclose(fit.clip.theta / first.sigma, first.mean / first.sigma, atol=1e-3)
@@ -291,7 +291,7 @@ def test_corner_weights_in_repeated_experiments():
     for _ in range(400):
         u, v = (true + 0.05 * rng.standard_normal(true.shape)).T
         one = table(matches.x, matches.y, u, v)
-        fit = fit_linear(one, model, radial_weight=20.0, **UNCLIPPED)
+        fit = fit_linear(one, model, rejection=Rejection(np.inf, None, 20.0))
         estimates.append(fit.mean)
     d = np.array(estimates) - truth.theta
     ratio = (d**2).mean(axis=0) / np.diag(fit.cov)  # chi-square_400 / 400

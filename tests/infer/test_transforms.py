@@ -10,7 +10,6 @@ from scipy import stats
 
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import (
-    in_exposure,
     linear_terms,
     lines,
     reference_gauge,
@@ -18,6 +17,8 @@ from bayesdist.infer.transforms import (
     without_frames,
 )
 from bayesdist.model import Chip, DistortionModel, TimeDependence
+
+from .small_campaign import seen_by
 
 CHIPS = (
     Chip(1, "WFC1", (4096.0, 2048.0), (2048.0, 1024.0)),
@@ -129,8 +130,10 @@ def jacobian_by_differences(transform, theta, size):
 
 def a_static(seed=2):
     """Polynomials alone, with any orientation."""
-    view = in_exposure(acs(seed), "b", epoch=2005.0)
-    return Gaussian(view.model, view.mean, view.cov)
+    source = acs(seed)
+    seen = seen_by("b", 2005.0, source.model, source.mean)
+    n = seen.model.n_params
+    return Gaussian(seen.model, seen.mean, source.cov[:n, :n])
 
 
 @pytest.mark.parametrize("chip", [1, 2])
@@ -346,30 +349,6 @@ def test_terms_that_do_not_drift_have_no_rate():
         lines(acs()).select("C_2")
 
 
-# -- one exposure ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("exposure", ["a", "b", 2])
-def test_an_exposure_is_seen_with_its_frame(exposure):
-    source = acs()
-    view = in_exposure(source, exposure, epoch=2011.0)
-    x, y = pixels()
-    for chip in (1, 2):
-        where = {"epoch": 2011.0, "chip": chip, "exposure": exposure}
-        np.testing.assert_allclose(
-            view.model.predict(view.mean, x, y, chip=chip),
-            source.model.predict(source.mean, x, y, **where),
-            atol=1e-9,
-        )
-    J = jacobian_by_differences(view.transform, source.mean, 1e-2 * np.sqrt(np.diag(source.cov)))
-    expected = J @ source.cov @ J.T
-    unit = np.outer(view.sigma, view.sigma)
-    np.testing.assert_allclose(view.cov / unit, expected / unit, atol=1e-6)
-    # a view of a view: the telescope's roll is gone, scale and shear of the exposure are not
-    gauged = reference_gauge(view)
-    assert abs(linear_terms(gauged, 2).select("A_3").values[0]) < 1e-13
-
-
 def test_without_frames_is_the_head_of_theta():
     source = acs()
     view = without_frames(source)
@@ -393,5 +372,3 @@ def test_wrong_places():
         linear_terms(acs(), 7, epoch=2005.0)
     with pytest.raises(InputError, match="no epoch is given"):
         linear_terms(acs())
-    with pytest.raises(InputError, match="no exposure 'z'"):
-        in_exposure(acs(), "z", epoch=2005.0)

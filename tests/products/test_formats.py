@@ -231,7 +231,7 @@ def test_a_new_format_is_one_module(toy, tmp_path):
     good("apply", toy, tmp_path / "stars.csv", "-o", tmp_path / "out.csv")
     row = (tmp_path / "out.csv").read_text().splitlines()[-1].split(",")
     assert float(row[3]) == pytest.approx(100 + 1e-6 * 1e4, rel=1e-9)
-    good("pam", toy, "-o", tmp_path / "pam.fits")
+    good("hst", "pam", toy, "-o", tmp_path / "pam.fits")
     settings = registry.product_settings()["toy"]()
     [one] = registry.build("toy", registry.read_calibration(toy), settings)
     again = registry.recognized(content_of(one))

@@ -12,10 +12,10 @@ from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.orientation import Aperture, lay_on_aperture, oriented
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import lines, reference_gauge, segment
+from bayesdist.missions.acs.simulate import acs_solution
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.products import IdcTab, idctab_from_solution, read_idctab
 from bayesdist.products.formats.idctab.drift import storable
-from bayesdist.simulate.acs import acs_solution
 
 from .support import (
     F606W,

@@ -16,14 +16,14 @@ from bayesdist.calibration.calibration import calibration_of, gaussian_solution
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
 from bayesdist.infer.transforms import reference_gauge
+from bayesdist.missions.acs.simulate import acs_solution
+from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products import idctab_from_solution, lint_idctab, read_idctab
 from bayesdist.products.formats.idctab.build import build_idctab
 from bayesdist.products.formats.idctab.drift import storable
 from bayesdist.products.formats.idctab.hst import combination_of
 from bayesdist.products.release import Period, Release, write_release
-from bayesdist.simulate.acs import acs_solution
-from bayesdist.simulate.acs.tables import detector_tables, filter_tables
 
 from .acs_offline import Pointing, to_sky
 from .acs_offline import corrected as corrected_by_stwcs

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from bayesdist.calibration.inverse import FIT_NODES, detector_grid
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.missions.wise.simulate import WISE_COEFFICIENTS, wise_solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import (
     lint_sip,
@@ -20,7 +21,6 @@ from bayesdist.products import (
     sip_header,
     worst_closure,
 )
-from bayesdist.simulate.wise import WISE_COEFFICIENTS, wise_solution
 
 from .support import StandIn, random_pixels, some_solution, wfc_solution
 

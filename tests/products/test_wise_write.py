@@ -15,6 +15,7 @@ from numpy.polynomial import polynomial
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear
+from bayesdist.missions.wise.simulate import WISE_COEFFICIENTS, wise_set, wise_solution
 from bayesdist.products import (
     describe,
     lint_wise_band,
@@ -25,8 +26,6 @@ from bayesdist.products import (
     write_sip,
     write_wise_meta,
 )
-from bayesdist.simulate import wise_solution
-from bayesdist.simulate.wise import WISE_COEFFICIENTS, wise_set
 from tests.app.support import begin_stagewise, cli, good, one_sentence, summary_of, write_config
 
 from .support import astropy_wcs, random_pixels, some_solution
@@ -278,7 +277,7 @@ def test_other_detectors_are_refused(tmp_path, section, value, words):
 def test_rotated_meta_data_are_those_of_appendix_a(printed, tmp_path):
     first = tmp_path / "0.meta"
     write_wise_meta(first, printed)
-    said = good("rotate", first, "--angle", 90, "-o", tmp_path / "90.meta").out
+    said = good("wise", "rotate", first, "--angle", 90, "-o", tmp_path / "90.meta").out
     assert "W4: A_DMAX 0.582 px, B_DMAX 0.971 px" in said
     old = {(e[1], e[2]): e[4] for e in entries(first)}
     new = {(e[1], e[2]): e[4] for e in entries(tmp_path / "90.meta")}
@@ -291,7 +290,7 @@ def test_rotated_meta_data_are_those_of_appendix_a(printed, tmp_path):
     # round about
     path = tmp_path / "90.meta"
     for k, angle in enumerate((180, -270, 0)):
-        good("rotate", path, "--angle", angle, "-o", tmp_path / f"turn{k}.meta")
+        good("wise", "rotate", path, "--angle", angle, "-o", tmp_path / f"turn{k}.meta")
         path = tmp_path / f"turn{k}.meta"
     assert path.read_text() == first.read_text()
 
@@ -299,9 +298,9 @@ def test_rotated_meta_data_are_those_of_appendix_a(printed, tmp_path):
 def test_mirrored_twice_is_the_same(printed, tmp_path):
     first, second, third = (tmp_path / f"{k}.meta" for k in range(3))
     write_wise_meta(first, printed)
-    good("rotate", first, "--mirror", "-o", second)
+    good("wise", "rotate", first, "--mirror", "-o", second)
     assert second.read_text() != first.read_text()
-    good("rotate", second, "--mirror", "-o", third)
+    good("wise", "rotate", second, "--mirror", "-o", third)
     assert third.read_text() == first.read_text()
 
 
@@ -311,7 +310,7 @@ def test_a_rotated_header_keeps_every_star_on_the_sky(tmp_path, name):
         some_solution(4, angle=0.3), scale_arcsec=0.1, crval=(30.0, -20.0), inverse_order=5
     )
     write_sip(header, tmp_path / "in.hdr")
-    good("rotate", tmp_path / "in.hdr", "--angle", 90, "-o", tmp_path / name)
+    good("wise", "rotate", tmp_path / "in.hdr", "--angle", 90, "-o", tmp_path / name)
     x, y = random_pixels(header.size, 500)
     before = astropy_wcs(sip_header(header)).all_pix2world(x, y, 1)
     turned = read_sip(tmp_path / name)
@@ -332,10 +331,10 @@ def test_what_cannot_be_rotated_is_refused(printed, tmp_path):
         ([tmp_path / "text"], ["of no kind that is understood"]),
         ([tmp_path / "nowhere"], ["nowhere"]),
     ):
-        result = cli("rotate", *arguments, "-o", tmp_path / "out")
+        result = cli("wise", "rotate", *arguments, "-o", tmp_path / "out")
         assert result.code == 1
         one_sentence(result.err, *words)
         assert not (tmp_path / "out").exists()
-    result = cli("rotate", path, "-o", path)
+    result = cli("wise", "rotate", path, "-o", path)
     assert result.code == 1
     one_sentence(result.err, "this file exists", "--force")

@@ -153,7 +153,7 @@ def fitted(pairs: Pairs, true: NDArray[np.bool_] | None = None) -> Fitted:
 
 def plain(matches: bd.MatchTable, model: bd.DistortionModel) -> bd.LinearFit:
     """Least squares that leaves nobody out."""
-    return bd.fit_linear(matches, model, clip_chi2=1e12, clip_abs=None)
+    return bd.fit_linear(matches, model, rejection=bd.Rejection(1e12, None))
 
 
 def repeated(matches: bd.MatchTable, model: bd.DistortionModel) -> bd.LinearFit:

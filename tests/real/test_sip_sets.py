@@ -12,6 +12,7 @@ from scipy import stats
 
 from bayesdist.calibration.inverse import detector_grid, fit_inverse
 from bayesdist.calibration.rotation import pixel_matrix
+from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.products import (
     read_sip,
     sip_from_solution,
@@ -20,7 +21,6 @@ from bayesdist.products import (
     write_sip,
 )
 from bayesdist.products.formats.sip.rotate import rotated_sip
-from bayesdist.simulate.wise import wise_solution
 
 from ..products.support import StandIn, astropy_wcs, random_pixels
 from ..products.test_sip_rotate import moved_pixels

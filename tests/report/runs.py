@@ -28,9 +28,9 @@ from bayesdist.assess.budget.detector import detector_budget
 from bayesdist.assess.mosaic import chip_places
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.sampler.convergence import Convergence, Limits
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import load
 from bayesdist.model import Chip, DistortionModel, TimeDependence

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm
+from bayesdist.assess.budget.budget import place_budget
 from bayesdist.assess.budget.detector import detector_budget
-from bayesdist.assess.budget.place import place_budget
 from bayesdist.assess.budget.surface import budget_surface
-from bayesdist.assess.drawn import position_errors
-from bayesdist.assess.terms.given import LocalTerm
-from bayesdist.assess.terms.parameters import LinearTerm
-from bayesdist.assess.terms.product_terms import ProductTerm
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.terms.forms import PRODUCT, Known, Row
+from bayesdist.assess.terms.given import Centroids
+from bayesdist.assess.terms.local import LocalErrors
+from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.report.run_report import write_report
 
@@ -49,27 +50,33 @@ def asked():
     run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
     solution, rng = run.solution, np.random.default_rng(4)
     local = {c.chip.number: rng.uniform(0.001, 0.01, (*GRID[::-1], 2)) for c in run.chips}
-    what = {
-        "terms": (*TERMS, UserTerm("background", "random", 0.003, 0.006)),
-        "fields": (LinearTerm("aberration", "scale", 2e-6, solution, "a paper"),),
-        "local": (LocalTerm("look-up tables", local),),
-        "grid": GRID,
-        "n_draws": DRAWS,
-        "pixel_scale": SCALE,
-    }
+    terms = (
+        ScaleError("aberration", "scale", 2e-6, solution, "a paper"),
+        LocalErrors.on_grid("look-up tables", local, solution.model),
+        *TERMS,
+        UserTerm("background", "random", 0.003, 0.006),
+        file_term("sip.hdr, forward", "its numbers"),
+    )
     mag, residual = (a[run.stars.used] for a in (run.stars.table.mag, run.stars.fit_residual))
-    errors = position_errors(
-        solution, centroid=estimate(mag, *residual.T), rng=np.random.default_rng(9), **what
-    )
-    files = (ProductTerm("sip.hdr, forward", "sip.hdr", "forward", plane, "its numbers"),)
+    centroids = Centroids(estimate(mag, *residual.T))
+    model = error_model(solution, (*terms, centroids), pixel_scale=SCALE)
+    errors = model.drawn(DRAWS, np.random.default_rng(9))
     budget = detector_budget(
-        solution, epoch=2010.3, rng=np.random.default_rng(9), products=files, **what
+        solution,
+        terms=terms,
+        epoch=2010.3,
+        rng=np.random.default_rng(9),
+        grid=GRID,
+        n_draws=DRAWS,
+        pixel_scale=SCALE,
     )
-    surface = budget_surface(
-        errors, epoch=2010.3, years=YEARS, sources={"aberration": "a paper"}, products=files
-    )
+    surface = budget_surface(errors, GRID, epoch=2010.3, years=YEARS)
     run = replace(run, budget=budget, surface=surface)
-    return SimpleNamespace(run=run, errors=errors, budget=budget, files=files)
+    return SimpleNamespace(run=run, errors=errors, budget=budget)
+
+
+def file_term(name: str, source: str) -> Known:
+    return Known(Row(name, PRODUCT, source, in_total=False), plane)
 
 
 def plane(x, y, chip, epoch):
@@ -177,12 +184,11 @@ def test_a_position_is_that_of_the_assessment(asked, opened, chip, x, y, epoch, 
         chip=chip + 1,
         epoch=slider(opened),
         magnitude=magnitude,
-        products=asked.files,
     )
     assert slider(opened) == pytest.approx(epoch, abs=0.026)  # the slider's steps
     found = shown(opened)
-    assert [t.name for t in truth.terms if t.name not in found] == []
-    for term in truth.terms:
+    assert [t.name for t in truth.every if t.name not in found] == []
+    for term in truth.every:
         values = (term.u[0], term.v[0], term.radial[0])
         assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
 
@@ -206,14 +212,13 @@ def test_the_difference_of_two_positions_is_that_of_the_assessment(asked, opened
         epoch=slider(opened),
         magnitude=14.0,
         relative=True,
-        products=asked.files,
     )
     found = shown(opened)
-    for term in truth.terms:
+    for term in truth.every:
         values = (term.u[0], term.v[0], term.radial[0])
         assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
     # what both positions share: the frames of this run are shifts
-    assert [t.name for t in truth.terms if t.radial[0] == 0] == [
+    assert [t.name for t in truth.every if t.radial[0] == 0] == [
         "exposure frame",
         "reference catalogue",
     ]
@@ -319,10 +324,10 @@ def wide(asked, opened, tmp_path):
     """A page of its own whose numbers are as long as any: daggers, two chips, names of files."""
     bad = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"), converged=False)
     long = "0461802ej_idc.fits, 0461802ej_d2i.fits, 0461802ej_npl.fits, forward"
-    files = (ProductTerm(long, "0461802ej", "forward", plane, "the file as it was read back"),)
-    options = {"terms": TERMS, "grid": GRID, "n_draws": DRAWS, "pixel_scale": SCALE}
+    terms = (*TERMS, file_term(long, "the file as it was read back"))
+    options = {"terms": terms, "grid": GRID, "n_draws": DRAWS, "pixel_scale": SCALE}
     rng = np.random.default_rng(1)
-    budget = detector_budget(bad.solution, epoch=2010.3, rng=rng, products=files, **options)
+    budget = detector_budget(bad.solution, epoch=2010.3, rng=rng, **options)
     write_report(tmp_path / "report.html", replace(bad, budget=budget), {})
     before = opened.current_window_handle
     opened.switch_to.new_window("tab")

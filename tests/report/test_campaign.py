@@ -13,16 +13,16 @@ from lxml import html as lxml_html
 from bayesdist.app.campaign.report import held_parameters
 from bayesdist.assess import Misfit
 from bayesdist.infer import GaussianPriors, fit_linear
+from bayesdist.missions.acs.published import LINES, published_lines
+from bayesdist.missions.acs.simulate.distortion import DRIFT
 from bayesdist.model import Chip, TimeDependence
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.campaign.checks import campaign_checks
 from bayesdist.report.sections.campaign.lookup import binned_of, largest_cell, rms_of_cells
-from bayesdist.report.sections.campaign.published import LINES, published_lines
 from bayesdist.report.sections.campaign.terms import course_of, line_error
 from bayesdist.report.sections.run.coefficients import coefficient_tables
 from bayesdist.report.sections.run.fit import fit_tables
-from bayesdist.simulate.acs.distortion import DRIFT
 
 from . import campaigns
 from .plots import drawings_of, plot_of, plots_of, tables_of

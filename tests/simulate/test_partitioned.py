@@ -10,8 +10,8 @@ from scipy import stats
 
 from bayesdist.data import MatchTable, open_matches, read_matches
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.simulate import simulate_wise, simulate_wise_partitioned, wise_solution
 from bayesdist.simulate import partitioned as partitioned_module
-from bayesdist.simulate import simulate_wise, simulate_wise_partitioned, wise_solution
 
 NAMES = ("x", "y", "u", "v", "sigma_u", "sigma_v", "mag")
 

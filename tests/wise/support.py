@@ -7,8 +7,8 @@ from dataclasses import fields
 import numpy as np
 
 from bayesdist.data import MatchTable
-from bayesdist.infer import fit_linear, sample
-from bayesdist.simulate.wise import WISE_BANDS, PairChunk, WiseSet, wise_set
+from bayesdist.infer import Rejection, fit_linear, sample
+from bayesdist.missions.wise.simulate import WISE_BANDS, PairChunk, WiseSet, wise_set
 
 CLIP_ABS = 3.0  # pixels: the match circle in the corners
 
@@ -32,7 +32,7 @@ def calibration_of(task: int, partition: bool) -> dict[str, object]:
     band, seed = WISE_BANDS[task % 4], 100 + task // 4
     one = wise_set(band, pairs=FEW, seed=seed, partition=partition)
     matches = matches_of(pairs_of(one))
-    fit = fit_linear(matches, one.model, clip_abs=CLIP_ABS)
+    fit = fit_linear(matches, one.model, rejection=Rejection(clip_abs=CLIP_ABS))
     posterior = sample(fit, matches, seed=seed)
     d = posterior.mean - one.theta
     return {

@@ -10,10 +10,15 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import distortion_vectors
-from bayesdist.infer import fit_linear
+from bayesdist.infer import Rejection, fit_linear
+from bayesdist.missions.wise.simulate import (
+    LARGEST_CORRECTIONS,
+    LONGEST_VECTORS,
+    WISE_BANDS,
+    wise_set,
+)
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from bayesdist.products.formats.common.coefficients import evaluate
-from bayesdist.simulate.wise import LARGEST_CORRECTIONS, LONGEST_VECTORS, WISE_BANDS, wise_set
 
 from .support import CLIP_ABS, matches_of, pairs_of
 
@@ -39,7 +44,9 @@ def places(band: str, side: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module", params=WISE_BANDS)
 def calibrated(request):
     one = wise_set(request.param, pairs=PAIRS[request.param], seed=3, partition=True)
-    return request.param, fit_linear(matches_of(pairs_of(one)), one.model, clip_abs=CLIP_ABS)
+    return request.param, fit_linear(
+        matches_of(pairs_of(one)), one.model, rejection=Rejection(clip_abs=CLIP_ABS)
+    )
 
 
 def test_longest_vectors(calibrated):

@@ -14,15 +14,15 @@ from scipy.stats import chi2
 from bayesdist.assess.wise import (
     WISE_ARCSEC,
     band_bins,
-    band_bins_of_stars,
     band_to_band_table,
     fitting_table,
     multiframe_table,
     pattern_changes,
     period_table,
 )
-from bayesdist.infer import fit_linear, load
-from bayesdist.simulate.wise import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
+from bayesdist.infer import Rejection, fit_linear, load
+from bayesdist.missions.wise.assess.histograms import band_sums
+from bayesdist.missions.wise.simulate import RESIDUAL_SIGMAS, WISE_BANDS, wise_set
 
 from .support import matches_of, pairs_of
 
@@ -39,9 +39,9 @@ def calibrated(band: str, partition: bool, bins: int = 31, pairs: int | None = N
     one = wise_set(band, pairs=pairs or PAIRS[band], seed=8, false_share=0.0, partition=partition)
     drawn = pairs_of(one)
     matches = matches_of(drawn)
-    fit = fit_linear(matches, one.model, clip_chi2=1e9, clip_abs=None)
+    fit = fit_linear(matches, one.model, rejection=Rejection(1e9, None))
     with_shards = load(one.model, matches)
-    found = with_shards.sum(band_bins_of_stars, fit.mean, fit.clip, bins)
+    found = with_shards.sum(band_sums, fit.mean, fit.clip, np.eye(2), {}, 1.0, bins).bins
     with_shards.close()
     return one, drawn, fit, found
 

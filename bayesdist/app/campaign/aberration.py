@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms.field_terms import EXPOSURE_SCATTER
-from bayesdist.assess.terms.parameters import LinearTerm
+from bayesdist.assess.terms.parameters import EXPOSURE_SCATTER, ScaleError
 
 if TYPE_CHECKING:
     from bayesdist.app.campaign.session import CampaignSession
@@ -51,7 +50,7 @@ def scale_error(exptime: float | None) -> float:
     return min(spread, spread * 2 * math.pi / PERIOD * exptime / math.sqrt(12))
 
 
-def aberration_term(session: CampaignSession, solution: Solution) -> LinearTerm:
+def aberration_term(session: CampaignSession, solution: Solution) -> ScaleError:
     """The error of the scale that VAFACTOR leaves, at most as large as exposures scatter.
 
     Parameters
@@ -77,4 +76,4 @@ def aberration_term(session: CampaignSession, solution: Solution) -> LinearTerm:
         if measured < sigma:
             sigma, source = measured, f"{source}, and no more than exposures scatter"
     source = f"{source}; part of {EXPOSURE_SCATTER}"
-    return LinearTerm(ABERRATION, "scale", sigma, solution, source, part_of=EXPOSURE_SCATTER)
+    return ScaleError(ABERRATION, "scale", sigma, solution, source, in_total=False)

@@ -21,6 +21,7 @@ from bayesdist.infer import load, save_fit
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
 from bayesdist.infer.exposures.trends import trend_p_values
+from bayesdist.infer.linear import Rejection
 from bayesdist.infer.sampler.checkpoints import write_arrays
 from bayesdist.infer.series import Series
 from bayesdist.model import Chip
@@ -41,10 +42,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
     _fit_errors(session)
     matches = session.matches
     assert isinstance(matches, MatchTable)
-    options = {
-        "clip_chi2": session.config.fit.clip_chi2,
-        "clip_abs": session.config.fit.clip_abs,
-    }
+    rejection = Rejection(session.config.fit.clip_chi2, session.config.fit.clip_abs)
     number = session.reference_chip
     asked = session.config.time()
     drifting = with_gap(replace(session.plain_model, time=asked))
@@ -57,7 +55,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
         priors=session.rate_priors(model) or gap_priors(model, asked, pixel),
         pixel=pixel,
         seed=session.config.sampler.seed,
-        **options,
+        rejection=rejection,
     )
     shards.close()
     save_fit(joint.fit, session.run / "fit.nc")
@@ -73,7 +71,7 @@ def run_campaign_fit(session: CampaignSession) -> None:
         },
     )
     session.fit_changed()
-    alone = fit_exposures(matches, session.plain_model, chip=number, skip=True, **options)
+    alone = fit_exposures(matches, session.plain_model, chip=number, skip=True, rejection=rejection)
     session.keep_terms(_series(alone, model.chips[0]))
     summarise_fit(session, joint.fit)
     summarise_lines(session, joint)

@@ -21,8 +21,8 @@ from bayesdist.data import (
     read_star_lists,
     select_motions,
 )
-from bayesdist.data.tables import read_table
-from bayesdist.data.tangent import mean_direction, tangent_plane
+from bayesdist.data.sky.tangent import mean_direction, tangent_plane
+from bayesdist.data.tables.files import read_table
 from bayesdist.errors import InputError
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration

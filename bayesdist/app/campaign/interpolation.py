@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms.given import MEASURED, LocalTerm
+from bayesdist.assess.terms.forms import MEASURED
+from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import MatchTable
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes, between_nodes
 from bayesdist.diagnose.tables.mean_square import MeanSquare
@@ -138,7 +139,7 @@ def interpolation_term(
     *,
     grid: tuple[int, int],
     epoch: float | None,
-) -> tuple[LocalTerm, ...]:
+) -> tuple[LocalErrors, ...]:
     """The term of the budget; nothing where a chip has not been measured.
 
     Parameters
@@ -166,4 +167,4 @@ def interpolation_term(
         sigma[chip.number] = np.sqrt(variance).reshape(grid[1], grid[0], 2)
         error = np.sqrt(into**2 @ found.error**2)
         squares[chip.number] = MeanSquare(into @ found.square, error)
-    return (LocalTerm(INTERPOLATION, sigma, SOURCE, squares),)
+    return (LocalErrors.on_grid(INTERPOLATION, sigma, solution.model, SOURCE, squares),)

@@ -19,7 +19,6 @@ from bayesdist.data import (
     neutralise_aberration,
     write_partitioned,
 )
-from bayesdist.data.match_doubts import match_doubts
 from bayesdist.errors import InputError
 from bayesdist.model import Chip
 from bayesdist.products import read_idctab
@@ -56,7 +55,7 @@ def run_match(session: CampaignSession) -> None:
         summary[name] = inputs.log.values(name)[order]
     warnings = [
         *_doubtful_parity(found.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
-        *match_doubts(found, inputs.log),
+        *found.warnings(inputs.log),
         *input_doubts(session),
         # as the stars show them, for the log need not have them
         *shear_doubts(np.asarray(summary["rotation"]), "of the matches"),

@@ -15,8 +15,8 @@ from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centr
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.compare.monitoring import NewFit, fit_new
-from bayesdist.infer.compare.monitoring_stars import with_star_errors_of
+from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
+from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
 from bayesdist.model import corrected
 
@@ -133,8 +133,7 @@ def fit_exposures_of(session: CampaignSession, new: NewExposures) -> NewFit:
     found = fit_new(
         new.released,
         new.matches,
-        clip_chi2=config.fit.clip_chi2,
-        clip_abs=config.fit.clip_abs,
+        rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
         scatter=dict(zip(kinds, np.sqrt((tau**2).mean(axis=0)), strict=True)),
     )
@@ -155,7 +154,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> MatchTable:
             raise InputError(
                 "is a configuration, whose star lists would have to be matched first",
                 where=str(new),
-                do="give the folder of its 'bayesdist run', or of 'bayesdist match'",
+                do="give the folder of its 'bayesdist run', or of 'bayesdist stage match'",
             )
         if not new.exists():
             raise InputError("there is no such file", where=str(new), do="check the name")

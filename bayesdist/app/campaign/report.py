@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.app.campaign.inputs import cuts_of, read_campaign_catalog
 from bayesdist.app.campaign.overlap import overlap_test
@@ -15,6 +14,8 @@ from bayesdist.data import MatchTable, with_centroid_errors
 from bayesdist.data.motions import motion_error_line
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
+from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import pixel_shifts
 from bayesdist.infer.nodes.alternation import inside_chips, with_columns
 from bayesdist.model import corrected
@@ -166,8 +167,7 @@ def _footprints(session: CampaignSession) -> Footprints:
     return Footprints(u[rows], catalog.v[rows], tuple(outlines), np.array(epochs), catalog.unit)
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
     """Pairs of each chip without the tables and with them, along the detector's axes."""
     pairs, moved, model = session.pairs, session.matches, session.plain_model
@@ -188,7 +188,7 @@ def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
     numbers, left = pairs.chip_number, []
     for table in (plain, moved) if session.tables else (plain,):
         # errors are those of the centroids: beside what the tables take out, chi-square is no guide
-        fit = fit_linear(table, model, clip_chi2=np.inf, clip_abs=farthest)
+        fit = fit_linear(table, model, rejection=Rejection(np.inf, farthest))
         left.append(pixel_shifts(fit, table).shift)
     good = np.all([np.hypot(*r.T) < (farthest or np.inf) for r in left], axis=0)
     out = []

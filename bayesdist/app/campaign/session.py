@@ -26,8 +26,8 @@ from bayesdist.app.campaign.table_file import KeptTables, read_tables, write_tab
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
-from bayesdist.assess import SAMPLE, LocalTerm
-from bayesdist.assess.terms.given import GIVEN, MEASURED
+from bayesdist.assess import SAMPLE, LocalErrors
+from bayesdist.assess.terms.forms import GIVEN, MEASURED
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
@@ -118,19 +118,25 @@ class CampaignSession(Session):
         """Look-up tables of an earlier stage: the detector's, and those of the filter."""
         return self._kept_tables.tables
 
+    @property
+    def structure_is_left(self) -> bool:
+        """Not where the errors of tables stand for it."""
+        return not self._kept_tables.position_sigma
+
     @cached_property
-    def local_terms(self) -> tuple[LocalTerm, ...]:
+    def local_terms(self) -> tuple[LocalErrors, ...]:
         """What the errors of the tables leave of the position, and what lies between nodes."""
         kept, grid = self._kept_tables, self.config.assess.grid
         between = interpolation_term(kept.between, self.posterior, grid=grid, epoch=self.epoch)
         sigma, block = kept.position_sigma, self.config.tables
         if not sigma:
-            return (*between, *super().local_terms)
+            return between
         source = MEASURED
         if block.detector is not None:
             given = f"{GIVEN}: errors of the detector's tables in {block.detector}"
             source = given if block.method == "none" else f"{MEASURED}, and {given}"
-        return (LocalTerm("look-up tables", sigma, source), *between)
+        tables = LocalErrors.on_grid("look-up tables", sigma, self.posterior.model, source)
+        return (tables, *between)
 
     @property
     def between_nodes(self) -> Mapping[int, BetweenNodes]:

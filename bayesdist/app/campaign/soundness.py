@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.config import ReleaseBlock
 from bayesdist.app.campaign.inputs import cuts_of
 from bayesdist.data import StarList
-from bayesdist.data.campaign_faults import check_campaign
+from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
-from bayesdist.infer.catalogue.catalogue_shear import one_roll_angle
 from bayesdist.model import Chip, TimeDependence
 
 if TYPE_CHECKING:
@@ -37,6 +36,7 @@ Float = NDArray[np.float64]
 FEWEST = 3  # exposures: two of them differ, but do not scatter
 SAME_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
 LINEAR_KINDS = 3  # drifting terms from which on scale and both shears drift
+ONE_ROLL = 2.0  # degrees: roll angles that scatter by less are one
 OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
 EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
 NAMED = 5  # exposures in a sentence
@@ -115,8 +115,18 @@ def _said_of_strangers(names: tuple[str, ...], log: str) -> str:
     )
 
 
+def one_roll_angle(angles: Float) -> bool:
+    """Whether exposures at these angles (E,), in radians, see a shear of the catalogue alike.
+
+    An exposure at roll angle a sees a shear of the catalogue as one of its detector turned by 2a:
+    at one angle, or at angles half a turn apart, nothing tells the two apart.
+    """
+    spread = 1.0 - abs(np.exp(2j * angles).mean())  # 2 s^2 for angles that scatter by a small s
+    return bool(spread < 2.0 * np.radians(ONE_ROLL) ** 2)
+
+
 def shear_doubts(rolls: Float, of: str) -> list[str]:
-    """Whether exposures at these roll angles, in degrees, leave a shear of the catalogue open."""
+    """Warnings of exposures at roll angles, in degrees, that leave a catalogue's shear open."""
     known = np.asarray(rolls, float)
     known = known[np.isfinite(known)]
     if not len(known) or not one_roll_angle(np.radians(known)):

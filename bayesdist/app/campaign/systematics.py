@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.aberration import aberration_term
 from bayesdist.app.fingerprint import fingerprint_of
 from bayesdist.app.systematics import Systematics
-from bayesdist.assess.terms.field_terms import MOTIONS, CatalogueTerm, ExposureScatter, FieldTerm
-from bayesdist.assess.terms.given import GIVEN
+from bayesdist.assess.terms.forms import GIVEN, ErrorTerm
+from bayesdist.assess.terms.parameters import MOTIONS, CatalogueErrors, ExposureVariation
+from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.recoloured import with_spread
+from bayesdist.infer.posterior.recoloured import with_spread
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 if TYPE_CHECKING:
@@ -51,19 +52,25 @@ def systematics_of(session: CampaignSession) -> Systematics:
     A campaign is assessed for a new exposure, one that it has not seen: it deviates from the mean
     of the exposures as these scatter, and its shift and rotation are fitted by whoever uses it.
     """
-    posterior, fields = session.posterior, list[FieldTerm]()
-    solution = posterior
+    posterior = solution = session.posterior
     stars, found = shared_stars_of(session), session.discrepancy
+    catalogue: tuple[CatalogueErrors, ...] = ()
     if stars is not None:
         solution = with_shared_stars(posterior, session.fit, stars)
-        fields += catalogue_terms(posterior, stars, session.inputs.catalog.source)
+        catalogue = catalogue_terms(posterior, stars, session.inputs.catalog.source)
+    terms = list[ErrorTerm]()
     if found is not None:
         before = covariance_of(session.posterior, session.fit, stars)
         solution = found.with_noise(solution, before)
-        fields += found.fields()
-    scatter = ExposureScatter(posterior.model, posterior.mean, *session.scatter)
-    aberration = aberration_term(session, solution)
-    return Systematics(solution, (*fields, scatter, aberration), aligned=True)
+        terms += found.terms(left=session.structure_is_left)
+    of_solution = SolutionErrors(solution, posterior if catalogue else None, catalogue)
+    scatter = ExposureVariation(
+        posterior.model,
+        posterior.mean,
+        *session.scatter,
+        aberration=aberration_term(session, solution),
+    )
+    return Systematics(solution, (of_solution, *terms, scatter), aligned=True)
 
 
 def shared_stars_of(session: CampaignSession) -> StarCovariance | None:
@@ -80,7 +87,7 @@ def shared_stars_of(session: CampaignSession) -> StarCovariance | None:
 
 def catalogue_terms(
     posterior: Posterior, stars: StarCovariance, catalogue: str
-) -> tuple[CatalogueTerm, ...]:
+) -> tuple[CatalogueErrors, ...]:
     """What the errors of the catalogue do: of its positions, and of its motions where it has some.
 
     Parameters
@@ -92,13 +99,14 @@ def catalogue_terms(
         Name of the file that states the errors.
     """
     source = f"{GIVEN}: errors of {{}} in {Path(catalogue).name}"
+    model, mean = posterior.model, posterior.mean
+    moved = 0.0 if stars.motions is None else stars.motions
+    of_positions = source.format("positions")
+    positions = CatalogueErrors(model, mean, stars.total - moved, source=of_positions)
     if stars.motions is None:
-        return (CatalogueTerm(posterior, stars.total, source=source.format("positions")),)
-    positions = stars.total - stars.motions
-    return (
-        CatalogueTerm(posterior, positions, source=source.format("positions")),
-        CatalogueTerm(posterior, stars.motions, MOTIONS, source.format("proper motions")),
-    )
+        return (positions,)
+    of_motions = source.format("proper motions")
+    return positions, CatalogueErrors(model, mean, stars.motions, MOTIONS, of_motions)
 
 
 def catalogue_covariance(

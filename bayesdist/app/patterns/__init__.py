@@ -1,1 +1,1 @@
-"""Comparison of dither patterns: `bayesdist plan PATTERNS.toml`."""
+"""Comparison of dither patterns: `bayesdist plan-dither PATTERNS.toml`."""

@@ -1,4 +1,4 @@
-"""`bayesdist plan PATTERNS.toml`: which dither pattern makes a self-calibration well determined?"""
+"""`bayesdist plan-dither`: which dither pattern makes a self-calibration well determined?"""
 
 from __future__ import annotations
 

@@ -15,11 +15,11 @@ from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
 from bayesdist.data import ReferenceCatalog, StarList, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
-from bayesdist.data.mutual import refuse_duplicates
-from bayesdist.data.naming import find_columns
-from bayesdist.data.tables import read_table
-from bayesdist.data.units import conversion
-from bayesdist.data.values import SourceColumn
+from bayesdist.data.matching.frames import refuse_duplicates
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import find_columns
+from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
 
 __all__ = ["Commanded", "Inputs", "read_commanded", "read_inputs", "read_references"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.data.detections import NO_STAR, Detections
-from bayesdist.data.pairs import hull_of, inside_hull
+from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.normal import memberships

@@ -31,7 +31,7 @@ from bayesdist.assess.maps import with_local
 from bayesdist.assess.solution import Solution as Assessed
 from bayesdist.data import MagnitudeErrors, MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
-from bayesdist.data.parallax import parallax_factors
+from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.diagnose import ScoreTest
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.selfcal.misfit import dithered_misfit
@@ -396,7 +396,7 @@ class SelfcalSession(Session):
         if found is not None:
             S = gauge_free_matrix(self.model, self.solution.mean, self.gauge.null)
             relative = replace(found.moved(S), frames=False)  # of the detector alone
-            local = relative.structure(where["grid"], where.get("epoch"))
+            local = relative.structure_sigma(self._domain(**where))
         return with_local(uncertainty_map(self.relative, **where), local)
 
     @property

@@ -11,9 +11,9 @@ from bayesdist.app.campaign.inputs import start_of
 from bayesdist.app.config import Config
 from bayesdist.app.selfcal.inputs import Commanded, Inputs
 from bayesdist.data import ReferenceCatalog
-from bayesdist.data.linear_map import LinearMap, best_similarity
-from bayesdist.data.mutual import mutual_frames
-from bayesdist.data.patterns import Similarity, find_similarity, pattern_index
+from bayesdist.data.matching.frames import mutual_frames
+from bayesdist.data.matching.linear_map import LinearMap, best_similarity
+from bayesdist.data.matching.similarity import Similarity, find_similarity, pattern_index
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.selfcal.start import (

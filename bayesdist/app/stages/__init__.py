@@ -110,5 +110,5 @@ def require(session: Session, stage: str, needs: tuple[str, ...]) -> None:
             raise InputError(
                 f"'{stage}' needs stage '{earlier}', which has not been run",
                 where=str(session.run.path),
-                do=f"run 'bayesdist {earlier} {session.run.path}' first",
+                do=f"run 'bayesdist stage {earlier} {session.run.path}' first",
             )

@@ -9,8 +9,9 @@ from typing import Any
 from bayesdist.app.made_files import made_files
 from bayesdist.app.session import Session
 from bayesdist.app.sky_closure import sky_closure
-from bayesdist.assess.terms.product_terms import PRODUCT, with_product
-from bayesdist.data import atomic_path
+from bayesdist.assess.budget.budget import with_product
+from bayesdist.assess.terms.forms import PRODUCT
+from bayesdist.files import atomic_path
 from bayesdist.products.registry import lint
 
 __all__ = ["run_export"]

@@ -14,7 +14,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import Config
 from bayesdist.app.holdout import held_out_of
 from bayesdist.app.horizon import kept_horizons
-from bayesdist.app.judging import budget_of, errors_of, margins_of, products_of
+from bayesdist.app.judging import budget_of, errors_of, margins_of
 from bayesdist.app.margins import judged_requirements
 from bayesdist.app.periods import periods_of
 from bayesdist.app.rundir import as_json
@@ -93,7 +93,7 @@ def _inputs(session: Session) -> ReportInput:
         coefficients=coefficient_table(fit, session.solution),
         budget=budget_of(session),
         surface=_surface(session),
-        # the requirements that were judged last, be it by `assess` or by `validate`
+        # the requirements that were judged last, be it by `assess` or by `requirements`
         margins=margins_of(session, judged),
         horizons=kept_horizons(run / "horizon.ecsv", judged),
         products=products,
@@ -132,14 +132,7 @@ def _surface(session: Session) -> BudgetSurface | None:
     if session.solution.model.time is not None and epochs is not None:
         seen = [*epochs, session.epoch]
         years = float(min(seen)), float(max(seen)) + YEARS_AHEAD
-    sources = {t.name: t.source for t in session.field_terms}
-    return budget_surface(
-        errors,
-        epoch=session.epoch,
-        years=years,
-        sources=sources,
-        products=products_of(session),
-    )
+    return budget_surface(errors, session.config.assess.grid, epoch=session.epoch, years=years)
 
 
 def _chip_results(session: Session) -> tuple[ChipResults, ...]:

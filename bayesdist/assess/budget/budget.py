@@ -1,30 +1,20 @@
-"""The error budget: what the position error at each place of the detector is made of."""
+"""The error budget: what the error of each position is made of."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.verdict import effective_draws
-from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.fields import MODEL, ErrorFields, draw_errors
-from bayesdist.assess.terms.given import LOCAL, MEASURED, LocalTerm, UserTerm
-from bayesdist.assess.terms.product_terms import PRODUCT, ProductTerm
-from bayesdist.assess.units import pixel_scale_of
-from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.assess.terms.forms import PRODUCT
 
-__all__ = [
-    "BudgetTerm",
-    "ErrorBudget",
-    "budget_rows",
-    "error_budget",
-    "error_budgets",
-]
+__all__ = ["TOTAL", "BudgetTerm", "ErrorBudget", "budget_of", "place_budget", "with_product"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -43,13 +33,15 @@ class BudgetTerm:
     kind : str
         'random', 'systematic' (as the parts of the model, which all stars share), 'local' (shared
         by the stars at one place), or 'product' (of a file, known, and in no total).
-    u, v : ndarray, shape (ny, nx)
+    u, v : ndarray, shape (P,)
         Standard deviations, in the unit of the budget; of products the displacements' sizes.
     source : str
         Begins with 'measured in this run', 'given by the user' or 'published'.
     relative_error : float or None
         How well the standard deviations are known themselves, relative to their size: of draws the
         Monte-Carlo error.  None where it is not known.
+    by_chip : mapping of int to float or None
+        The same by chip number, where that differs; `relative_error` is that of the first chip.
     """
 
     name: str
@@ -58,275 +50,261 @@ class BudgetTerm:
     v: Float
     source: str
     relative_error: float | None = None
+    by_chip: Mapping[int, float | None] = field(default_factory=dict)
 
     @property
     def radial(self) -> Float:
-        """hypot(u, v), (ny, nx)."""
+        """hypot(u, v), (P,)."""
         return np.hypot(self.u, self.v)
+
+    def on(self, chip: int, rows: slice) -> BudgetTerm:
+        """The same on one chip, whose positions are some of the rows."""
+        known = self.by_chip.get(chip, self.relative_error)
+        return replace(self, u=self.u[rows], v=self.v[rows], relative_error=known, by_chip={})
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """Contributions to the position error over the detector, and their total.
+    """Contributions to the errors of positions, or of their differences to the first one.
 
     Parameters
     ----------
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        FITS 1-based pixels.
+    domain : EvaluationDomain
+        N positions; P = N, or N - 1 where errors are those of differences to the first.
     unit : str
-    chip : int
-    epoch : float or None
     terms : tuple of BudgetTerm
-        Parts of the model first, then field terms, local ones, and the user's.
-    model_u, model_v : ndarray, shape (ny, nx)
-        All parts of the model and the field terms jointly.  They are correlated, so this may be
-        smaller than any of them.
-    total_u, total_v : ndarray, shape (ny, nx)
-        The former, the local terms and the user's in quadrature.
-    dominant : ndarray of int, shape (ny, nx)
-        Index into `terms` of the one with the largest radial error.
+        Errors of parameters first, then local ones, and the user's.
+    total : BudgetTerm
+        All terms together.  Rows of one term are correlated, so this may be smaller than any of
+        them.
     n_draws : int
         Draws behind the model's parts: their relative error is about 1 / sqrt(2 n_draws).
     products : tuple of BudgetTerm
         What files differ by from the solution: in no total.
     """
 
-    x: Float
-    y: Float
+    domain: EvaluationDomain
     unit: str
-    chip: int
-    epoch: float | None
     terms: tuple[BudgetTerm, ...]
-    model_u: Float
-    model_v: Float
-    total_u: Float
-    total_v: Float
-    dominant: Int
+    total: BudgetTerm
     n_draws: int
     products: tuple[BudgetTerm, ...] = ()
 
     @property
-    def radial(self) -> Float:
-        """Total radial error hypot(total_u, total_v), (ny, nx)."""
-        return np.hypot(self.total_u, self.total_v)
+    def x(self) -> Float:
+        """FITS 1-based columns (P,)."""
+        return self.domain.x[self._kept]
 
     @property
-    def total(self) -> BudgetTerm:
-        """All terms together, as one."""
-        return BudgetTerm("total", TOTAL, self.total_u, self.total_v, TOGETHER)
+    def y(self) -> Float:
+        """FITS 1-based rows (P,)."""
+        return self.domain.y[self._kept]
+
+    @property
+    def _kept(self) -> slice:
+        return slice(1 if self.domain.relative else 0, None)
+
+    @property
+    def epoch(self) -> float | None:
+        """Decimal years."""
+        return self.domain.epoch
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the terms."""
+        return tuple(t.name for t in self.terms)
+
+    @property
+    def every(self) -> tuple[BudgetTerm, ...]:
+        """All rows: terms, products, and the total last."""
+        return (*self.terms, *self.products, self.total)
+
+    @property
+    def radial(self) -> Float:
+        """Total radial error (P,)."""
+        return self.total.radial
+
+    @property
+    def dominant(self) -> Int:
+        """Index into `terms` of the one with the largest radial error, (P,)."""
+        return np.argmax([t.radial for t in self.terms], axis=0)
+
+    @property
+    def share(self) -> Float:
+        """Fraction of the positions at which each term is the largest."""
+        dominant = self.dominant
+        return np.bincount(dominant, minlength=len(self.terms)) / dominant.size
+
+    @property
+    def chips(self) -> tuple[ErrorBudget, ...]:
+        """The budget of each chip by itself."""
+        return tuple(
+            replace(
+                self,
+                domain=self.domain.on(chip),
+                terms=tuple(t.on(chip, rows) for t in self.terms),
+                total=self.total.on(chip, rows),
+                products=tuple(t.on(chip, rows) for t in self.products),
+            )
+            for chip, rows in self.domain.by_chip()
+        )
+
+    @property
+    def axes(self) -> tuple[Float, Float]:
+        """Columns (nx,) and rows (ny,) of the grid, of a budget over the grid of one chip."""
+        nx, ny = self.domain.grid or (self.domain.size, 1)
+        return self.x[:nx], self.y.reshape(ny, nx)[:, 0]
+
+    def on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values (N,) of a budget over the grid of one chip as a map (ny, nx)."""
+        nx, ny = self.domain.grid or (self.domain.size, 1)
+        return values.reshape(ny, nx)
 
     def rows(self) -> list[dict[str, Any]]:
         """The budget as a table: one row for each term and each product, the total last.
 
+        The total is known as well as its terms are: not where one of them was given without an
+        error.
+
         Returns
         -------
         list of dict
-            name, kind, u, v, radial (root mean squares over the grid), radial_error (how well that
-            is known; None where it is not), source.
+            name, kind, u, v, radial (root mean squares over the positions), radial_error (how well
+            that is known; None where it is not), source.
         """
-        return budget_rows([*self.terms, *self.products, self.total])
+        rows = []
+        for t in self.every:
+            mean_u, mean_v = float(np.mean(t.u**2)), float(np.mean(t.v**2))
+            radial = (mean_u + mean_v) ** 0.5
+            error = None if t.relative_error is None else t.relative_error * radial
+            rows.append(
+                {
+                    "name": t.name,
+                    "kind": t.kind,
+                    "u": mean_u**0.5,
+                    "v": mean_v**0.5,
+                    "radial": radial,
+                    "radial_error": error,
+                    "source": t.source,
+                }
+            )
+        total = rows[-1]
+        if total["radial"] > 0:
+            parts = [(r["radial"], r["radial_error"]) for r in rows[:-1] if r["kind"] != PRODUCT]
+            known = [(radial, error) for radial, error in parts if error is not None]
+            spread = sum((radial * error) ** 2 for radial, error in known) ** 0.5
+            # a term of nothing needs no error
+            whole = len(known) == sum(radial > 0 or error is not None for radial, error in parts)
+            total["radial_error"] = spread / total["radial"] if whole else None
+        return rows
+
+    def rows_by_chip(self) -> list[dict[str, Any]]:
+        """As `rows`, followed by those of each chip alone; column chip is 'all' or its number."""
+        alone = zip(self.domain.chips, self.chips, strict=True)
+        parts = [("all", self.rows()), *((str(chip), b.rows()) for chip, b in alone)]
+        return [{"chip": chip} | row for chip, rows in parts for row in rows]
 
 
-def budget_rows(terms: Sequence[BudgetTerm]) -> list[dict[str, Any]]:
-    """Rows of a budget: root mean squares of the standard deviations; the total is the last one.
+def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:
+    """The error budget of positions, or of their differences to the first one.
 
-    The total is known as well as its terms are: not where one of them was given without an error.
-    """
-    rows = []
-    for t in terms:
-        mean_u, mean_v = float(np.mean(t.u**2)), float(np.mean(t.v**2))
-        radial = (mean_u + mean_v) ** 0.5
-        error = None if t.relative_error is None else t.relative_error * radial
-        rows.append(
-            {
-                "name": t.name,
-                "kind": t.kind,
-                "u": mean_u**0.5,
-                "v": mean_v**0.5,
-                "radial": radial,
-                "radial_error": error,
-                "source": t.source,
-            }
-        )
-    total = rows[-1]
-    if total["kind"] == TOTAL and total["radial"] > 0:
-        parts = [(r["radial"], r["radial_error"]) for r in rows[:-1] if r["kind"] != PRODUCT]
-        known = [(radial, error) for radial, error in parts if error is not None]
-        spread = sum((radial * error) ** 2 for radial, error in known) ** 0.5
-        # a term of nothing needs no error
-        whole = len(known) == sum(radial > 0 or error is not None for radial, error in parts)
-        total["radial_error"] = spread / total["radial"] if whole else None
-    return rows
-
-
-def error_budget(
-    solution: Solution,
-    *,
-    terms: Sequence[UserTerm] = (),
-    fields: Sequence[FieldTerm] = (),
-    aligned: bool = False,
-    grid: tuple[int, int] = DEFAULT_GRID,
-    epoch: float | None = None,
-    chip: int | None = None,
-    n_draws: int = 4000,
-    rng: np.random.Generator,
-    pixel_scale: float | None = None,
-) -> ErrorBudget:
-    """The error budget of a solution over a grid, at an epoch.
-
-    The parts of the model and the field terms are combined by joint draws, for they are correlated;
-    the user's terms are independent and added in quadrature.
+    Terms are independent of each other, so that their squares add up to the total; rows of one term
+    may be correlated, and the term counts as they do together.
 
     Parameters
     ----------
-    solution : LinearFit or Posterior
-    terms : sequence of UserTerm
-    fields : sequence of FieldTerm
-        Errors that are fields over the detector, each a row of its own.
-    aligned : bool
-        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`.
-        The user's terms stay as they are given.
-    grid : tuple of int
-        Points on x and y.
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-    chip : int, optional
-        Chip number; the first chip by default.
-    n_draws : int
-    rng : numpy.random.Generator
-    pixel_scale : float, optional
-        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+    errors : DrawnErrors
+    domain : EvaluationDomain
 
     Returns
     -------
     ErrorBudget
-        In the unit of u, v.
 
     Raises
     ------
     InputError
-        For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
-        needs a pixel scale that is not known.
+        For a missing epoch, and a magnitude where no errors by magnitude are known.
     """
-    number = place_of(solution.model, epoch=epoch, chip=chip).chip.number
-    (budget,) = error_budgets(
-        solution,
-        (number,),
-        terms=terms,
-        fields=fields,
-        aligned=aligned,
-        grid=grid,
-        epoch=epoch,
-        n_draws=n_draws,
-        rng=rng,
-        pixel_scale=pixel_scale,
+    monte_carlo = (2.0 * effective_draws(errors.solution, errors.n_draws)) ** -0.5
+    fields = errors.at(domain)
+    terms: list[tuple[bool, BudgetTerm]] = []
+    products = []
+    for one in fields:
+        squares = one.squares()
+        for row in one.rows:
+            known = {c: one.relative_error(row.name, c, monte_carlo) for c in domain.chips}
+            found = BudgetTerm(
+                row.name,
+                row.kind,
+                *np.sqrt(squares[row.name]).T,
+                row.source,
+                known[domain.chips[0]],
+                known,
+            )
+            if row.kind == PRODUCT:
+                products.append(found)
+            else:
+                terms.append((not one.of_parameters(row.name), found))
+    total = sum(one.total() for one in fields)
+    return ErrorBudget(
+        domain,
+        errors.unit,
+        # errors of parameters come first, whatever else their term holds
+        tuple(t for _, t in sorted(terms, key=lambda pair: pair[0])),
+        BudgetTerm(TOTAL, TOTAL, *np.sqrt(total).T, TOGETHER),
+        errors.n_draws,
+        tuple(products),
     )
-    return budget
 
 
-def error_budgets(
-    solution: Solution,
-    chips: Sequence[int],
+def place_budget(
+    errors: DrawnErrors,
+    x: ArrayLike,
+    y: ArrayLike,
     *,
-    terms: Sequence[UserTerm] = (),
-    fields: Sequence[FieldTerm] = (),
-    aligned: bool = False,
-    local: Sequence[LocalTerm] = (),
-    products: Sequence[ProductTerm] = (),
-    grid: tuple[int, int] = DEFAULT_GRID,
+    chip: int,
     epoch: float | None = None,
-    n_draws: int = 4000,
-    rng: np.random.Generator,
-    pixel_scale: float | None = None,
-) -> tuple[ErrorBudget, ...]:
-    """Error budgets of several chips from one set of draws: the chips share parameters.
+    magnitude: float | None = None,
+    relative: bool = False,
+) -> ErrorBudget:
+    """The error budget of some positions, or of their differences to the first one.
 
     Parameters
     ----------
-    solution : LinearFit or Posterior
-    chips : sequence of int
-        Chip numbers.
-    local : sequence of LocalTerm
-        Measured beside the solution, on this grid.
-    products : sequence of ProductTerm
-        Shown beside the others, and in no total.
-    terms, fields, aligned, grid, epoch, n_draws, rng, pixel_scale
-        As in `error_budget`.
+    errors : DrawnErrors
+    x, y : array_like, shape (N,)
+        FITS 1-based pixels; two or more for relative errors.
+    chip : int
+        Chip number.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    magnitude : float, optional
+        Of the stars: their centroids' errors are a term then.
+    relative : bool
+        Errors of the differences to the first position, in one image: what all positions share
+        drops out, and what is independent counts twice.
 
     Returns
     -------
-    tuple of ErrorBudget
+    ErrorBudget
 
     Raises
     ------
     InputError
-        As `error_budget`.
+        For an unknown chip, a position off the chip, a missing epoch, a magnitude where no errors
+        by magnitude are known, and relative errors of one position.
     """
-    unit = solution.model.unit
-    if pixel_scale is None:
-        pixel_scale = pixel_scale_of(solution, chips[0])
-    sigmas = [t.sigma(unit, pixel_scale) for t in terms]  # refuse bad units before the work
-    grids = {
-        c: grid_pixels(place_of(solution.model, epoch=epoch, chip=c).chip.size, grid) for c in chips
-    }
-    draws = draw_errors(solution, n_draws, rng, fields=fields, aligned=aligned)
-    drawn = draws.at({c: mesh(*xy) for c, xy in grids.items()}, epoch=epoch)
-    noise = 1.0 / (2.0 * effective_draws(solution, n_draws)) ** 0.5
-    sources = {t.name: t.source for t in fields}
-    return tuple(
-        replace(
-            _budget(f, *grids[f.chip], terms, sigmas, local, noise, sources),
-            products=tuple(_product(p, *grids[f.chip], f.chip, f.epoch) for p in products),
-        )
-        for f in drawn
+    return budget_of(
+        errors,
+        EvaluationDomain.at_pixels(
+            errors.solution.model, chip, x, y, epoch=epoch, magnitude=magnitude, relative=relative
+        ),
     )
 
 
-def _product(term: ProductTerm, x: Float, y: Float, chip: int, epoch: float | None) -> BudgetTerm:
-    u, v = np.abs(term.at(*mesh(x, y), chip, epoch)).T.reshape(2, y.size, x.size)
-    return BudgetTerm(term.name, PRODUCT, u, v, term.source, 0.0)
+def with_product(total: float, product: float) -> float:
+    """Root mean square of an error of mean zero together with a displacement that never changes.
 
-
-def _budget(
-    fields: ErrorFields,
-    x: Float,
-    y: Float,
-    terms: Sequence[UserTerm],
-    sigmas: Sequence[tuple[float, float]],
-    local: Sequence[LocalTerm],
-    noise: float,
-    sources: Mapping[str, str],
-) -> ErrorBudget:
-    shape = (y.size, x.size)
-    measured = {part: tuple(s.reshape(shape) for s in fields.sigma(part)) for part in fields.parts}
-    model_u, model_v = measured.pop(MODEL)
-    entries = [
-        BudgetTerm(n, "systematic", u, v, sources.get(n, MEASURED), noise)
-        for n, (u, v) in measured.items()
-    ]
-    n_parts = len(entries)
-    entries += [
-        BudgetTerm(
-            t.name, LOCAL, *t.on(fields.chip, shape), t.source, t.relative_error(fields.chip)
-        )
-        for t in local
-    ]
-    for t, (su, sv) in zip(terms, sigmas, strict=True):
-        entries.append(BudgetTerm(t.name, t.kind, np.full(shape, su), np.full(shape, sv), t.source))
-    others = entries[n_parts:]
-    user_u2, user_v2 = (sum(getattr(t, axis) ** 2 for t in others) for axis in "uv")
-    return ErrorBudget(
-        x=x,
-        y=y,
-        unit=fields.unit,
-        chip=fields.chip,
-        epoch=fields.epoch,
-        terms=tuple(entries),
-        model_u=model_u,
-        model_v=model_v,
-        total_u=np.sqrt(model_u**2 + user_u2),
-        total_v=np.sqrt(model_v**2 + user_v2),
-        dominant=np.argmax([t.radial for t in entries], axis=0),
-        n_draws=fields.n_draws,
-    )
+    A constant is independent of every error: the squares add up exactly.
+    """
+    return float(np.hypot(total, product))

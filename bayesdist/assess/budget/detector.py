@@ -1,116 +1,52 @@
-"""The error budget of a detector of one or many chips."""
+"""Error budgets over the grid of a chip, or of all chips."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesdist.assess.budget.budget import ErrorBudget, budget_rows, error_budgets
-from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.given import LocalTerm, UserTerm
-from bayesdist.assess.terms.product_terms import ProductTerm
+from bayesdist.assess.budget.budget import ErrorBudget
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.error_model import error_model
+from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.terms.forms import ErrorTerm
+from bayesdist.assess.units import pixel_scale_of
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["DetectorBudget", "detector_budget"]
-
-Float = NDArray[np.float64]
+__all__ = ["detector_budget", "error_budget"]
 
 
-@dataclass(frozen=True, eq=False)
-class DetectorBudget:
-    """The error budgets of all chips of a detector, from the same draws.
-
-    Parameters
-    ----------
-    chips : tuple of ErrorBudget
-        One for each chip, all with the same terms and the same number of grid points.
-    """
-
-    chips: tuple[ErrorBudget, ...]
-
-    @property
-    def unit(self) -> str:
-        """Unit of all standard deviations."""
-        return self.chips[0].unit
-
-    @property
-    def epoch(self) -> float | None:
-        """Decimal years."""
-        return self.chips[0].epoch
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the terms."""
-        return tuple(t.name for t in self.chips[0].terms)
-
-    @property
-    def share(self) -> Float:
-        """Fraction of the grid points of all chips at which each term is the largest."""
-        dominant = np.concatenate([b.dominant.ravel() for b in self.chips])
-        return np.bincount(dominant, minlength=len(self.names)) / dominant.size
-
-    def rows(self) -> list[dict[str, Any]]:
-        """The budget as a table: root mean squares over the grid points of all chips.
-
-        Returns
-        -------
-        list of dict
-            As those of an `ErrorBudget`; one for each term and product, the total last.
-        """
-        by_term = zip(*((*b.terms, *b.products, b.total) for b in self.chips), strict=True)
-        return budget_rows(
-            [
-                replace(
-                    terms[0],
-                    u=np.stack([t.u for t in terms]),
-                    v=np.stack([t.v for t in terms]),
-                )
-                for terms in by_term
-            ]
-        )
-
-    def rows_by_chip(self) -> list[dict[str, Any]]:
-        """As `rows`, followed by those of each chip alone; column chip is 'all' or its number."""
-        parts = [("all", self.rows()), *((str(b.chip), b.rows()) for b in self.chips)]
-        return [{"chip": chip} | row for chip, rows in parts for row in rows]
-
-
-def detector_budget(
+def error_budget(
     solution: Solution,
     *,
-    terms: Sequence[UserTerm] = (),
-    fields: Sequence[FieldTerm] = (),
+    terms: Sequence[ErrorTerm] = (),
     aligned: bool = False,
-    local: Sequence[LocalTerm] = (),
-    products: Sequence[ProductTerm] = (),
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
+    chip: int | None = None,
     n_draws: int = 4000,
     rng: np.random.Generator,
     pixel_scale: float | None = None,
-) -> DetectorBudget:
-    """The error budget of a solution over all of its chips, the same grid on each.
+) -> ErrorBudget:
+    """The error budget of a solution over a grid on a chip, at an epoch.
+
+    The parts of the model are combined by joint draws, for they are correlated; other terms are
+    independent and added in quadrature.
 
     Parameters
     ----------
     solution : LinearFit or Posterior
-    terms : sequence of UserTerm
-    fields : sequence of FieldTerm
+    terms : sequence of ErrorTerm
+        Of the user, and others; each gives one row or more.
     aligned : bool
-        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`.
-    local : sequence of LocalTerm
-        Measured beside the solution, on this grid.
-    products : sequence of ProductTerm
-        Shown beside the others, and in no total.
+        Whether shift and rotation of the exposure are the observer's to fit, as of `ErrorModel`.
     grid : tuple of int
-        Points on x and y of each chip.
+        Points on x and y.
     epoch : float, optional
         Decimal years; needed by a model with time dependence.
+    chip : int, optional
+        Chip number; the first chip by default.
     n_draws : int
     rng : numpy.random.Generator
     pixel_scale : float, optional
@@ -118,7 +54,53 @@ def detector_budget(
 
     Returns
     -------
-    DetectorBudget
+    ErrorBudget
+        In the unit of u, v.
+
+    Raises
+    ------
+    InputError
+        For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
+        needs a pixel scale that is not known.
+    """
+    return detector_budget(
+        solution,
+        terms=terms,
+        aligned=aligned,
+        grid=grid,
+        epoch=epoch,
+        chips=(place_of(solution.model, epoch=epoch, chip=chip).chip.number,),
+        n_draws=n_draws,
+        rng=rng,
+        pixel_scale=pixel_scale,
+    )
+
+
+def detector_budget(
+    solution: Solution,
+    *,
+    terms: Sequence[ErrorTerm] = (),
+    aligned: bool = False,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chips: Sequence[int] | None = None,
+    n_draws: int = 4000,
+    rng: np.random.Generator,
+    pixel_scale: float | None = None,
+) -> ErrorBudget:
+    """The error budget of a solution over its chips, the same grid on each.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    chips : sequence of int, optional
+        Chip numbers; all by default.
+    terms, aligned, grid, epoch, n_draws, rng, pixel_scale
+        As in `error_budget`.
+
+    Returns
+    -------
+    ErrorBudget
         In the unit of u, v.
 
     Raises
@@ -126,19 +108,8 @@ def detector_budget(
     InputError
         As `error_budget`.
     """
-    return DetectorBudget(
-        error_budgets(
-            solution,
-            tuple(c.number for c in solution.model.chips),
-            terms=terms,
-            fields=fields,
-            aligned=aligned,
-            local=local,
-            products=products,
-            grid=grid,
-            epoch=epoch,
-            n_draws=n_draws,
-            rng=rng,
-            pixel_scale=pixel_scale,
-        )
-    )
+    if pixel_scale is None:
+        pixel_scale = pixel_scale_of(solution, None if chips is None else chips[0])
+    domain = EvaluationDomain.of_chips(solution.model, grid, chips=chips, epoch=epoch)
+    errors = error_model(solution, terms, aligned=aligned, pixel_scale=pixel_scale)
+    return errors.at(domain, n=n_draws, rng=rng)

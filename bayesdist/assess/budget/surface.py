@@ -15,19 +15,27 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.drawn import PositionErrors
-from bayesdist.assess.terms.fields import MODEL
-from bayesdist.assess.terms.given import LocalTerm, UserTerm
-from bayesdist.assess.terms.product_terms import ProductTerm
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.terms.forms import (
+    LOCAL,
+    ErrorField,
+    Image,
+    Known,
+    PolynomialField,
+    Row,
+    TogetherField,
+)
+from bayesdist.assess.terms.given import Centroids
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
-from bayesdist.model.grid import grid_pixels, mesh
 
-__all__ = ["BudgetSpan", "BudgetSurface", "SurfaceProduct", "budget_surface"]
+__all__ = ["JOINT", "BudgetSpan", "BudgetSurface", "GridRow", "budget_surface"]
 
 Float = NDArray[np.float64]
 
+JOINT = "model"  # all errors of parameters together
 CONSTANT = 1e-9  # moments that change less, relative to the largest, do not depend on time
 
 
@@ -50,20 +58,20 @@ class BudgetSpan:
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceProduct:
-    """What a file differs by from the solution, on the grid.
+class GridRow:
+    """A row that is no polynomial: values on the grid.
 
     Parameters
     ----------
-    name, source : str
-    shifts : tuple of dict of int to ndarray, shape (n, N, 2)
-        For each span, by chip number: displacements at its nodes, linear in time between them;
-        n = 1 for those that do not depend on time.
+    row : Row
+    values : tuple of dict of int to ndarray, shape (n, N, 2)
+        For each span, by chip number: of an error its standard deviations, n = 1; of a file its
+        displacements at the nodes, linear in time between them, n = 1 for those that do not depend
+        on time.
     """
 
-    name: str
-    source: str
-    shifts: tuple[dict[int, Float], ...]
+    row: Row
+    values: tuple[dict[int, Float], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +87,14 @@ class BudgetSurface:
         Points on x and y of a chip over which it is averaged, and on which `local` is known.
     spans : tuple of BudgetSpan
         In the order of time.
-    sources : dict of str to str
-        Where parts come from, of those that say so.
-    terms : tuple of UserTerm
-    sigmas : tuple of (float, float)
-        Of these, in the unit of the model.
-    local : tuple of LocalTerm
+    parts : tuple of Row
+        Errors of parameters, whose moments are in the spans.
+    local : tuple of GridRow
+        Other errors, at the epoch at which the budget is quoted.
+    constant : tuple of (Row, ndarray of shape (2,))
+        Errors that are as large everywhere.
     centroid : MagnitudeErrors or None
-    products : tuple of SurfaceProduct
+    products : tuple of GridRow
         In no total.
     """
 
@@ -94,41 +102,32 @@ class BudgetSurface:
     epoch: float | None
     grid: tuple[int, int]
     spans: tuple[BudgetSpan, ...]
-    sources: dict[str, str]
-    terms: tuple[UserTerm, ...]
-    sigmas: tuple[tuple[float, float], ...]
-    local: tuple[LocalTerm, ...]
+    parts: tuple[Row, ...]
+    local: tuple[GridRow, ...]
+    constant: tuple[tuple[Row, Float], ...]
     centroid: MagnitudeErrors | None
-    products: tuple[SurfaceProduct, ...] = ()
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """Names of the model's parts and of the field terms, without the joint error."""
-        first = next(iter(self.spans[0].moments.values()))
-        return tuple(name for name in first if name != MODEL)
+    products: tuple[GridRow, ...] = ()
 
 
 def budget_surface(
-    errors: PositionErrors,
+    errors: DrawnErrors,
+    grid: tuple[int, int],
     *,
     epoch: float | None = None,
     years: tuple[float, float] | None = None,
-    sources: dict[str, str] | None = None,
-    products: Sequence[ProductTerm] = (),
 ) -> BudgetSurface:
     """Second moments of all errors of a position.
 
     Parameters
     ----------
-    errors : PositionErrors
+    errors : DrawnErrors
         The same draws as those of a budget give the same numbers.
+    grid : tuple of int
+        Points on x and y of a chip.
     epoch : float, optional
-        Decimal years, at which the budget is quoted.
+        Decimal years, at which the budget is quoted; the first of the years by default.
     years : tuple of float, optional
         First and last epoch; needed by a model with time dependence.
-    sources : dict of str to str, optional
-        Where parts come from.
-    products : sequence of ProductTerm
 
     Returns
     -------
@@ -139,37 +138,43 @@ def budget_surface(
     InputError
         For a model with time dependence and no years, or years that do not rise.
     """
-    model = errors.fields.whole.solution.model
-    spans = tuple(BudgetSpan(nodes, _moments(errors, nodes)) for nodes in _nodes(model, years))
+    model = errors.solution.model
+    nodes = _nodes(model, years)
+    if epoch is None and nodes[0]:
+        epoch = nodes[0][0]
+    domain = EvaluationDomain.of_chips(model, grid, epoch=epoch)
+    parts, local, constant, products = [], list[GridRow](), [], list[GridRow]()
+    for draws, one in zip(errors.draws, errors.at(domain), strict=True):
+        squares = one.squares()
+        for row in one.rows:
+            values = squares[row.name]
+            if one.of_parameters(row.name):
+                parts.append(row)
+            elif isinstance(draws, Known):
+                products.append(GridRow(row, tuple(_shifts(draws, domain, n) for n in nodes)))
+            elif row.kind != LOCAL and np.ptp(values, axis=0).max() <= CONSTANT * values.max():
+                constant.append((row, np.sqrt(values[0])))
+            else:
+                sigma = {chip: np.sqrt(values[rows])[None] for chip, rows in domain.by_chip()}
+                local.append(GridRow(row, (sigma,)))
+    centroid = [term.errors for term in errors.terms if isinstance(term, Centroids)]
     return BudgetSurface(
         model=model,
         epoch=epoch,
-        grid=errors.grid,
-        spans=spans,
-        sources=dict(sources or {}),
-        terms=errors.terms,
-        sigmas=errors.sigmas,
-        local=errors.local,
-        centroid=errors.centroid,
-        products=tuple(_on_the_grid(p, model, errors.grid, spans) for p in products),
+        grid=grid,
+        spans=tuple(BudgetSpan(n, _moments(errors, n)) for n in nodes),
+        parts=tuple(parts),
+        local=tuple(local),
+        constant=tuple(constant),
+        centroid=centroid[0] if centroid else None,
+        products=tuple(products),
     )
 
 
-def _on_the_grid(
-    term: ProductTerm,
-    model: DistortionModel,
-    grid: tuple[int, int],
-    spans: Sequence[BudgetSpan],
-) -> SurfaceProduct:
-    shifts = []
-    for span in spans:
-        by_chip = {}
-        for chip in model.chips:
-            at = mesh(*grid_pixels(chip.size, grid))
-            nodes = [term.at(*at, chip.number, epoch) for epoch in span.nodes or (None,)]
-            by_chip[chip.number] = _short(np.stack(nodes))
-        shifts.append(by_chip)
-    return SurfaceProduct(term.name, term.source, tuple(shifts))
+def _shifts(draws: Known, domain: EvaluationDomain, nodes: Sequence[float]) -> dict[int, Float]:
+    """Displacements (n, N, 2) by chip number, at the nodes of a span."""
+    moved = [draws.on(domain.at(epoch), Image()).shift for epoch in nodes or (None,)]
+    return {chip: _short(np.stack([one[rows] for one in moved])) for chip, rows in domain.by_chip()}
 
 
 def _nodes(
@@ -189,18 +194,40 @@ def _nodes(
     return tuple(out)
 
 
-def _moments(errors: PositionErrors, nodes: Sequence[float]) -> dict[int, dict[str, Float]]:
-    nowhere = np.empty(0), np.empty(0)
-    numbers = [chip.number for chip in errors.fields.whole.solution.model.chips]
-    points = dict.fromkeys(numbers, nowhere)
-    at = [errors.fields.at(points, epoch=epoch) for epoch in nodes or (None,)]
-    out = {}
-    for number, fields in zip(numbers, zip(*at, strict=True), strict=True):
-        out[number] = {
-            part: _short(np.stack([_second(f.polynomials[part]) for f in fields]))
-            for part in fields[0].parts
-        }
+def _moments(errors: DrawnErrors, nodes: Sequence[float]) -> dict[int, dict[str, Float]]:
+    """By chip number and part, moments (n, 2, K, K) at the nodes; the joint ones are the last."""
+    model = errors.solution.model
+    epochs = nodes or (None,)
+    # moments know of no positions: any will do
+    domain = EvaluationDomain.of_chips(model, (2, 2), epoch=epochs[0])
+    at = [errors.at(domain.at(epoch)) for epoch in epochs]
+    out: dict[int, dict[str, Float]] = {chip.number: {} for chip in model.chips}
+    for chip, moments in out.items():
+        by_node = [_of_parameters(fields, chip) for fields in at]
+        for part in by_node[0]:
+            moments[part] = _short(np.stack([one[part] for one in by_node]))
     return out
+
+
+def _of_parameters(fields: Sequence[ErrorField], chip: int) -> dict[str, Float]:
+    """Moments (2, K, K) of each part on a chip, and of all together."""
+    out: dict[str, Float] = {}
+    joint: Float | float = 0.0
+    for one in fields:
+        if isinstance(one, PolynomialField):
+            parts: Sequence[ErrorField] = (one,)
+            whole: Sequence[ErrorField] = (one,)
+        elif isinstance(one, TogetherField):
+            parts, whole = one.parts, one.summed
+        else:
+            continue
+        for part in parts:
+            if isinstance(part, PolynomialField):
+                out[part.rows[0].name] = _second(part.coefficients[chip])
+        added = [p.coefficients[chip] for p in whole if isinstance(p, PolynomialField)]
+        if added:
+            joint = joint + _second(sum(added[1:], added[0]))
+    return out | {JOINT: np.asarray(joint)}
 
 
 def _second(e: Float) -> Float:

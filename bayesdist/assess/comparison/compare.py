@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.comparison.frame import CommonFrame, Similarity, common_frame
 from bayesdist.calibration.chip_map import ChipMap, position_moments
-from bayesdist.infer.equations.field_test import FieldTest, field_test, known_terms
+from bayesdist.infer.equations.scaled import FieldTest, chi_square, known_terms
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
@@ -183,7 +183,9 @@ def compare(
         # of a sum of estimates as Welch and Satterthwaite count them
         lost = sum(share**2 / c.draws for share, c in zip(frame.shares, (a, b), strict=True))
         draws = 1.0 / lost if lost > 0 else np.inf
-        field = field_test(d.ravel(), frame.raw_cov, frame.taken, frame.norm, draws=draws)
+        field = chi_square(
+            d.ravel(), frame.raw_cov, without=frame.taken, norm=frame.norm, draws=draws
+        )
         rest = ~known_terms(frame.raw_cov)
         rest[[0, K]] &= not frame.taken.shape[1]
         unknown = float(np.sqrt(frame.norm[rest] @ d.ravel()[rest] ** 2))

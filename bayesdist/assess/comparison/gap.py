@@ -23,7 +23,7 @@ from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.similarity import as_real, similarity_fields, turn_between
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.frame_fields import term_squares
-from bayesdist.infer.equations.field_test import FieldTest, field_test
+from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import PolynomialBasis
 
 __all__ = ["ChipPair", "GapDifference", "gap_difference", "pair_of_chips"]
@@ -186,7 +186,7 @@ def _test(
     shares = [float(np.mean(np.diag(e) / np.diag(cov))) for e in errors]
     lost = sum(share**2 / c.draws for share, c in zip(shares, with_errors, strict=True))
     draws = 1.0 / lost if lost > 0 else np.inf
-    return field_test(values, cov, np.zeros((4, 0)), norm, draws=draws)
+    return chi_square(values, cov, norm=norm, draws=draws)
 
 
 def _estimate(fields: Float, basis: PolynomialBasis) -> Float:

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.drawn import Judged, Place, PositionErrors, position_errors
+from bayesdist.assess.domain import EvaluationDomain, WorstPosition
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.remedy import Remedy, find_remedy
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import (
@@ -18,15 +20,13 @@ from bayesdist.assess.requirements.verdict import (
     verdict_of,
 )
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms.field_terms import FieldTerm
-from bayesdist.assess.terms.given import LocalTerm, UserTerm
+from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
-from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["Margin", "Requirement", "check_requirements", "judged_places"]
+__all__ = ["Margin", "Requirement", "check_requirements", "domains_of"]
 
 Float = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class Margin:
         Independent draws that the draws are worth.
     draws : ndarray, shape (n,)
         The statistic of every draw; over a range of epochs the largest.
-    worst : Place
+    worst : WorstPosition
         Where the error is largest, at that epoch; its size in `unit`.
     rests_on : tuple of str
         What the verdict takes for granted or has measured, as clauses.
@@ -84,7 +84,7 @@ class Margin:
     epoch: float | None
     n_effective: float
     draws: Float
-    worst: Place
+    worst: WorstPosition
     remedy: Remedy | None = None
     rests_on: tuple[str, ...] = ()
 
@@ -98,28 +98,23 @@ def check_requirements(
     solution: Solution,
     requirements: Sequence[Requirement],
     *,
-    terms: Sequence[UserTerm] = (),
-    fields: Sequence[FieldTerm] = (),
+    terms: Sequence[ErrorTerm] = (),
     aligned: bool = False,
-    local: Sequence[LocalTerm] = (),
-    centroid: MagnitudeErrors | None = None,
     grid: tuple[int, int] = DEFAULT_GRID,
     epoch: float | None = None,
     chip: int | None = None,
     n_draws: int = 2000,
     rng: np.random.Generator,
     pixel_scale: float | None = None,
-    converged: bool | None = None,
     caveats: Sequence[Caveat] = (),
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws of the position error.
 
     Each draw is an error field over the grid: a draw of the solution minus its mean (all parts of
-    the model jointly, so with the correlation between positions), plus a draw of every field term
-    that is not among the solution's errors, plus for the systematic terms one Gaussian offset of
-    each axis for the whole field, plus for the random and the local terms an independent Gaussian
-    error at every grid point.  The statistic of each field gives a
-    distribution, and the fraction of draws at or under the limit is compared with the probability
+    the model jointly, so with the correlation between positions), plus a draw of every term: of a
+    systematic one of the user one Gaussian offset of each axis for the whole field, of random and
+    local ones an independent Gaussian error at every grid point.  The statistic of each field gives
+    a distribution, and the fraction of draws at or under the limit is compared with the probability
     asked for.
 
     The field is that of all chips: the same grid on each of them, so that each has the same weight.
@@ -133,15 +128,11 @@ def check_requirements(
     ----------
     solution : LinearFit or Posterior
     requirements : sequence of Requirement
-    terms : sequence of UserTerm
-    fields : sequence of FieldTerm
+    terms : sequence of ErrorTerm
+        For requirements that name a magnitude `Centroids` among them.
     aligned : bool
-        Whether shift and rotation of the exposure are the observer's to fit, as in `error_fields`:
-        over all chips, also where one is judged.  The user's terms stay as they are given.
-    local : sequence of LocalTerm
-        Measured beside the solution, on this grid.
-    centroid : MagnitudeErrors, optional
-        Errors of centroids, in the unit of the solution: for requirements that name a magnitude.
+        Whether shift and rotation of the exposure are the observer's to fit, as of `ErrorModel`:
+        over all chips, also where one is judged.  Terms that are no polynomials stay as they are.
     grid : tuple of int
         Points on x and y.
     epoch : float, optional
@@ -152,11 +143,9 @@ def check_requirements(
     rng : numpy.random.Generator
     pixel_scale : float, optional
         Size of one pixel in mas; `pixel_scale_of` the solution by default.
-    converged : bool, optional
-        Whether the posterior may be trusted; by default what its convergence says.  If not, every
-        verdict is 'undecided'.
     caveats : sequence of Caveat
-        Other reasons why the errors may not be as stated.
+        Reasons why the errors may not be as stated, beside a posterior that is not converged: its
+        verdicts are all 'undecided'.
 
     Returns
     -------
@@ -175,38 +164,26 @@ def check_requirements(
         pixel_scale = pixel_scale_of(solution, chip)
     for r in requirements:
         convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
-    for t in terms:
-        t.sigma(unit, pixel_scale)
+    model = error_model(solution, terms, aligned=aligned, pixel_scale=pixel_scale)
     if not requirements:
         return ()
-    cases = [judged_places(r, solution.model, epoch=epoch, chip=chip) for r in requirements]
-    errors = position_errors(
-        solution,
-        terms=terms,
-        fields=[term for term in fields if term.without is None],
-        aligned=aligned,
-        local=local,
-        centroid=centroid,
-        grid=grid,
-        n_draws=n_draws,
-        rng=rng,
-        pixel_scale=pixel_scale,
-    )
-    wanted: dict[Judged, set[str]] = {}
+    cases = [domains_of(r, solution.model, grid, epoch=epoch, chip=chip) for r in requirements]
+    errors = model.drawn(n_draws, rng)
+    wanted: dict[EvaluationDomain, set[str]] = {}
     for r, case in zip(requirements, cases, strict=True):
-        for judged in case:
-            wanted.setdefault(judged, set()).add(r.statistic)
-    ways, found = (errors, *errors.varied()), {}
-    for judged, names in wanted.items():
-        owner = next(r for r, case in zip(requirements, cases, strict=True) if judged in case)
+        for domain in case:
+            wanted.setdefault(domain, set()).add(r.statistic)
+    ways, found = (errors, *errors.treatments(grid)), {}
+    for domain, names in wanted.items():
+        owner = next(r for r, case in zip(requirements, cases, strict=True) if domain in case)
         try:
-            found[judged] = [one.statistics(judged, sorted(names)) for one in ways]
-        except InputError as error:  # of its region, separation or magnitude
+            found[domain] = [one.statistics(domain, sorted(names)) for one in ways]
+        except InputError as error:  # of its separation or magnitude
             raise InputError(
                 error.cause, where=f"{owner.where}, {error.where}", do=error.do
             ) from None
 
-    caveats = (*_not_converged(solution, converged), *caveats)
+    caveats = (*_not_converged(solution), *caveats)
     n_effective = effective_draws(solution, n_draws)
     margins = []
     for r, case in zip(requirements, cases, strict=True):
@@ -215,39 +192,47 @@ def check_requirements(
             _margin(r, case, draws, way, factor, n_effective, caveats)
             for way, *draws in zip(
                 ways,
-                *([factor * one[r.statistic] for one in found[judged]] for judged in case),
+                *([factor * one[r.statistic] for one in found[domain]] for domain in case),
                 strict=True,
             )
         ]
-        margins.append(_of_extremes(extremes, [t.name for t in terms if t.varies], caveats))
+        margins.append(
+            _of_extremes(
+                extremes, [t.rows[0].name for t in terms if getattr(t, "varies", False)], caveats
+            )
+        )
     return tuple(margins)
 
 
-def judged_places(
+def domains_of(
     requirement: Requirement,
     model: DistortionModel,
+    grid: tuple[int, int],
     *,
     epoch: float | None = None,
     chip: int | None = None,
-) -> tuple[Judged, ...]:
+) -> tuple[EvaluationDomain, ...]:
     """Where and when a requirement is judged: one for each epoch.
 
     Parameters
     ----------
     requirement : Requirement
     model : DistortionModel
+    grid : tuple of int
+        Points on x and y of a chip.
     epoch, chip
         For a requirement that names none.
 
     Returns
     -------
-    tuple of Judged
+    tuple of EvaluationDomain
 
     Raises
     ------
     InputError
-        For an unknown chip, a missing epoch, a range of epochs where nothing depends on time, and a
-        polygon that is not said to lie on one of several chips.
+        For an unknown chip, a missing epoch, a range of epochs where nothing depends on time, a
+        polygon that is not said to lie on one of several chips, and a region that holds fewer than
+        four points of the grid.
     """
     r = requirement
     epochs: list[float | None] = [r.epoch if r.epoch is not None else epoch]
@@ -276,7 +261,20 @@ def judged_places(
             where=r.where,
             do=f"name its chip, one of {', '.join(str(c.number) for c in chips)}",
         )
-    return tuple(Judged(chips, t, r.region, r.relative, r.separation, r.magnitude) for t in epochs)
+    try:
+        first = EvaluationDomain.of_chips(
+            model,
+            grid,
+            chips=[c.number for c in chips],
+            region=r.region,
+            epoch=epochs[0],
+            magnitude=r.magnitude,
+            relative=r.relative,
+            separation=r.separation,
+        )
+    except InputError as error:  # of its region
+        raise InputError(error.cause, where=f"{r.where}, {error.where}", do=error.do) from None
+    return tuple(first.at(epoch) for epoch in epochs)
 
 
 def _chips_of(
@@ -314,12 +312,10 @@ def _of_extremes(
     return replace(worse, verdict="undecided", reason="; ".join(texts))
 
 
-def _not_converged(solution: Solution, converged: bool | None) -> tuple[Caveat, ...]:
+def _not_converged(solution: Solution) -> tuple[Caveat, ...]:
     """Why draws cannot be trusted, where they cannot."""
     convergence = getattr(solution, "convergence", None)
-    if converged is None:
-        converged = convergence is None or bool(convergence.converged)
-    if converged:
+    if convergence is None or convergence.converged:
         return ()
     reasons = "; ".join(getattr(convergence, "reasons", ()))
     text = "the posterior is not converged" + (f": {reasons}" if reasons else "")
@@ -328,9 +324,9 @@ def _not_converged(solution: Solution, converged: bool | None) -> tuple[Caveat, 
 
 def _margin(
     requirement: Requirement,
-    case: Sequence[Judged],
+    case: Sequence[EvaluationDomain],
     by_epoch: Sequence[Float],
-    errors: PositionErrors,
+    errors: DrawnErrors,
     factor: float,
     n_effective: float,
     caveats: Sequence[Caveat],

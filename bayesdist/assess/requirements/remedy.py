@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.assess.drawn import Judged, PositionErrors
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.requirement import Requirement
 
 __all__ = ["Remedy", "find_remedy"]
@@ -26,7 +27,7 @@ class Remedy:
     factor : float
         By which its error must be multiplied; 0 where it cannot do it alone.
     now, needed : float
-        Its radial rms over the places that are judged, in the requirement's unit.
+        Its radial rms over the places that are domain, in the requirement's unit.
     enough : bool
         Whether the requirement is met then, the other terms being as they are.
     unit : str
@@ -54,7 +55,7 @@ class Remedy:
 
 
 def find_remedy(
-    errors: PositionErrors, requirement: Requirement, judged: Judged, factor: float
+    errors: DrawnErrors, requirement: Requirement, domain: EvaluationDomain, factor: float
 ) -> Remedy:
     """The term of which the least shrinking meets a requirement.
 
@@ -62,9 +63,9 @@ def find_remedy(
 
     Parameters
     ----------
-    errors : PositionErrors
+    errors : DrawnErrors
     requirement : Requirement
-    judged : Judged
+    domain : EvaluationDomain
         Where, and at the worst epoch.
     factor : float
         Unit of the solution, in the unit of the requirement.
@@ -77,12 +78,12 @@ def find_remedy(
     statistic = requirement.statistic
 
     def met(term: str, size: float) -> bool:
-        found = errors.statistics(judged, [statistic], shrink={term: size}, n_draws=n)
+        found = errors.statistics(domain, [statistic], scale={term: size}, n_draws=n)
         return bool(
             np.mean(factor * found[statistic] <= requirement.limit) >= requirement.probability
         )
 
-    sizes = {name: factor * errors.size(judged, name) for name in errors.names(judged)}
+    sizes = {name: factor * size for name, size in errors.sizes(domain).items()}
     largest = max(sizes, key=lambda name: sizes[name])
     alone = {}
     for name in sizes:

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.drawn import PositionErrors
-from bayesdist.assess.requirements.margins import judged_places
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.units import convert
 from bayesdist.errors import InputError
+from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = ["Horizon", "horizon_of"]
 
@@ -90,12 +91,12 @@ class Horizon:
 
 
 def horizon_of(
-    errors: PositionErrors,
+    errors: DrawnErrors,
     requirement: Requirement,
     epochs: ArrayLike,
     *,
+    grid: tuple[int, int] = DEFAULT_GRID,
     n_effective: float | None = None,
-    chip: int | None = None,
     pixel_scale: float | None = None,
 ) -> Horizon:
     """Follow a requirement through time.
@@ -106,15 +107,17 @@ def horizon_of(
 
     Parameters
     ----------
-    errors : PositionErrors
+    errors : DrawnErrors
         One set of draws for all epochs: the curve has no noise of its own between them.
     requirement : Requirement
         Its own epoch is not used.
     epochs : array_like, shape (n,)
         Decimal years, rising.
+    grid : tuple of int
+        Points on x and y of a chip.
     n_effective : float, optional
         Independent draws that the draws are worth; their number by default.
-    chip, pixel_scale
+    pixel_scale : float, optional
         As `check_requirements`.
 
     Returns
@@ -126,7 +129,7 @@ def horizon_of(
     InputError
         For a model that does not depend on time, and epochs that do not rise.
     """
-    model = errors.fields.whole.solution.model
+    model = errors.solution.model
     at = np.atleast_1d(np.asarray(epochs, float))
     if model.time is None:
         raise InputError(
@@ -138,12 +141,11 @@ def horizon_of(
         raise InputError("the epochs do not rise", where="epochs", do="give two or more in order")
     factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
     n = n_effective or float(errors.n_draws)
-    (judged,) = judged_places(
-        replace(requirement, epoch=float(at[0]), epochs=None), model, chip=chip
-    )
-    cases = [replace(judged, epoch=float(epoch)) for epoch in at]
-    name = requirement.statistic
-    draws = factor * np.array([found[name] for found in errors.course(cases, [name])])
+    here = replace(requirement, epoch=float(at[0]), epochs=None)
+    (domain,) = domains_of(here, model, grid)
+    epochs = [float(epoch) for epoch in at]
+    found = errors.over_epochs(domain, epochs, [requirement.statistic])
+    draws = factor * np.array([one[requirement.statistic] for one in found])
     met, value = np.mean(draws <= requirement.limit, axis=1), np.median(draws, axis=1)
     low, high = np.array([clopper_pearson(p, n, BAND) for p in met]).T
     return Horizon(requirement, at, met, low, high, value)

@@ -1,1 +1,1 @@
-"""Error terms: whatever moves a position beside the noise of its own measurement."""
+"""Error terms: whatever moves a position."""

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
-from bayesdist.data.preparing import LEAST_SHARE
+from bayesdist.data.preparing import MIN_CENTROID_FRACTION
 from bayesdist.diagnose.residuals.sample import StarSample
 from bayesdist.errors import InputError
 
@@ -91,7 +91,7 @@ def without(errors: MagnitudeErrors, sigma_u: float, sigma_v: float) -> Magnitud
         At least a quarter of what they were.
     """
     left = {
-        name: np.sqrt(np.maximum(sigma**2 - known**2, (LEAST_SHARE * sigma) ** 2))
+        name: np.sqrt(np.maximum(sigma**2 - known**2, (MIN_CENTROID_FRACTION * sigma) ** 2))
         for name, sigma, known in (
             ("sigma_u", errors.sigma_u, sigma_u),
             ("sigma_v", errors.sigma_v, sigma_v),

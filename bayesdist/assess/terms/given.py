@@ -1,38 +1,41 @@
-"""Error terms beside those of the solution: given by the user, or measured in another way."""
+"""Error terms that the user gives, and errors of a star's own centroid."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.names import require_known
+from bayesdist.assess.terms.forms import (
+    GIVEN,
+    PUBLISHED,
+    ErrorDraws,
+    ErrorTerm,
+    Functions,
+    Independent,
+    Row,
+)
 from bayesdist.assess.units import UNITS, convert
-from bayesdist.diagnose.tables.mean_square import MeanSquare
+from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
+from bayesdist.model import DistortionModel, PolynomialBasis
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 
-__all__ = [
-    "GIVEN",
-    "LOCAL",
-    "MEASURED",
-    "TERM_KINDS",
-    "LocalTerm",
-    "UserTerm",
-    "said_by_user",
-]
+__all__ = ["CENTROID", "TERM_KINDS", "Centroids", "SmoothTerm", "UserTerm", "said_by_user"]
 
 Float = NDArray[np.float64]
 
 TERM_KINDS = ("random", "systematic")
-LOCAL = "local"
+CENTROID = "centroid"
 
-MEASURED = "measured in this run"
-GIVEN = "given by the user"
-PUBLISHED = "published"
+SMOOTH_ORDER = 3  # of fields that stand for what may vary over the detector
+SMOOTH_DRAWS = 1000
+BEYOND = 0.5  # magnitudes by which the outermost bins may be left
 
 
 def said_by_user(source: str) -> str:
@@ -99,77 +102,142 @@ class UserTerm:
         )
         return float(su), float(sv)
 
+    def in_unit(self, unit: str, pixel_scale: float | None = None) -> UserTerm:
+        """The same with its standard deviations in another unit."""
+        su, sv = self.sigma(unit, pixel_scale)
+        return replace(self, sigma_u=su, sigma_v=sv, unit=unit)
 
-@dataclass(frozen=True, eq=False)
-class LocalTerm:
-    """A Gaussian error that all stars at a place share, and that differs from place to place.
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """One row."""
+        return (Row(self.name, self.kind, self.source),)
 
-    Such is the error of a look-up table: its nodes are closer than the points of the grid on which
-    budgets and requirements are evaluated, and there the errors count as independent.
+    def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
+        """One offset for the whole field, or independent errors; in the unit of the term."""
+        size = np.array([self.sigma_u, self.sigma_v])
+        if self.kind == "random":
+            return Independent(self.rows[0], partial(_everywhere, size))
+        offset = size * rng.standard_normal((n, 2))
+        covariance = {None: (size**2)[:, None, None]}
+        return Functions(
+            self.rows[0], {None: offset[..., None]}, _one, n, uniform=True, covariance=covariance
+        )
 
-    Parameters
-    ----------
-    name : str
-    sigma : dict of int to ndarray, shape (ny, nx, 2)
-        By chip number: standard deviations of u and v on that grid, in the unit of the solution.
-    source : str
-    squares : mapping of int to MeanSquare
-        By chip number: how well their mean squares are known themselves, where that is known.
-    drawn : mapping of int to ndarray, shape (n, ny, nx, 2)
-        By chip number: draws of the error on that grid, where neighbouring positions have some of
-        it in common; without them positions err independently of each other.
-    """
-
-    name: str
-    sigma: dict[int, Float]
-    source: str = MEASURED
-    squares: Mapping[int, MeanSquare] = field(default_factory=dict)
-    drawn: Mapping[int, NDArray[np.floating]] = field(default_factory=dict)
-
-    def relative_error(self, chip: int) -> float | None:
-        """How well the sizes on a chip are known, relative to them; None where it is not known."""
-        if chip in self.drawn:
-            by_draw = np.sqrt(np.mean(np.square(self.drawn[chip]), axis=(1, 2, 3)))
-            return float(by_draw.std() / max(float(by_draw.mean()), 1e-300))
-        return self.squares[chip].relative_error if chip in self.squares else None
-
-    def on(self, chip: int, shape: tuple[int, int]) -> tuple[Float, Float]:
-        """Standard deviations (u, v), each (ny, nx), on a chip.
-
-        Raises
-        ------
-        InputError
-            For another grid, or a chip without values.
-        """
-        found = self.sigma.get(chip)
-        if found is None or found.shape != (*shape, 2):
-            raise InputError(
-                f"is not known on a grid of {shape[1]} x {shape[0]} points of chip {chip}",
-                where=f"budget term {self.name!r}",
-                do="ask for the grid on which it was computed",
-            )
-        return found[..., 0], found[..., 1]
-
-    def at(self, chip: int, size: tuple[float, float], x: Float, y: Float) -> Float:
-        """Standard deviations (N, 2) at any pixels of a chip, interpolated on the grid.
+    def treatments(
+        self, model: DistortionModel, grid: tuple[int, int] | None
+    ) -> tuple[ErrorTerm, ...]:
+        """The error as a smooth field and as independent errors, where it may vary; else nothing.
 
         Parameters
         ----------
-        chip : int
-        size : tuple of float
-            Columns and rows of the chip.
-        x, y : ndarray, shape (N,)
-            FITS 1-based pixels; beyond the grid the value of its edge holds.
+        model : DistortionModel
+        grid : tuple of int or None
+            Points of each chip over which the smooth field has its size.
+        """
+        if not (self.varies and self.kind == "systematic" and (self.sigma_u or self.sigma_v)):
+            return ()
+        return SmoothTerm(self, model, grid or DEFAULT_GRID), replace(self, kind="random")
+
+
+def _everywhere(size: Float, domain: EvaluationDomain) -> Float:
+    """A standard deviation (N, 2) that is the same at all positions."""
+    return np.tile(size, (domain.size, 1))
+
+
+def _one(chip: int, x: Float, y: Float) -> Float:
+    """The function that is 1."""
+    return np.ones((len(x), 1))
+
+
+@dataclass(frozen=True)
+class SmoothTerm:
+    """A user's error as a smooth field over each chip, larger at the edges than inside.
+
+    As the distortion of a catalogue, or of another camera, would be.
+
+    Parameters
+    ----------
+    term : UserTerm
+        In the unit of the model.
+    model : DistortionModel
+    grid : tuple of int
+        Points of each chip over which the mean square is that of the term.
+    """
+
+    term: UserTerm
+    model: DistortionModel
+    grid: tuple[int, int]
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """The row of the term."""
+        return self.term.rows
+
+    def draw(self, n: int, rng: np.random.Generator) -> Functions:
+        """Coefficients of polynomials, of each chip by itself."""
+        n_own, coefficients, covariance = min(n, SMOOTH_DRAWS), {}, {}
+        size = np.array([self.term.sigma_u, self.term.sigma_v])[:, None]
+        for chip in self.model.chips:
+            phi = self(chip.number, *mesh(*grid_pixels(chip.size, self.grid)))
+            unit = np.sqrt(len(phi) / np.square(phi).sum())
+            m = phi.shape[1]
+            coefficients[chip.number] = size * unit * rng.standard_normal((n_own, 2, m))
+            covariance[chip.number] = np.square(size * unit)[:, :, None] * np.eye(m)
+        return Functions(self.rows[0], coefficients, self, n, covariance=covariance)
+
+    def __call__(self, chip: int, x: Float, y: Float) -> Float:
+        """Polynomials (N, m) on a chip."""
+        one = self.model.chips[self.model.chip_code(chip)]
+        return PolynomialBasis(SMOOTH_ORDER, one.size, one.reference_pixel).evaluate(x, y)
+
+
+@dataclass(frozen=True, eq=False)
+class Centroids:
+    """Errors of the centroids of stars of a stated magnitude.
+
+    Parameters
+    ----------
+    errors : MagnitudeErrors or None
+        In the unit of the solution; None where none are known.
+    """
+
+    errors: MagnitudeErrors | None
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """One row."""
+        return (Row(CENTROID, "random"),)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Independent:
+        """Independent errors of the stars that a domain names."""
+        return Independent(self.rows[0], self.sigma)
+
+    def sigma(self, domain: EvaluationDomain) -> Float | None:
+        """Standard deviations (N, 2); None where the domain names no magnitude."""
+        if domain.magnitude is None:
+            return None
+        return np.tile(self.at(domain.magnitude), (domain.size, 1))
+
+    def at(self, magnitude: float) -> Float:
+        """Errors (2,) of the centroid of a star.
 
         Raises
         ------
         InputError
-            For a chip without values.
+            Where no errors by magnitude are known, or none near this one.
         """
-        ny, nx, _ = self.sigma[chip].shape if chip in self.sigma else (0, 0, 0)
-        self.on(chip, (ny, nx))  # refuses an unknown chip
-        axes = [np.linspace(1.0, n, k) for n, k in zip(size, (nx, ny), strict=True)]
-        points = [np.clip(a, axis[0], axis[-1]) for a, axis in zip((x, y), axes, strict=True)]
-        return np.asarray(
-            RegularGridInterpolator(axes[::-1], self.sigma[chip])(np.column_stack(points[::-1]))
-        )
+        if self.errors is None:
+            raise InputError(
+                f"the error of a star of magnitude {magnitude:g} is not known",
+                where="magnitude",
+                do="give the matches magnitudes, or leave it out",
+            )
+        low, high = self.errors.mag[0] - BEYOND, self.errors.mag[-1] + BEYOND
+        if not low <= magnitude <= high:
+            raise InputError(
+                f"centroids of magnitude {magnitude:g} were not measured, but those of "
+                f"{low:.1f} to {high:.1f}",
+                where="magnitude",
+                do="name one of these",
+            )
+        return np.ravel(self.errors.at([magnitude]))

@@ -1,8 +1,4 @@
-"""Errors of an image's scale or orientation that a calibration does not know.
-
-Velocity aberration that is left out, or known only as far as the header knows the spacecraft's
-velocity, is an error of the scale: VAFACTOR differs from 1 by up to 1e-4.
-"""
+"""Errors of parameters: of the catalogue, of a new exposure, of scale and orientation."""
 
 from __future__ import annotations
 
@@ -14,20 +10,82 @@ from numpy.typing import NDArray
 
 from bayesdist.assess.names import require_known
 from bayesdist.assess.solution import Solution, place_of
-from bayesdist.assess.terms.field_terms import FieldDraws
-from bayesdist.assess.terms.given import GIVEN
+from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorDraws, Polynomials, Row, Together
 from bayesdist.errors import InputError
+from bayesdist.model import DistortionModel
 
-__all__ = ["LINEAR_KINDS", "LinearTerm"]
+__all__ = [
+    "CATALOGUE",
+    "EXPOSURE_SCATTER",
+    "LINEAR_KINDS",
+    "MOTIONS",
+    "CatalogueErrors",
+    "ExposureVariation",
+    "ScaleError",
+]
 
 Float = NDArray[np.float64]
+
+CATALOGUE = "reference catalogue (shared stars)"
+MOTIONS = "proper motions (shared stars)"
+EXPOSURE_SCATTER = "exposure scatter"
 
 LINEAR_KINDS = ("scale", "rotation")
 
 
 @dataclass(frozen=True, eq=False)
-class LinearTerm:
+class CatalogueErrors:
+    """What the errors of the reference catalogue do to polynomials and drift.
+
+    A star has one error in however many exposures it is matched.  The solution that is assessed
+    has this error; the one without it took the catalogue's errors for independent from match to
+    match, and shows the rows of the budget beside this one.  So what independent errors of the
+    catalogue would do stands in those rows, and all of what the true ones do in this row: the
+    squares of the rows add up to more than the total, which is drawn from the solution.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    mean : ndarray, shape (D,)
+        Of its parameters.
+    covariance : ndarray, shape (D, D)
+        Of the error of its parameters that the catalogue causes: `total` of a `StarCovariance`, or
+        its part for the positions, and the one for the motions in a term of its own.
+    name : str
+    source : str
+        Where the errors of the catalogue come from.
+    """
+
+    model: DistortionModel
+    mean: Float
+    covariance: Float
+    name: str = CATALOGUE
+    source: str = GIVEN
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """A row that the solution holds already."""
+        return (Row(self.name, source=self.source, in_total=False),)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
+        """Draws of the error from N(0, covariance)."""
+        mean, D = np.asarray(self.mean, float), self.model.n_distortion
+        # scales of units and sizes apart, a sum of squares: eigenvalues below 0 are rounding
+        scale = np.sqrt(np.diag(self.covariance)[:D])
+        scale = np.where(scale > 0, scale, 1.0)
+        values, vectors = np.linalg.eigh(self.covariance[:D, :D] / np.outer(scale, scale))
+        root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        theta = np.tile(mean, (n, 1))
+        theta[:, :D] += rng.standard_normal((n, D)) @ root.T
+        return Polynomials(self.rows[0], self.model, mean, theta)
+
+
+@dataclass(frozen=True, eq=False)
+class ScaleError:
     """A Gaussian error of scale or orientation about the reference pixel of the first chip.
+
+    Velocity aberration that is left out, or known only as far as the header knows the spacecraft's
+    velocity, is an error of the scale: VAFACTOR differs from 1 by up to 1e-4.
 
     Parameters
     ----------
@@ -39,8 +97,8 @@ class LinearTerm:
     solution : Solution
         Whose positions it moves.
     source : str
-    part_of : str
-        Name of the term that holds this one, which is then shown and not added.
+    in_total : bool
+        False where another row holds this error.
 
     Raises
     ------
@@ -53,8 +111,7 @@ class LinearTerm:
     sigma: float
     solution: Solution
     source: str = GIVEN
-    part_of: str = ""
-    without: None = None
+    in_total: bool = True
 
     def __post_init__(self) -> None:
         where = f"budget term {self.name!r}"
@@ -64,7 +121,12 @@ class LinearTerm:
                 f"sigma is {self.sigma}", where=where, do="give a number that is not negative"
             )
 
-    def draws(self, n: int, rng: np.random.Generator) -> FieldDraws:
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """One row."""
+        return (Row(self.name, source=self.source, in_total=self.in_total),)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
         """Draws of the error: one number for the whole image."""
         model, mean = self.solution.model, np.asarray(self.solution.mean, float)
         epoch = None if model.time is None else model.time.epoch0[0]
@@ -81,4 +143,79 @@ class LinearTerm:
             for s, change in zip(slices, position, strict=True):
                 moved[s] = change
         sizes = self.sigma * rng.standard_normal((n, 1))
-        return FieldDraws(model, mean, mean + sizes * moved)
+        return Polynomials(self.rows[0], model, mean, mean + sizes * moved)
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureVariation:
+    """How a new exposure deviates from the polynomials that all exposures have in common.
+
+    Parameters
+    ----------
+    model : DistortionModel
+        With frames in gauge 'held', in which exposures deviate from the polynomials.
+    mean : ndarray, shape (D,)
+        Of its parameters.
+    kinds : tuple of str, length k
+        Deviations that scatter, as an exposure's parameters are named: 'scale', 'shear_plus', ...
+    tau : ndarray, shape (m, k)
+        Draws of the scatter of each kind.
+    aberration : ScaleError, optional
+        What of it is known to be velocity aberration: shown beside, as this scatter holds it.
+    name, source : str
+
+    Raises
+    ------
+    InputError
+        For a kind that is no parameter of an exposure, or another number of kinds in `tau`.
+    """
+
+    model: DistortionModel
+    mean: Float
+    kinds: tuple[str, ...]
+    tau: Float
+    aberration: ScaleError | None = None
+    name: str = EXPOSURE_SCATTER
+    source: str = MEASURED
+
+    def __post_init__(self) -> None:
+        known = self.model.free_frame_names(self._exposure)
+        unknown = [kind for kind in self.kinds if kind not in known]
+        if unknown:
+            raise InputError(
+                f"exposures have no deviation {unknown[0]!r}",
+                where=f"budget term {self.name!r}",
+                do=f"choose among {', '.join(known) or 'those of a model with frames'}",
+            )
+        if self.tau.shape[1:] != (len(self.kinds),):
+            raise InputError(
+                f"scatter has shape {self.tau.shape} for {len(self.kinds)} kinds of deviation",
+                where=f"budget term {self.name!r}",
+                do="give draws by kinds",
+            )
+
+    @property
+    def _exposure(self) -> int:
+        """The exposure whose place a new one takes: any, as its own deviations are put to zero."""
+        return len(self.model.exposures) - 1
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """The scatter, and what of it is aberration."""
+        own = Row(self.name, source=self.source)
+        return (own,) if self.aberration is None else (own, *self.aberration.rows)
+
+    def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
+        """Draws of deviations, each from a normal distribution with a scatter of its own."""
+        known = self.model.free_frame_names(self._exposure)
+        first = self.model.frame_slice(self._exposure).start
+        at = [first + known.index(kind) for kind in self.kinds]
+        mean = np.array(self.mean, float)
+        mean[at] = 0.0
+        theta = np.tile(mean, (n, 1))
+        tau = self.tau[rng.integers(len(self.tau), size=n)]
+        theta[:, at] = tau * rng.standard_normal(tau.shape)
+        own = Polynomials(self.rows[0], self.model, mean, theta, self._exposure)
+        if self.aberration is None:
+            return own
+        return Together((own, self.aberration.draw(n, rng)))

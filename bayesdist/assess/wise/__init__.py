@@ -5,20 +5,9 @@ from bayesdist.assess.wise.bands import (
     WISE_ARCSEC,
     BandBins,
     band_bins,
-    band_bins_of_stars,
 )
 from bayesdist.assess.wise.changes import PatternChange, pattern_changes
-from bayesdist.assess.wise.contradictions import contradictions_across, contradictions_within
 from bayesdist.assess.wise.pairs import pair_statistics
-from bayesdist.assess.wise.published import (
-    TABLE_5_1,
-    TABLE_5_2,
-    TABLE_5_3,
-    TABLE_C_1,
-    PrintedRow,
-    noise_of_bins,
-    printed_rows,
-)
 from bayesdist.assess.wise.rows import STATISTICS, BinValues, StatisticsRow, bin_row, pair_row
 from bayesdist.assess.wise.tables import (
     StatisticsTable,
@@ -31,29 +20,19 @@ from bayesdist.assess.wise.tables import (
 __all__ = [
     "BAND_AXES",
     "STATISTICS",
-    "TABLE_5_1",
-    "TABLE_5_2",
-    "TABLE_5_3",
-    "TABLE_C_1",
     "WISE_ARCSEC",
     "BandBins",
     "BinValues",
     "PatternChange",
-    "PrintedRow",
     "StatisticsRow",
     "StatisticsTable",
     "band_bins",
-    "band_bins_of_stars",
     "band_to_band_table",
     "bin_row",
-    "contradictions_across",
-    "contradictions_within",
     "fitting_table",
     "multiframe_table",
-    "noise_of_bins",
     "pair_row",
     "pair_statistics",
     "pattern_changes",
     "period_table",
-    "printed_rows",
 ]

@@ -10,10 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from bayesdist.assess.names import require_known
 from bayesdist.assess.wise.rows import BinValues
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
-from bayesdist.infer.linear import Clip
-from bayesdist.infer.stars.stars import Stars
 
-__all__ = ["BAND_AXES", "WISE_ARCSEC", "BandBins", "band_bins", "band_bins_of_stars"]
+__all__ = ["BAND_AXES", "WISE_ARCSEC", "BandBins", "band_bins"]
 
 Float = NDArray[np.float64]
 
@@ -95,25 +93,3 @@ def band_bins(
     axes = binned_sums(x, y, ru, rv, bins=bins, size=size, weights=weights)
     length = np.hypot(ru, rv)
     return BandBins(axes, binned_sums(x, y, length, length, bins=bins, size=size, weights=weights))
-
-
-def band_bins_of_stars(stars: Stars, theta: Float, clip: Clip, bins: int = 31) -> BandBins:
-    """Bins of the stars that a fit used: a task for `Shards.sum`.
-
-    Parameters
-    ----------
-    stars : Stars
-        Of a model with one chip, in pixels.
-    theta : ndarray, shape (D,)
-        Where the residuals are taken.
-    clip : Clip
-        Says which stars are used.
-    bins : int
-
-    Returns
-    -------
-    BandBins
-    """
-    used = clip.keeps_of(stars)
-    columns = (*stars.pixels(), *stars.residuals(theta).T)
-    return band_bins(*(c[used] for c in columns), bins=bins, size=stars.model.chips[0].size)

@@ -103,12 +103,6 @@ class StatisticsRow:
         """The part of sigma that noise makes: sigma^2 is its square plus `variance`."""
         return float(np.sqrt(max(self.value["sigma"] ** 2 - self.variance, 0.0)))
 
-    @property
-    def sigma_interval(self) -> tuple[float, float]:
-        """Sigma without noise, one standard error of its square down and up; not below zero."""
-        low, high = (self.variance + s * self.variance_error for s in (-1, 1))
-        return float(np.sqrt(max(low, 0.0))), float(np.sqrt(max(high, 0.0)))
-
 
 def bin_row(
     label: str, bins: BinValues, *, absorbed: int, rng: np.random.Generator

@@ -186,7 +186,6 @@ def multiframe_table(
     rng: np.random.Generator,
     absorbed: int = 1,
     arcsec: Mapping[str, float] = WISE_ARCSEC,
-    across: bool = False,
 ) -> StatisticsTable:
     """Table 5-3: differences over all pairs of bins, in arcsec.
 
@@ -194,9 +193,6 @@ def multiframe_table(
     ----------
     bands, rng, absorbed, arcsec
         As `band_to_band_table`.
-    across : bool
-        Rows of two different bands in place of those of one: the extension to band-to-band
-        smearing that the report names and does not make.
 
     Returns
     -------
@@ -210,19 +206,6 @@ def multiframe_table(
         As `fitting_table`.
     """
     values = _in_arcsec(bands, arcsec)
-    if across:
-        rows = tuple(
-            pair_row(
-                f"{later}-{earlier}/{axis}",
-                values[later, axis],
-                values[earlier, axis],
-                absorbed=absorbed,
-                rng=rng,
-            )
-            for earlier, later, axis in _two_bands(bands)
-        )
-        title = "Band-to-band multiframe alignment residuals"
-        return StatisticsTable(title, "Bands/Axis", "arcsec", rows)
     rows = tuple(
         pair_row(f"{name}/{axis}", values[name, axis], absorbed=absorbed, rng=rng)
         for name, axis in values

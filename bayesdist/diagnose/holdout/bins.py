@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["ALL", "Bin", "Partition", "partitions_of"]

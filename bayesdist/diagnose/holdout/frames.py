@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.data.pieces import Piece
 from bayesdist.diagnose.holdout.predictive import Predictive, scores_of
 from bayesdist.infer.stars.stars import errors_of

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.holdout.frames import AT_ONCE, Frame, framed, noise_of
 from bayesdist.diagnose.holdout.predictive import Predictive
 

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
 
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.clusters import joint_clusters, products_over, sums_over
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.rows import Rows
 
@@ -112,7 +112,7 @@ class ClusterSums:
     def _settle_bins(self, sums: BinSums, code: Int) -> None:
         inside = np.flatnonzero(code >= 0)
         n_bins, at = len(sums.n), code[inside]
-        sums.place_cov = _product(at, self._star[inside], self._all["place"][inside], n_bins)
+        sums.place_cov = products_over(at, self._star[inside], self._all["place"][inside], n_bins)
         for b in range(n_bins):
             sums.place_2[b] = sums.place_cov[2 * b : 2 * b + 2, 2 * b : 2 * b + 2]
         owner = _spread_together(sums, at, self._star[inside], self._all["share"][inside])
@@ -120,7 +120,7 @@ class ClusterSums:
         if self._cell is not None:
             _spread_together(sums, at, self._cell[inside], self._all["local_share"][inside])
             local = self._all["local"][inside]
-            extra = _product(at, self._cell[inside], local[:, None], n_bins)
+            extra = products_over(at, self._cell[inside], local[:, None], n_bins)
             extra[np.diag_indices(n_bins)] -= np.bincount(at, local**2, n_bins)
             sums.place_cov += np.kron(extra, np.eye(2))
 
@@ -158,44 +158,19 @@ class ClusterSums:
         far = (self._all["size"] > limit).astype(float)
         rest = far - far.mean()
         single = float((rest**2).sum())
-        return max(1.0, float((_sums(self._star, rest) ** 2).sum()) / single) if single else 1.0
-
-
-def _clusters(code: Int, member: Int) -> tuple[Int, Int]:
-    """Bin of each cluster of matches of one bin and one member, and cluster of each match."""
-    n = int(member.max(initial=0)) + 1
-    keys, of = np.unique(code * n + member, return_inverse=True)
-    return keys // n, of
+        return max(1.0, float((sums_over(self._star, rest) ** 2).sum()) / single) if single else 1.0
 
 
 def _spread_together(sums: BinSums, code: Int, member: Int, share: Float) -> Int:
     """Add what members of a cluster scatter together; the bin of each cluster."""
     n_bins = len(sums.n)
-    owner, of = _clusters(code, member)
-    p1, p2, p3 = (_sums(of, share**k) for k in (1, 2, 3))
+    owner, of = joint_clusters(code, member)
+    p1, p2, p3 = (sums_over(of, share**k) for k in (1, 2, 3))
     pairs = np.maximum(p1**2 - p2, 0.0)
     triples = np.maximum(p1**3 - 3 * p1 * p2 + 2 * p3, 0.0)
     sums.spread_2 += np.bincount(owner, 4 * pairs, n_bins)
     sums.spread_3 += np.bincount(owner, 16 * (3 * pairs + triples), n_bins)
     return owner
-
-
-def _product(code: Int, member: Int, values: Float, n_bins: int) -> Float:
-    """Squares (k B, k B) of sums of values (n, k) over bins and members, added over members."""
-    k = values.shape[1]
-    rows = (code[:, None] * k + np.arange(k)).ravel()
-    columns = np.repeat(member, k)
-    shape = (n_bins * k, int(member.max(initial=0)) + 1)
-    table = csr_matrix((values.ravel(), (rows, columns)), shape=shape)
-    return np.asarray((table @ table.T).toarray())
-
-
-def _sums(of: Int, values: Float) -> Float:
-    """Sums (c, ...) over clusters."""
-    n = int(of.max(initial=-1)) + 1
-    if values.ndim == 1:
-        return np.bincount(of, values, n).astype(np.float64)
-    return np.stack([np.bincount(of, column, n) for column in values.T], axis=1)
 
 
 def _outer(code: Int, cluster: Int, m: int) -> Float:

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.data.pieces import Piece
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame

@@ -20,7 +20,7 @@ from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.spread import scale_of, sum_tails
 from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
 
-__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of", "holm"]
+__all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of"]
 
 Float = NDArray[np.float64]
 
@@ -159,24 +159,6 @@ def all_tests(
         out += _spreads(found, predictive, partition)
     out += _axes(sums, predictive)
     return [*out, *_distributions(sums, predictive), *_tails(sums, predictive)]
-
-
-def holm(p_values: Float) -> Float:
-    """Probabilities corrected for their number (Holm 1979).
-
-    Parameters
-    ----------
-    p_values : ndarray, shape (m,)
-
-    Returns
-    -------
-    ndarray, shape (m,)
-    """
-    order = np.argsort(p_values, kind="stable")
-    steps = np.arange(len(p_values), 0, -1) * p_values[order]
-    out = np.empty(len(p_values))
-    out[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
-    return out
 
 
 def _of_clusters(t: float, dof: int, n: int) -> float:

@@ -14,7 +14,8 @@ from bayesdist.diagnose.holdout.frames import frames_for
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
 from bayesdist.diagnose.holdout.spread import scale_of
 from bayesdist.diagnose.holdout.sums import held_sums
-from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, coverage_of, holm
+from bayesdist.diagnose.holdout.tests import AxisCoverage, HeldTest, all_tests, coverage_of
+from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.shards import Matches
@@ -103,7 +104,7 @@ class HeldOutTruth:
             found = self.tests[0]
         if found is None:
             return f"held-out stars agree with the prediction (p = {self.p_value:.2g})"
-        return f"{self._words(found)} ({_chance(found.p_corrected)})"
+        return f"{self._words(found)} ({p_words(found.p_corrected)})"
 
     def _telling(self, level: float) -> HeldTest | None:
         """The test that tells most of those that matter."""
@@ -143,10 +144,6 @@ def _rank(test: HeldTest) -> tuple[float, int, float, bool]:
     """
     size = -abs(test.value - test.expected)
     return test.p_value, ORDER.index(test.name), size, test.part == "epoch"
-
-
-def _chance(p: float) -> str:
-    return "p < 1e-300" if p < 1e-300 else f"p = {p:.1g}"
 
 
 def held_out_truth(

@@ -21,6 +21,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
 from bayesdist.infer.transforms import Solution
 from bayesdist.model.basis import polynomial_terms
@@ -132,8 +133,7 @@ def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     # a star has one motion in all of its detections, and its error is in both factors
     _, star = np.unique(motion, axis=1, return_inverse=True)
     score = (weight * (left * P - dt * error**2)).sum(axis=0)
-    scores = np.bincount(star.ravel(), score)
-    sigma = float(np.sqrt((scores**2).sum()) / information)
+    sigma = float(np.sqrt(squares_over(star.ravel(), score)[0]) / information)
     after = _scatter(left[:, known])
     found = abs(dt) > SIGNIFICANT * sigma and after < before
     return EpochShift(dt, sigma, before, after, sample.model.unit, bool(found))

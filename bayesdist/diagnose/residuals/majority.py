@@ -8,7 +8,8 @@ settle where all pairs are true and their errors large: that shows in the jitter
 
 from __future__ import annotations
 
-from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.posterior import Posterior
 
 __all__ = ["majority_sentence"]
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
+from bayesdist.diagnose.significance import p_words
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
 
@@ -84,11 +85,9 @@ class Misfit:
     def finding(self) -> str:
         """The same without the consequence."""
         part = "the detector" if self.chip is None else f"chip {self.chip.name}"
-        # tails underflow: no probability is zero
-        p = "p < 1e-300" if self.p_value < 1e-300 else f"p = {self.p_value:.1g}"
         return (
             f"the residuals hold structure that the model does not describe ({self.structure:.2g} "
-            f"{self.unit} rms in {self.partition} of {part}, {p})"
+            f"{self.unit} rms in {self.partition} of {part}, {p_words(self.p_value)})"
         )
 
 

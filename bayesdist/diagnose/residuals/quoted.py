@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from bayesdist.data import MatchTable
-from bayesdist.infer import LinearFit
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.stars import prepare
 
 __all__ = ["error_scale", "error_scale_sentence"]

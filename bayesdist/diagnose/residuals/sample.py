@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer import LinearFit, Posterior
-from bayesdist.infer.density.memberships import memberships_of
+from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.posterior.memberships import memberships_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 
 __all__ = ["SAMPLE", "StarSample", "star_sample"]

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
-from bayesdist.infer.density.memberships import averaged_draws, star_averages
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.linear import Clip
 from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.posterior.memberships import averaged_draws, star_averages
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import cho_solve
 
+from bayesdist.diagnose.clusters import add_over, sums_over
 from bayesdist.diagnose.score.projection import Projection
 from bayesdist.diagnose.score.result import Outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.score.score import independent_directions, smallest_pattern
+from bayesdist.diagnose.significance import LEAST_P
 from bayesdist.model.frames import frame_names
 
 __all__ = ["exposure_test"]
@@ -30,7 +32,6 @@ __all__ = ["exposure_test"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-LEAST_P = 1e-300
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
 MOST_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
 INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
@@ -115,7 +116,7 @@ class _Meat:
         for block in sample.blocks:
             F = projection.functions.polynomials(block.rows)
             psi = projection.star_scores(F, block, projection.through(block, np.eye(G)))
-            np.add.at(by_star, sample.star[block.rows], psi)
+            add_over(by_star, sample.star[block.rows], psi)
         total = by_star.T @ by_star + np.diag(projection.precision[:G])
         for one in projection.exposures.values():
             gain = one.gain[:, :G]
@@ -135,11 +136,9 @@ class _Meat:
             Scores of the detections before the parameters are projected out.
         """
         which, of = np.unique(star, return_inverse=True)
-        direct = np.zeros((len(which), own.shape[1]))
-        np.add.at(direct, of, own)
         # a star is one, in this exposure and in all others
         through = self.by_star[which] @ nuisance
-        left = direct - through
+        left = sums_over(of, own) - through
         rest = nuisance.T @ self.total @ nuisance - through.T @ through
         return left.T @ left, rest
 

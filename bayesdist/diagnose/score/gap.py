@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.projection import Projection
 from bayesdist.diagnose.score.result import Outcome
 from bayesdist.diagnose.score.sample import Block
@@ -221,8 +222,7 @@ def _of_stars(some: list[_Exposure], at: list[tuple[int, int]], pull: Float) -> 
     psi = np.concatenate(
         [p * one.by_star[:, k, way] for p, one, (k, way) in zip(pull, some, at, strict=True)]
     )
-    together = np.bincount(np.unique(star, return_inverse=True)[1], psi)
-    return max(float((together**2).sum() - (psi**2).sum()), 0.0)
+    return max(float(squares_over(star, psi)[0] - (psi**2).sum()), 0.0)
 
 
 def _exposures(projection: Projection) -> Iterator[_Exposure]:

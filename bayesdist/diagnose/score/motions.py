@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.score.projection import Projection
 from bayesdist.diagnose.score.result import Outcome, noncentrality
 
@@ -119,18 +120,13 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     S = int(star.max()) + 1
     good = (H[:, 0, 0] > 0) & (H[:, 1, 1] > 0)
 
-    def summed(values: Float) -> Float:
-        flat = values.reshape(len(values), -1)
-        out = np.stack([np.bincount(star, column, S) for column in flat.T], axis=1)
-        return np.asarray(out.reshape(S, *values.shape[1:]), float)
-
     g, H = g * good[:, None], H * good[:, None, None]
-    members = summed(good.astype(float)[:, None])[:, 0]
-    A = summed(H) + data.precision
+    members = sums_over(star, good.astype(float), S)
+    A = sums_over(star, H, S) + data.precision
     many = np.flatnonzero(members >= FEWEST_DETECTIONS)
-    mean = summed((good * data.epoch)[:, None])[:, 0] / np.maximum(members, 1)
+    mean = sums_over(star, good * data.epoch, S) / np.maximum(members, 1)
     t = data.epoch - mean[star]
-    cross, square = summed(t[:, None, None] * H)[many], summed(t[:, None, None] ** 2 * H)[many]
+    cross, square = (sums_over(star, t[:, None, None] ** k * H, S)[many] for k in (1, 2))
     if len(many):
         back = np.linalg.solve(A[many], cross)
         left = square - np.swapaxes(cross, 1, 2) @ back
@@ -144,9 +140,8 @@ def motion_outcome(data: StarResiduals, unit: str, *, remedy: str, present: str)
     of, t, g, H = of[star[rows]], t[rows], g[rows], H[rows]
     # the slope's derivative beside the position, of each detection
     T = t[:, None, None] * np.eye(2) - back[of]
-    slope, whole = np.zeros((len(many), 2)), np.zeros((len(many), 2))
-    np.add.at(slope, of, np.einsum("nba,nb->na", T, g))
-    np.add.at(whole, of, g)
+    slope = sums_over(of, np.einsum("nba,nb->na", T, g), len(many))
+    whole = sums_over(of, g, len(many))
     inside, outside = np.linalg.inv(left), np.linalg.inv(A[many])
     step = np.einsum("nab,nb->na", inside, slope)
     place = np.einsum("nab,nb->na", outside, whole)

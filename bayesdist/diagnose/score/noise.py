@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.result import Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.score.score import smallest_pattern
+from bayesdist.model.grid import cell_index
 
 __all__ = ["Scored", "noise_tests"]
 
@@ -132,10 +134,8 @@ def _cells(projection: Scored, rows: Int) -> Int:
         here = chip == c
         n = len(np.unique(sample.star[rows[here]]))
         side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MOST_CELLS))
-        ix, iy = (
-            np.clip(((z[rows[here]] + 1) * side / 2).astype(np.int64), 0, side - 1)
-            for z in (sample.X, sample.Y)
-        )
+        at = rows[here]
+        iy, ix = np.divmod(cell_index(sample.X[at], sample.Y[at], (side, side)), side)
         # boustrophedon: cells with few stars are joined to neighbours
         code[here] = c * MOST_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
     return code
@@ -177,10 +177,7 @@ def _by_part(squares: _Squares, name: str, code: Int) -> Outcome | None:
     ratio = np.bincount(code, y) / expected
     # detections of one star in one part are one
     left = y - ratio[code] * c
-    pair, of = np.unique(code * (int(squares.star.max()) + 1) + squares.star, return_inverse=True)
-    sums2 = np.bincount(of, left) ** 2
-    part = pair // (int(squares.star.max()) + 1)
-    own = np.bincount(part, sums2) / (ratio * expected) ** 2
+    own = squares_over(squares.star, left, code, m) / (ratio * expected) ** 2
     n = np.bincount(code)
     pooled = float(own @ n**2) / n.sum() / n
     # of the means of so many squares, the cube root is all but Gaussian (Wilson and Hilferty 1931)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.score.projection import Projection
 from bayesdist.diagnose.score.result import Outcome
+from bayesdist.model.grid import cell_index
 
 __all__ = ["pattern_test"]
 
@@ -90,11 +91,7 @@ def _frequencies(order: int) -> NDArray[np.bool_]:
 def _binned(projection: Projection) -> dict[int, tuple[Float, Float]]:
     """Scores (2, BINS, BINS) along the axes of the polynomials on each chip, and their squares."""
     sample, out = projection.sample, dict[int, tuple[Float, Float]]()
-    ix, iy = (
-        np.clip(((z + 1) * (0.5 * BINS)).astype(np.int64), 0, BINS - 1)
-        for z in (sample.X, sample.Y)
-    )
-    code = iy * BINS + ix
+    code = cell_index(sample.X, sample.Y, (BINS, BINS))
     for block in sample.blocks:
         g = block.frame.T @ projection.whole_score[:, block.rows]
         scores, squares = out.setdefault(block.chip, (np.zeros((2, BINS, BINS)), np.zeros(2)))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy import special, stats
+
+from bayesdist.diagnose.significance import holm, p_words
 
 __all__ = ["FAMILY_LEVEL", "POWER", "Outcome", "ScoreTest", "corrected", "noncentrality"]
 
@@ -88,8 +88,7 @@ class Outcome:
     def judged(self, significant: bool, level: float) -> ScoreTest:
         """The test among others, by whether it is significant and by the level of each."""
         smallest = self.smallest(level)
-        # tails underflow: no probability is zero
-        p = "p < 1e-300" if self.p_value < 1e-300 else f"p = {self.p_value:.1g}"
+        p = p_words(self.p_value)
         if significant:
             finding = f"{self.present} ({self.size:.2g} {self.unit} rms, {p})"
         else:
@@ -122,12 +121,7 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
         In the same order.
     """
     n = len(outcomes)
-    order = np.argsort([one.p_value for one in outcomes], kind="stable")
-    significant: NDArray[np.bool_] = np.zeros(n, bool)
-    for rank, k in enumerate(order):
-        if outcomes[k].p_value > FAMILY_LEVEL / (n - rank):
-            break
-        significant[k] = True
+    significant = holm([one.p_value for one in outcomes]) <= FAMILY_LEVEL
     # what is alone has to pass the first step
     return tuple(
         one.judged(bool(found), FAMILY_LEVEL / n)

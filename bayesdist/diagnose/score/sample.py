@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.density.memberships import star_averages
-from bayesdist.infer.stars.likelihood import scores_of
+from bayesdist.infer.posterior.likelihood import scores_of
+from bayesdist.infer.posterior.memberships import star_averages
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel

@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import block_diag
 
+from bayesdist.diagnose.clusters import add_over
 from bayesdist.diagnose.score.projection import LARGEST_LEVERAGE, Projection
 from bayesdist.diagnose.score.regressors import Regressors
 from bayesdist.diagnose.score.result import Outcome, noncentrality
 from bayesdist.diagnose.score.sample import Block
+from bayesdist.diagnose.significance import LEAST_P
 
 __all__ = ["independent_directions", "regressor_tests", "smallest_pattern"]
 
@@ -34,20 +36,16 @@ Int = NDArray[np.int64]
 
 MOST_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
 LEAST_DOF = 3  # of the noise: below, its covariance says nothing
-LEAST_P = 1e-300
 MOST_CHIPS = 4  # that are tested together, with the covariance of all their scores
 SQUARES = ("size2", "noise2")
 
 
-def regressor_tests(projection: Projection, meat: str = "robust") -> list[Outcome]:
+def regressor_tests(projection: Projection) -> list[Outcome]:
     """Outcomes of all regressor tests that there are stars enough for.
 
     Parameters
     ----------
     projection : Projection
-    meat : str
-        'robust', or 'homoscedastic': all errors are wrong by one factor, as an F test has it.  For
-        least squares only.
 
     Returns
     -------
@@ -55,7 +53,7 @@ def regressor_tests(projection: Projection, meat: str = "robust") -> list[Outcom
     """
     found: dict[str, list[_Part]] = {}
     for chips in _chips_together(projection):
-        for name, part in _parts_of(projection, chips, meat):
+        for name, part in _parts_of(projection, chips):
             found.setdefault(name, []).append(part)
     families = {one.name: one for one in projection.functions.regressors}
     return [_outcome(projection, families[name], parts) for name, parts in found.items()]
@@ -111,7 +109,7 @@ def _outcome(projection: Projection, family: Regressors, parts: Sequence[_Part])
     )
 
 
-def _parts_of(projection: Projection, chips: list[int], meat: str) -> Iterator[tuple[str, _Part]]:
+def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _Part]]:
     """Tests of all families on some chips, with the names of the families."""
     tried = []
     for family in projection.functions.regressors:
@@ -120,24 +118,16 @@ def _parts_of(projection: Projection, chips: list[int], meat: str) -> Iterator[t
         one = _Directions.of(projection, family, columns, own)
         if one.q:
             tried.append(one)
-    if meat == "robust":
-        sums = _star_sums(projection, chips, tried)
-    else:
-        sums = [(np.eye(one.q), 0.0, 0.0) for one in tried]
+    sums = _star_sums(projection, chips, tried)
     for one, (V, spread, taken) in zip(tried, sums, strict=True):
         if taken > MOST_TAKEN:
             continue
-        if meat == "robust":
-            # as a Wishart matrix that scatters as much
-            dof = one.q * (one.q + 1) / spread
-            dof_residual = dof - one.q + 1
-            shrink = dof_residual / dof
-        else:
-            dof_residual, scale = _scale(projection, float(one.score @ one.score), one.q)
-            V, shrink = V * scale, 1.0
+        # as a Wishart matrix that scatters as much
+        dof = one.q * (one.q + 1) / spread
+        dof_residual = dof - one.q + 1
         if dof_residual < LEAST_DOF:
             continue
-        T = shrink * float(one.score @ np.linalg.solve(V, one.score))
+        T = dof_residual / dof * float(one.score @ np.linalg.solve(V, one.score))
         p = float(stats.f.sf(T / one.q, one.q, dof_residual))
         square = np.repeat(projection.functions.mean_square[one.family.every], 2)
         Q = (one.basis.T * np.tile(square, len(chips)) / len(chips)) @ one.basis
@@ -220,9 +210,8 @@ def _star_sums(
             for k, part in enumerate(parts):
                 V[k] += psi[:, part].T @ psi[:, part]
         else:
-            np.add.at(by_star, star, psi)
-            np.add.at(trace, star, both[0])
-            np.add.at(norm, star, both[1])
+            for total, values in ((by_star, psi), (trace, both[0]), (norm, both[1])):
+                add_over(total, star, values)
         if not all_chips:
             uu, uv, vv = sample.curvature[:, block.rows]
             for k, part in enumerate(parts):
@@ -323,17 +312,6 @@ def independent_directions(whole: Float, left: Float, least: float) -> Float:
     basis = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
     kept, turn = np.linalg.eigh(basis.T @ left @ basis)
     return np.asarray(basis @ turn[:, kept > least])
-
-
-def _scale(projection: Projection, gain: float, q: int) -> tuple[float, float]:
-    """Degrees of freedom beside parameters and regressors, and the chi-square of each."""
-    sample = projection.sample
-    h = sample.curvature[[0, 2]]
-    good = h > 0
-    chi2 = float((sample.score[good] ** 2 / h[good]).sum())
-    informative = int((projection.precision > 0).sum())
-    dof = int(good.sum()) - projection.sample.model.n_params + informative - q
-    return float(dof), (chi2 - gain) / max(dof, 1)
 
 
 def smallest_pattern(noise: float, dof: float, dof_residual: float | None, level: float) -> float:

@@ -18,6 +18,7 @@ from scipy import optimize, special, stats
 
 from bayesdist.diagnose.score.projection import Projection
 from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.significance import LEAST_P
 
 __all__ = ["truncation_test"]
 
@@ -25,7 +26,6 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 FEWEST_STARS = 50
-LEAST_P = 1e-300
 LARGEST_LEVERAGE = 0.5
 ENDS = 0.25  # of the expected number: with more, nothing ends at the match radius
 STARS_PER_PART = 150  # with errors alike, from which their scatter is measured

@@ -26,6 +26,7 @@ from bayesdist.infer.selfcal import Solution
 from bayesdist.infer.selfcal.following import Following, following
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
+from bayesdist.model.grid import cell_index
 
 __all__ = ["dithered_misfit"]
 
@@ -133,12 +134,9 @@ def _add(sums: _Shifts, some: Following, cell: Int) -> None:
 def _cells(problem: Problem, rows: slice, bins: tuple[int, int]) -> Int:
     """Cell (n,) of each detection, counted over all chips."""
     nx, ny = bins
-    k, m = (
-        np.clip(((seen[rows] + 1) / 2 * n).astype(np.int64), 0, n - 1)
-        for seen, n in zip(problem.seen, bins, strict=True)
-    )
     chip = problem.groups.chip[problem.groups.index[rows]]
-    return np.asarray((chip * ny + m) * nx + k, np.int64)
+    X, Y = (seen[rows] for seen in problem.seen)
+    return np.asarray(chip * (nx * ny) + cell_index(X, Y, bins), np.int64)
 
 
 def _polynomials(order: int, n_chips: int, bins: tuple[int, int]) -> Float:

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.diagnose.clusters import squares_over, sums_over
 from bayesdist.diagnose.tables.mean_square import MeanSquare
 from bayesdist.diagnose.tables.node_cells import NodeCells
 from bayesdist.errors import DegenerateError
@@ -140,9 +141,7 @@ def between_nodes(
 
 def _of_stars(residual: Float, precision: Float, star: Int) -> Float:
     """Variance (2,) of the mean of all residuals, as far as stars err by themselves."""
-    _, code = np.unique(star, return_inverse=True)
-    sums = [np.bincount(code, v) for v in (precision * residual).T]
-    return np.asarray(np.sum(np.square(sums), axis=1) / precision.sum(axis=0) ** 2)
+    return squares_over(star, precision * residual)[0] / precision.sum(axis=0) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,17 +223,12 @@ def _pairs(
     p = precision * residual
     each = np.column_stack([p, precision, p**2, np.ones(len(p))])
 
-    def squared(of: Int) -> Float:
-        """By cell, the squares of the sums over what has the same code."""
-        codes = int(of.max(initial=0)) + 1
-        key, into = np.unique(cell * codes + of, return_inverse=True)
-        sums = [np.bincount(key // codes, np.bincount(into, v) ** 2, n) for v in each.T]
-        return np.stack(sums, axis=1).astype(np.float64)
-
     # of all pairs, those of one star and those of one exposure are taken off; the stars with
     # themselves, taken off twice, are put back
-    sums = squared(np.zeros_like(cell)) - squared(star) - squared(exposure)
-    sums += squared(np.arange(len(cell)))
+    sums = squares_over(np.zeros_like(cell), each, cell, n)
+    for of in (star, exposure):
+        sums -= squares_over(of, each, cell, n)
+    sums += squares_over(np.arange(len(cell)), each, cell, n)
     squares = cells.squares()
-    whole = np.stack([np.bincount(squares, v) for v in sums.T], axis=1).astype(np.float64)
+    whole = sums_over(squares, sums)
     return _Pairs(cells, sums[:, 2:4], whole[:, :2], whole[:, 2:4], 2 * whole[:, 4:6], whole[:, 6])

@@ -1,27 +1,26 @@
-"""Errors beyond the quoted ones, one for both axes or one for each group of stars: which do the
-data ask for, and how large are they?
+"""Errors to be added to the quoted ones: one for both axes, or one for each group of stars.
 
 A star of group g has, along an axis, the variance s^2 + a_g.  The a_g are those of the restricted
-likelihood (REML: Patterson and Thompson 1971), in which what the fit takes up of the residuals is
-given back star by star,
+likelihood (REML: Patterson and Thompson 1971), in which the part of the residuals that the fit
+absorbs is added again star by star,
 
     E[e_i^2] = r_i^2 + x_i^T C x_i
 
 with the covariance C of the fit and the derivatives x_i of the star's position; without it errors
-would be too small by the parameters per star.  Good stars and false matches are told apart by the
-same mixture as in `by_magnitude`, so that few false ones do not count, and parameters, memberships
-and errors climb one bound in turn.
+would be too small by the parameters per star.  Good stars and false matches are separated by the
+mixture of `by_magnitude`, so that a few false ones do not count, and parameters, memberships and
+errors climb one bound in turn.
 
 Groupings are compared by their evidence after Laplace with unit-information priors,
 
     ln E = ln L_R / c - sum_g ln(n_g) / 2
 
-where n_g are the good stars of a group and c, one for normal errors, is by how much more the sums
-of squares scatter than those of independent normal errors (from the squares themselves, all
-detections of a star together): long tails and stars that are matched often make no groups.  With
-few stars in a group the penalty keeps it from being split off; where there are many groups, their
-errors are drawn to the common one by what chance makes them differ (empirical Bayes), as the
-errors that come out are used as if they were known.
+where n_g are the good stars of a group and c, one for normal errors, is the factor by which the
+sums of squares scatter more than those of independent normal errors (from the squares themselves,
+all detections of a star together): long tails and stars that are matched often make no groups.
+With few stars in a group the penalty keeps it from being split off; where there are many groups,
+their errors are shrunk to the common one as far as chance makes them differ (empirical Bayes), as
+the errors that come out are used as if they were known.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from bayesdist.infer.catalogue.by_magnitude import (
     variances_of,
 )
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.linear import NO_REJECTION, LinearFit, fit_linear
 from bayesdist.model import DistortionModel
 
 __all__ = ["ONE", "GroupedErrors", "grouped_errors"]
@@ -50,52 +49,35 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 ONE, AXIS = "one", "axis"
-STARS = 50_000  # of which the errors are learnt: they are then known to half a percent
-PER_EXPOSURE = 100  # stars of each exposure among these, on average, at the least
-DECISIVE = 3.0  # ln evidence: odds of 20 to 1 for what is not the same for all stars
-MATERIAL = 0.01  # of the errors of typical stars: groups that differ by less are not worth it
-SETTLED, TURNS = 1e-3, 50  # change of ln variance at which the climb ends, and most turns
+STARS = 50_000  # from which the errors are estimated: they are then known to half a percent
+PER_EXPOSURE = 100  # mean number of stars of each exposure among these, at least
+DECISIVE = 3.0  # ln evidence, odds of 20 to 1, needed for errors that differ between stars
+MATERIAL = 0.01  # of the errors of typical stars: groups that differ by less are not separated
+SETTLED, TURNS = 1e-3, 50  # change of ln variance at which the maximisation ends; most iterations
 HALVINGS = 45  # of the range in which an added variance lies
-FALSE = 0.02, 50.0  # fraction of false matches before the data, and the stars that this is worth
-WIDER = 5.0  # false matches scatter so many times as wide as typical good ones, or wider
-SHRUNK = 3  # labels from which on they tell how much labels scatter
+FALSE = 0.02, 50.0  # prior mean of the fraction of false matches, worth so many stars
+WIDER = 5.0  # false matches scatter at least this many times as wide as typical good ones
+SHRUNK = 3  # fewest labels whose scatter can be estimated
 
 
 @dataclass(frozen=True, eq=False)
 class GroupedErrors:
-    """Added errors by group, as the evidence has chosen the groups.
+    """Added errors by group, for the grouping of largest evidence."""
 
-    Parameters
-    ----------
-    grouping : str
-        'one' (for both axes), 'axis', or 'chip', 'exposure', 'filter' (for both axes), or these
-        'and axis'.
-    by : str
-        'chip', 'exposure', 'filter', or empty.
-    labels : tuple of str, length G
-        As of `AddedErrors`.
-    n : ndarray, shape (G, 2)
-        Good stars of each group that its error rests on.
-    variance, error : ndarray, shape (G, 2)
-        Added variance along u and v, and its standard error.
-    evidence : dict of str to float
-        Gain of ln evidence over one error for both axes, of each grouping that was compared.
-    dispersion : float
-        The factor c.
-    """
-
+    # 'one' (both axes alike), 'axis', 'chip', 'exposure', 'filter' (both axes alike), or these 'and
+    # axis'
     grouping: str
-    by: str
-    labels: tuple[str, ...]
-    n: Float
-    variance: Float
-    error: Float
-    evidence: dict[str, float]
-    dispersion: float
+    by: str  # 'chip', 'exposure', 'filter' or empty
+    labels: tuple[str, ...]  # of the G groups, as in `AddedErrors`
+    n: Float  # good stars (G, 2) on which each error rests
+    variance: Float  # added variances (G, 2) along u and v
+    error: Float  # standard errors (G, 2) of the variances
+    evidence: dict[str, float]  # gain of ln evidence over 'one', by grouping compared
+    dispersion: float  # the factor c
 
     @property
     def by_axis(self) -> bool:
-        """Whether the axes have errors of their own."""
+        """True if each axis has errors of its own."""
         return self.grouping.endswith(AXIS)
 
     @property
@@ -105,22 +87,22 @@ class GroupedErrors:
 
     @property
     def sigma_error(self) -> Float:
-        """Their standard errors (G, 2); of errors near zero what their variance leaves room for."""
+        """Standard errors (G, 2) of `sigma`; near zero they follow from that of the variance."""
         return self.error / (2.0 * np.sqrt(np.maximum(self.variance, self.error)))
 
     @property
     def gain(self) -> float:
-        """The largest gain of ln evidence over one error for both axes."""
+        """Largest gain of ln evidence over one error for both axes."""
         return max(self.evidence.values())
 
     @property
     def excess(self) -> Float:
-        """What is added to the quoted errors (G, 2): the least is left to the jitter."""
+        """Errors (G, 2) to add to the quoted ones; the smallest of them is left to the jitter."""
         return np.sqrt(self.variance - self.variance.min())
 
     @property
     def added(self) -> AddedErrors | None:
-        """The excess as errors to be added; None where one jitter will do."""
+        """The excess as errors to be added; None where one jitter is enough."""
         if self.grouping == ONE:
             return None
         excess = self.excess
@@ -131,7 +113,7 @@ class GroupedErrors:
 
 @dataclass(eq=False)
 class _Climb:
-    """The state of the climb: fit, mixture and added variances of one grouping."""
+    """State of the maximisation: fit, mixture and added variances of one grouping."""
 
     fit: LinearFit
     square: Float
@@ -150,31 +132,15 @@ def grouped_errors(
     outliers: bool = True,
     priors: GaussianPriors | None = None,
 ) -> GroupedErrors:
-    """Compare one added error for both axes with one for each group.
+    """Added errors of the best grouping: one error for both axes compared with one for each group.
 
-    Parameters
-    ----------
-    matches : MatchTable
-        With the quoted errors; of very many a sample is used.
-    fit : LinearFit
-        Of these matches, or of those that they are a sample of: where the climb begins.
-    by : str
-        'chip', 'exposure' or 'filter': groups that are compared beside the axes.
-    outliers : bool
-        Whether some matches may be false.
-    priors : GaussianPriors, optional
-        Of the fit.
+    Of very many matches a sample is used.  The maximisation starts from `fit`, made of these
+    matches or of those that they are a sample of, with `priors`.  `by` ('chip', 'exposure',
+    'filter') names groups that are compared in addition to the axes; with `outliers` some matches
+    may be false.
 
-    Returns
-    -------
-    GroupedErrors
-
-    Raises
-    ------
-    InputError
-        Where all matches are of one chip, exposure or filter, by which they are to be grouped.
-    DegenerateError
-        Where the sample does not determine the model.
+    Raises InputError where all matches are of one chip, exposure or filter by which they are to be
+    grouped, and DegenerateError where the sample does not determine the model.
     """
     model = fit.model
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
@@ -220,7 +186,7 @@ def _quoted(table: MatchTable) -> Float:
 
 
 def _begun(table: MatchTable, fit: LinearFit, quoted: Float, outliers: bool) -> _Climb:
-    """One added variance for all, from the median residual."""
+    """Starting state with one added variance for all, from the median residual."""
     square = residuals_of(fit, table) ** 2
     core = float(np.median(square)) / 0.4549  # of a squared normal variable
     variance = max(0.0, core - float(np.median(quoted)))
@@ -238,7 +204,7 @@ def _climbed(
     outliers: bool,
     priors: GaussianPriors | None,
 ) -> _Climb:
-    """The restricted likelihood at its maximum, with groups of these codes (2, N)."""
+    """State at the maximum of the restricted likelihood, for groups with codes (2, N)."""
     n_groups = int(code.max()) + 1
     variance = np.full(n_groups, float(np.average(start.variance)))
     f, wide, square, typical = start.f, start.wide, start.square, float(np.median(quoted))
@@ -254,7 +220,7 @@ def _climbed(
         before, variance = variance, _maxima(quoted, square, good, code, n_groups)
         var = quoted + variance[code]
         weighted = table.with_sigma(*(np.sqrt(var / np.maximum(good, LEAST_WEIGHT))))
-        fit = fit_linear(weighted, model, clip_chi2=np.inf, clip_abs=None, priors=priors)
+        fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
         residual = residuals_of(fit, table) ** 2
         square = residual + variances_of(fit, table)
         if (np.abs(variance - before) < SETTLED * (typical + variance)).all():
@@ -265,13 +231,13 @@ def _climbed(
         each = np.logaddexp(log_good, log_bad)
     else:
         each = -0.5 * (residual / var + np.log(var)).sum(axis=0)
-    # the determinant is that of the fit's normal matrix: what makes the likelihood restricted
+    # the determinant of the fit's normal matrix makes the likelihood the restricted one
     value = float(each.sum() + 0.5 * np.linalg.slogdet(fit.cov)[1])
     return _Climb(fit, square, f, wide, variance, good, value)
 
 
 def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int) -> Float:
-    """Variance (G,) of each group at which its likelihood is largest, 0 or more.
+    """Variance (G,), 0 or more, of each group at which its likelihood is largest.
 
     The derivative, sum w (e^2 - s^2 - a) / (s^2 + a)^2, changes its sign there: found by halving.
     """
@@ -286,7 +252,7 @@ def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int)
     high = np.bincount(flat, weight * e2, n_groups) / np.maximum(
         np.bincount(flat, weight, n_groups), 1e-300
     )
-    for _ in range(HALVINGS):  # where small quoted errors go with large residuals
+    for _ in range(HALVINGS):  # where small quoted errors come with large residuals
         if not (up := rising(high)).any():
             break
         high = np.where(up, 2.0 * high, high)
@@ -299,12 +265,12 @@ def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int)
 
 
 def _counts(good: Float, code: Int) -> Float:
-    """Good stars (G,) of each group, each axis of a star counted."""
+    """Number (G,) of good stars in each group; each axis of a star counts."""
     return np.asarray(np.bincount(code.ravel(), np.concatenate([good, good])), float)
 
 
 def _dispersion(table: MatchTable, climb: _Climb, quoted: Float, code: Int) -> float:
-    """By how much more the sums of squares scatter than those of independent normal errors."""
+    """Factor by which sums of squares scatter more than those of independent normal errors."""
     var = quoted + climb.variance[code]
     score = climb.good * (climb.square / var - 1.0)
     star = np.arange(len(table)) if table.star is None else table.star
@@ -324,7 +290,7 @@ def _result(
     evidence: dict[str, float],
     dispersion: float,
 ) -> GroupedErrors:
-    """The chosen groups as a table of labels and axes."""
+    """Table of labels and axes for the chosen groups."""
     columns = 2 if grouping.endswith(AXIS) else 1
     flat, weight = code.ravel(), np.concatenate([climb.good, climb.good])
     weight = weight / (quoted + climb.variance[code]).ravel() ** 2
@@ -358,10 +324,10 @@ def _result(
 
 
 def _drawn_together(variance: Float, noise: Float) -> Float:
-    """Variances (G,) whose logarithms are drawn to their mean by how much chance explains.
+    """Variances (G,) whose logarithms are shrunk to their mean by how much chance explains.
 
     After DerSimonian and Laird 1986; `noise` (G,) is the variance of each logarithm by chance, half
-    of which its mean falls short of that of the variance.
+    of which a logarithm's mean lies below that of the variance.
     """
     log = np.log(variance) + 0.5 * noise
     weight = 1.0 / noise

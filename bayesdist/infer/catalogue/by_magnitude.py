@@ -1,15 +1,14 @@
-"""Fit and errors by magnitude together: one function climbed, which nothing makes turn back.
+"""Fit and errors by magnitude together, by climbing one function, so that no step goes back.
 
 Stars are good with probability 1 - f and have the errors of a smooth law of magnitude
 (`magnitude_law`), or are false matches of a wide normal distribution.  Parameters of the
 distortion, memberships and law climb the same bound on the restricted likelihood in turn
-(variational EM: the law is that of the errors after what the fit takes up, star by star, is given
-back).  Rejection by a limit has no part in it: stars that go in and out of a fit made errors swing.
+(variational EM: the law is that of the errors after the part that the fit absorbs is added again,
+star by star).  There is no rejection by a limit: stars that go in and out of a fit made errors
+swing.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,8 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import LinearFit, fit_linear
-from bayesdist.infer.stars.shards import Matches
+from bayesdist.infer.linear import DEFAULT_REJECTION, NO_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.stars.shards import Compute, Matches
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
 
@@ -28,31 +27,33 @@ __all__ = ["LEAST_WEIGHT", "fit_by_magnitude", "memberships_of", "residuals_of",
 
 Float = NDArray[np.float64]
 
-STARS = 200_000  # of which the law is learnt: it is then known to a part in a thousand
-PER_EXPOSURE = 100  # stars of each exposure among these, on average, at the least
-SETTLED = 1e-3  # change of ln sigma at which the climb ends
-TURNS = 200  # far more than it takes; where it ends no earlier, what it has reached is the best
-FALSE = 0.02, 50.0  # fraction of false matches before the data, and the stars that this is worth
-WIDER = 10.0  # false matches scatter so many times as wide as the worst good ones, or wider
-LEAST_WEIGHT = 1e-9  # of a star: a fit wants finite errors
+STARS = 200_000  # from which the law is estimated: it is then known to a part in a thousand
+PER_EXPOSURE = 100  # mean number of stars of each exposure among these, at least
+SETTLED = 1e-3  # change of ln sigma at which the maximisation ends
+TURNS = 200  # far more than it takes; after these the last iteration is the best there is
+FALSE = 0.02, 50.0  # prior mean of the fraction of false matches, worth so many stars
+WIDER = 10.0  # false matches scatter at least this many times as wide as the worst good ones
+LEAST_WEIGHT = 1e-9  # of a star: a fit needs finite errors
 
 
 def fit_by_magnitude(
     matches: Matches,
     model: DistortionModel,
     *,
+    rejection: Rejection = DEFAULT_REJECTION,
     priors: GaussianPriors | None = None,
-    **options: Any,
+    compute: Compute | None = None,
 ) -> tuple[LinearFit, Matches, MagnitudeErrors]:
     """Fit, and errors by magnitude from its residuals, estimated together.
 
     Parameters
     ----------
     matches : MatchTable or PartitionedMatches
-        With magnitudes; errors, if there are any, are replaced.
+        With magnitudes; errors already in the table are replaced.
     model : DistortionModel
+    rejection : Rejection
     priors : GaussianPriors, optional
-    **options
+    compute : Compute, optional
         As of `fit_linear`.
 
     Returns
@@ -76,21 +77,21 @@ def fit_by_magnitude(
             do="map column 'mag' or give data.sigma another value",
         )
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
-    errors = _law(matches.sample(count), model, priors, options)
+    errors = _law(matches.sample(count), model, rejection, priors)
     table = matches.with_errors_by_magnitude(errors)
-    return fit_linear(table, model, priors=priors, **options), table, errors
+    fit = fit_linear(table, model, rejection=rejection, priors=priors, compute=compute)
+    return fit, table, errors
 
 
 def _law(
     stars: MatchTable,
     model: DistortionModel,
+    rejection: Rejection,
     priors: GaussianPriors | None,
-    options: dict[str, Any],
 ) -> MagnitudeErrors:
-    """Errors by magnitude of some stars."""
+    """Law of the errors with magnitude of some stars."""
     assert stars.mag is not None
-    options = {name: value for name, value in options.items() if name != "compute"}
-    fit = fit_linear(stars.with_sigma(1.0, 1.0), model, priors=priors, **options)
+    fit = fit_linear(stars.with_sigma(1.0, 1.0), model, rejection=rejection, priors=priors)
     residual = residuals_of(fit, stars)
     bins = estimate(stars.mag, *residual, n_params=model.n_params)
     law = MagnitudeLaw.of(stars.mag, bins)
@@ -102,7 +103,7 @@ def _law(
         good = memberships_of(square, var, f, wide)
         weight = np.sqrt(np.maximum(good, LEAST_WEIGHT))
         weighted = stars.with_sigma(*(np.sqrt(var) / weight))
-        fit = fit_linear(weighted, model, clip_chi2=np.inf, clip_abs=None, priors=priors)
+        fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
         square = residuals_of(fit, stars) ** 2 + variances_of(fit, stars)
         bad = 1.0 - good
         f = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
@@ -116,14 +117,14 @@ def _law(
 
 
 def memberships_of(square: Float, var: Float, f: float, wide: float) -> Float:
-    """Probability (N,) of each star to be a good match."""
+    """Probability (N,) that each star is a good match."""
     log_good = np.log1p(-f) - 0.5 * (square / var + np.log(var)).sum(axis=0)
     log_bad = np.log(f) - 0.5 * (square / wide).sum(axis=0) - np.log(wide)
     return np.asarray(0.5 * (1.0 + np.tanh(0.5 * (log_good - log_bad))))
 
 
 def _scatter(bins: MagnitudeErrors, mag: Float, good: Float, square: Float) -> Float:
-    """Scatter (2, B) of the good stars that are nearest to each node."""
+    """Scatter (2, B) on each axis of the good stars that are nearest to each node."""
     nearest = np.searchsorted((bins.mag[1:] + bins.mag[:-1]) / 2.0, mag)
     count = len(bins.mag)
     n = np.bincount(nearest, weights=good, minlength=count)

@@ -1,8 +1,8 @@
-"""A smooth law of the errors with magnitude, by penalised likelihood.
+"""Smooth law of the errors with magnitude, by penalised likelihood.
 
 ln sigma is linear between nodes in magnitude.  Its changes of slope have a normal prior (an
-integrated Wiener process), whose size comes from the scatter in the bins by restricted likelihood
-and is then held, so that all of what follows climbs one and the same function.
+integrated Wiener process), whose size is estimated from the scatter in the bins by restricted
+likelihood and then fixed, so that all later steps climb one function.
 """
 
 from __future__ import annotations
@@ -20,47 +20,26 @@ __all__ = ["MagnitudeLaw"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-CELLS = 1000  # cells of magnitude within which the law does not change to any purpose
-LOG_VARIANCE = 1.36  # variance of ln(scatter) times n, of the median absolute deviation
-BENDS = (1e-3, 1e2)  # changes of slope of ln sigma over the range of magnitudes: limits of the size
-ROOM = 2.0  # prior sigma of ln sigma about the scatter of the bins: a factor of 7, and no zero
+CELLS = 1000  # cells of magnitude, within which the law hardly changes
+LOG_VARIANCE = 1.36  # variance of ln(scatter) times n, for the median absolute deviation
+BENDS = (1e-3, 1e2)  # limits of the prior size: changes of slope over the range of magnitudes
+ROOM = 2.0  # prior sigma of ln sigma about the scatter of the bins: a factor of 7, and never zero
 
 
 @dataclass(frozen=True, eq=False)
 class MagnitudeLaw:
-    """Design and prior of ln sigma at nodes, for cells of stars of about equal magnitude.
+    """Design and prior of ln sigma at B nodes, for cells of stars of about equal magnitude."""
 
-    Parameters
-    ----------
-    cell : ndarray of int, shape (N,)
-        Cell of each star.
-    design : ndarray, shape (C, B)
-        Linear interpolation from the nodes to the cells.
-    start : ndarray, shape (2, B)
-        ln sigma of u and v at the nodes, from the scatter in bins; centre of a weak prior that
-        keeps it from zero.
-    penalty : ndarray, shape (B, B)
-        Inverse covariance of the prior of the shape.
-    """
-
-    cell: Int
-    design: Float
+    cell: Int  # cell (N,) of each star
+    design: Float  # linear interpolation (C, B) from the nodes to the cells
+    # ln sigma (2, B) of u and v at the nodes, from the scatter in bins; centre of a weak prior that
+    # keeps it from zero
     start: Float
-    penalty: Float
+    penalty: Float  # inverse covariance (B, B) of the prior of the shape
 
     @classmethod
     def of(cls, mag: Float, bins: MagnitudeErrors) -> MagnitudeLaw:
-        """The law for stars of some magnitudes, with nodes and start from bins.
-
-        Parameters
-        ----------
-        mag : ndarray, shape (N,)
-        bins : MagnitudeErrors
-
-        Returns
-        -------
-        MagnitudeLaw
-        """
+        """Law for stars with magnitudes (N,), with nodes and start from bins."""
         count = min(len(mag), CELLS)
         rank = np.argsort(np.argsort(mag, kind="stable"), kind="stable")
         cell = rank * count // len(mag)
@@ -81,22 +60,11 @@ class MagnitudeLaw:
         return np.asarray(np.exp(2.0 * nodes @ self.design.T)[:, self.cell])
 
     def climbed(self, nodes: Float, weight: Float, square: Float) -> Float:
-        """ln sigma (2, B) at the maximum of the penalised likelihood.
+        """ln sigma (2, B) at the maximum of the penalised likelihood, starting from `nodes` (2, B).
 
-        Parameters
-        ----------
-        nodes : ndarray, shape (2, B)
-            Where to begin.
-        weight : ndarray, shape (N,)
-            Probability of each star to be a good match.
-        square : ndarray, shape (2, N)
-            Expected squared error of each star on either axis.
-
-        Returns
-        -------
-        ndarray, shape (2, B)
-            The likelihood is concave: Newton's steps, halved where they do not climb, find its only
-            maximum.
+        `weight` (N,) is the probability that a star is a good match, `square` (2, N) its expected
+        squared error.  The likelihood is concave: Newton's steps, halved where they do not climb,
+        find its only maximum.
         """
         n = self._of_cells(weight)
         prior = self.penalty + np.eye(len(self.penalty)) / ROOM**2
@@ -109,7 +77,7 @@ class MagnitudeLaw:
                 pull = self.penalty @ eta + (eta - self.start[axis]) / ROOM**2
                 gradient = self.design.T @ (of_cells - n) - pull
                 hessian = 2.0 * (self.design.T * of_cells) @ self.design + prior
-                # far below the maximum the curvature is that of an exponential: no longer steps
+                # far below the maximum the curvature is that of an exponential: limit the steps
                 step = np.linalg.solve(hessian, gradient)
                 step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-300))
                 there = self._value(eta + step, axis, n, s)
@@ -134,7 +102,7 @@ class MagnitudeLaw:
 
 
 def _bends(mag: Float) -> Float:
-    """Changes of slope (B - 2, B) at the inner nodes, each of unit variance for unit size."""
+    """Matrix (B - 2, B) of changes of slope at the inner nodes, of unit variance for unit size."""
     at = (mag - mag[0]) / (mag[-1] - mag[0])
     gap = np.diff(at)
     slopes = np.diff(np.eye(len(mag)), axis=0) / gap[:, None]
@@ -142,7 +110,7 @@ def _bends(mag: Float) -> Float:
 
 
 def _size_of_bends(found: Float, bends: Float, n: Int) -> float:
-    """Size of the changes of slope, by their likelihood beside the noise of the bins."""
+    """Prior size of the changes of slope, by their likelihood given the noise of the bins."""
     noise = (bends * (LOG_VARIANCE / n)) @ bends.T
 
     def misfit(log_tau: float) -> float:

@@ -1,14 +1,14 @@
-"""The error of the reference catalogue: one star has one error, in however many exposures it is.
+"""Effect of reference-catalogue errors, which a star has in common in all of its exposures.
 
-A fit counts every match as a measurement of its own, with the catalogue's error in its sigma.  But
-a star that is matched in many exposures is wrong in all of them by the same amount (and by a proper
-motion that is wrong by the same amount), so this part of the error does not average out.  With
-normal matrix H, residual weights W and the derivatives J of all matches i of star s,
+A fit counts every match as an independent measurement, with the catalogue's error in its sigma.
+But a star that is matched in many exposures is wrong in all of them by the same amount (and by a
+proper motion that is wrong by the same amount), so this part of the error does not average out.
+With normal matrix H and the sums G_s over all matches of star s (`star_sums`),
 
-    cov = H^-1 [sum_s G_s Sigma_s G_s^T] H^-1          G_s = sum_i a_i J_i^T W_i
+    cov = H^-1 [sum_s G_s Sigma_s G_s^T] H^-1
 
-is what the errors Sigma_s of the catalogue do to the parameters; a_i is 1 for a position and t - t0
-for a proper motion.  The fit has already counted the diagonal part, sum_i instead of (sum_i)^2.
+is the covariance of the parameters by the errors Sigma_s of the catalogue.  The fit has already
+counted the diagonal part, sum_i instead of (sum_i)^2.
 """
 
 from __future__ import annotations
@@ -17,33 +17,31 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.recoloured import Recoloured
-from bayesdist.infer.stars.stars import Stars, prepare
+from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
+from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.stars.stars import prepare
 from bayesdist.infer.transforms import Solution
 
-__all__ = ["StarCovariance", "star_covariance", "with_star_errors"]
+__all__ = ["StarCovariance", "star_covariance"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-SCRATCH = 64_000_000  # bytes of the stars' sums G_s that are held at a time
-
 
 @dataclass(frozen=True, eq=False)
 class StarCovariance:
-    """What the errors of the catalogue do to the parameters of a solution.
+    """Covariance of a solution's parameters by the errors of the catalogue.
 
     Parameters
     ----------
     total : ndarray, shape (D, D)
         Covariance of the parameters' error that the catalogue causes.
     counted : ndarray, shape (D, D)
-        The part of it that is in the solution's covariance: that of errors which are independent
-        from match to match.  Zero where the quoted errors are without the catalogue's.
+        The part of it that is in the solution's covariance, by errors taken as independent from
+        match to match.  Zero where the quoted errors do not contain the catalogue's.
     motions : ndarray, shape (D, D), optional
         The part of `total` that the errors of the proper motions cause; None where there are none.
     """
@@ -54,28 +52,11 @@ class StarCovariance:
 
     @property
     def extra(self) -> Float:
-        """What has to be added to the solution's covariance."""
+        """Covariance (D, D) to add to the solution's own."""
         return self.total - self.counted
 
 
-def with_star_errors(solution: Solution, stars: StarCovariance) -> Recoloured:
-    """A solution whose covariance and draws know that a star has one error.
-
-    Parameters
-    ----------
-    solution : Solution
-        The one that `star_covariance` was asked for.  Views are made of the result, not before.
-    stars : StarCovariance
-
-    Returns
-    -------
-    Recoloured
-    """
-    return Recoloured(solution, np.asarray(solution.cov) + stars.extra)
-
-
-# a second BLAS thread gains little here and loses much on a machine that has other work
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def star_covariance(
     solution: Solution,
     matches: MatchTable,
@@ -90,7 +71,7 @@ def star_covariance(
     included: bool = True,
     frames: bool = True,
 ) -> StarCovariance:
-    """Covariance of the parameters by the errors of the catalogue.
+    """Covariance of a solution's parameters by the errors of the catalogue.
 
     Parameters
     ----------
@@ -111,11 +92,11 @@ def star_covariance(
         Probability that a match is true.  By default 1 for the stars that a fit used and 0 for
         those that it left out.
     included : bool
-        Whether the quoted errors of the matches contain the catalogue's.
+        True if the quoted errors of the matches contain the catalogue's.
     frames : bool
-        Whether the frames of the exposures are followed exactly.  Without, polynomials and drift
-        still are, in a fraction of the time (a seventh with 110 exposures), and the errors of the
-        frames change only as far as they are correlated with those.
+        True to propagate to the frames of the exposures exactly.  If False, only polynomials and
+        drift are exact, in a fraction of the time (a seventh with 110 exposures), and the errors of
+        the frames change only as far as they are correlated with those.
 
     Returns
     -------
@@ -153,118 +134,27 @@ def star_covariance(
     if included:
         _require_contained(matches, code, variances, levers)
     stars, order = prepare(solution.model, matches)
-    pairs = _Pairs.of(stars, code[order], weight[order], [lever[order] for lever in levers])
+    inverse = np.stack([weight[order] / stars.var_u, weight[order] / stars.var_v])
+    sums = StarSums.of(stars, code[order], inverse, [lever[order] for lever in levers])
+    cov, mean = np.asarray(solution.cov, float), np.asarray(solution.mean)
     D = solution.model.n_params if frames else solution.model.n_distortion
-    influence = _influence(solution, stars, D)
-    parts = np.zeros((len(levers), D, D))
-    step = max(1, SCRATCH // (16 * D * len(levers)))
-    for first in range(0, n_stars, step):
-        sums = pairs.sums(influence, first, min(first + step, n_stars))
-        for c, variance in enumerate(variances):
-            for axis in (0, 1):
-                part = sums[c, axis]
-                part *= np.sqrt(variance[first : first + step, axis])[:, None]
-                parts[c] += part.T @ part
-    counted = np.zeros((D, D))
-    if included:
-        counted = pairs.diagonal(influence, variances)
+    influence = influence_by_group(solution.model, mean, stars.groups, cov, D)
+    parts = sums.shared(influence, variances)
+    counted = sums.independent(influence, variances) if included else np.zeros((D, D))
     if not frames:
-        cov = np.asarray(solution.cov, float)
         follow = np.linalg.solve(cov[:D, :D], cov[:D]).T
         parts, counted = (follow @ c @ follow.T for c in (parts, counted))
     positions, *motions = (parts + np.swapaxes(parts, 1, 2)) / 2
     return StarCovariance(sum(motions, positions), (counted + counted.T) / 2, *motions)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Matches in the order of their groups, and of their stars within each.
-
-    Parameters
-    ----------
-    starts : ndarray of int, shape (G + 1,)
-    code : ndarray of int, shape (N,)
-    phi : list of ndarray, shape (n_g, K)
-        Basis functions of each group.
-    weight : ndarray, shape (2, N)
-        Inverse variances of both axes.
-    levers : list of ndarray, shape (N,)
-        How an error of the star moves the match: first 1, then years where stars move.
-    """
-
-    starts: Int
-    code: Int
-    phi: list[Float]
-    weight: Float
-    levers: list[Float]
-
-    @classmethod
-    def of(cls, stars: Stars, code: Int, weight: Float, levers: list[Float]) -> _Pairs:
-        bounds = [slice(a, b) for a, b in zip(stars.starts[:-1], stars.starts[1:], strict=True)]
-        order = np.concatenate(
-            [rows.start + np.argsort(code[rows], kind="stable") for rows in bounds]
-        )
-        model, chips = stars.model, stars.groups.chip
-        phi = [
-            model.basis(model.chips[c].number).evaluate_scaled(
-                stars.X[order[rows]], stars.Y[order[rows]]
-            )
-            for c, rows in zip(chips, bounds, strict=True)
-        ]
-        inverse = np.stack([weight / stars.var_u, weight / stars.var_v])[:, order]
-        return cls(stars.starts, code[order], phi, inverse, [lever[order] for lever in levers])
-
-    def sums(self, influence: list[Float], first: int, end: int) -> Float:
-        """H^-1 G_s of the stars first to end, each lever and axis: (levers, 2, stars, D)."""
-        out = np.zeros((len(self.levers), 2, end - first, influence[0].shape[2]))
-        for g, phi in enumerate(self.phi):
-            a = int(self.starts[g])
-            code = self.code[a : self.starts[g + 1]]
-            lo, hi = np.searchsorted(code, [first, end])
-            if lo == hi:
-                continue
-            rows, at = slice(a + lo, a + hi), code[lo:hi] - first
-            new = np.flatnonzero(np.diff(at, prepend=-1))  # a star may stand twice in a group
-            twice = len(new) < len(at)
-            for axis in (0, 1):
-                each = (phi[lo:hi] * self.weight[axis, rows, None]) @ influence[g][axis]
-                for c, lever in enumerate(self.levers):
-                    moved = each if c == 0 else each * lever[rows, None]  # the first lever is 1
-                    if twice:
-                        moved = np.add.reduceat(moved, new, axis=0)
-                    out[c, axis, at[new]] += moved
-        return out
-
-    def diagonal(self, influence: list[Float], variances: list[Float]) -> Float:
-        """The same with each match as a star of its own: shape (D, D)."""
-        D = influence[0].shape[2]
-        out = np.zeros((D, D))
-        for g, phi in enumerate(self.phi):
-            rows = slice(self.starts[g], self.starts[g + 1])
-            for axis in (0, 1):
-                variance = sum(
-                    lever[rows] ** 2 * v[self.code[rows], axis]
-                    for lever, v in zip(self.levers, variances, strict=True)
-                )
-                moment = (phi * (self.weight[axis, rows] ** 2 * variance)[:, None]).T @ phi
-                out += influence[g][axis].T @ moment @ influence[g][axis]
-        return out
-
-
-def _influence(solution: Solution, stars: Stars, D: int) -> list[Float]:
-    """For each group the matrices (2, K, D) from weighted basis functions to D parameters."""
-    cov = np.asarray(solution.cov, float)[:, :D]
-    jacobians = solution.model.effective_jacobian(np.asarray(solution.mean), stars.groups)
-    return [d @ cov[columns] for columns, d in jacobians]
-
-
 def _require_contained(
     matches: MatchTable, code: Int, variances: list[Float], levers: list[Float]
 ) -> None:
-    """Refuse quoted errors that are smaller than the catalogue's part of them."""
+    """Raise InputError for quoted errors that are smaller than the catalogue's part of them."""
     for axis, quoted in enumerate((matches.sigma_u, matches.sigma_v)):
         if quoted is None:
-            continue  # which `prepare` refuses
+            continue  # `prepare` refuses these
         part = sum(lever**2 * v[code, axis] for lever, v in zip(levers, variances, strict=True))
         small = quoted**2 < part * (1 - 1e-9)
         if small.any():
@@ -295,7 +185,7 @@ def _codes(matches: MatchTable, star: ArrayLike | None) -> Int:
 
 
 def _by_star(values: ArrayLike, n_stars: int, name: str, *, signed: bool = False) -> Float:
-    """Values of every star, one or n_stars or more of them given."""
+    """Values of every star, from one for all or an array of n_stars or more."""
     values = np.asarray(values, float)
     if values.ndim and (values.ndim > 1 or len(values) < n_stars):
         raise InputError(

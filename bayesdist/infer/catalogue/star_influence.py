@@ -1,8 +1,8 @@
-"""What the error of a single star of the catalogue has in common with a solution.
+"""Covariance of single catalogue stars' errors with a solution.
 
-With the notation of `star_errors`, an error c_s of star s moves the parameters by H^-1 G_s c_s.  So
-a star that is seen again, in an exposure that was no part of the fit, has an error that the
-solution's own is correlated with: cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
+With the notation of `star_sums`, an error c_s of star s moves the parameters by H^-1 G_s c_s.  So a
+star that is seen again, in an exposure that was no part of the fit, has an error with which the
+solution's own is correlated: cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.stars.stars import prepare
 
 __all__ = ["StarErrors", "StarInfluence", "star_influence"]
 
@@ -24,24 +26,15 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class StarErrors:
-    """Errors of a catalogue by code of the star.
+    """Errors of a catalogue by code of the star."""
 
-    Parameters
-    ----------
-    position : ndarray, shape (S, 2)
-        Standard errors, in the unit of u, v.
-    motion : ndarray, shape (S, 2), optional
-        In that unit per year.
-    epoch : ndarray, shape (S,), optional
-        Dates at which errors of positions and motions are uncorrelated.
-    """
-
-    position: Float
-    motion: Float | None = None
+    position: Float  # standard errors (S, 2), in the unit of u, v
+    motion: Float | None = None  # errors (S, 2) of proper motions, in that unit per year
+    # dates (S,) at which errors of positions and motions are uncorrelated
     epoch: Float | None = None
 
     def levers(self, star: Int, epoch: Float | None) -> Float:
-        """How the errors of position and motion move matches, shape (levers, n)."""
+        """Derivatives (levers, n) of matched positions by the errors of position and motion."""
         one = np.ones(len(star))
         if self.motion is None or self.epoch is None or epoch is None:
             return one[None]
@@ -49,12 +42,12 @@ class StarErrors:
 
     @property
     def variances(self) -> Float:
-        """Of positions, then of motions where there are any: shape (levers, S, 2)."""
+        """Variances (levers, S, 2) of positions, and then of motions where there are any."""
         parts = [self.position] if self.motion is None else [self.position, self.motion]
         return np.asarray(np.stack(parts) ** 2)
 
     def at(self, star: Int, epoch: Float | None) -> Float:
-        """Variances (n, 2) of the catalogue's positions of some matches."""
+        """Variances (n, 2) of the catalogue's positions for some matches."""
         levers = self.levers(star, epoch)
         variances = self.variances[: len(levers), star]
         return np.asarray(np.einsum("ln,lna->na", levers**2, variances))
@@ -62,20 +55,12 @@ class StarErrors:
 
 @dataclass(frozen=True, eq=False)
 class StarInfluence:
-    """Errors of a catalogue, and what they have in common with polynomials and drift of a solution.
-
-    Parameters
-    ----------
-    errors : StarErrors
-    codes : ndarray of int, shape (k,)
-        Stars, rising, of which the following is known.  Of others there is none: no solution has
-        seen them.
-    by : ndarray, shape (levers, 2, k, n_distortion)
-        How the parameters move with the errors of these stars on either axis.
-    """
+    """Errors of a catalogue, and their effect on polynomials and drift of a solution."""
 
     errors: StarErrors
-    codes: Int
+    codes: Int  # stars (k,) in the solution, ascending; all others have no effect on it
+    # derivatives (levers, 2, k, n_distortion) of the parameters by these stars' errors on either
+    # axis
     by: Float
 
     def with_solution(self, star: Int, epoch: Float | None) -> Float:
@@ -93,25 +78,13 @@ class StarInfluence:
         return out
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def star_influence(
     fit: LinearFit, matches: MatchTable, errors: StarErrors, codes: Int
 ) -> StarInfluence:
-    """How single stars of a catalogue have moved a fit.
+    """Effect on a fit of the catalogue errors of the stars `codes` (k,), ascending.
 
-    Parameters
-    ----------
-    fit : LinearFit
-        Without extra weight in the corners.
-    matches : MatchTable
-        Those that it was made from, with errors and codes of the stars.
-    errors : StarErrors
-    codes : ndarray of int, shape (k,)
-        Stars that are asked for, rising.
-
-    Returns
-    -------
-    StarInfluence
+    The fit has no extra weight in the corners; `matches` are its own, with errors and star codes.
     """
     assert matches.star is not None
     model, D = fit.model, fit.model.n_distortion
@@ -120,21 +93,12 @@ def star_influence(
     wanted = np.isin(matches.star, codes) & fit.uses(matches)
     if not wanted.any():
         return StarInfluence(errors, codes, by)
-    table = matches.select(wanted)
-    assert table.star is not None and table.sigma_u is not None and table.sigma_v is not None
-    names = {name: k for k, name in enumerate(model.exposures)}
-    exposure = np.array([names[name] for name in table.exposure_names])[table.exposure]
-    groups = model.groups(len(table), epoch=table.epoch, exposure=exposure, chip=table.chip_number)
-    inverse = np.stack([table.sigma_u, table.sigma_v]) ** -2.0
-    levers = errors.levers(table.star, table.epoch)
-    at = np.searchsorted(codes, table.star)
-    cov = np.asarray(fit.cov, float)[:, :D]
-    jacobians = model.effective_jacobian(np.asarray(fit.mean), groups)
-    for g, rows in enumerate(groups.members()):
-        columns, d = jacobians[g]
-        phi = model.basis(model.chips[groups.chip[g]].number).evaluate(table.x[rows], table.y[rows])
-        for axis in (0, 1):
-            moved = (phi * inverse[axis, rows, None]) @ (d[axis] @ cov[columns])
-            for c, lever in enumerate(levers):
-                np.add.at(by[c, axis], at[rows], lever[rows, None] * moved)
+    stars, order = prepare(model, matches.select(wanted))
+    star = matches.star[wanted][order]
+    epoch = None if matches.epoch is None else matches.epoch[wanted][order]
+    levers = list(errors.levers(star, epoch))
+    inverse = np.stack([1 / stars.var_u, 1 / stars.var_v])
+    sums = StarSums.of(stars, np.searchsorted(codes, star), inverse, levers)
+    influence = influence_by_group(model, fit.mean, stars.groups, fit.cov, D)
+    by[: len(levers)] = sums.each(influence, 0, len(codes))
     return StarInfluence(errors, codes, by)

@@ -1,8 +1,8 @@
-"""Since when does a solution no longer describe the data?  A scan over the dates of new matches.
+"""Date since when a solution no longer describes the data: a scan over the dates of new matches.
 
-Each period of the new matches says, once its frames are eliminated, something of the polynomials:
-a normal matrix N_b and a score r_b about the released ones.  With the release's own error e, of
-covariance C and common to all periods, and a change d from the date t on,
+Each period of the new matches, once its frames are eliminated, gives a normal matrix N_b and a
+score r_b of the polynomials about the released ones.  With the release's own error e, of covariance
+C and common to all periods, and a change d from the date t on,
 
     r_b = N_b (e + d [b from t on]) + noise of covariance N_b
 
@@ -21,8 +21,8 @@ from scipy.stats import chi2 as chi_square
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
-from bayesdist.infer.equations.field_test import FieldTest, determined
 from bayesdist.infer.equations.normal import NormalEquations, mixture
+from bayesdist.infer.equations.scaled import FieldTest, determined
 from bayesdist.infer.stars.shards import Matches
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
@@ -38,84 +38,45 @@ CREDIBLE = 0.95
 
 @dataclass(frozen=True, eq=False)
 class PeriodScore:
-    """What the matches of one period say of the polynomials, frames eliminated.
+    """Normal matrix and score of the polynomials by the matches of one period, without frames."""
 
-    Parameters
-    ----------
-    first, last : float
-        Dates of its first and last match, decimal years.
-    n : int
-        Matches.
-    normal : ndarray, shape (n, n)
-    score : ndarray, shape (n,)
-        About the released polynomials.
-    """
-
-    first: float
-    last: float
-    n: int
-    normal: Float
-    score: Float
+    first: float  # date of the first match, decimal years
+    last: float  # date of the last match
+    n: int  # number of matches
+    normal: Float  # normal matrix (n, n)
+    score: Float  # score (n,) about the released polynomials
 
 
 @dataclass(frozen=True, eq=False)
 class ChangeDate:
-    """The date from which on a change describes the data best.
+    """Date from which on a change describes the data best.
 
-    Parameters
-    ----------
-    after, before : float
-        The change lies between these dates; `after` is minus infinity where it is there from the
-        first new match on.
-    interval : tuple of float
-        Dates that hold 95 % of the likelihood, all gaps between periods being as probable
-        beforehand; minus infinity as above.
-    gain : ndarray, shape (P,)
-        Chi-square that a change from period k on takes up.
-    dof : int
-        Of the best.
-    p_value : float
-        Probability of the largest of these by chance, times their number.
-    change : Change
-        The change from the best date on, in place of that of all matches.
-    scatter : float
-        Chi-square per degree of freedom of the periods about the best change; 1 where errors are
-        right and independent, or slightly less, since the date was chosen.
-    scatter_dof : int
-    p_scatter : float
-        Probability of a larger one.
+    The change lies between `after` and `before`.  `after` and the start of `interval` are minus
+    infinity where it may be there from the first new match on.
     """
 
     after: float
     before: float
+    # dates that hold 95 % of the likelihood, for a prior that is equal for all gaps between periods
     interval: tuple[float, float]
-    gain: Float
-    dof: int
-    p_value: float
-    change: Change
+    gain: Float  # decrease (P,) of chi-square by a change from period k on
+    dof: int  # of the best change
+    p_value: float  # probability of the largest gain by chance, times the number of gains
+    change: Change  # from the best date on, in place of the change of all matches
+    # chi-square per degree of freedom of the periods about the best change; 1 where errors are
+    # right and independent, or slightly less, since the date was chosen
     scatter: float
     scatter_dof: int
-    p_scatter: float
+    p_scatter: float  # probability of a larger scatter
 
 
 def period_scores(
     new: NewFit, change: Change, matches: Matches, *, most: int = MOST_PERIODS
 ) -> tuple[PeriodScore, ...]:
-    """Sums of each period: one pass over the data, piece by piece.
+    """Scores of each period in the order of time, from one pass over the data in chunks.
 
-    Parameters
-    ----------
-    new : NewFit
-    change : Change
-    matches : MatchTable or PartitionedMatches
-        Those of `new`, with epochs.
-    most : int
-        Periods; where there are no more dates than this, each date is one.
-
-    Returns
-    -------
-    tuple of PeriodScore
-        In the order of time.
+    `matches` are those of `new`, with epochs; where they have no more than `most` dates, each date
+    is a period.
     """
     edges = _edges(matches, most)
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
@@ -175,7 +136,7 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
             single = new.theta[new.model.frame_slice(int(code))][len(frame) - model.n_frame :]
             theta[model.frame_slice(k + 1)] = [*frame, *(single if model.chip_deviations else ())]
     n = model.n_polynomial
-    # exposures that deviate do so as they scatter
+    # exposures deviate within their prior scatter
     scatter = new.scatter if len(new.scatter) else np.zeros(model.n_frame)
     equations = replace(equations, groups=groups, cross=equations.cross[:, :0])
     for last in (False, False, True):
@@ -188,7 +149,7 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
         local = matrix.split(right)[1] - scatter * values
         if last:
             break
-        # frames settle with the polynomials held at the release
+        # frames are at their mode for polynomials fixed at the release
         step = np.linalg.solve(blocks, local[..., None])[..., 0]
         theta[model.n_global :] += step.ravel()
     gain = np.linalg.solve(blocks, np.swapaxes(matrix.edge[:, :n], 1, 2))
@@ -198,25 +159,17 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
 
 
 def _of_exposures(model: DistortionModel, codes: NDArray[np.int64]) -> DistortionModel:
-    """The model of some exposures, behind one without matches in the frame of the release."""
+    """Model of some exposures, after one without matches in the frame of the release."""
     names = tuple(model.exposures[int(code)] for code in codes)
     return replace(model, exposures=("(release)", *names))
 
 
 def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
-    """The most likely date of a change, its interval, and the scatter of the periods.
+    """Most likely date of a change, its interval, and the scatter of the periods.
 
-    Parameters
-    ----------
-    scores : tuple of PeriodScore
-    change : Change
-        The covariance of the release, and what frames take up.
-
-    Returns
-    -------
-    ChangeDate
+    `change` gives the covariance of the release and the fields that frames absorb.
     """
-    # what frames take up is no change; a drift between the periods leaves a trace of it in N_b
+    # what frames absorb is no change; a drift between the periods leaves a trace of it in N_b
     free = null_space((change.taken / np.linalg.norm(change.taken, axis=0)).T)
     cov, normals = change.released_cov, np.array([s.normal for s in scores])
     rights = np.array([s.score for s in scores])
@@ -258,27 +211,24 @@ def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
 
 
 def _gain(normal: Float, right: Float, free: Float) -> tuple[float, int]:
-    """Twice the gain in log-likelihood of the best polynomials, and how many are determined."""
+    """Twice the gain in log-likelihood of the best polynomials, and the number determined."""
     white = right @ _root(normal, free)
     return float(white @ white), len(white)
 
 
 def _root(normal: Float, free: Float) -> Float:
-    """Root (n, rank) of the covariance of what is free."""
+    """Root (n, rank) of the covariance of the free directions."""
     inside = free.T @ normal @ free
     return np.asarray(free @ determined((inside + inside.T) / 2))
 
 
 def _from_then_on(change: Change, normal: Float, right: Float, free: Float) -> Change:
-    """The change that a normal matrix and its score tell, without what frames take up."""
+    """Change for a normal matrix and its score, without what frames absorb."""
     root = without(change.taken, mean_squares(change.model)) @ _root(normal, free)
     white = right @ _root(normal, free)
-    test = FieldTest(
-        float(white @ white), len(white), float(chi_square.sf(white @ white, len(white)))
-    )
     return replace(
         change,
         difference=(root @ white).reshape(change.difference.shape),
         cov=root @ root.T,
-        test=test,
+        test=FieldTest.of(white),
     )

@@ -1,4 +1,4 @@
-"""What frames of exposures can do to polynomials: the part of a difference that says nothing."""
+"""Changes of polynomials that frames of exposures can absorb, and that are thus no difference."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Float = NDArray[np.float64]
 
 
 def term_squares(basis: PolynomialBasis) -> Float:
-    """Mean square over the detector of each term of u and then of v, shape (2 K,)."""
+    """Mean square (2 K,) over the detector of each term of u and then of v."""
     return np.tile([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in basis.terms], 2)
 
 
 def mean_squares(model: DistortionModel) -> Float:
-    """Mean square of each polynomial term (n,) over the whole detector, chips by their area."""
+    """Mean square (n,) of each polynomial term over the whole detector, chips weighted by area."""
     area = np.array([chip.size[0] * chip.size[1] for chip in model.chips])
     return np.kron(area / area.sum(), term_squares(model.basis()))
 
@@ -27,15 +27,7 @@ def mean_squares(model: DistortionModel) -> Float:
 def without(fields: Float, norm: Float) -> Float:
     """Matrix (n, n) that takes fields (n, q) out of a polynomial, by least squares over the area.
 
-    Parameters
-    ----------
-    fields : ndarray, shape (n, q)
-    norm : ndarray, shape (n,)
-        As of `mean_squares`.
-
-    Returns
-    -------
-    ndarray, shape (n, n)
+    `norm` (n,) is the mean square of each term, from `mean_squares`.
     """
     out = np.eye(len(fields))
     if fields.shape[1]:
@@ -45,7 +37,7 @@ def without(fields: Float, norm: Float) -> Float:
 
 
 def frame_between(old: Float, now: Float, model: DistortionModel) -> tuple[Float, Float]:
-    """The frame of the model's kind that brings the release nearest to the new polynomials."""
+    """Frame (matrix, shift) of the model's kind that brings the release nearest to new values."""
     if model.frames == "none":
         return np.eye(2), np.zeros(2)
     norm = mean_squares(model).reshape(old.shape)[:, 0]
@@ -64,7 +56,7 @@ def frame_between(old: Float, now: Float, model: DistortionModel) -> tuple[Float
 
 
 def frame_fields(model: DistortionModel, kind: str, w: Float, origin: Float) -> Float:
-    """What each parameter of a frame does to the polynomials (chips, 2, K), as columns (n, q)."""
+    """Derivatives (n, q) of the polynomials (chips, 2, K) by each parameter of a frame."""
     about = w.copy()
     about[:, :, 0] -= origin
     names = frame_names(kind)
@@ -76,7 +68,7 @@ def frame_fields(model: DistortionModel, kind: str, w: Float, origin: Float) -> 
         else:
             unit = np.zeros(len(names))
             unit[k] = 1e-6
-            # rotations have cosines: the difference of both signs leaves the first order
+            # rotations have cosines: the difference of both signs cancels the second order
             slope = (frame_matrix(kind, unit)[0] - frame_matrix(kind, -unit)[0]) / 2e-6
             field = np.einsum("ab,cbk->cak", slope, about)
         out.append(field.ravel())

@@ -1,11 +1,11 @@
-"""Does a released solution still describe new matches?
+"""Test of a released solution against new matches.
 
-The new matches are fitted by themselves, with the polynomial order of the release, frames of their
-own for every exposure, the drift held at its released rates, and the outlier mixture with its
-jitter anew.  Their polynomials at their mean date, laid on the released ones by the one frame that
-no data can tell, differ by a change whose covariance is that of the fit plus that of the release at
-this date, extrapolated rates included.  Exposures of a campaign deviate from their polynomials as
-those of the release scatter, and what no data can tell are then their shifts and rotations alone.
+The new matches are fitted independently, with the polynomial order of the release, own frames for
+every exposure, the drift fixed at its released rates, and the outlier mixture with its jitter anew.
+Their polynomials at their mean date, mapped to the released ones by the frame that no data can
+determine, differ by a change whose covariance is that of the fit plus that of the release at this
+date, extrapolated rates included.  Exposures of a campaign deviate from their polynomials with the
+scatter of the release; no data can then determine their shifts and rotations alone.
 """
 
 from __future__ import annotations
@@ -16,42 +16,45 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.infer.catalogue.star_errors import star_covariance
+from bayesdist.infer.catalogue.star_influence import StarErrors, star_influence
 from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.equations.field_test import FieldTest, field_test
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Matches, load
 from bayesdist.infer.transforms import Solution, View, without_frames
 from bayesdist.model import DistortionModel
 
-__all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model"]
+__all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
 
 Float = NDArray[np.float64]
 
-SAMPLE = 1_000_000  # matches that tell the mean date
-HELD = 1e-4  # of its own sigma: how exactly a released rate is held
+SAMPLE = 1_000_000  # matches from which the mean date is computed
+HELD = 1e-4  # sigma of a fixed rate, in units of its released sigma
 
 
 @dataclass(frozen=True, eq=False)
 class NewFit:
-    """The new matches fitted by themselves.
+    """Independent fit of the new matches.
 
     Parameters
     ----------
     released : View
         The released polynomials and their drift, without frames.
     fit : LinearFit
-        Least squares of the new matches, which seeds the mixture.
+        Least squares of the new matches, which starts the mixture.
     theta : ndarray, shape (D,)
         Mode of the mixture, in the model of `fit`.
     cov : ndarray, shape (D, D)
     hyper : dict of str to float
-        'j', 'f', 's_out' at the mode, those of them that the mixture has.
+        'j', 'f', 's_out' at the mode, as far as the mixture has them.
     target : Target
         Density of the new matches.
     psi : ndarray
@@ -61,9 +64,9 @@ class NewFit:
     scatter : ndarray, shape (q,)
         Inverse variances of the parameters of an exposure; zero for those that are free.
     extra : ndarray, shape (n, n) or None
-        What errors that all the matches of a star share add to the covariance of the polynomials.
+        Added to the covariance of the polynomials for errors that all matches of a star share.
     common : ndarray, shape (n_distortion, n) or None
-        Covariance of the release with these polynomials, by stars that both have.
+        Covariance of the release with these polynomials, by stars in both.
     """
 
     released: View
@@ -80,12 +83,12 @@ class NewFit:
 
     @property
     def model(self) -> DistortionModel:
-        """Of the new matches: the released structure with their exposures."""
+        """Model of the new matches: the released structure with their exposures."""
         return self.fit.model
 
     @property
     def open(self) -> DistortionModel:
-        """A model whose frames are those that no data can tell."""
+        """Model with only those frame parameters that no data can determine."""
         if self.model.gauge == "first":
             return self.model
         return replace(
@@ -99,7 +102,7 @@ class NewFit:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What the new matches say has changed.
+    """Difference of the new matches' polynomials from the released ones.
 
     Parameters
     ----------
@@ -110,14 +113,13 @@ class Change:
     released : ndarray, shape (chips, 2, K)
         Released polynomials at that date.
     difference : ndarray, shape (chips, 2, K)
-        New minus released, in the frame of the release; what frames could take up is taken out.
+        New minus released, in the frame of the release, without what frames could absorb.
     cov : ndarray, shape (n, n)
         Of the difference, n = 2 K chips.
     released_cov : ndarray, shape (n, n)
-        Of the released polynomials at that date, and of whatever else is common to all the new
-        matches.
+        Of the released polynomials at that date, and of all other errors common to the new matches.
     taken : ndarray, shape (n, q)
-        Fields that frames take up.
+        Fields that frames absorb.
     test : FieldTest
         Of the whole difference.
     frame : tuple of ndarray
@@ -140,28 +142,26 @@ def fit_new(
     matches: Matches,
     *,
     mixture: OutlierMixture | None = None,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
+    rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
     scatter: Mapping[str, float] | None = None,
 ) -> NewFit:
-    """Fit new matches by themselves.
+    """Fit new matches independently of the release.
 
     Parameters
     ----------
     released : Solution
-        A fit or a posterior; its frames, those of the exposures it was made from, play no part but
-        for their kind.
+        A fit or a posterior; only the kind of its frames matters, not the frames of its exposures.
     matches : MatchTable or PartitionedMatches
         With errors.
     mixture : OutlierMixture, optional
         That of a released posterior by default, else Gaussian outliers.
-    clip_chi2, clip_abs
+    rejection : Rejection
         As of `fit_linear`.
     compute : Compute, optional
     scatter : mapping of str to float, optional
-        Standard deviations by which exposures of a campaign deviate, as their parameters are named:
-        'scale', ...  Of such a release they have to be given.
+        Standard deviations of a campaign's exposures, by the name of the parameter: 'scale', ...
+        Required for such a release.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def fit_new(
     shards = load(model, matches, compute)
     mixture = mixture or getattr(released, "mixture", None) or OutlierMixture()
     priors = _with_scatter(_held_drift(bare, model), model, scatter or {})
-    fit = fit_linear(shards, model, clip_chi2=clip_chi2, clip_abs=clip_abs, priors=priors)
+    fit = fit_linear(shards, model, rejection=rejection, priors=priors)
     target = Target(shards, mixture, priors)
     proposal = build_proposal(target, fit)
     best, n = proposal.best, model.n_params
@@ -205,7 +205,7 @@ def fit_new(
 
 
 def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
-    """The released structure with the exposures of new matches.
+    """Released structure with the exposures of new matches.
 
     Raises
     ------
@@ -237,14 +237,14 @@ def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
 
 
 def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
-    """How the new matches differ from the release.
+    """Difference of the new matches' polynomials from the release.
 
     Parameters
     ----------
     new : NewFit
     draws : float
-        Effective draws from which the released covariance was estimated: worth the more, the
-        smaller its share of the whole is (Welch and Satterthwaite).
+        Effective draws from which the released covariance was estimated; they are worth the more,
+        the smaller its fraction of the whole is (Welch and Satterthwaite).
 
     Returns
     -------
@@ -290,13 +290,13 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
         cov=projector @ cov @ projector.T,
         released_cov=released_cov,
         taken=taken,
-        test=field_test(rest, cov, taken, norm, draws=draws / max(share, 1e-3) ** 2),
+        test=chi_square(rest, cov, without=taken, norm=norm, draws=draws / max(share, 1e-3) ** 2),
         frame=(M, d),
     )
 
 
 def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
-    """Priors that hold the drift at its released values."""
+    """Priors that fix the drift at its released values."""
     priors = GaussianPriors.none(model)
     rows = slice(released.model.n_polynomial, released.model.n_distortion)
     centre, precision = priors.centre.copy(), priors.precision.copy()
@@ -310,7 +310,7 @@ def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
 def _with_scatter(
     priors: GaussianPriors, model: DistortionModel, scatter: Mapping[str, float]
 ) -> GaussianPriors:
-    """The priors with those of the deviations of all exposures."""
+    """Priors extended by those of the deviations of all exposures."""
     precision = priors.precision.copy()
     for code in range(len(model.exposures)):
         first = model.frame_slice(code).start
@@ -334,3 +334,51 @@ def _at_epoch(model: DistortionModel, epoch: float | None) -> Float:
         out[c * size : (c + 1) * size] = 0.0
         out[c * size : (c + 1) * size, columns] = d.reshape(size, -1)
     return out
+
+
+def with_star_errors_of(
+    errors: StarErrors,
+    new: NewFit,
+    matches: MatchTable,
+    released: tuple[LinearFit, MatchTable] | None = None,
+) -> NewFit:
+    """New fit whose covariance includes the catalogue errors that the matches of a star share.
+
+    A star has one error in all of its new exposures.  Where the release was made with the same
+    catalogue, that error has moved both sides, and what it moved alike is no change.
+
+    Parameters
+    ----------
+    errors : StarErrors
+        Of the catalogue, by code of the star; the quoted errors contain them.
+    new : NewFit
+    matches : MatchTable
+        Those of `new`, with codes of the stars.
+    released : tuple of LinearFit and MatchTable, optional
+        The release and its matches, where they have the same catalogue and codes.
+
+    Returns
+    -------
+    NewFit
+    """
+    n = new.model.n_polynomial
+    motion_u, motion_v = (0.0, 0.0) if errors.motion is None else errors.motion.T
+    shared = star_covariance(
+        new.fit,
+        matches,
+        *errors.position.T,
+        motion_u=motion_u,
+        motion_v=motion_v,
+        epoch0=errors.epoch,
+        frames=False,
+    )
+    out = replace(new, extra=shared.extra[:n, :n])
+    if released is None or released[1].star is None or matches.star is None:
+        return out
+    codes = np.intersect1d(released[1].star, matches.star)
+    old, now = (
+        star_influence(fit, table, errors, codes).by
+        for fit, table in (released, (new.fit, matches))
+    )
+    variances = errors.variances[: len(old), codes]
+    return replace(out, common=np.einsum("lasd,lsa,lasn->dn", old, variances, now[..., :n]))

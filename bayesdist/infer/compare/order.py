@@ -1,8 +1,8 @@
-"""Which polynomial order do the data ask for?  By binned surfaces, and by stars held out.
+"""Selection of the polynomial order, by binned surfaces and by stars held out.
 
 WSDC D-T033, section 3, fits surfaces of order 3 to 9 to mean offsets in bins, and finds order 3
-just short and order 4 as good as those above.  Beside it stands how well each order predicts what
-it has not seen.  All of it comes from two passes over the data, beyond those of one fit of the
+just short and order 4 as good as those above.  In addition each order predicts stars that it was
+not fitted to.  All of it comes from two passes over the data, beyond those of one fit of the
 highest order.
 """
 
@@ -24,7 +24,7 @@ from bayesdist.infer.compare.order_sums import (
     share_sums,
     truncated,
 )
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
@@ -44,49 +44,25 @@ def select_order(
     bins: int = 31,
     regions: int = 10,
     shares: int = 100,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
+    rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
 ) -> OrderSelection:
-    """Compare polynomial orders.
+    """Comparison of two or more polynomial orders, for one chip without frames and time dependence.
 
-    Stars are clipped once, by the two-pass fit of the highest order, and alike for all orders.
+    Stars are clipped once, by the two-pass fit of the highest order, and alike for all orders; the
+    model's own order does not matter.  `bins` (surfaces) and `regions` (held out, each made of
+    whole bins) are numbers along each axis; `shares` is the number of random subsets of the stars
+    that are held out, one at a time.
 
-    Parameters
-    ----------
-    matches : MatchTable, PartitionedMatches or Shards
-        With errors; shards are those of the model of the highest order.
-    model : DistortionModel
-        One chip, without frames and time dependence; its own order does not matter.
-    orders : sequence of int
-        At least two.
-    bins : int
-        Bins of the surfaces on each axis.
-    regions : int
-        Regions that are held out, on each axis; each is made of whole bins.
-    shares : int
-        Shares of the stars that are held out, one at a time.
-    clip_chi2, clip_abs
-        As `fit_linear`.
-    compute : Compute, optional
-
-    Returns
-    -------
-    OrderSelection
-
-    Raises
-    ------
-    InputError
-        For fewer than two orders, orders that are none, a model of several chips, or numbers of
-        bins, regions and shares that do not go together.
-    DegenerateError
-        As `fit_linear`, for the highest order; when too few bins have stars, or a lot holds all
-        that determines a coefficient.
+    Raises InputError for fewer than two orders, unusable ones, a model of several chips, or numbers
+    of bins, regions and subsets that do not fit together; DegenerateError as `fit_linear`, for the
+    highest order, and when too few bins have stars, or a group holds all that determines a
+    coefficient.
     """
     chosen = _checked(orders, model, bins, regions, shares)
     top = replace(model, order=chosen[-1])
     with opened(top, matches, compute) as shards:
-        fit = fit_linear(shards, top, clip_chi2=clip_chi2, clip_abs=clip_abs)
+        fit = fit_linear(shards, top, rejection=rejection)
         binned = shards.sum(bin_sums, fit.mean, fit.clip, bins)
         shared = shards.sum(share_sums, fit.mean, fit.clip, shares)
     n_terms = [(n + 1) * (n + 2) // 2 for n in chosen]
@@ -120,7 +96,7 @@ def select_order(
 def _checked(
     orders: Sequence[int], model: DistortionModel, bins: int, regions: int, shares: int
 ) -> tuple[int, ...]:
-    """The orders, rising."""
+    """Orders in ascending sequence; InputError if a setting cannot be used."""
     chosen = tuple(sorted({int(n) for n in orders}))
     if len(chosen) < 2 or chosen[0] < 1 or chosen[-1] > MAX_ORDER:
         raise InputError(
@@ -169,7 +145,7 @@ def _surfaces(
 
 
 def _lost(sums: LotSums, about: Float, n_terms: list[int], scale2: float, fit: LinearFit) -> Float:
-    """Rms over the detector of what each order lacks of the highest."""
+    """Rms over the detector of the difference of each order's fit from the highest."""
     i, j = np.array(fit.model.basis().terms).T
     area = 1.0 / ((2 * i + 1) * (2 * j + 1))  # mean square of a product of Legendre polynomials
     square = (departures(sums, about, n_terms) ** 2 @ area).sum(axis=1)

@@ -1,4 +1,4 @@
-"""What a comparison of polynomial orders says: figures for each order, and the verdict."""
+"""Result of a comparison of polynomial orders: statistics for each order, and the verdict."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["HeldOutOrders", "OrderSelection", "OrderSurfaces"]
 
 Float = NDArray[np.float64]
 
-CLEAR = 3.0  # standard errors from which on a higher order is better
+CLEAR = 3.0  # standard errors from which on a higher order counts as better
 CLEAR_P = float(stats.norm.sf(CLEAR))
 
 
@@ -24,47 +24,25 @@ class OrderSurfaces:
 
     A bin's mean is compared with the mean of the model over the same stars, not with its value at
     the bin's centre: neither curvature inside a bin nor its uneven filling matters.
-
-    Parameters
-    ----------
-    orders : tuple of int
-    n_bins : int
-        Bins that have stars.
-    chi2 : ndarray, shape (orders, 2)
-        Of what is left in u and v, against the noise of the bins' means.
-    dof : ndarray of int, shape (orders,)
-        Of one axis.
-    rms : ndarray, shape (orders, 2)
-        Of what is left in the bins of u and v, in the unit of u, v; bins weigh as their stars do.
-    noise : ndarray, shape (2,)
-        What of that is noise of the bins' means.
     """
 
     orders: tuple[int, ...]
-    n_bins: int
-    chi2: Float
-    dof: NDArray[np.int64]
+    n_bins: int  # bins that have stars
+    chi2: Float  # remaining in u and v (orders, 2), relative to the noise of the bins' means
+    dof: NDArray[np.int64]  # of one axis (orders,)
+    # remaining in the bins of u and v (orders, 2), in the unit of u, v; bins weigh as their stars
+    # do
     rms: Float
-    noise: Float
+    noise: Float  # part (2,) of the rms that is noise of the bins' means
 
     def p_noise(self) -> Float:
-        """Probability of a larger chi-square if only noise is left, (orders, 2)."""
+        """Probability (orders, 2) of a larger chi-square if only noise is left."""
         return np.asarray(stats.chi2.sf(self.chi2, self.dof[:, None]))
 
     def f_test(self, low: int, high: int) -> tuple[float, float]:
-        """Does a higher order leave less than chance would make it?
+        """F of both axes together, and the probability of a larger F if the lower order is right.
 
-        The noise is that of the surface itself, as what the higher order leaves tells it.
-
-        Parameters
-        ----------
-        low, high : int
-            Orders.
-
-        Returns
-        -------
-        F, p : float
-            Of both axes together, and the probability of a larger F if the lower order is right.
+        The noise is estimated from the surface itself, as the residuals of the higher order.
         """
         a, b = self.orders.index(low), self.orders.index(high)
         left = self.chi2.sum(axis=1)
@@ -75,33 +53,17 @@ class OrderSurfaces:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutOrders:
-    """How well each order predicts lots of stars from all others.
-
-    Parameters
-    ----------
-    orders : tuple of int
-    kind : str
-        'stars' or 'regions'.
-    log_density : ndarray, shape (L, orders, 2)
-        Of each lot, of u and v, up to a constant that the orders share.
-    """
+    """Predictive density of groups of stars by each order, fitted to all other groups."""
 
     orders: tuple[int, ...]
-    kind: str
+    kind: str  # 'stars' or 'regions'
+    # of L groups (L, orders, 2), of u and v, up to a constant that the orders share
     log_density: Float
 
     def difference(self, low: int, high: int) -> tuple[float, float]:
-        """Log predictive density of a higher order minus that of a lower one, both axes.
+        """Log predictive density of a higher order minus that of a lower one, with its error.
 
-        Parameters
-        ----------
-        low, high : int
-            Orders.
-
-        Returns
-        -------
-        difference, error : float
-            The standard error is from the scatter between the lots.
+        Both axes together; the standard error is from the scatter between the groups.
         """
         a, b = self.orders.index(low), self.orders.index(high)
         each = (self.log_density[:, b] - self.log_density[:, a]).sum(axis=-1)
@@ -110,50 +72,30 @@ class HeldOutOrders:
 
 @dataclass(frozen=True, eq=False)
 class OrderSelection:
-    """What the data say of the polynomial order.
+    """Result of the selection of the polynomial order."""
 
-    Parameters
-    ----------
-    orders : tuple of int
-        Rising.
-    surfaces : OrderSurfaces
-    stars, regions : HeldOutOrders
-        With arbitrary shares of the stars held out, and with whole regions of the detector.
-    lost : ndarray, shape (orders,)
-        Rms over the detector, both axes in quadrature, of how a fit of each order differs from
-        that of the highest; the part that is noise is taken off.
-    pair_rms : float
-        Rms residual of a single pair, both axes in quadrature.
-    error_scale : float
-        What all quoted errors were multiplied by: with it the highest order has a chi-square of 1
-        for each degree of freedom.
-    n_used : int
-        Pairs; the others were clipped.
-    unit : str
-        Of `lost`, `pair_rms` and the surfaces.
-    """
-
-    orders: tuple[int, ...]
+    orders: tuple[int, ...]  # ascending
     surfaces: OrderSurfaces
-    stars: HeldOutOrders
-    regions: HeldOutOrders
+    stars: HeldOutOrders  # for random subsets of the stars
+    regions: HeldOutOrders  # for whole regions of the detector
+    # rms (orders,) over the detector, both axes in quadrature, of the difference of each order's
+    # fit from the highest, noise subtracted
     lost: Float
-    pair_rms: float
+    pair_rms: float  # rms residual of a single match, both axes in quadrature
+    # factor on all quoted errors by which the highest order has a chi-square of 1 per degree of
+    # freedom
     error_scale: float
-    n_used: int
-    unit: str
+    n_used: int  # matches that were not clipped
+    unit: str  # of `lost`, `pair_rms` and the surfaces
 
     def rows(self) -> list[dict[str, Any]]:
-        """Surfaces and held-out stars beside each other, a row for each order.
+        """Row of surfaces and held-out stars for each order.
 
-        Returns
-        -------
-        list of dict
-            order; terms (of one axis); rms_u, rms_v of the bins; chi2_u, chi2_v for each degree of
-            freedom, and p_noise, the smaller of their two probabilities; F and p_surface of the
-            F-test between this order and the chosen one; stars and stars_error, regions and
-            regions_error: log density of what is held out, minus that of the chosen order; lost.
-            None where the chosen order would be compared with itself.
+        Keys: order; terms (of one axis); rms_u, rms_v of the bins; chi2_u, chi2_v for each degree
+        of freedom, and p_noise, the smaller of their two probabilities; F and p_surface of the
+        F-test between this order and the chosen one; stars and stars_error, regions and
+        regions_error: log density of the held-out stars, minus that of the chosen order; lost.
+        None where the chosen order would be compared with itself.
         """
         noise, s = self.surfaces.p_noise(), self.surfaces
         out = []
@@ -167,7 +109,7 @@ class OrderSelection:
                 "chi2_v": float(s.chi2[k, 1] / s.dof[k]),
                 "p_noise": float(noise[k].min()),
             }
-            lost = 0.0 if order == self.orders[-1] else float(self.lost[k])  # without its rounding
+            lost = 0.0 if order == self.orders[-1] else float(self.lost[k])  # no rounding error
             out.append(one | self._against_chosen(order) | {"lost": lost})
         return out
 
@@ -200,9 +142,9 @@ class OrderSelection:
 
     @property
     def order(self) -> int:
-        """The lowest order to which nothing objects: neither surfaces nor held-out stars.
+        """Lowest order that neither surfaces nor held-out stars reject.
 
-        Held-out regions do not vote: where they disagree, `sentence` says so.
+        Held-out regions are left out of this: where they disagree, `sentence` says so.
         """
         return max(self.by_surfaces, self.by_stars)
 
@@ -214,7 +156,7 @@ class OrderSelection:
 
     @property
     def sentence(self) -> str:
-        """The verdict with its reason."""
+        """Verdict on the order with its reason."""
         parts = [self._of_the_chosen()]
         k = self.orders.index(self.order)
         if k > 0:
@@ -247,7 +189,7 @@ class OrderSelection:
         lost = float(np.sqrt(max(here**2 - there**2, 0.0)))
         F, p = self.surfaces.f_test(low, self.order)
         gain, error = self.stars.difference(low, self.order)
-        # what is smaller than the error of one pair shows only in the mean of many
+        # an effect below the error of one match shows only in the mean of many
         word = "just inadequate" if lost < self.pair_rms else "inadequate"
         return (
             f"Order {low} is {word}: order {self.order} differs from it by {lost:.2g} {self.unit} "
@@ -279,5 +221,5 @@ def _clear(held_out: HeldOutOrders, low: int, high: int) -> bool:
 
 
 def _p(p: float) -> str:
-    """A probability, also where it is below what a float holds."""
+    """Probability as text, also below the smallest float."""
     return f"p = {p:.2g}" if p > 0 else "p < 1e-300"

@@ -1,7 +1,7 @@
-"""Normal equations of the highest order, kept apart by lots of stars: they hold all lower orders.
+"""Normal equations of the highest order by group of stars, which contain those of all lower orders.
 
-The terms of a polynomial stand by total order, so that the normal matrix of a lower order is the
-first part of that of a higher one.  A lot is a bin of the detector, or an arbitrary share of the
+The terms of a polynomial are sorted by total order, so that the normal matrix of a lower order is
+the first part of that of a higher one.  A lot is a bin of the detector, or a random subset of the
 stars.  With the sums of each lot, every order is fitted to all lots, to all but one, or to the
 means of the lots, without the data.
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
 from bayesdist.infer.linear import Clip
-from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.stars import Stars, cell_of
 
 __all__ = ["LotSums", "bin_sums", "departures", "held_out_gain", "share_sums", "truncated"]
 
@@ -25,21 +25,11 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class LotSums:
-    """Sums over the stars of each lot, about one polynomial; sums of pieces of the data add.
+    """Sums over the stars of each lot, about one polynomial; sums of chunks of the data add up."""
 
-    Parameters
-    ----------
-    count : ndarray of int, shape (L,)
-        Stars, those included that the clipping leaves out.
-    weight : ndarray, shape (L, 2, K, K)
-        sum of w phi phi^T of u and of v.
-    right : ndarray, shape (L, 2, K)
-        sum of w r phi, r the residual.
-    """
-
-    count: Int
-    weight: Float
-    right: Float
+    count: Int  # number (L,) of stars, including clipped ones
+    weight: Float  # sum (L, 2, K, K) of w phi phi^T of u and of v
+    right: Float  # sum (L, 2, K) of w r phi, r the residual
 
     def __add__(self, other: LotSums) -> LotSums:
         return LotSums(
@@ -47,7 +37,7 @@ class LotSums:
         )
 
     def joined(self, code: Int, n: int) -> LotSums:
-        """Sums of `n` larger lots; `code` (L,) says to which one each lot goes."""
+        """Sums of `n` larger lots; `code` (L,) is the larger lot of each."""
         out = LotSums(
             np.zeros(n, np.int64),
             np.zeros((n, *self.weight.shape[1:])),
@@ -59,50 +49,25 @@ class LotSums:
         return out
 
     def filled(self) -> LotSums:
-        """Without the lots that have no weight."""
+        """Sums of the lots that have weight."""
         has = self.weight[:, 0, 0, 0] > 0
         return LotSums(self.count[has], self.weight[has], self.right[has])
 
 
 def bin_sums(stars: Stars, theta: Float, clip: Clip, bins: int) -> LotSums:
-    """Sums of equal bins that cover the detector: lot `iy * bins + ix`.
+    """Sums of equal bins that cover the detector, `bins` on each axis: lot `iy * bins + ix`.
 
-    Parameters
-    ----------
-    stars : Stars
-        Of one chip, without frames.
-    theta : ndarray, shape (n_params,)
-        Where residuals are taken.
-    clip : Clip
-        Which stars are left out.
-    bins : int
-        On each axis.
-
-    Returns
-    -------
-    LotSums
+    The stars are of one chip, without frames; residuals are taken about `theta`, and `clip` leaves
+    stars out.
     """
-    ix, iy = (
-        np.clip(((z + 1) * (0.5 * bins)).astype(np.int64), 0, bins - 1) for z in (stars.X, stars.Y)
-    )
-    return _sums(stars, iy * bins + ix, bins * bins, theta, clip)
+    return _sums(stars, cell_of(stars.X, stars.Y, bins), bins * bins, theta, clip)
 
 
 def share_sums(stars: Stars, theta: Float, clip: Clip, shares: int) -> LotSums:
-    """Sums of arbitrary shares of the stars.
+    """Sums of `shares` random subsets of the stars; other arguments as of `bin_sums`.
 
-    A star's share follows from the digits of its own numbers, so that it depends neither on the
-    order of the rows nor on how the data are cut into pieces.
-
-    Parameters
-    ----------
-    stars, theta, clip
-        As `bin_sums`.
-    shares : int
-
-    Returns
-    -------
-    LotSums
+    The subset of a star follows from the digits of its own numbers, so that it depends neither on
+    the order of the rows nor on the chunks into which the data are cut.
     """
     mixed = np.zeros(len(stars), np.uint64)
     for column in (stars.X, stars.Y, stars.u, stars.v):
@@ -111,7 +76,7 @@ def share_sums(stars: Stars, theta: Float, clip: Clip, shares: int) -> LotSums:
 
 
 def _scrambled(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The finaliser of SplitMix64 (Steele, Lea and Flood 2014): every bit depends on every bit."""
+    """Finaliser of SplitMix64 (Steele, Lea and Flood 2014): every bit depends on every bit."""
     z = z + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -144,25 +109,14 @@ def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> LotSums:
 
 
 def truncated(weight: Float, right: Float, about: Float, n_terms: int) -> Float:
-    """How a fit of fewer terms differs from the polynomial that residuals are taken about.
+    """Coefficients (..., K), minus `about`, of a fit with only the first `n_terms` terms.
 
-    Parameters
-    ----------
-    weight : ndarray, shape (..., K, K)
-    right : ndarray, shape (..., K)
-    about : ndarray, shape (..., K)
-        Coefficients of that polynomial.
-    n_terms : int
-        The first terms, which the fit has.
-
-    Returns
-    -------
-    ndarray, shape (..., K)
-        Coefficients of the fit minus `about`.
+    `weight` (..., K, K) and `right` (..., K) are the normal equations of the residuals about the
+    polynomial `about` (..., K).
     """
     low, high = slice(None, n_terms), slice(n_terms, None)
     out = -np.broadcast_to(about, right.shape)
-    # the fit has to do without the high terms of `about`: their part returns to the residuals
+    # the fit lacks the high terms of `about`: their part returns to the residuals
     owed = np.einsum("...kl,...l->...k", weight[..., low, high], out[..., high])
     out[..., low] = np.linalg.solve(weight[..., low, low], (right[..., low] - owed)[..., None])[
         ..., 0
@@ -171,29 +125,18 @@ def truncated(weight: Float, right: Float, about: Float, n_terms: int) -> Float:
 
 
 def departures(sums: LotSums, about: Float, n_terms: list[int]) -> Float:
-    """Each order's fit to all lots, minus `about`: (orders, 2, K)."""
+    """Coefficients (orders, 2, K) of each order's fit to all lots, minus `about`."""
     weight, right = sums.weight.sum(axis=0), sums.right.sum(axis=0)
     return np.stack([truncated(weight, right, about, k) for k in n_terms])
 
 
 def held_out_gain(sums: LotSums, about: Float, n_terms: list[int]) -> Float:
-    """What each order says of every lot from all the others.
+    """Log predictive density (L, orders, 2) of every lot by each order's fit to all others.
 
-    Parameters
-    ----------
-    sums : LotSums
-    about : ndarray, shape (2, K)
-        Coefficients that the residuals are taken about.
-    n_terms : list of int
-        Terms of each order.
-
-    Returns
-    -------
-    ndarray, shape (L, orders, 2)
-        Minus half the chi-square of the lot, of u and of v, against that about `about`: the log
-        predictive density up to a constant that is the same for all orders.  The coefficients'
-        own uncertainty is not added to the errors: where a star's leverage h is small, that would
-        change the expectation by terms of the second order in h only.
+    It is minus half the difference of the lot's chi-square, of u and of v, from that about the
+    coefficients `about` (2, K), and so up to a constant that all orders share.  The coefficients'
+    own uncertainty is not added to the errors: where a star's leverage h is small, that would
+    change the expectation by terms of the second order in h only.
     """
     weight = sums.weight.sum(axis=0) - sums.weight
     right = sums.right.sum(axis=0) - sums.right

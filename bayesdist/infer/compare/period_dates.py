@@ -1,16 +1,19 @@
-"""Periods: when they begin and end."""
+"""Periods: their begin and end, and sums over the matches of each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from astropy.time import Time
 
+from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.infer.stars.shards import Matches
 
-__all__ = ["Periods", "check_periods", "mjd_periods"]
+__all__ = ["Periods", "check_periods", "mjd_periods", "sum_by_period"]
 
 Periods = Mapping[str, tuple[float, float]]  # begin and end by name, decimal years
 
@@ -18,23 +21,9 @@ MOST_MJD = 2e6  # some five thousand years: calendars end not far beyond
 
 
 def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
-    """Periods of some days about Modified Julian Dates, for `period_sums`.
+    """Periods of `days` about Modified Julian Dates, in decimal years, by name of the central date.
 
-    Parameters
-    ----------
-    centres : sequence of float
-    days : float
-        Length of each.
-
-    Returns
-    -------
-    dict of str to tuple of float
-        Decimal years, by the centres' dates.
-
-    Raises
-    ------
-    InputError
-        For a length that is not positive, and a centre that is no date.
+    InputError for a length that is not positive, and a centre that is no date.
     """
     if not days > 0:
         raise InputError(
@@ -47,7 +36,7 @@ def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float,
             where="periods",
             do="give days such as 55212.5",
         )
-    # the time scale of the epochs that a file gives as Modified Julian Dates
+    # time scale of the epochs that a file gives as Modified Julian Dates
     edges = np.asarray(centres, float)[:, None] + np.array([-days / 2, days / 2])
     years = np.asarray(Time(edges, format="mjd", scale="tt").decimalyear, float)
     return {
@@ -57,13 +46,7 @@ def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float,
 
 
 def check_periods(periods: Periods) -> None:
-    """Refuse periods that cannot be compared.
-
-    Raises
-    ------
-    InputError
-        For less than two, for one that ends before it begins, and for two that overlap.
-    """
+    """Raise InputError for fewer than two periods, one that ends before it begins, or overlap."""
     if len(periods) < 2:
         raise InputError(
             f"{len(periods)} periods are given",
@@ -85,3 +68,35 @@ def check_periods(periods: Periods) -> None:
                 where="periods",
                 do="let each begin where the one before it is over, or later",
             )
+
+
+def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable], Any]) -> Any:
+    """Sum of a task over the matches of each period, from one pass over the data in chunks.
+
+    The matches need epochs; those outside all periods [first, end) are not used.  `task` gets the
+    matches of a period in one chunk, and its results are added.  InputError without epochs, for
+    periods that overlap, and for a period without matches.
+    """
+    where = ", ".join(matches.sources)
+    if not matches.has_epoch:
+        raise InputError(
+            "periods need an epoch for every pair", where=where, do="map column 'epoch'"
+        )
+    check_periods(periods)
+    sums: dict[str, Any] = {}
+    for piece in matches.pieces():
+        table = piece.read()
+        assert table.epoch is not None
+        for name, (start, stop) in periods.items():
+            inside = (table.epoch >= start) & (table.epoch < stop)
+            if inside.any():
+                part = task(table.select(inside))
+                sums[name] = sums[name] + part if name in sums else part
+    for name, (start, stop) in periods.items():
+        if name not in sums:
+            raise InputError(
+                f"period {name} ({start:.8g} to {stop:.8g}) has no pairs",
+                where=where,
+                do="correct the period or leave it out",
+            )
+    return {name: sums[name] for name in periods}

@@ -1,20 +1,20 @@
-"""Does the distortion change with time, and does that matter?  One sentence."""
+"""One sentence on the change of the distortion with time, and on its importance."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bayesdist.infer.compare.period_changes import PeriodComparison
+from bayesdist.infer.compare.periods import PeriodComparison
 from bayesdist.infer.compare.positions import PositionChange
 
 __all__ = ["SIGNIFICANT", "all_below", "period_verdict"]
 
-SIGNIFICANT = 0.01  # probability under which a difference is called one
+SIGNIFICANT = 0.01  # probability below which a difference is significant
 
 
 def all_below(changes: Mapping[str, PositionChange], tolerance: float) -> bool:
-    """Whether no period differs by more than a tolerance, errors of two sigma allowed for."""
-    # the largest of a noisy field lies too high rather than too low
+    """True if no period differs by more than a tolerance, with two sigma allowed for errors."""
+    # the largest value of a noisy field is biased high
     return all(one.largest + 2 * one.sigma <= tolerance for one in changes.values())
 
 
@@ -23,19 +23,10 @@ def period_verdict(
     changes: Mapping[str, PositionChange],
     tolerance: float | None = None,
 ) -> str:
-    """One sentence: whether the distortion changes, by how much, and whether that matters.
+    """Sentence on the size, significance and importance of the change with time.
 
-    Parameters
-    ----------
-    comparison : PeriodComparison
-    changes : mapping of str to PositionChange
-        Of every period, against the combined model.
-    tolerance : float, optional
-        Largest difference of positions that does not matter, in the unit of u, v.
-
-    Returns
-    -------
-    str
+    `changes` has every period against the combined model; differences of positions up to
+    `tolerance`, in the unit of u, v, do not matter.
     """
     chi2, dof, p = comparison.homogeneity
     # the most significant, not the largest: the shortest period has the largest noise

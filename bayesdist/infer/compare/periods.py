@@ -1,36 +1,45 @@
-"""Models of several periods from one pass over the data (WSDC D-T033, Appendix C).
+"""Models of several periods, their differences, and the significance of these.
 
-The normal equations of the periods add up to those of all data, so that the model of each period,
-the combined one and all that is to be known of their differences come from these sums.
+WSDC D-T033, Appendix C.  The normal equations of the periods add up to those of all data, so that
+the model of each period, the combined one and all statistics of their differences come from these
+sums.  The combined model shares its data with each period: with A_p = N^-1 N_p, the fraction of
+period p in the normal equations, it is sum_q A_q theta_q, hence
+
+    theta_p - theta = (1 - A_p) theta_p - sum_{q != p} A_q theta_q,
+
+whose covariance for weights that are the inverse variances is C_p - C, not C_p + C.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag
+from scipy.stats import norm
 
-from bayesdist.data import MatchTable
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.compare.period_changes import PeriodComparison
-from bayesdist.infer.compare.period_dates import Periods, check_periods
+from bayesdist.infer.compare.positions import (
+    DifferenceField,
+    PositionChange,
+    difference_field,
+    largest_difference,
+)
 from bayesdist.infer.equations.normal import NormalEquations, least_squares
 from bayesdist.infer.equations.rank import require_full_rank
+from bayesdist.infer.equations.scaled import FieldTest, chi_square, scaled_inverse
 from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.stars.shards import Matches
-from bayesdist.infer.stars.stars import Stars, prepare
-from bayesdist.model import DistortionModel
+from bayesdist.infer.stars.stars import Stars
+from bayesdist.model import Chip, DistortionModel
 
 __all__ = [
+    "CoefficientChange",
+    "PeriodComparison",
     "PeriodSums",
     "compare_periods",
-    "period_sums",
-    "sum_by_period",
     "sums_of_stars",
 ]
 
@@ -39,16 +48,16 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PeriodSums:
-    """All that the pairs of one period say: sums, which add over pieces of the data.
+    """Sums over the matches of one period, which add over chunks of the data.
 
     Parameters
     ----------
     equations : NormalEquations
-        About the mean of the fit of all data, with the pairs that it uses.
+        About the mean of the fit of all data, with the matches that it uses.
     squares : NormalEquations or None
-        The same with squared weights, where extra weights make the sandwich necessary.
+        With squared weights, where extra weights make the sandwich necessary.
     n : int
-        Pairs used.
+        Number of matches used.
     """
 
     equations: NormalEquations
@@ -62,96 +71,16 @@ class PeriodSums:
         return PeriodSums(self.equations + other.equations, squares, self.n + other.n)
 
 
-def sum_by_period(matches: Matches, periods: Periods, task: Callable[[MatchTable], Any]) -> Any:
-    """Sum over the pairs of each period of a task: one pass over the data, piece by piece.
-
-    Parameters
-    ----------
-    matches : MatchTable or PartitionedMatches
-        With epochs.
-    periods : mapping of str to tuple of float
-        First epoch of each period, and the epoch at which it is over, in decimal years.  Pairs
-        outside all of them are not used.
-    task : callable
-        Of the pairs of a period that one piece of the data holds; what it returns adds.
-
-    Returns
-    -------
-    dict of str to what the task returns
-
-    Raises
-    ------
-    InputError
-        Without epochs, for periods that overlap, and for a period without pairs.
-    """
-    where = ", ".join(matches.sources)
-    if not matches.has_epoch:
-        raise InputError(
-            "periods need an epoch for every pair", where=where, do="map column 'epoch'"
-        )
-    check_periods(periods)
-    sums: dict[str, Any] = {}
-    for piece in matches.pieces():
-        table = piece.read()
-        assert table.epoch is not None
-        for name, (start, stop) in periods.items():
-            inside = (table.epoch >= start) & (table.epoch < stop)
-            if inside.any():
-                part = task(table.select(inside))
-                sums[name] = sums[name] + part if name in sums else part
-    for name, (start, stop) in periods.items():
-        if name not in sums:
-            raise InputError(
-                f"period {name} ({start:.8g} to {stop:.8g}) has no pairs",
-                where=where,
-                do="correct the period or leave it out",
-            )
-    return {name: sums[name] for name in periods}
-
-
-def period_sums(
-    fit: LinearFit, matches: Matches, periods: Periods, *, radial_weight: float = 1.0
-) -> dict[str, PeriodSums]:
-    """Sums over the pairs of each period.
-
-    Parameters
-    ----------
-    fit : LinearFit
-        Of all data: its model, and its rule for leaving pairs out, which is then one for all.
-    matches : MatchTable or PartitionedMatches
-        With errors and epochs.
-    periods : mapping of str to tuple of float
-        As `sum_by_period`.
-    radial_weight : float
-        As the fit's.
-
-    Returns
-    -------
-    dict of str to PeriodSums
-
-    Raises
-    ------
-    InputError
-        As `sum_by_period`, and for a model with frames or time dependence.
-    """
-    _check_model(fit.model)
-    task = partial(_sums_of, fit=fit, radial_weight=radial_weight)
-    out: dict[str, PeriodSums] = sum_by_period(matches, periods, task)
-    return out
-
-
-def _sums_of(matches: MatchTable, *, fit: LinearFit, radial_weight: float) -> PeriodSums:
-    return sums_of_stars(prepare(fit.model, matches)[0], fit, radial_weight)
-
-
 def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:
-    """What some pairs of one period say.
+    """Sums over some matches of one period.
 
     Parameters
     ----------
     stars : Stars
-    fit, radial_weight
-        As `period_sums`.
+    fit : LinearFit
+        Of all data: its model, and its rule for leaving matches out, which is then one for all.
+    radial_weight : float
+        As the fit's.
 
     Returns
     -------
@@ -177,19 +106,19 @@ def _check_model(model: DistortionModel) -> None:
 def compare_periods(
     fit: LinearFit, sums: Mapping[str, PeriodSums], *, rescale: bool = True
 ) -> PeriodComparison:
-    """The model of each period, and how they differ from the combined one.
+    """Model of each period, and the differences from the combined one.
 
     Parameters
     ----------
     fit : LinearFit
-        That `period_sums` was given.
+        Of all data, as given to `sums_of_stars`.
     sums : mapping of str to PeriodSums
         Two or more periods.  Together they are the combined data set, of which `fit` need not be
-        the fit: where pairs lie outside all periods it is not.
+        the fit: where matches lie outside all periods it is not.
     rescale : bool
-        Whether all errors are multiplied by one factor, the root of chi-square per degree of
-        freedom about the models of the periods.  Without it, quoted errors that are too small make
-        a change of noise.
+        True to multiply all errors by one factor, the root of chi-square per degree of freedom
+        about the models of the periods.  Otherwise quoted errors that are too small make a change
+        of noise.
 
     Returns
     -------
@@ -200,7 +129,7 @@ def compare_periods(
     Raises
     ------
     InputError
-        For less than two periods, and for a model with frames or time dependence.
+        For fewer than two periods, and for a model with frames or time dependence.
     DegenerateError
         When a period does not determine the model, naming the parameters.
     """
@@ -223,7 +152,7 @@ def compare_periods(
                 do="give longer periods or lower model.order",
             ) from error
         normal = arrow.dense()
-        inverse = _inverse(normal)
+        inverse = scaled_inverse(normal)
         rights.append(right)
         steps.append(inverse @ right)
         if one.squares is not None:
@@ -232,7 +161,7 @@ def compare_periods(
         else:
             covs.append(inverse)
         normals.append(normal)
-    all_inverse = _inverse(np.sum(normals, axis=0))
+    all_inverse = scaled_inverse(np.sum(normals, axis=0))
     shares = np.array([all_inverse @ normal for normal in normals])
     scale = _error_scale(sums.values(), rights, steps) if rescale else 1.0
     return PeriodComparison(
@@ -244,13 +173,6 @@ def compare_periods(
         counts=tuple(one.n for one in sums.values()),
         error_scale=scale,
     )
-
-
-def _inverse(normal: Float) -> Float:
-    """Inverse of a normal matrix, scaled to unit diagonal on the way."""
-    scale = np.sqrt(np.diag(normal))
-    unit = cho_solve(cho_factor(normal / np.outer(scale, scale)), np.eye(len(normal)))
-    return np.asarray(unit / np.outer(scale, scale))
 
 
 def _error_scale(
@@ -266,3 +188,213 @@ def _error_scale(
             chi2 -= float(right @ step)
             dof -= len(step)
     return float(np.sqrt(chi2 / dof))
+
+
+@dataclass(frozen=True, eq=False)
+class CoefficientChange:
+    """Differences of all coefficients between two models.
+
+    Parameters
+    ----------
+    names : tuple of str, length D
+    difference, sigma : ndarray, shape (D,)
+        Difference and its standard error.
+    """
+
+    names: tuple[str, ...]
+    difference: Float
+    sigma: Float
+
+    @property
+    def z(self) -> Float:
+        """Differences (D,) in units of their errors."""
+        return self.difference / self.sigma
+
+    @property
+    def p_value(self) -> Float:
+        """Two-sided probability (D,) of each difference, regardless of the others."""
+        return np.asarray(2 * norm.sf(np.abs(self.z)))
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodComparison:
+    """Models of several periods and the combined one.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    names : tuple of str, length P
+        Periods.
+    means : ndarray, shape (P, D)
+    covs : ndarray, shape (P, D, D)
+        Covariance of each, independent of the others.
+    shares : ndarray, shape (P, D, D)
+        A_p = N^-1 N_p; their sum is the identity.
+    counts : tuple of int
+        Number of matches in each.
+    error_scale : float
+        Factor on the quoted errors.
+    """
+
+    model: DistortionModel
+    names: tuple[str, ...]
+    means: Float
+    covs: Float
+    shares: Float
+    counts: tuple[int, ...]
+    error_scale: float
+
+    @cached_property
+    def combined(self) -> Float:
+        """Parameters (D,) of the model of all periods."""
+        return np.einsum("pij,pj->i", self.shares, self.means)
+
+    def _code(self, period: str) -> int:
+        if period not in self.names:
+            raise InputError(
+                f"there is no period {period!r}", do=f"choose among {', '.join(self.names)}"
+            )
+        return self.names.index(period)
+
+    def _contrast(self, period: str, against: str | None) -> Float:
+        """Factors (P, D, D) on the means that give a difference."""
+        D = self.means.shape[1]
+        out = np.zeros_like(self.covs)
+        p = self._code(period)
+        if against is not None:
+            q = self._code(against)
+            if p == q:
+                raise InputError(f"period {period} is compared with itself", do="name another")
+            out[p], out[q] = np.eye(D), -np.eye(D)
+            return out
+        out[:] = -self.shares
+        # 1 - A_p without the cancellation that occurs for a period with most of the data
+        out[p] = np.delete(self.shares, p, axis=0).sum(axis=0)
+        return out
+
+    def difference(self, period: str, against: str | None = None) -> tuple[Float, Float]:
+        """Parameters of a period minus those of the combined model, or of another period.
+
+        Parameters
+        ----------
+        period : str
+        against : str, optional
+            Another period; the combined model by default.
+
+        Returns
+        -------
+        difference : ndarray, shape (D,)
+        cov : ndarray, shape (D, D)
+
+        Raises
+        ------
+        InputError
+            For an unknown period, or one against itself.
+        """
+        contrast = self._contrast(period, against)
+        # differences of the means: large constants cancel before they meet rounding errors
+        difference = np.einsum("pij,pj->i", contrast, self.means - self.means[0])
+        return difference, _covariance(contrast, self.covs, contrast)
+
+    def coefficients(
+        self, period: str, against: str | None = None, *, monomial: bool = False
+    ) -> CoefficientChange:
+        """Difference of each coefficient with its error.
+
+        Parameters
+        ----------
+        period, against
+            As `difference`.
+        monomial : bool
+            True for coefficients of pixel offsets, as in SIP, in place of Legendre ones.
+
+        Returns
+        -------
+        CoefficientChange
+        """
+        difference, cov = self.difference(period, against)
+        if monomial:
+            both = (self.model.basis(chip.number).monomial_matrix for chip in self.model.chips)
+            # without time and frames the parameters are u and v of each chip in turn
+            to_monomials = block_diag(*(m for m in both for _ in (0, 1)))
+            difference, cov = to_monomials @ difference, to_monomials @ cov @ to_monomials.T
+        return CoefficientChange(self.model.names, difference, np.sqrt(np.diag(cov)))
+
+    def joint(self, period: str, against: str | None = None) -> FieldTest:
+        """Chi-square of all coefficients together."""
+        difference, cov = self.difference(period, against)
+        return chi_square(difference, cov)
+
+    def positions(
+        self,
+        period: str,
+        against: str | None = None,
+        *,
+        rng: np.random.Generator,
+        grid: int = 33,
+        n_draws: int = 2000,
+    ) -> PositionChange:
+        """Largest difference over the array with its significance.
+
+        Parameters
+        ----------
+        period, against
+            As `difference`.
+        rng : numpy.random.Generator
+        grid : int
+            Points along each axis, from edge to edge of the detector.
+        n_draws : int
+            Fields of noise that the largest difference is compared with; its probability is at
+            least 1 / (n_draws + 1).
+
+        Returns
+        -------
+        PositionChange
+        """
+        difference, cov = self.difference(period, against)
+        return largest_difference(self.model, difference, cov, rng=rng, grid=grid, n_draws=n_draws)
+
+    def field(
+        self,
+        period: str,
+        against: str | None = None,
+        *,
+        chip: Chip | None = None,
+        grid: tuple[int, int] = (17, 17),
+    ) -> DifferenceField:
+        """Difference of the positions over a chip.
+
+        Parameters
+        ----------
+        period, against
+            As `difference`.
+        chip : Chip, optional
+            The first chip by default.
+        grid : tuple of int
+            Points on x and on y.
+
+        Returns
+        -------
+        DifferenceField
+        """
+        chip = chip or self.model.chips[0]
+        return difference_field(self.model, *self.difference(period, against), chip, grid)
+
+    @cached_property
+    def homogeneity(self) -> FieldTest:
+        """Chi-square of the periods about one model for all.
+
+        Computed from the differences of all periods but one from the combined model, with their
+        joint covariance: the last one follows from them.
+        """
+        contrasts = [self._contrast(name, None) for name in self.names[:-1]]
+        cov = np.block(
+            [[_covariance(one, self.covs, other) for other in contrasts] for one in contrasts]
+        )
+        differences = np.concatenate([self.difference(name)[0] for name in self.names[:-1]])
+        return chi_square(differences, cov)
+
+
+def _covariance(one: Float, covs: Float, other: Float) -> Float:
+    """Covariance (D, D) of two combinations (P, D, D) of independent vectors."""
+    return np.asarray((one @ covs @ other.swapaxes(1, 2)).sum(axis=0))

@@ -1,4 +1,4 @@
-"""What more data would do to a solution: Fisher information of exposures not yet taken."""
+"""Gain of a solution by more data: Fisher information of exposures not yet taken."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.recoloured import Recoloured
+from bayesdist.infer.equations.scaled import scaled_cholesky, scaled_inverse
+from bayesdist.infer.posterior.recoloured import Recoloured
 from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 
@@ -21,16 +22,10 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ExposureContent:
-    """What the stars of an average exposure tell of polynomials on each chip.
+    """Information of an average exposure's stars about the polynomials of each chip."""
 
-    Parameters
-    ----------
-    moments : dict of int to ndarray, shape (2, K, K)
-        By chip number: sums over the stars of weight times products of basis functions, of each
-        axis.
-    n_stars : float
-    """
-
+    # by chip number, sums (2, K, K) over the stars of weight times products of basis functions, for
+    # each axis
     moments: dict[int, Float]
     n_stars: float
 
@@ -43,22 +38,10 @@ def exposure_content(
     n_total: int | None = None,
     n_exposures: int = 1,
 ) -> ExposureContent:
-    """The average exposure of some data.
+    """Content of the average of `n_exposures` exposures.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    matches : MatchTable
-        All stars, or some that stand for all.
-    weight : array_like, shape (N, 2)
-        Inverse variances of both axes times the probability that the match is true.
-    n_total : int, optional
-        Stars that there are in all.
-    n_exposures : int, optional
-
-    Returns
-    -------
-    ExposureContent
+    `matches` are all stars, or a sample of `n_total`; `weight` (N, 2) is the inverse variance of
+    both axes times the probability that the match is true.
     """
     weight = np.asarray(weight, float)
     K = model.n_terms
@@ -81,25 +64,12 @@ def exposure_information(
     *,
     scatter: Mapping[str, float] | None = None,
 ) -> Float:
-    """Fisher information of one more exposure about polynomials and drift.
+    """Fisher information (d, d) of one more exposure about polynomials and drift.
 
-    The exposure's own frame is fitted as that of the others; what it leaves open is eliminated.
-
-    Parameters
-    ----------
-    solution : Solution
-        Where the model is linearised.
-    content : ExposureContent
-    epoch : float or None
-        Decimal years; needed by a model with time dependence.
-    scatter : mapping of str to float, optional
-        How deviations of exposures, by the names of their parameters, scatter: those are no free
-        parameters.  Free where not named.
-
-    Returns
-    -------
-    ndarray, shape (d, d)
-        Of the model's first d = `n_distortion` parameters.
+    The model is linearised at the solution; d is its `n_distortion`, and `epoch` (decimal years) is
+    needed with time dependence.  The exposure's own frame is fitted as that of the others, and its
+    free parameters are eliminated.  `scatter` gives the standard deviations of exposures by the
+    names of their parameters, which are then not free.
     """
     model = solution.model
     D, last = model.n_params, len(model.exposures) - 1
@@ -127,24 +97,10 @@ def exposure_information(
 
 
 def with_information(solution: Solution, information: Float) -> Recoloured:
-    """A solution as it would be with more information about polynomials and drift.
+    """Solution with the additional information (d, d) about polynomials and drift.
 
-    Frames of the exposures that are there change as far as they are correlated with these.
-
-    Parameters
-    ----------
-    solution : Solution
-    information : ndarray, shape (d, d)
-        As of `exposure_information`, or a sum of such.
-
-    Returns
-    -------
-    Recoloured
-
-    Raises
-    ------
-    InputError
-        For information of another number of parameters.
+    Frames of the existing exposures change as far as they are correlated with these.  InputError
+    for information of another number of parameters.
     """
     n = solution.model.n_distortion
     if information.shape != (n, n):
@@ -153,13 +109,10 @@ def with_information(solution: Solution, information: Float) -> Recoloured:
             do="give that of the polynomials and their drift",
         )
     cov = np.asarray(solution.cov, float)
-    scale = np.sqrt(np.diag(cov)[:n])
-    unit = np.outer(scale, scale)
-    before = cov[:n, :n] / unit
     # (C^-1 + H)^-1 without inverting C, which may be nearly singular
-    L = np.linalg.cholesky(before)
-    inner = np.eye(n) + L.T @ (information * unit) @ L
-    after = L @ np.linalg.solve(inner, L.T)
-    follow = np.linalg.solve(before, (cov[:, :n] / scale).T).T
-    changed = cov + follow @ (after - before) @ follow.T
+    root = scaled_cholesky(cov[:n, :n])
+    inner = np.eye(n) + root.T @ information @ root
+    after = root @ np.linalg.solve(inner, root.T)
+    follow = cov[:, :n] @ scaled_inverse(cov[:n, :n])
+    changed = cov + follow @ (after - cov[:n, :n]) @ follow.T
     return Recoloured(solution, (changed + changed.T) / 2)

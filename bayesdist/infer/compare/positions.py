@@ -1,4 +1,4 @@
-"""How far two models differ in positions over the array, and how far noise makes them differ."""
+"""Difference of two models in positions over the array, compared with that of noise."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import chi2 as chi_square
+from scipy.stats import chi2 as chi_square_distribution
 
+from bayesdist.infer.equations.scaled import chi_square, scaled_cholesky
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = [
     "DifferenceField",
     "PositionChange",
-    "chi_square_of",
     "difference_field",
     "largest_difference",
 ]
@@ -24,65 +23,34 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PositionChange:
-    """The largest difference of two models over the array, and how likely noise makes one.
+    """Largest difference of two models over the array, and the probability that noise makes it."""
 
-    Parameters
-    ----------
-    largest : float
-        Radial, in the unit of u, v.
-    at : tuple of float
-        Where, FITS 1-based pixels.
-    chip : int
-        On which chip.
-    sigma : float
-        Standard error of the difference there, along its direction.
-    noise_median, noise_95 : float
-        Largest difference over the array that noise alone makes: median and 95th percentile.
-    p_value : float
-        Share of noise fields with a largest difference of this size: it accounts for the search
-        over the array.
-    chi2 : float
-        Of the whole field with its joint covariance.  The field is as good as its coefficients, so
-        this is also the chi-square of these.
-    dof : int
-    p_field : float
-        Probability of a chi-square as large.
-    """
-
-    largest: float
-    at: tuple[float, float]
-    chip: int
-    sigma: float
-    noise_median: float
-    noise_95: float
+    largest: float  # length of the vector, in the unit of u, v
+    at: tuple[float, float]  # position of the largest, FITS 1-based pixels
+    chip: int  # number of its chip
+    sigma: float  # standard error of the difference there, along its direction
+    noise_median: float  # of the largest difference over the array by noise alone
+    noise_95: float  # its 95th percentile
+    # fraction of noise fields with a largest difference of this size, which accounts for the search
+    # over the array
     p_value: float
+    # of the whole field with its joint covariance; the field has the information of its
+    # coefficients, so this is also the chi-square of these
     chi2: float
     dof: int
-    p_field: float
+    p_field: float  # probability of a larger chi-square
 
 
 @dataclass(frozen=True, eq=False)
 class DifferenceField:
-    """Difference of the positions of two models over one chip.
-
-    Parameters
-    ----------
-    chip : Chip
-    x : ndarray, shape (nx,)
-    y : ndarray, shape (ny,)
-        FITS 1-based pixels, from edge to edge.
-    du, dv : ndarray, shape (ny, nx)
-        In the unit of u, v.
-    p_value : ndarray, shape (ny, nx)
-        Probability of as long a vector by noise, at each place by itself.
-    """
+    """Difference of the positions of two models over one chip."""
 
     chip: Chip
-    x: Float
-    y: Float
-    du: Float
+    x: Float  # (nx,) FITS 1-based pixels, from edge to edge
+    y: Float  # (ny,)
+    du: Float  # (ny, nx) in the unit of u, v
     dv: Float
-    p_value: Float
+    p_value: Float  # (ny, nx) probability of a vector as long by noise, at each position alone
 
 
 def largest_difference(
@@ -94,28 +62,12 @@ def largest_difference(
     grid: int,
     n_draws: int,
 ) -> PositionChange:
-    """The largest difference over the array, against those of fields of noise.
+    """Largest difference over the array, compared with `n_draws` fields of noise.
 
-    Parameters
-    ----------
-    model : DistortionModel
-        Without frames and time dependence.
-    difference : ndarray, shape (D,)
-        Of the parameters.
-    cov : ndarray, shape (D, D)
-    rng : numpy.random.Generator
-    grid : int
-        Points along each axis.
-    n_draws : int
-        Fields of noise.
-
-    Returns
-    -------
-    PositionChange
+    The model is without frames and time dependence; `difference` (D,) and `cov` (D, D) are of its
+    parameters; `grid` is the number of points along each axis.
     """
-    scale = np.sqrt(np.diag(cov))
-    root = np.linalg.cholesky(cov / np.outer(scale, scale)) * scale[:, None]
-    noise = rng.standard_normal((n_draws, len(scale))) @ root.T
+    noise = rng.standard_normal((n_draws, len(cov))) @ scaled_cholesky(cov).T
     largest, worst = np.zeros(n_draws), (-1.0, 0, (0.0, 0.0), 0.0)
     for chip in model.chips:
         x, y = (a.ravel() for a in np.meshgrid(*_axes(chip, (grid, grid))))
@@ -127,12 +79,12 @@ def largest_difference(
         size = np.hypot(*field)
         k = int(np.argmax(size))
         if size[k] > worst[0]:
-            along = np.zeros(len(scale))
+            along = np.zeros(len(cov))
             direction = field[:, k] / size[k] if size[k] > 0 else np.array([1.0, 0.0])
             along[u], along[v] = direction[0] * phi[k], direction[1] * phi[k]
             sigma = float(np.sqrt(along @ cov @ along))
             worst = (float(size[k]), chip.number, (float(x[k]), float(y[k])), sigma)
-    chi2, dof, p_field = chi_square_of(difference, cov)
+    chi2, dof, p_field = chi_square(difference, cov)
     return PositionChange(
         largest=worst[0],
         at=worst[2],
@@ -150,20 +102,7 @@ def largest_difference(
 def difference_field(
     model: DistortionModel, difference: Float, cov: Float, chip: Chip, grid: tuple[int, int]
 ) -> DifferenceField:
-    """The difference on a grid of one chip.
-
-    Parameters
-    ----------
-    model, difference, cov
-        As `largest_difference`.
-    chip : Chip
-    grid : tuple of int
-        Points on x and on y.
-
-    Returns
-    -------
-    DifferenceField
-    """
+    """Difference on a grid (nx, ny) of one chip; other arguments as of `largest_difference`."""
     x, y = _axes(chip, grid)
     phi = model.basis(chip.number).evaluate(*(a.ravel() for a in np.meshgrid(x, y)))
     parts = [model.coefficient_slice(chip.number, axis) for axis in (0, 1)]
@@ -173,19 +112,12 @@ def difference_field(
         for b, other in enumerate(parts):
             joint[:, a, b] = np.einsum("nk,kl,nl->n", phi, cov[one, other], phi, optimize=True)
     z2 = np.einsum("na,na->n", field, np.linalg.solve(joint, field[..., None])[..., 0])
-    du, dv, p_value = (a.reshape(len(y), len(x)) for a in (*field.T, chi_square.sf(z2, 2)))
+    du, dv, p_value = (
+        a.reshape(len(y), len(x)) for a in (*field.T, chi_square_distribution.sf(z2, 2))
+    )
     return DifferenceField(chip, x, y, du, dv, p_value)
 
 
-def chi_square_of(difference: Float, cov: Float) -> tuple[float, int, float]:
-    """Chi-square of a vector, its degrees of freedom, and the probability of one as large."""
-    scale = np.sqrt(np.diag(cov))
-    factor = cho_factor(cov / np.outer(scale, scale))
-    scaled = difference / scale
-    value = float(scaled @ cho_solve(factor, scaled))
-    return value, len(scaled), float(chi_square.sf(value, len(scaled)))
-
-
 def _axes(chip: Chip, grid: tuple[int, int]) -> tuple[Float, Float]:
-    """Pixels from edge to edge of a chip."""
+    """Pixel coordinates along both axes, from edge to edge of a chip."""
     return np.linspace(1, chip.size[0], grid[0]), np.linspace(1, chip.size[1], grid[1])

@@ -29,7 +29,7 @@ def to_cube_root(names: tuple[str, ...], h: Float) -> Float:
 
 
 def inside(names: tuple[str, ...], z: Float) -> NDArray[np.bool_]:
-    """Which points (..., k) lie in the support."""
+    """Boolean mask (...) of points (..., k) in the support."""
     ok = np.all(z > 0, axis=-1)
     if "f" in names:
         ok &= z[..., names.index("f")] < 1
@@ -37,21 +37,11 @@ def inside(names: tuple[str, ...], z: Float) -> NDArray[np.bool_]:
 
 
 def from_cube_root(names: tuple[str, ...], z: Float) -> tuple[Float, Float, Float, Float, Float]:
-    """Sampled coordinates and what a change of variables needs.
+    """Sampled coordinates h and the derivatives needed for a change of variables.
 
-    Parameters
-    ----------
-    names : tuple of str
-        'f' or 's_out' for each coordinate.
-    z : ndarray, shape (..., k)
-        Points inside the support.
-
-    Returns
-    -------
-    h, h1, h2 : ndarray, shape (..., k)
-        logit f or log s_out, and its first and second derivative by z.
-    log_h1_1, log_h1_2 : ndarray, shape (..., k)
-        First and second derivative of log |h1|.
+    Of points z (..., k) inside the support, with a name 'f' or 's_out' for each coordinate: h
+    (logit f or log s_out), its first and second derivative by z, h1 and h2, and the first and
+    second derivative of log |h1|, all (..., k).
     """
     h, h1, h2 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
     g1, g2 = np.empty_like(z), np.empty_like(z)
@@ -71,37 +61,29 @@ def from_cube_root(names: tuple[str, ...], z: Float) -> tuple[Float, Float, Floa
 
 @dataclass(frozen=True)
 class Split:
-    """Which hyperparameters are held on a grid, and which move with the distortion.
+    """Division of the hyperparameters into those on a grid and those that move with the distortion.
 
-    Sampled coordinates psi (..., D) fall into y = (theta, cube-root hyperparameters), (..., D'),
-    and the grid's coordinates `at` (..., g): log j, log s_out.
-
-    Parameters
-    ----------
-    n_theta : int
-    hyper : tuple of str
-        Of 'j', 'f', 's_out', in this order: all that are sampled.
-    held : tuple of str
-        Those of them on the grid: 'j' at least, where it is sampled.
+    Sampled coordinates psi (..., D) are divided into y = (theta, cube-root hyperparameters), (...,
+    D'), and the grid's coordinates `at` (..., g): log j, log s_out.
     """
 
     n_theta: int
-    hyper: tuple[str, ...]
-    held: tuple[str, ...]
+    hyper: tuple[str, ...]  # sampled ones of 'j', 'f', 's_out', in this order
+    held: tuple[str, ...]  # those on the grid: 'j' at least, where it is sampled
 
     @property
     def rest(self) -> tuple[str, ...]:
-        """Hyperparameters that are not held."""
+        """Hyperparameters that are not on the grid."""
         return tuple(name for name in self.hyper if name not in self.held)
 
     @property
     def columns(self) -> tuple[list[int], list[int]]:
-        """Where those held stand among the hyperparameters, and where the rest."""
+        """Indices among the hyperparameters of those on the grid, and of the rest."""
         held = [self.hyper.index(name) for name in self.held]
         return held, [self.hyper.index(name) for name in self.rest]
 
     def contains(self, y: Float) -> NDArray[np.bool_]:
-        """Which points (..., D') lie in the support."""
+        """Boolean mask (...) of points (..., D') in the support."""
         return np.isfinite(y).all(axis=-1) & inside(self.rest, y[..., self.n_theta :])
 
     def to_psi(self, y: Float, at: Float) -> Float:

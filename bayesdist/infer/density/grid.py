@@ -1,4 +1,4 @@
-"""Where the nodes of the proposal's grid go: along the modes, as far as the posterior reaches."""
+"""Nodes of the proposal's grid, along the modes as far as the posterior extends."""
 
 from __future__ import annotations
 
@@ -26,35 +26,25 @@ Float = NDArray[np.float64]
 Line = dict[float, Conditional]  # nodes by their value on one axis
 
 N_NODES = 25
-N_SCALES, STRIDE = 17, 2  # of log s_out; then every other one of log j is enough
-DROP = 18.0  # how far (in log density) the grid reaches below the top: beyond lies 1e-8
-NOTHING = 40.0  # as far below the top as nodes are said to be that were not searched for
+N_SCALES, STRIDE = 17, 2  # nodes of log s_out; then every other one of log j is enough
+DROP = 18.0  # distance (in log density) below the top to which the grid extends: 1e-8 lies beyond
+NOTHING = 40.0  # distance below the top that is assigned to nodes that were not searched for
 NEAR = 1e-4  # Newton decrement at which a node's search stops
-FEW, CLOSE = 30.0, 2.0  # outliers, and their scale over the core's, below which it may be open
+# number of outliers, and their scale over the core's, below which the scale may be open
+FEW, CLOSE = 30.0, 2.0
 TRIAL = 128  # proposals that compare both grids
-GOOD, WORSE = 0.98, 0.8  # efficiency that needs no second axis; share of it that is a fair price
+# efficiency that needs no second axis; fraction of it that may be lost by one
+GOOD, WORSE = 0.98, 0.8
 VAGUE = 0.2  # standard deviation of log s_out beyond which one Gaussian is not enough
 # distance from the median quoted error at which the end of an axis may begin to be its prior's tail
 FAR = {"j": 0.3, "s_out": 30.0}
 
 
 def build_proposal(target: Target, fit: LinearFit) -> GridProposal:
-    """Conditional modes over a grid that carries all but 1e-8 of the posterior.
+    """Proposal from conditional modes over a grid that carries all but 1e-8 of the posterior.
 
-    Parameters
-    ----------
-    target : Target
-    fit : LinearFit
-        Where the search starts.
-
-    Returns
-    -------
-    GridProposal
-
-    Raises
-    ------
-    DegenerateError
-        When no mode is found, or the posterior of the grid's coordinates has no end.
+    The search starts from `fit`.  DegenerateError when no mode is found, or the posterior of the
+    grid's coordinates has no end.
     """
     hyper = target.mixture.hyper
     split = Split(target.n_theta, hyper, tuple(name for name in hyper if name == "j"))
@@ -73,14 +63,14 @@ def build_proposal(target: Target, fit: LinearFit) -> GridProposal:
         wide = _with_scales(target, narrow, line, best)
     except DegenerateError:
         return narrow
-    # a few draws do not show the tails, for which the second axis is there
+    # a few draws do not show the tails, for which the second axis is needed
     return wide if _trial(target, wide) > WORSE * worth else narrow
 
 
 def _is_vague(target: Target, split: Split, node: Node) -> bool:
-    """Whether the data may leave the scale of the outliers open.
+    """True if the data may not determine the scale of the outliers.
 
-    They do where their curvature says so, where the outliers are few, and where they are hardly
+    That is so where the curvature shows it, where the outliers are few, and where they are hardly
     wider than the core: the mode that was found may then be one of several.
     """
     if "s_out" not in split.rest:
@@ -96,7 +86,7 @@ def _is_vague(target: Target, split: Split, node: Node) -> bool:
 
 
 def _trial(target: Target, proposal: GridProposal) -> float:
-    """Importance efficiency of a few draws."""
+    """Importance efficiency of the proposal from a few draws."""
     psi = proposal.draw(TRIAL, np.random.default_rng(0))
     out = np.full(TRIAL, np.nan)
     inside = np.isfinite(psi).all(axis=1)
@@ -108,7 +98,7 @@ def _trial(target: Target, proposal: GridProposal) -> float:
 def _with_scales(
     target: Target, narrow: GridProposal, line: Line, best: Conditional
 ) -> GridProposal:
-    """The grid with log s_out as a further axis."""
+    """Proposal with log s_out as a further axis of the grid."""
     split = narrow.split
     wide = Split(split.n_theta, split.hyper, (*split.held, "s_out"))
     y, at = wide.from_psi(split.to_psi(best.mode, best.at))
@@ -133,10 +123,10 @@ def _thinned(line: Line, best: Conditional) -> list[float]:
 def _column(
     target: Target, split: Split, middle: Conditional, log_j: list[float], top: float
 ) -> list[Node]:
-    """Nodes at some jitters and the s_out of one node, found from there outwards.
+    """Nodes at some jitters and the s_out of one node, searched from there outwards.
 
-    Beyond where the posterior has ended nothing is searched: the last node is repeated there, with
-    a marginal density as good as none.
+    Beyond the end of the posterior there is no search: the last node is repeated with a negligible
+    marginal density.
     """
     start = float(middle.at[0])
     found: dict[float, Node] = {start: middle}
@@ -157,7 +147,7 @@ def _column(
 
 
 def _reached(target: Target, split: Split, here: Conditional, at: Float) -> Conditional | None:
-    """The node at a place next to another, or None where no mode is found."""
+    """Node at a point next to another node, or None where no mode is found."""
     y = expected_mode(split, here, at - here.at)
     try:
         return conditional_mode(target, split, y, at, tolerance=NEAR)
@@ -169,7 +159,7 @@ def _reached(target: Target, split: Split, here: Conditional, at: Float) -> Cond
 
 
 def _line(target: Target, split: Split, node: Conditional, axis: int, n: int) -> Line:
-    """Nodes along an axis, from a first one near the top: `n` of them, where they matter most."""
+    """Nodes along an axis, from a first one near the top: `n` of them, where the density is."""
     nodes = {float(node.at[axis]): node}
     for direction in (1, -1):
         _walk(target, split, nodes, axis, direction)
@@ -192,7 +182,7 @@ def _ahead(split: Split, node: Conditional, axis: int, step: float) -> Float:
 
 
 def _climb(target: Target, split: Split, node: Conditional) -> Conditional:
-    """Up along the modes to where log j is about most probable."""
+    """Node along the modes where log j is about most probable."""
     for _ in range(30):
         # where the curvature is not that of a peak, steps of a size that leaves the plateau
         slope = float(node.slope[0])
@@ -235,7 +225,7 @@ def _walk(target: Target, split: Split, nodes: Line, axis: int, direction: int) 
 
 
 def _is_tail(target: Target, name: str, x: float, direction: int, slope: float) -> bool:
-    """Whether the likelihood has forgotten the hyperparameter."""
+    """True if the likelihood no longer depends on the hyperparameter."""
     end, known = TAILS[name]
     outward = -1 if end == "left" else 1
     distance = outward * (x - np.log(FAR[name] * target.hyper.scale))
@@ -243,7 +233,7 @@ def _is_tail(target: Target, name: str, x: float, direction: int, slope: float) 
 
 
 def _worth_keeping(nodes: Line) -> Line:
-    """Without the nodes far below the top, but for one on either side."""
+    """Nodes without those far below the top, except one on either side."""
     top = max(node.log_marginal for node in nodes.values())
     grid = sorted(nodes)
     good = [k for k, x in enumerate(grid) if nodes[x].log_marginal > top - DROP]

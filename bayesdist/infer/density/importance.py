@@ -1,8 +1,8 @@
-"""What log importance weights say of a proposal, and of the chain that it drives.
+"""Quality of a proposal, and of the chain that it drives, from log importance weights.
 
 The weight of a proposal is w = target / proposal density.  An independence chain at a point of
-weight w rejects a proposal of weight w' with probability 1 - min(1, w'/w); hence all that is asked
-here -- quality, warm-up, price of an effective draw -- follows from the weights alone.
+weight w rejects a proposal of weight w' with probability 1 - min(1, w'/w); hence quality, warm-up
+and the price of an effective draw follow from the weights alone.
 
 Log weights are NaN for proposals outside the support, which were not evaluated: weight zero.
 """
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.sampler.convergence import importance_efficiency, pareto_k
+from bayesdist.infer.convergence import importance_efficiency, pareto_k
 
 __all__ = ["Quality", "draws_per_effective", "quality_of", "rejection", "warmup_steps"]
 
@@ -26,24 +26,12 @@ MOST_WARMUP = 10_000
 
 @dataclass(frozen=True)
 class Quality:
-    """How good a proposal is.
+    """Quality of a proposal."""
 
-    Parameters
-    ----------
-    efficiency : float
-        Effective share of its draws.
-    k : float
-        Pareto shape of the tail of the weights.
-    log_weights : ndarray, shape (n,)
-        Those inside the support.
-    n_outside : int
-        Number outside the support.
-    """
-
-    efficiency: float
-    k: float
-    log_weights: Float
-    n_outside: int
+    efficiency: float  # effective fraction of its draws
+    k: float  # Pareto shape of the tail of the weights
+    log_weights: Float  # of draws inside the support
+    n_outside: int  # number of draws outside the support
 
 
 def quality_of(log_weights: Float) -> Quality:
@@ -57,19 +45,10 @@ def quality_of(log_weights: Float) -> Quality:
 
 
 def rejection(log_weights: Float) -> tuple[Float, Float]:
-    """Weights of the proposals with any, rising, and the rejection rate of a chain that is there.
+    """Normalised non-zero weights (m,), ascending, and the rejection rate (m,) of a chain at each.
 
-    Parameters
-    ----------
-    log_weights : ndarray
-        Of proposals, any shape.
-
-    Returns
-    -------
-    weight : ndarray, shape (m,)
-        Normalised to a sum of one: the posterior mass of each of these points.
-    rate : ndarray, shape (m,)
-        Mean of 1 - min(1, w'/w) over the other proposals.
+    A weight is the posterior mass of its point; the rate is the mean of 1 - min(1, w'/w) over the
+    other proposals.
     """
     flat = log_weights.ravel()
     log_w = np.sort(flat[np.isfinite(flat)])
@@ -89,16 +68,7 @@ def warmup_steps(log_weights: Float) -> int:
     numbers.  Once the one of larger weight accepts, so does the other, and they are one from then
     on; until then the larger weight stays.  Hence the distance in total variation after t steps is
     at most the mean of r(max(w, w*))^t with w drawn from the proposal, w* from the posterior and r
-    the rejection rate.
-
-    Parameters
-    ----------
-    log_weights : ndarray
-
-    Returns
-    -------
-    int
-        The first t for which this bound is at most 0.02.
+    the rejection rate.  Returned is the first t for which this bound is at most 0.02.
     """
     mass, rate = rejection(log_weights)
     by_proposal = np.arange(1, len(mass) + 1) / len(mass)

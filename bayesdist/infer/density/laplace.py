@@ -21,7 +21,7 @@ __all__ = ["Conditional", "Node", "conditional_mode", "expected_mode", "starting
 
 Float = NDArray[np.float64]
 
-ON_A_RIDGE = 1e-2  # decrement at which a search stops where the curvature had to be mended
+ON_A_RIDGE = 1e-2  # decrement at which a search stops where the curvature had to be made positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,53 +29,28 @@ class Node:
     """Laplace approximation of everything else at one point of the grid.
 
     Coordinates are y = (theta, cube-root hyperparameters) and those of the grid: see `Split`.
-
-    Parameters
-    ----------
-    at : ndarray, shape (g,)
-        The grid's coordinates.
-    mode : ndarray, shape (D',)
-    factor : ArrowFactor
-        Of minus the Hessian, as of the last pass of the search, and made positive where it is not.
-    log_marginal : float
-        Laplace estimate of the log posterior density of the grid's coordinates, up to a constant.
     """
 
-    at: Float
-    mode: Float
+    at: Float  # the grid's coordinates (g,)
+    mode: Float  # y (D',) at the mode
+    # of minus the Hessian in the last step of the search, made positive where it is not
     factor: ArrowFactor
+    # Laplace estimate of the log posterior density of the grid's coordinates, up to a constant
     log_marginal: float
 
 
 @dataclass(frozen=True, eq=False)
 class Conditional(Node):
-    """A `Node` and its surroundings, as the search finds them.
+    """A `Node` with the derivatives that the search for its neighbours needs."""
 
-    Parameters
-    ----------
-    at, mode, factor, log_marginal
-        As in `Node`.
-    tangent : ndarray, shape (g, D')
-        Derivative of the mode by the grid's coordinates: where the search at a neighbour begins.
-    slope : ndarray, shape (g,)
-        Gradient by the grid's coordinates of the log posterior along the modes.
-    curvature : ndarray, shape (g, g)
-        Minus its Hessian.
-    """
-
+    # derivative (g, D') of the mode by the grid's coordinates, for the start at a neighbour
     tangent: Float
-    slope: Float
-    curvature: Float
+    slope: Float  # gradient (g,), by the grid's coordinates, of the log posterior along the modes
+    curvature: Float  # minus its Hessian (g, g)
 
 
 def starting_point(target: Target, fit: LinearFit) -> Float:
-    """Where to begin, (D,): the linear fit, and hyperparameters from what it rejected.
-
-    Parameters
-    ----------
-    target : Target
-    fit : LinearFit
-    """
+    """Starting point (D,): the linear fit, and hyperparameters from its rejected stars."""
     scale = target.hyper.scale
     excess = max(fit.chi2 / max(fit.dof, 1) - 1.0, 0.0)
     f = np.clip(fit.n_rejected / fit.n_rows, 0.5 / fit.n_rows, 0.9)
@@ -96,29 +71,11 @@ def conditional_mode(
     tolerance: float = 1e-9,
     max_steps: int = 60,
 ) -> Conditional:
-    """Mode of the posterior of everything that the grid does not hold.
+    """Mode of the posterior at the grid's coordinates `at` (g,), starting from y (D',).
 
-    Parameters
-    ----------
-    target : Target
-    split : Split
-    y : ndarray, shape (D',)
-        Starting point.
-    at : ndarray, shape (g,)
-        The grid's coordinates.
-    tolerance : float
-        The Newton decrement (expected gain in log density) at which to stop.  Where the curvature
-        is not positive, along a ridge, `ON_A_RIDGE` is enough: steps would be many and gain little.
-    max_steps : int
-
-    Returns
-    -------
-    Conditional
-
-    Raises
-    ------
-    DegenerateError
-        When no maximum is found, or the curvature there is not positive.
+    The search ends at a Newton decrement (expected gain in log density) of `tolerance`.  Where the
+    curvature is not positive, along a ridge, `ON_A_RIDGE` is enough: steps would be many and gain
+    little.  DegenerateError when no maximum is found, or the curvature there is not positive.
     """
     here = _expand(target, split, y, at)
     for _ in range(max_steps):
@@ -151,7 +108,7 @@ def conditional_mode(
             where="posterior",
             do="check the match, the errors and the outlier model",
         )
-    # the last step is made without another pass: what it gains is its decrement, to second order
+    # the last step needs no pass of its own: to second order its gain is its decrement
     gain = float(here.gradient @ (y - here.y)) / 2
     tangent = -factor.solve(here.coupling) if len(at) else here.coupling
     return Conditional(
@@ -166,9 +123,9 @@ def conditional_mode(
 
 
 def expected_mode(split: Split, node: Conditional, step: Float) -> Float:
-    """Where to begin the search at a point of the grid that is a step (g,) away from a node.
+    """Starting point for the search at a point of the grid that is a step (g,) away from a node.
 
-    The tangent may lead out of the support, to a fraction above one or below none: then it is the
+    The tangent may lead out of the support, to a fraction above one or below zero: then it is the
     node's own mode.
     """
     y = node.mode + step @ node.tangent
@@ -177,7 +134,7 @@ def expected_mode(split: Split, node: Conditional, step: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class _Expansion:
-    """Second-order expansion in the coordinates y at a point of the grid, and what couples both.
+    """Second-order expansion in the coordinates y at a point of the grid, and mixed derivatives.
 
     `slope` (g,) and `curvature` (g, g) are the gradient by the grid's coordinates and minus the
     Hessian; `coupling` (g, D') is minus the mixed derivatives.
@@ -195,11 +152,11 @@ class _Expansion:
 def _positive(
     target: Target, split: Split, here: _Expansion, at: Float
 ) -> tuple[ArrowFactor, bool]:
-    """Factor of the Hessian, made positive where it is not, and whether that was needed.
+    """Factor of the Hessian, made positive where it is not, and True if that was needed.
 
     The distortion part falls back to the EM weights.  The hyperparameters' Schur complement gets
-    eigenvalues of at least one, in units of half their own value: where outliers cannot be told
-    from the core, the posterior is flat in f and s_out, or even curved upwards.
+    eigenvalues of at least one, in units of half their own value: where outliers cannot be
+    separated from the core, the posterior is flat in f and s_out, or even curved upwards.
     """
     for em in (False, True):
         matrix = _expand(target, split, here.y, at, em=True).matrix if em else here.matrix

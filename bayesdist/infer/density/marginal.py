@@ -16,18 +16,14 @@ __all__ = ["Marginal", "cardinal"]
 
 Float = NDArray[np.float64]
 
-MESH = {1: 4001, 2: 401}  # points of each axis, by their number
+MESH = {1: 4001, 2: 401}  # points of each axis, by the number of axes
 
 
 def cardinal(axis: Float, *, local: bool) -> CubicSpline | CubicHermiteSpline:
     """Splines (len(axis),) that are one at their own node and zero at the others.
 
-    Parameters
-    ----------
-    axis : ndarray, shape (n,)
-    local : bool
-        Slopes of the parabolas through three nodes each, so that a node is not felt beyond its
-        neighbours' neighbours; else natural splines, which are smoother.
+    If `local`, slopes are those of the parabolas through three nodes each, so that a node has no
+    effect beyond its neighbours' neighbours; else natural splines, which are smoother.
     """
     unit = np.eye(len(axis))
     if not local:
@@ -37,31 +33,19 @@ def cardinal(axis: Float, *, local: bool) -> CubicSpline | CubicHermiteSpline:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """A normalised density in no, one or two dimensions, to be drawn from and evaluated.
-
-    Parameters
-    ----------
-    first : PiecewiseExponential or None
-        Of the first coordinate.
-    second : tuple of PiecewiseExponential
-        Of the second one, in the neighbourhood of each mesh point of the first.
-    """
+    """A normalised density in zero, one or two dimensions, to be drawn from and evaluated."""
 
     first: PiecewiseExponential | None
+    # of the second coordinate, around each mesh point of the first
     second: tuple[PiecewiseExponential, ...] = ()
 
     @classmethod
     def of(cls, names: Sequence[str], axes: Sequence[Float], values: Float) -> Marginal:
-        """Interpolate log densities at the nodes of a product grid.
+        """Density interpolated from log densities at the nodes of a product grid.
 
-        Parameters
-        ----------
-        names : sequence of str
-            Hyperparameters of the axes: what is known of their tails.
-        axes : sequence of ndarray
-        values : ndarray, one dimension for each axis
+        `names` are the hyperparameters of the axes, which give the slopes of their tails.
         """
-        # along one axis the nodes are where they are needed; a product has some far below the top
+        # along one axis the nodes are where the density is; a product has some far below the top
         kind = CubicSpline if len(axes) == 1 else PchipInterpolator
         meshes = [np.linspace(axis[0], axis[-1], MESH[len(axes)]) for axis in axes]
         for k, (axis, mesh) in enumerate(zip(axes, meshes, strict=True)):
@@ -93,7 +77,7 @@ class Marginal:
         return out
 
     def _conditionals(self, at: Float) -> Iterator[tuple[NDArray[np.bool_], PiecewiseExponential]]:
-        """Which points have which density of their second coordinate."""
+        """Masks (n,) of points, with the density of their second coordinate."""
         if self.first is None or not self.second:
             return
         mesh = self.first.mesh

@@ -11,16 +11,10 @@ Float = NDArray[np.float64]
 
 
 class PiecewiseExponential:
-    """A density whose logarithm is linear between mesh points and beyond them.
+    """Density whose logarithm is linear between ascending mesh points (m,) and beyond them.
 
-    Parameters
-    ----------
-    mesh : ndarray, shape (m,)
-        Rising.
-    values : ndarray, shape (m,)
-        Log density there, up to a constant.
-    left_slope, right_slope : float
-        Beyond the mesh: positive and negative.
+    `values` (m,) are log densities up to a constant; beyond the mesh `left_slope` is positive and
+    `right_slope` negative.
     """
 
     def __init__(self, mesh: Float, values: Float, left_slope: float, right_slope: float) -> None:
@@ -48,7 +42,7 @@ class PiecewiseExponential:
         return self.values[anchor] + self.slopes[k] * (x - self.mesh[anchor])
 
     def quantile(self, p: Float) -> Float:
-        """Where the distribution reaches probabilities."""
+        """Points at which the distribution function equals probabilities."""
         m = np.clip(p, 1e-300, 1 - 1e-16) * self.total
         k = np.clip(np.searchsorted(self.cumulative, m, side="right") - 1, 0, len(self.slopes) - 1)
         share = (m - self.cumulative[k]) / (self.cumulative[k + 1] - self.cumulative[k])
@@ -56,7 +50,7 @@ class PiecewiseExponential:
         last = len(self.slopes) - 1
         left, right = self.mesh[np.maximum(k - 1, 0)], self.mesh[np.minimum(k, last - 1)]
         rise = self.slopes[k] * (right - left)  # of the cell; 0 for the tails
-        # from the higher end: share of the mass beyond x, and how far down the cell that is
+        # from the higher end: fraction of the mass beyond x, and depth in the cell at which that is
         beyond = np.where(rise > 0, 1 - share, share)
         fall = np.abs(rise)
         flat = fall < 1e-9

@@ -1,11 +1,11 @@
-"""The independence proposal: a Laplace approximation at each node of a grid.
+"""Independence proposal: a Laplace approximation at each node of a grid.
 
 When the quoted errors are right, the jitter piles up at its bound and a single Gaussian misses the
 tail of log j while its acceptance still looks fine.  Here log j is drawn from its marginal,
 interpolated over about 25 values, with the exact exponential tail that prior and Jacobian give at
 small j; everything else is drawn from the conditional Gaussian.
 
-A table with next to no false matches says little of their scale, and the fraction that it allows
+A table with next to no false matches hardly determines their scale, and the fraction that it allows
 depends on that scale by orders of magnitude.  Then the grid has log s_out as its second axis, and
 the conditional of f has heavier tails than a Gaussian: one doubtful star skews it.
 """
@@ -31,7 +31,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Random = np.random.Generator | np.random.RandomState
 
-WIDE, SHARE = 2.0, 0.1  # how much wider, and how often, draws of an uncertain f are
+WIDE, SHARE = 2.0, 0.1  # draws of an uncertain f are so much wider, so often
 
 
 class Proposal(Protocol):
@@ -39,7 +39,7 @@ class Proposal(Protocol):
 
     @property
     def best(self) -> Node:
-        """The Laplace approximation where the grid's coordinates are most probable."""
+        """Laplace approximation where the grid's coordinates are most probable."""
 
     def draw(self, n: int, rng: Random) -> Float:
         """Points (n, D) in sampled coordinates; NaN where a draw falls outside the support."""
@@ -52,12 +52,8 @@ class Proposal(Protocol):
 class GridProposal:
     """Proposal density q(psi), to be drawn from and evaluated.
 
-    Parameters
-    ----------
-    split : Split
-    nodes : tuple of Node
-        On the product of the axes that `split` holds, the last of them running fastest; a single
-        one where none is held.
+    The nodes are on the product of the axes of `split`, the last of them running fastest; a single
+    one where no hyperparameter is on the grid.
     """
 
     split: Split
@@ -65,7 +61,7 @@ class GridProposal:
 
     @cached_property
     def best(self) -> Node:
-        """The node with the largest marginal density."""
+        """Node with the largest marginal density."""
         return max(self.nodes, key=lambda node: node.log_marginal)
 
     @cached_property
@@ -92,9 +88,9 @@ class GridProposal:
 
     @cached_property
     def _between(self) -> Float:
-        """What is interpolated (nodes, 2 D'): means, and logarithms of the standard deviations.
+        """Interpolated quantities (nodes, 2 D'): means, and logarithms of the standard deviations.
 
-        Of the hyperparameters, which change by orders of magnitude, the means' logarithms.
+        The means of the hyperparameters, which change by orders of magnitude, are logarithms too.
         """
         means, n = self._modes.copy(), self.split.n_theta
         means[:, n:] = np.log(means[:, n:])
@@ -103,14 +99,13 @@ class GridProposal:
 
     @property
     def _n_wide(self) -> int:
-        """How many of the last coordinates have heavier tails."""
+        """Number of the last coordinates that have heavier tails."""
         return len(self.split.rest) if "s_out" in self.split.held else 0
 
     def _conditional(self, at: Float) -> tuple[Float, Float, Int]:
-        """Conditional mean (n, D'), and the nearest node (n,) with the factors (n, D').
+        """Conditional mean (n, D'), and nearest node (n,) with factors (n, D') on its sigma.
 
-        By these its standard deviations are to be multiplied: correlations hardly change from node
-        to node.
+        Correlations hardly change from node to node, so only standard deviations are scaled.
         """
         weights, nearest = np.ones((len(at), 1)), np.zeros(len(at), np.int64)
         local = len(self._axes) > 1
@@ -158,7 +153,7 @@ class GridProposal:
     # -- as arrays, for checkpoints ---------------------------------------------------------------
 
     def to_arrays(self) -> dict[str, Float]:
-        """Everything needed to build it again, bit for bit."""
+        """Arrays by name from which `from_arrays` builds it again, bit for bit."""
         return {
             "at": self._at,
             "held": np.array(self.split.columns[0], float),
@@ -173,7 +168,7 @@ class GridProposal:
     def from_arrays(
         cls, n_theta: int, hyper: tuple[str, ...], arrays: Mapping[str, Float]
     ) -> GridProposal:
-        """The proposal that `to_arrays` stored; the rest as in `Split`."""
+        """Proposal from the arrays of `to_arrays`; other arguments as in `Split`."""
         split = Split(n_theta, hyper, tuple(hyper[int(k)] for k in arrays["held"]))
         n_tail = len(split.rest)
         matrices = zip(arrays["border"], arrays["edge"], arrays["blocks"], strict=True)

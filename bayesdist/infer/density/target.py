@@ -1,4 +1,4 @@
-"""The posterior density as a function: parameters in, log density out, for many points at once."""
+"""The posterior density as a function of parameters, for many points at once."""
 
 from __future__ import annotations
 
@@ -22,23 +22,14 @@ __all__ = ["Target"]
 
 Float = NDArray[np.float64]
 
-SCRATCH = 32_000_000  # bytes of effective coefficients held at a time
+SCRATCH = 32_000_000  # bytes of effective coefficients in memory at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
     """Posterior density of psi = (theta, hyperparameters).
 
-    Parameters
-    ----------
-    shards : Shards
-    mixture : OutlierMixture
-    priors : GaussianPriors
-
-    Raises
-    ------
-    InputError
-        For a star outside the circle in which it was matched.
+    InputError for a star outside the circle in which it was matched.
     """
 
     shards: Shards
@@ -69,7 +60,7 @@ class Target:
         return self.model.names + self.hyper.names
 
     def log_density(self, psi: Float) -> Float:
-        """Log posterior of points (n, D), up to a constant: one sweep over the data for all.
+        """Log posterior of points (n, D), up to a constant, from one pass over the data for all.
 
         Points outside the support, or not finite, give minus infinity.
         """
@@ -84,20 +75,10 @@ class Target:
         return out
 
     def expand(self, psi: Float, *, em: bool = False) -> tuple[float, Float, Arrow]:
-        """Second-order expansion of the log posterior at one point: one pass over the data.
+        """Value, gradient (D,) and minus the Hessian of the log posterior at one point: one pass.
 
-        Parameters
-        ----------
-        psi : ndarray, shape (D,)
-        em : bool
-            Curvature from the EM weights, whose distortion part is never indefinite.
-
-        Returns
-        -------
-        value : float
-        gradient : ndarray, shape (D,)
-        curvature : Arrow
-            Minus the Hessian; may be indefinite away from the mode.
+        With `em` the curvature has the EM weights, whose distortion part is never indefinite;
+        otherwise it may be indefinite away from the mode.
         """
         model = self.model
         theta, h = psi[: self.n_theta], psi[self.n_theta :]

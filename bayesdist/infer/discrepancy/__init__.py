@@ -1,4 +1,4 @@
-"""Discrepancy: what lies outside the fitted model, with priors and posteriors of its own."""
+"""Discrepancy: structure outside the fitted model, with priors and posteriors of its own."""
 
 from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
 from bayesdist.infer.discrepancy.result import Discrepancy

@@ -1,7 +1,7 @@
 """Scores, curvatures and squared scores summed over small cells of the detector: one pass.
 
-Cells are so small that all functions that are asked of them are smooth within one: what follows
-then needs no star again, however many there are.
+Cells are so small that all functions evaluated on them are smooth within one: later steps then need
+no star again, however many there are.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.stars.likelihood import Scores
-from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.posterior.likelihood import Scores
+from bayesdist.infer.stars.stars import Stars, cell_of
 from bayesdist.model import Groups, merge_groups
 
 __all__ = ["CellSums", "cell_sums", "cells_per_side"]
@@ -20,31 +20,21 @@ __all__ = ["CellSums", "cell_sums", "cells_per_side"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-# cells along each side of a chip, by the number of groups at most: memory and time are bounded
+# cells along each side of a chip, by largest number of groups: limits memory and time
 SIDES = ((8, 64), (32, 48), (10**9, 32))
 COLUMNS = 9  # n, g_u, g_v, h_uu, h_uv, h_vv, g_u^2, g_u g_v, g_v^2
 
 
 @dataclass(frozen=True, eq=False)
 class CellSums:
-    """Sums over the stars of each group and cell; those of pieces of the data add.
-
-    Parameters
-    ----------
-    groups : Groups
-    side : int
-        Cells on each side of a chip.
-    sums : ndarray, shape (G, C, 9)
-        Number of stars, gradient of the log-likelihood by the model's u and v, minus its second
-        derivatives uu, uv, vv, and products of the gradients uu, uv, vv.
-    position : ndarray, shape (chips, C, 3)
-        Number of stars and sums of their scaled positions X and Y.
-    """
+    """Sums over the stars of each group and cell, which add over chunks of the data."""
 
     groups: Groups
-    side: int
+    side: int  # cells on each side of a chip
+    # (G, C, 9) number of stars, gradient of the log-likelihood by the model's u and v, minus its
+    # second derivatives uu, uv, vv, and products of the gradients uu, uv, vv
     sums: Float
-    position: Float
+    position: Float  # (chips, C, 3) number of stars and sums of their scaled positions X and Y
 
     def __add__(self, other: CellSums) -> CellSums:
         groups, sums = self.groups, self.sums
@@ -65,34 +55,19 @@ class CellSums:
 
 
 def cells_per_side(n_groups: int) -> int:
-    """Cells on each side of a chip for so many groups."""
+    """Number of cells on each side of a chip for this number of groups."""
     return next(side for most, side in SIDES if n_groups <= most)
 
 
 def cell_sums(stars: Stars, scores: Scores, side: int) -> CellSums:
-    """Sums over some stars: a task for `Shards.sum`.
-
-    Parameters
-    ----------
-    stars : Stars
-    scores : Scores
-    side : int
-        Cells on each side of a chip.
-
-    Returns
-    -------
-    CellSums
-    """
+    """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`."""
     g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
-    # Where it is open whether a star is a false match its curvature is negative.  Such stars say
-    # nothing here, so that every sum of curvatures is that of a possible likelihood.
+    # Where a star may or may not be a false match its curvature is negative.  Such stars are left
+    # out, so that every sum of curvatures is that of a possible likelihood.
     good = (h_uu > 0) & (h_vv > 0)
     h_uu, h_uv, h_vv = (np.where(good, h, 0.0) for h in (h_uu, h_uv, h_vv))
     columns = (None, g_u, g_v, h_uu, h_uv, h_vv, g_u**2, g_u * g_v, g_v**2)
-    ix, iy = (
-        np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (stars.X, stars.Y)
-    )
-    code, C, G = iy * side + ix, side * side, len(stars.groups)
+    code, C, G = cell_of(stars.X, stars.Y, side), side * side, len(stars.groups)
     sums = np.zeros((G, C, COLUMNS))
     position = np.zeros((len(stars.model.chips), C, 3))
     for g, chip in enumerate(stars.groups.chip):

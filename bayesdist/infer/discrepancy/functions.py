@@ -1,9 +1,9 @@
-"""Functions over a chip that stand for what the polynomial leaves out.
+"""Functions over a chip that represent structure outside the polynomial.
 
 Legendre products above the model's order, and sines on a box that is larger than the chip, whose
 coefficients are independent with the spectrum of a Matern field for their variances (Solin and
-Sarkka 2020, Statistics and Computing 30, 419).  What the sines have in common with the model's
-polynomials, over the whole chip, is taken off them.
+Sarkka 2020, Statistics and Computing 30, 419).  The part of the sines that the model's polynomials
+can represent, over the whole chip, is subtracted.
 """
 
 from __future__ import annotations
@@ -22,36 +22,26 @@ __all__ = ["StructureFunctions", "legendre_products"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-ORDERS = 3  # above the model's
+ORDERS = 3  # Legendre orders above the model's
 FALL = 0.5  # rms of an order relative to the one below it
-MARGIN = 0.3  # of the longer half side, by which the box is larger than the chip
-SMOOTHNESS = 1.5  # of the Matern field: it has a slope
-FINE = 48  # waves that stand for what is finer than the sines
+MARGIN = 0.3  # fraction of the longer half side by which the box is larger than the chip
+SMOOTHNESS = 1.5  # of the Matern field: its slope exists
+FINE = 48  # waves that represent structure finer than the sines
 LEAST_SIDE, MOST_SIDE = 6, 20  # sines along a square chip
 STARS_PER_SINE = 4.0
 
 
 @dataclass(frozen=True)
 class StructureFunctions:
-    """Functions over one chip; all of unit mean square before their coefficients' scales.
+    """Functions over one chip, all of unit mean square before their coefficients' scales."""
 
-    Parameters
-    ----------
-    order : int
-        Of the fitted polynomial.
-    size : tuple of float
-        Columns and rows of the chip.
-    n_side : int
-        Sines along the longer side of the box, were it a square.
-    """
-
-    order: int
-    size: tuple[float, float]
-    n_side: int
+    order: int  # of the fitted polynomial
+    size: tuple[float, float]  # columns and rows of the chip
+    n_side: int  # sines along the longer side of the box, were it a square
 
     @classmethod
     def for_stars(cls, order: int, size: tuple[float, float], n: int) -> StructureFunctions:
-        """As many functions as so many stars on the chip can tell apart."""
+        """As many functions as n stars on the chip can resolve."""
         side = int(np.clip(np.sqrt(n / STARS_PER_SINE), LEAST_SIDE, MOST_SIDE))
         return cls(order, size, side)
 
@@ -68,7 +58,7 @@ class StructureFunctions:
 
     @property
     def n_terms(self) -> int:
-        """Number of these."""
+        """Number of Legendre products."""
         return len(self.terms)
 
     @cached_property
@@ -87,7 +77,7 @@ class StructureFunctions:
 
     @cached_property
     def frequency(self) -> Float:
-        """Angular frequency (m,) of each sine, in that unit."""
+        """Angular frequency (m,) of each sine, in the unit of `cut`."""
         return np.hypot(*(np.pi * self._waves / (2 * (self._half + MARGIN))).T)
 
     @property
@@ -97,7 +87,7 @@ class StructureFunctions:
 
     @property
     def n_known(self) -> int:
-        """Functions of which the data can tell something: terms and sines."""
+        """Number of functions that the data can determine: terms and sines."""
         return self.n_terms + self.n_sines
 
     def decline(self) -> Float:
@@ -140,7 +130,7 @@ class StructureFunctions:
 
     @cached_property
     def _in_polynomials(self) -> Float:
-        """What the sines have of each of the model's polynomials, (K, n_sines)."""
+        """Projections (K, n_sines) of the sines on the model's polynomials."""
         low = polynomial_terms(self.order)
         nodes, weights = legendre.leggauss(2 * self.n_side + self.order + 8)
         one = [
@@ -151,7 +141,7 @@ class StructureFunctions:
         return np.stack([one[0][i, a] * one[1][j, b] for a, b in low])
 
     def finer_waves(self, rng: np.random.Generator) -> Float:
-        """Wave vectors (FINE, 2) of what is finer than the sines, in inverse half sides."""
+        """Wave vectors (FINE, 2) of structure finer than the sines, in inverse half sides."""
         frequency = self.cut * rng.uniform(size=FINE) ** (-1 / (2 * SMOOTHNESS))
         angle = rng.uniform(0, 2 * np.pi, FINE)
         return frequency[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])

@@ -1,4 +1,4 @@
-"""What cells say of the model's parameters, and of any further functions beside them."""
+"""Information of the cells about the model's parameters, and about any further functions."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bayesdist.infer.discrepancy.cells import CellSums
 from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.model import DistortionModel
 
 __all__ = ["GroupCells", "Information"]
@@ -19,51 +20,27 @@ __all__ = ["GroupCells", "Information"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-# A star that determines a parameter alone has no residual; its squared score says nothing.
+# A star that alone determines a parameter has no residual: its squared score is uninformative.
 LEAST_FREE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class GroupCells:
-    """One group of stars, cell by cell.
+    """One group of stars, cell by cell."""
 
-    Parameters
-    ----------
-    chip, exposure : int
-        Codes.
-    epoch : float
-    X, Y : ndarray, shape (C,)
-        Scaled positions.
-    phi : ndarray, shape (C, K)
-        The model's basis there.
-    count : ndarray, shape (C,)
-    score : ndarray, shape (C, 2)
-        Gradient of the log-likelihood by the model's u and v.
-    curvature : ndarray, shape (C, 2, 2)
-        Minus its second derivatives.
-    squares : ndarray, shape (C, 2, 2)
-        Sums of products of the stars' own gradients.
-    columns : ndarray of int, shape (m,)
-        Parameters that move these positions.
-    derivative : ndarray, shape (2, K, m)
-        Of the effective coefficients by them.
-    frame : ndarray, shape (2, 2)
-        From the axes of the polynomials to those of u and v.
-    """
-
-    chip: int
-    exposure: int
+    chip: int  # code
+    exposure: int  # code
     epoch: float
-    X: Float
+    X: Float  # scaled positions (C,)
     Y: Float
-    phi: Float
-    count: Float
-    score: Float
-    curvature: Float
-    squares: Float
-    columns: Int
-    derivative: Float
-    frame: Float
+    phi: Float  # the model's basis (C, K) there
+    count: Float  # number of stars (C,)
+    score: Float  # gradient (C, 2) of the log-likelihood by the model's u and v
+    curvature: Float  # minus its second derivatives (C, 2, 2)
+    squares: Float  # sums (C, 2, 2) of products of the stars' own gradients
+    columns: Int  # indices (m,) of the parameters that move these positions
+    derivative: Float  # of the effective coefficients by them (2, K, m)
+    frame: Float  # matrix (2, 2) from the axes of the polynomials to those of u and v
 
     def onto_parameters(self, values: Float) -> Float:
         """Sums (m, q) of J^T values, given values (C, 2, q) along u and v."""
@@ -73,23 +50,14 @@ class GroupCells:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Likelihood of all cells about a solution, to second order.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-    sums : CellSums
-    priors : GaussianPriors
-    excess : ndarray, shape (chips, C, 2), optional
-        Variance of the gradients relative to their curvature, by chip, cell of the square grid and
-        axis; 1 by default, as it is where the likelihood is right.
-    """
+    """Likelihood of all cells about a solution, to second order."""
 
     model: DistortionModel
     theta: Float
     sums: CellSums
     priors: GaussianPriors
+    # variance (chips, C, 2) of the gradients relative to their curvature, by chip, cell of the
+    # square grid and axis; 1 by default, as where the likelihood is right
     excess: Float | None = None
 
     def groups(self) -> Iterator[GroupCells]:
@@ -145,17 +113,14 @@ class Information:
 
     @cached_property
     def precision(self) -> Float:
-        """Information of all parameters with their priors, (D, D)."""
+        """Information (D, D) of all parameters with their priors."""
         matrix = self._assembled([cells.curvature for cells in self.groups()])
         return matrix + np.diag(self.priors.precision)
 
     @cached_property
     def covariance(self) -> Float:
-        """Its inverse: formal where the likelihood is right."""
-        scale = 1 / np.sqrt(np.diag(self.precision))
-        inverse = np.linalg.inv(self.precision * np.outer(scale, scale))
-        inverse = inverse * np.outer(scale, scale)
-        return (inverse + inverse.T) / 2
+        """Inverse (D, D) of `precision`; formal where the likelihood is right."""
+        return scaled_inverse(self.precision)
 
     @cached_property
     def score(self) -> Float:
@@ -170,11 +135,11 @@ class Information:
         return out
 
     def with_excess(self, excess: Float) -> Information:
-        """The same cells with the likelihood flattened where gradients vary more than it says."""
+        """Information of these cells, its likelihood flattened by the excess (chips, C, 2)."""
         return replace(self, excess=excess)
 
     def leverage(self, cells: GroupCells) -> Float:
-        """Fraction (C, 2) of its own residual that a star of each cell takes, on each axis."""
+        """Fraction (C, 2) of its own residual that a star of each cell absorbs, on each axis."""
         cov = self.covariance[np.ix_(cells.columns, cells.columns)]
         d = cells.derivative
         within = np.einsum("akm,mn,aln->akl", d, cov, d, optimize=True)
@@ -183,7 +148,7 @@ class Information:
         return np.asarray(np.clip(per_star * variance, 0.0, 1 - LEAST_FREE))
 
     def sandwich(self) -> Float:
-        """Covariance (D, D) of the parameters whatever the variances of single stars.
+        """Covariance (D, D) of the parameters, valid for any variances of single stars.
 
         Each squared score is divided by the square of one minus its leverage (HC3 of MacKinnon and
         White 1985, Journal of Econometrics 29, 305): a jackknife, to first order.

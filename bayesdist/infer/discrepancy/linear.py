@@ -1,8 +1,8 @@
 """Linear deviations of exposures from one another, and the curvature of drifts.
 
-Both are seen in differences between exposures only, and few of these say little: two exposures say
-nothing of a curvature, and next to nothing of a scatter when a drift is fitted to them.  Then the
-prior decides, as it must where one extrapolates.
+Both are seen in differences between exposures only, and few of these determine little: two
+exposures do not determine a curvature, and hardly a scatter when a drift is fitted to them.  Then
+the prior decides, as it must in any extrapolation.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = [
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-# deviations of an exposure by what scatters together, and the frames that fit them already
+# deviations of an exposure that scatter together, and the frames that fit them already
 KINDS = {
     "shift": ("shift", "shift_rotation", "shift_rotation_scale", "affine"),
     "rotation": ("shift_rotation", "shift_rotation_scale", "affine"),
@@ -41,46 +41,30 @@ KINDS = {
 SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
 CURVATURE = "curvature"
 MOST_EXPOSURES = 40
-# amplitudes of each scatter that are gone through, by how many scatters there are: first to see
-# where the density is, then there alone
+# steps in each amplitude, by the number of scatters: first to find where the density is, then only
+# there
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
-RANGE = 10.0  # of amplitudes about the prior's median and what the data resolve
+RANGE = 10.0  # range of amplitudes about the prior's median and the resolution of the data
 NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
 
 
 @dataclass(frozen=True, eq=False)
 class LinearDeviations:
-    """Draws of the deviations of exposures, and of the curvature of the drift.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (n, D)
-        What the deviations did to the parameters of the fit, with the sign of its error.
-    terms : tuple of (int, int, int)
-        Chip (by code), axis and basis function that bends in time.
-    curvature : ndarray, shape (n, terms)
-        In the unit of u, v per squared year; half of it multiplies the squared time.
-    epoch : float
-        About which time is counted, in decimal years; NaN without curvature.
-    scatter : dict of str to ndarray, shape (n,)
-        Draws of each scatter.
-    n_exposures : int
-    kinds : tuple of str
-        Deviations of each exposure: of 'shift', 'rotation', 'scale' and 'shear'.
-    size : float
-        Half the longer side of a chip, in the unit of u, v: that of a shift of 1.
-    """
+    """Draws of the deviations of exposures, and of the curvature of the drift."""
 
     model: DistortionModel
+    # effect (n, D) of the deviations on the parameters of the fit, with the sign of its error
     theta: Float
+    # chip (by code), axis and basis function that is curved in time
     terms: tuple[tuple[int, int, int], ...]
+    # (n, terms) in the unit of u, v per squared year; half of it multiplies the squared time
     curvature: Float
-    epoch: float
-    scatter: dict[str, Float]
+    epoch: float  # zero of time, decimal years; NaN without curvature
+    scatter: dict[str, Float]  # draws (n,) of each scatter
     n_exposures: int
+    # deviations of each exposure: of 'shift', 'rotation', 'scale' and 'shear'
     kinds: tuple[str, ...] = ()
-    size: float = 1.0
+    size: float = 1.0  # half the longer side of a chip, in the unit of u, v: that of a shift of 1
 
     def polynomials(self, epoch: float | None, chip: int) -> Float:
         """Coefficients (n, 2, K) on a chip of the curvature alone, at an epoch."""
@@ -92,15 +76,9 @@ class LinearDeviations:
         return out
 
     def of_single_exposures(self, mean: Float, chip: int, rng: np.random.Generator) -> Float:
-        """Coefficients (n, 2, K) of the deviation of an exposure that is yet to come.
+        """Coefficients (n, 2, K) on a chip (by number) of the deviation of a future exposure.
 
-        Parameters
-        ----------
-        mean : ndarray, shape (D,)
-            Parameters, whose polynomials are deformed.
-        chip : int
-            Number.
-        rng : numpy.random.Generator
+        The polynomials of the parameters `mean` (D,) are deformed.
         """
         code, n = self.model.chip_code(chip), len(self.theta)
         at = np.array([self.model.time.epoch0[0] if self.model.time else 0.0])
@@ -124,43 +102,25 @@ class LinearDeviations:
 
 @dataclass(frozen=True, eq=False)
 class DeviationColumns:
-    """Functions whose coefficients scatter: displacements of the stars of some groups.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-    kinds : tuple of str
-        Deviations of each exposure.
-    terms : tuple of (int, int, int)
-        Chip (by code), axis and basis function that bends in time.
-    scatter : ndarray of str, shape (n,)
-        Of which scatter each coefficient is.
-    of_group : ndarray of int, shape (G,)
-        Exposure of each group of stars, from 0.
-    n_exposures : int
-    middle : float
-        Date about which time is counted; NaN without terms.
-    size : float
-        Half the longer side of a chip, in the unit of u, v.
-    """
+    """Functions whose coefficients scatter: displacements of the stars of some groups."""
 
     model: DistortionModel
     theta: Float
-    kinds: tuple[str, ...]
+    kinds: tuple[str, ...]  # deviations of each exposure
+    # chip (by code), axis and basis function that is curved in time
     terms: tuple[tuple[int, int, int], ...]
-    scatter: NDArray[np.str_]
-    of_group: Int
+    scatter: NDArray[np.str_]  # name (n,) of the scatter that each coefficient has
+    of_group: Int  # exposure (G,) of each group of stars, from 0
     n_exposures: int
-    middle: float
-    size: float
+    middle: float  # zero of time; NaN without terms
+    size: float  # half the longer side of a chip, in the unit of u, v
 
     def __len__(self) -> int:
         return len(self.scatter)
 
     @property
     def n_of_exposures(self) -> int:
-        """Number of the coefficients that are deviations of exposures; they come first."""
+        """Number of coefficients that are deviations of exposures; they come first."""
         return len(self) - len(self.terms)
 
     def positions(self, chip: int, epoch: float, phi: Float) -> Float:
@@ -169,17 +129,9 @@ class DeviationColumns:
         return np.asarray(phi @ poly[..., 0, :, :].T)
 
     def at(self, g: int, chip: int, epoch: float, phi: Float, centre: Float) -> tuple[Int, Float]:
-        """Which functions (q,) displace stars of a group, and by what (C, 2, q).
+        """Indices (q,) of the functions that displace stars of a group, and their values (C, 2, q).
 
-        Parameters
-        ----------
-        g, chip : int
-            Number of the group, and code of its chip.
-        epoch : float
-        phi : ndarray, shape (C, K)
-            The model's basis at the stars.
-        centre : ndarray, shape (2,)
-            About which exposures deviate.
+        Exposures deviate about `centre` (2,); `phi` (C, K) is the model's basis at the stars.
         """
         own = _deviations(self.positions(chip, epoch, phi) - centre, self.kinds, self.size)
         columns = int(self.of_group[g]) * own.shape[2] + np.arange(own.shape[2])
@@ -203,23 +155,9 @@ def deviation_columns(
 ) -> DeviationColumns | None:
     """Deviations that the frames of a model do not fit, and curvatures of its drift.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-    groups : Groups
-    counts : ndarray, shape (G,)
-        Stars of each group.
-    exposures : bool
-        Whether single exposures deviate; not where a hierarchy of them has been fitted.
-    most : int
-        Exposures of which single deviations are told: the scatter of more averages out.
-
-    Returns
-    -------
-    DeviationColumns or None
-        None where nothing can deviate: without a drift for a single exposure, and for more than so
-        many.
+    `counts` (G,) is the number of stars of each group.  Single exposures deviate only if
+    `exposures`; not where a hierarchy of them has been fitted.  None where nothing can deviate:
+    without a drift for a single exposure, and for more than `most`, whose scatter averages out.
     """
     keys = np.column_stack([groups.exposure, groups.epoch])
     distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
@@ -254,25 +192,10 @@ def linear_deviations(
     *,
     exposures: bool = True,
 ) -> LinearDeviations | None:
-    """Posterior of the deviations of exposures and of the curvature of drifts, as draws.
+    """Posterior draws of the deviations of exposures and of the curvature of drifts.
 
-    Parameters
-    ----------
-    information : Information
-        With the excess of the scores.
-    working : Information
-        Of the likelihood that the solution was made with.
-    priors : DiscrepancyPriors
-    n : int
-        Draws.
-    rng : numpy.random.Generator
-    exposures : bool
-        As `deviation_columns`.
-
-    Returns
-    -------
-    LinearDeviations or None
-        None where nothing can deviate.
+    `information` has the excess of the scores, `working` is that of the likelihood of the solution.
+    None where nothing can deviate.
     """
     model = working.model
     counts = np.array([c.count.sum() for c in working.groups()])
@@ -318,16 +241,8 @@ def deviation_draws(
 ) -> LinearDeviations:
     """Posterior draws of deviations, the sizes of their scatters marginalised.
 
-    Parameters
-    ----------
-    columns : DeviationColumns
-    S, score : ndarray, shape (q, q), (q,)
-        Information and score of their coefficients, with what the fit takes eliminated.
-    taken : ndarray, shape (D, q)
-        What a fit makes of a unit of each.
-    priors : DiscrepancyPriors
-    n : int
-    rng : numpy.random.Generator
+    S (q, q) and `score` (q,) are information and score of the coefficients, with what the fit
+    absorbs eliminated; `taken` (D, q) is the effect of a unit of each on the fit.
     """
     total, scatter = len(columns), columns.scatter
     S = (S + S.T) / 2
@@ -351,7 +266,7 @@ def deviation_draws(
     S = (vectors * np.maximum(values, 0.0)) @ vectors.T
 
     def conditional(amplitude: Float) -> tuple[Float, Float, Float]:
-        """Scales, factor of the precision, and the score in its terms, of scaled coefficients."""
+        """Scales of the coefficients, factor of their scaled precision, and the scaled score."""
         spread = amplitude[index]
         scaled = S * np.outer(spread, spread) + np.eye(total)
         factor = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
@@ -385,7 +300,7 @@ def deviation_draws(
     coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
     return LinearDeviations(
         model=columns.model,
-        # the fit takes a deviation for its own; the truth lies on the other side
+        # the fit absorbs a deviation; the truth lies on the other side
         theta=-coefficients @ taken.T,
         terms=columns.terms,
         curvature=coefficients[:, columns.n_of_exposures :] * columns.size,
@@ -409,7 +324,7 @@ def _where_it_counts(grids: Sequence[Float], weight: Float) -> list[Float]:
 
 
 def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:
-    """Functions that may bend in time: those that the model lets drift, on each chip."""
+    """Functions that may be curved in time: those that drift in the model, on each chip."""
     if model.time is None:
         return ()
     out = []

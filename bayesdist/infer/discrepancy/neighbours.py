@@ -1,13 +1,14 @@
-"""What is finer than the structure's functions, from products of neighbouring stars' scores.
+"""Structure finer than the functions, from products of neighbouring stars' scores.
 
-A pattern of a few tens of pixels is next to white noise for all functions that the stars can tell
-apart, and yet stars that lie side by side have it in common.  With scores g and curvatures h of
-stars whose own errors are independent, a displacement with covariance C(d) at separation d makes
+A pattern of a few tens of pixels is hardly different from white noise for all functions that the
+stars can resolve, and yet stars that lie next to each other share it.  With scores g and curvatures
+h of stars whose own errors are independent, a displacement with covariance C(d) at separation d
+makes
 
     sum g_i g_j = C(d) sum h_i h_j
 
-on the mean over pairs, but for what the fit has taken of them and what is smooth.  Both are the
-same for pairs that are a little farther apart: the difference to these is looked at.
+on the mean over pairs, but for the parts that the fit has absorbed and that are smooth.  Both are
+the same for pairs a little farther apart, so that only the difference to these is used.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.posterior.likelihood import Scores
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 
@@ -29,32 +30,22 @@ __all__ = ["SharedVariance", "shared_variances"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])  # of separations, in pixels; the last is apart
+# of separations, in pixels; the last bin is of pairs farther apart
+EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])
 MOST_PAIRS = 2_000_000
-SHAPE = 0.3  # by which the correlation at a separation may be another: patterns are periodic
-FEWEST_PAIRS = 50  # of a bin: fewer have no variance of their own
+SHAPE = 0.3  # by which the correlation at a separation may differ: patterns are periodic
+FEWEST_PAIRS = 50  # of a bin; the variance of fewer cannot be estimated
 
 
 @dataclass(frozen=True, eq=False)
 class SharedVariance:
-    """What pairs on one axis of a chip tell of the covariance of their displacements.
+    """Covariance of displacements of neighbouring stars, on one axis of a chip."""
 
-    Parameters
-    ----------
-    separation : ndarray, shape (b,)
-        Mean one of each bin, in longer half sides of the chip.
-    apart : float
-        That of the pairs farther apart.
-    covariance : ndarray, shape (b,)
-        Beyond that of these, in the squared unit of u, v.
-    variance : ndarray, shape (b,)
-        Of it, by the scatter of the products.
-    """
-
-    separation: Float
-    apart: float
+    separation: Float  # mean (b,) of each bin, in longer half sides of the chip
+    apart: float  # mean separation of the pairs farther apart
+    # (b,) in excess of that of the pairs farther apart, in the squared unit of u, v
     covariance: Float
-    variance: Float
+    variance: Float  # (b,) of the covariance, by the scatter of the products
 
     def of_field(self, length: float) -> Callable[[float], float]:
         """Log likelihood of a Matern field's amplitude, by its correlation length in half sides."""
@@ -77,21 +68,11 @@ def _matern(separation: Float) -> Float:
 def shared_variances(
     table: MatchTable, scores: Scores, model: DistortionModel
 ) -> dict[int, tuple[SharedVariance | None, SharedVariance | None]]:
-    """Evidence of neighbouring stars on the axes of each chip, by its code.
+    """Evidence of neighbouring stars on the two axes of each chip, by its code.
 
-    Parameters
-    ----------
-    table : MatchTable
-        The matches that a solution was made from, or some of them.  A star that is matched several
-        times is no neighbour of itself: its catalogue position has one error.
-    scores : Scores
-        Of the solution.
-    model : DistortionModel
-
-    Returns
-    -------
-    dict of int to tuple
-        None for an axis with too few pairs.
+    The matches are those of the solution with these scores, or some of them.  A star that is
+    matched several times is no neighbour of itself: its catalogue position has one error.  None for
+    an axis with too few pairs.
     """
     stars, order = prepare(model, table)
     g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
@@ -131,7 +112,7 @@ def _shared(
         np.bincount(bins, w, minlength=len(EDGES) - 1).astype(float)
         for w in (None, weight, product, separation)
     )
-    # without pairs that say anything nothing is compared
+    # without informative pairs there is no comparison
     if count[-1] < FEWEST_PAIRS or not (total > 0).all():
         return None
     mean = together / np.maximum(total, 1e-300)

@@ -1,4 +1,4 @@
-"""Variance of the stars' scores over the detector, relative to what the likelihood says."""
+"""Variance of the stars' scores over the detector, relative to the likelihood's prediction."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.discrepancy.information import Information
+from bayesdist.infer.equations.scaled import scaled_inverse
+from bayesdist.infer.stars.stars import cell_of
 
 __all__ = ["not_narrower", "score_excess", "shrunk_ratios"]
 
@@ -17,11 +19,11 @@ LEAST, MOST = 0.25, 100.0
 
 
 def score_excess(information: Information) -> Float:
-    """Ratio of the variance of the scores to their curvature: by chip, cell and axis (chips, C, 2).
+    """Ratio (chips, C, 2) of the variance of the scores to their curvature, by chip, cell and axis.
 
-    Where the likelihood is right the two agree.  Ratios of blocks of the detector are drawn
-    towards their mean as their own errors and their scatter about it ask for (a normal model of
-    their logarithms, by moments: DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177).
+    Where the likelihood is right the two agree.  Ratios of blocks of the detector are shrunk to
+    their mean as their own errors and their scatter about it require (a normal model of their
+    logarithms, by moments: DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177).
     """
     sums = information.sums
     side, n_chips = sums.side, len(information.model.chips)
@@ -31,7 +33,7 @@ def score_excess(information: Information) -> Float:
     curvature = np.zeros_like(squares)
     count = np.zeros((n_chips, side * side))
     for cells in information.groups():
-        at = _cell_of(cells.X, cells.Y, side)
+        at = cell_of(cells.X, cells.Y, side)
         free = 1 - information.leverage(cells)
         for a in (0, 1):
             np.add.at(squares[cells.chip, :, a], at, cells.squares[:, a, a] / free[:, a])
@@ -52,29 +54,19 @@ def score_excess(information: Information) -> Float:
 
 
 def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
-    """The covariance by the stars' scatter, on the whole not below the formal one, and its ratio.
+    """Covariance by the stars' scatter, on the whole not below the formal one, and their ratio.
 
-    Quoted errors that are too large are the user's statement: residuals cannot tell them from
-    matches that were cut.
+    Quoted errors that are too large are the user's statement: residuals cannot distinguish them
+    from matches that were cut.
     """
-    D = len(formal)
-    # a little of the formal one, so that no direction is without variance
+    # a small part of the formal one, so that no direction is without variance
     noise = 0.99 * noise + 0.01 * formal
-    scale = np.sqrt(np.diag(formal))
-    ratio = float(
-        np.trace(np.linalg.solve(formal / np.outer(scale, scale), noise / np.outer(scale, scale)))
-    )
-    ratio /= D
+    ratio = float(np.sum(scaled_inverse(formal) * noise)) / len(formal)
     return noise * max(1.0, 1 / ratio), ratio
 
 
-def _cell_of(X: Float, Y: Float, side: int) -> NDArray[np.int64]:
-    ix, iy = (np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (X, Y))
-    return np.asarray(iy * side + ix)
-
-
 def shrunk_ratios(top: Float, bottom: Float, n: Float) -> Float:
-    """Ratios of sums over blocks, drawn towards their mean."""
+    """Ratios of sums over blocks, shrunk to their mean."""
     mean = top.sum() / bottom.sum()
     good = (n >= STARS_PER_BLOCK / 6) & (bottom > 0) & (top > 0)
     out = np.full(len(n), mean)

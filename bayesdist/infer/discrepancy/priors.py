@@ -1,4 +1,4 @@
-"""Priors of what a calibration leaves out: half-Cauchy distributions of a few amplitudes.
+"""Priors of the discrepancy: half-Cauchy distributions of a few amplitudes.
 
 A half-Cauchy distribution has most of its weight below its scale and a tail that falls as the
 inverse square, so that it neither insists on a discrepancy where the data exclude one nor resists
@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DiscrepancyPriors:
-    """Medians of the amplitudes of what the model leaves out.
+    """Prior medians of the discrepancy's amplitudes.
 
     The defaults are below what published calibrations leave in residuals (0.01 to 0.03 pixels rms
     in ACS ISR 2015-06 after its look-up tables, 0.02 in the WISE partition pattern of WSDC D-T033,
@@ -69,10 +69,10 @@ class DiscrepancyPriors:
 
 
 def log_widths(grid: Float) -> Float:
-    """Logarithms of the weights of rising amplitudes in an integral over their logarithm.
+    """Logarithms of the weights of ascending amplitudes in an integral over their logarithm.
 
-    Those of the trapezoidal rule, and at both ends what a half-Cauchy density has beyond them: it
-    falls in proportion to the amplitude, or its inverse.
+    They are those of the trapezoidal rule, plus the mass of a half-Cauchy density beyond both ends:
+    it falls in proportion to the amplitude, or its inverse.
     """
     x = np.log(grid)
     width = np.empty(len(x))

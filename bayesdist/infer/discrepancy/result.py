@@ -1,4 +1,4 @@
-"""Draws of everything that a calibration may leave out, and what it does to the parameters."""
+"""Draws of all discrepancies of a calibration, and their effect on the parameters."""
 
 from __future__ import annotations
 
@@ -21,20 +21,11 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ChipStructure:
-    """Draws of the structure on one chip: what is added to the fitted polynomial.
-
-    Parameters
-    ----------
-    functions : StructureFunctions
-    waves : ndarray, shape (FINE, 2)
-        Of what is finer than the functions.
-    coefficients : ndarray, shape (n, 2, m)
-        Of functions and waves, along u and v of the polynomials.
-    """
+    """Draws of the structure on one chip, which is added to the fitted polynomial."""
 
     functions: StructureFunctions
-    waves: Float
-    coefficients: Float
+    waves: Float  # wave vectors (FINE, 2) of structure finer than the functions
+    coefficients: Float  # (n, 2, m) of functions and waves, along u and v of the polynomials
 
     def evaluate(self, X: Float, Y: Float) -> Float:
         """Values (N, m) of all functions at scaled positions."""
@@ -44,22 +35,22 @@ class ChipStructure:
 
 @dataclass(frozen=True, eq=False)
 class Discrepancy:
-    """What lies outside the fitted model, as independent draws.
+    """Structure outside the fitted model, as independent draws.
 
     Parameters
     ----------
     model : DistortionModel
     mean : ndarray, shape (D,)
-        Of the solution that errs.
+        Of the solution.
     formal : ndarray, shape (D, D)
         Covariance of its parameters by the likelihood.
     noise : ndarray, shape (D, D)
-        Covariance by the stars' errors as they scatter, and by the errors that a star of the
+        Covariance by the observed scatter of the stars, and by the errors that a star of the
         catalogue has in all of its exposures.
     structure : dict of int to ChipStructure
         By chip number.
     structure_theta : ndarray, shape (n, D)
-        Error of the parameters that goes with each draw of the structure.
+        Error of the parameters that belongs to each draw of the structure.
     linear : LinearDeviations or None
         Of exposures and drifts.
     facts : mapping
@@ -81,7 +72,7 @@ class Discrepancy:
         return len(self.structure_theta)
 
     def moved(self, matrix: Float) -> Discrepancy:
-        """The same with all errors of the parameters times a matrix (D, D)."""
+        """Discrepancy with all errors of the parameters multiplied by a matrix (D, D)."""
         linear = self.linear
         return replace(
             self,

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.discrepancy.priors import log_half_cauchy
-from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.posterior.likelihood import Scores
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 
@@ -24,56 +25,30 @@ RANGE = 300.0
 
 @dataclass(frozen=True, eq=False)
 class SharedStars:
-    """Errors that stars of the catalogue have in all of their matches.
+    """Errors that stars of the catalogue have in all of their matches."""
 
-    Parameters
-    ----------
-    rms : float
-        Of a star on an axis, in the unit of u, v; 0 where no star is matched twice.
-    repetition : float
-        Mean factor, over the matches, by which a star's matches tell less of what lies at its
-        position than as many stars would.
-    stars : Stars
-    code : ndarray of int, shape (N,)
-        Star of each match, in the order of `stars`.
-    curvature : ndarray, shape (N, 2, 2)
-    """
-
-    rms: float
+    rms: float  # of a star on an axis, in the unit of u, v; 0 where no star is matched twice
+    # mean factor, over the matches, by which a star's matches determine the structure at its
+    # position less than as many stars would
     repetition: float
     stars: Stars
-    code: Int
-    curvature: Float
+    code: Int  # star (N,) of each match, in the order of `stars`
+    curvature: Float  # minus second derivatives (3, N) uu, uv, vv of the log-likelihood
 
     def covariance(self, model: DistortionModel, theta: Float, formal: Float) -> Float:
-        """Covariance (D, D) beyond what independent errors of the same size would do.
+        """Covariance (D, D) in excess of that by independent errors of the same size.
 
-        Parameters
-        ----------
-        model : DistortionModel
-        theta : ndarray, shape (D,)
-        formal : ndarray, shape (D, D)
-            Of the parameters, by their likelihood.
+        `formal` (D, D) is the covariance of the parameters by their likelihood.
         """
-        D = model.n_distortion  # frames follow as they are correlated
-        together = np.zeros((int(self.code.max()) + 1, D, 2))
-        alone = np.zeros((D, D))
-        stars = self.stars
-        for g, (columns, derivative) in enumerate(model.effective_jacobian(theta, stars.groups)):
-            rows = slice(stars.starts[g], stars.starts[g + 1])
-            own = columns < D
-            phi = model.basis(model.chips[stars.groups.chip[g]].number).evaluate_scaled(
-                stars.X[rows], stars.Y[rows]
-            )
-            pull = np.einsum(
-                "nk,nab,bkm->nma", phi, self.curvature[rows], derivative[:, :, own], optimize=True
-            )
-            columns = columns[own]
-            alone[np.ix_(columns, columns)] += np.einsum("nma,nla->ml", pull, pull, optimize=True)
-            np.add.at(together, (self.code[rows][:, None], columns), pull)
-        shared = np.einsum("sma,sla->ml", together, together, optimize=True)
+        D = model.n_distortion  # frames change as far as they are correlated
+        uu, uv, vv = self.curvature
+        one = np.ones(len(self.code))
+        sums = StarSums.of(self.stars, self.code, np.stack([uu, vv]), [one], uv)
+        gradient = influence_by_group(model, theta, self.stars.groups, None, D)
+        alike = [np.ones((int(self.code.max()) + 1, 2))]
+        shared = sums.shared(gradient, alike)[0] - sums.independent(gradient, alike)
         by_scores = formal[:, :D]
-        extra = self.rms**2 * by_scores @ (shared - alone) @ by_scores.T
+        extra = self.rms**2 * by_scores @ shared @ by_scores.T
         return np.asarray((extra + extra.T) / 2)
 
 
@@ -82,27 +57,14 @@ def shared_stars(
 ) -> SharedStars | None:
     """Size of the errors that stars have in all of their matches; None where none is repeated.
 
-    A star with an error a of its own in all of its matches has a summed score of mean a h, h its
-    summed curvature, so that with a ~ N(0, w^2)
+    A star with an error a in all of its matches has a summed score of mean a h, h its summed
+    curvature, so that with a ~ N(0, w^2)
 
         log p(w) = sum over stars and axes of [g^2 w^2 / (1 + w^2 h) - log(1 + w^2 h)] / 2
 
-    in which stars that are matched once say nothing that a jitter would not say as well, and are
-    left out.
-
-    Parameters
-    ----------
-    table : MatchTable
-        Matches with codes of the stars.
-    scores : Scores
-        Of the solution.
-    model : DistortionModel
-    median : float
-        Of the half-Cauchy prior of w, in the unit of u, v.
-
-    Returns
-    -------
-    SharedStars or None
+    Stars that are matched once are left out: their likelihood could not separate w from a jitter.
+    The table has codes of the stars; `median` is that of the half-Cauchy prior of w, in the unit of
+    u, v.
     """
     assert table.star is not None
     stars, order = prepare(model, table)
@@ -126,8 +88,8 @@ def shared_stars(
         ).sum(axis=1)
     weight = np.exp(log_density - log_density.max())
     square = float(weight @ size**2 / weight.sum())
-    curvature = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2) * good[:, None, None]
-    # the matches of a star share its error, of which one match alone would show its own part
+    curvature = np.stack([h_uu, h_uv, h_vv]) * good
+    # the matches of a star share its error; one match alone would show only its own part
     rest = np.mean(summed, axis=0) * (1 - 1 / np.maximum(n_matches, 1))
     repetition = float(np.average(1 + square * rest, weights=n_matches))
     return SharedStars(float(np.sqrt(square)), repetition, stars, code, curvature)

@@ -1,4 +1,4 @@
-"""The discrepancy of a solution from the truth, estimated from its residuals in one pass."""
+"""Discrepancy of a solution from the truth, estimated from its residuals in one pass."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_side
@@ -23,10 +22,11 @@ from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.infer.discrepancy.shared_stars import shared_stars
 from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.stars.likelihood import Scores, scores_of
+from bayesdist.infer.posterior.likelihood import Scores, scores_of
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
-from bayesdist.infer.stars.stars import prepare
+from bayesdist.infer.stars.stars import cell_of, prepare
 from bayesdist.infer.transforms import Solution
 from bayesdist.model import DistortionModel
 
@@ -38,8 +38,7 @@ DRAWS = 2000
 POINTS = 12  # on each axis
 
 
-# a second BLAS thread gains little here and loses much on a machine that has other work
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def estimate_discrepancy(
     matches: Matches | Shards,
     solution: Solution,
@@ -55,29 +54,31 @@ def estimate_discrepancy(
     n_draws: int = DRAWS,
     compute: Compute | None = None,
 ) -> Discrepancy:
-    """Estimate what a solution leaves out, with priors on its size and never a decision against it.
+    """Estimate the structure that a solution leaves out, with priors on its size.
+
+    There is never a decision that it is absent.
 
     Parameters
     ----------
     matches : MatchTable, PartitionedMatches or Shards
-        That the solution was made from.
+        Data of the solution.
     solution : Posterior or LinearFit
         Without extra weight in the corners.
     rng : numpy.random.Generator
     priors : DiscrepancyPriors, optional
     parameter_priors : GaussianPriors, optional
-        That the solution was made with.
+        Priors of the solution's parameters.
     sample : MatchTable, optional
-        Some of the matches, or all: what is finer than the functions is seen in neighbouring stars.
+        Some of the matches, or all: structure finer than the functions shows in neighbouring stars.
     stars : MatchTable, optional
-        The same matches in memory: those of a star of the catalogue, by its code, have errors in
-        common, and exposures without frames of their own are told apart.
+        The matches in memory.  By the star codes, errors common to a star's matches are estimated,
+        and exposures without frames of their own are separated.
     structure : bool
-        Whether there is structure beyond the model; not where look-up tables were fitted to it.
+        False for no structure beyond the model, where look-up tables were fitted to it.
     exposures : bool
-        Whether single exposures deviate; not where a hierarchy of them was fitted.
+        False for no deviations of single exposures, where a hierarchy of them was fitted.
     settling : Settling, optional
-        What was done to the shifts of single chips after sampling.
+        Transformation of the single chips' shifts that was made after sampling.
     n_draws : int
     compute : Compute, optional
 
@@ -128,12 +129,12 @@ def estimate_discrepancy(
 
 
 def _several(stars: MatchTable) -> bool:
-    """Whether the matches are of several exposures, few enough that each may deviate."""
+    """True for matches of several exposures, few enough that each may deviate."""
     return 1 < len(stars.exposure_names) <= MOST_EXPOSURES
 
 
 def _by_exposure(stars: MatchTable, scores: Scores, model: DistortionModel) -> CellSums:
-    """Sums with groups of their own for exposures that have no frames of their own."""
+    """Sums with separate groups for exposures that have no frames of their own."""
     side = cells_per_side(len(stars.exposure_names) * len(model.chips))
     parts = []
     for code in range(len(stars.exposure_names)):
@@ -155,7 +156,7 @@ def _structures(
     n: int,
     rng: np.random.Generator,
 ) -> tuple[dict[int, ChipStructure], Float, dict[str, object]]:
-    """Structure of chips (by code), and what it does to the parameters."""
+    """Structure of chips (by code), its effect on the parameters, and its sizes for summaries."""
     model, sums = working.model, working.sums
     stars = sums.position[:, :, 0].sum(axis=1)
     shift = information.covariance @ information.score
@@ -179,7 +180,7 @@ def _structures(
         )
         drawn = posterior.draws(n, rng)
         for a in (0, 1):
-            # the fit takes structure for polynomials; the truth lies on the other side
+            # the fit absorbs structure into polynomials; the truth lies on the other side
             theta -= drawn[:, a] @ (working.covariance @ taken[a]).T
             by_draw = np.sqrt(np.mean((drawn[:, a] @ here.T) ** 2, axis=1))
             rows.append(
@@ -213,10 +214,10 @@ def _star_error(information: Information, chip: int) -> float:
 def _along_axes(
     information: Information, working: Information, structure: ChipStructure, chip: int
 ) -> tuple[list[Float], list[Float], list[Float], list[Float]]:
-    """Of u and v: information and score of the functions, and their products with the parameters.
+    """Information and score of the functions on u and v, and their products with the parameters.
 
-    The products are those of the flattened likelihood and of the working one, these with the finer
-    waves as well.
+    The products are those of the flattened likelihood and of the working one, the latter with the
+    finer waves too.
     """
     model, side = working.model, working.sums.side
     m, D = structure.functions.n_known, model.n_params
@@ -231,7 +232,7 @@ def _along_axes(
         for cells in source.groups():
             if cells.chip != chip:
                 continue
-            at = _rows(cells.X, cells.Y, side, row)
+            at = row[cell_of(cells.X, cells.Y, side)]
             here, M = values[at], cells.frame
             turned = np.einsum("cab,bd->cad", cells.curvature, M)
             for a in (0, 1):
@@ -243,9 +244,3 @@ def _along_axes(
     n = len(used)
     S = [B.T @ (weight[a, :n, None] * B) for a in (0, 1)]
     return S, crossed, taken, [B.T @ score[a, :n] for a in (0, 1)]
-
-
-def _rows(X: Float, Y: Float, side: int, row: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows of the chip's cells at their mean positions."""
-    ix, iy = (np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (X, Y))
-    return np.asarray(row[iy * side + ix])

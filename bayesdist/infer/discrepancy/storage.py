@@ -48,7 +48,7 @@ def discrepancy_to_arrays(
 def discrepancy_from_arrays(
     model: DistortionModel, arrays: Mapping[str, NDArray[Any]]
 ) -> Discrepancy:
-    """The discrepancy that `discrepancy_to_arrays` described."""
+    """Discrepancy from the arrays of `discrepancy_to_arrays`."""
     structure = {}
     for chip in model.chips:
         name = f"chip{chip.number}"

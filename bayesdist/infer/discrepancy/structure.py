@@ -1,14 +1,14 @@
-"""Posterior of what a polynomial leaves out on a chip, amplitudes marginalised.
+"""Posterior of the structure outside a polynomial on a chip, amplitudes marginalised.
 
-With what the fit has taken eliminated, the data speak of the coefficients z of the structure's
-functions through a score s and an information S, so that for amplitudes eta
+With the part that the fit absorbs eliminated, the data determine the coefficients z of the
+structure's functions through a score s and an information S, so that for amplitudes eta
 
     z | eta   ~ N((S + P)^-1 s, (S + P)^-1)             P = P(eta), the prior precision
     log p(eta | data) = log p(eta) + (s^T (S + P)^-1 s - log|S + P| + log|P|) / 2
 
 The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
-are gone through on a grid that is refined where the density is.  What is too fine
-for the functions is seen in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
+are integrated on a grid that is refined where the density is.  Structure too fine for the functions
+shows in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
 """
 
 from __future__ import annotations
@@ -29,44 +29,31 @@ __all__ = ["Structure", "chip_structure"]
 
 Float = NDArray[np.float64]
 
-LENGTHS = np.geomspace(0.02, 0.6, 7)  # of the field, in longer half sides; all alike beforehand
+# of the field, in longer half sides; all equally probable beforehand
+LENGTHS = np.geomspace(0.02, 0.6, 7)
 STEPS = 8  # of the amplitude, before the grid is refined
-HALVINGS = 6  # at most: neighbouring stars may tell an amplitude to some percent
-CHANGE = 0.7  # of the log density between two points, below which none is put between them,
+HALVINGS = 6  # at most: neighbouring stars may determine an amplitude to some percent
+CHANGE = 0.7  # of the log density between two points, below which none is inserted between them,
 WIDEST = 0.4  # or width of their interval in the logarithm, where most of the density is
 NEGLIGIBLE = 10.0  # in log density, below the largest
-MOST_OF_IT = 2.0  # in the same way
-UNLIKE = 0.2  # prior probability that the field differs on the two axes, by a factor e or so
+MOST_OF_IT = 2.0  # likewise, for most of the density
+UNLIKE = 0.2  # prior probability that the field differs on the two axes, by about a factor e
 TERM_STEPS = 24  # of the amplitude of the higher orders
 
 
 @dataclass(frozen=True, eq=False)
 class _Axis:
-    """What the data say of one axis, given length and amplitude of the field.
+    """Likelihood along one axis, given length and amplitude of the field."""
 
-    Parameters
-    ----------
-    factor : ndarray
-        Lower Cholesky factor of the sines' precision.
-    right : ndarray
-        Its inverse times the sines' score.
-    tied : ndarray
-        And times what ties them to the terms.
-    values, vectors : ndarray
-        Of the terms' information without the sines.
-    score : ndarray
-        Of the terms, along these.
-    """
-
-    factor: Float
-    right: Float
-    tied: Float
-    values: Float
-    vectors: Float
-    score: Float
+    factor: Float  # lower Cholesky factor of the sines' precision
+    right: Float  # its inverse times the sines' score
+    tied: Float  # its inverse times the coupling of the sines to the terms
+    values: Float  # eigenvalues of the terms' information without the sines
+    vectors: Float  # eigenvectors of the same
+    score: Float  # of the terms, along these
 
     def log_evidence(self, amplitudes: Float) -> Float:
-        """By the amplitude of the terms, but for what the spectrum of the sines adds."""
+        """Log evidence by the amplitude of the terms, without the part of the sines' spectrum."""
         out = 0.5 * self.right @ self.right - np.log(np.diag(self.factor)).sum()
         out += 0.5 * (self.score**2 / (self.values + amplitudes[:, None] ** -2)).sum(axis=1)
         return np.asarray(out - 0.5 * np.log1p(self.values * amplitudes[:, None] ** 2).sum(axis=1))
@@ -93,23 +80,12 @@ class _Point:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Posterior of the structure on a chip.
-
-    Parameters
-    ----------
-    functions : StructureFunctions
-    terms_amplitude : ndarray, shape (TERM_STEPS,)
-        Amplitudes of the higher orders that are gone through.
-    points : tuple
-        Lengths and amplitudes of the field.
-    weight : ndarray, shape (points, TERM_STEPS)
-        Posterior probability of each combination.
-    """
+    """Posterior of the structure on a chip."""
 
     functions: StructureFunctions
-    terms_amplitude: Float
-    points: tuple[_Point, ...]
-    weight: Float
+    terms_amplitude: Float  # grid (TERM_STEPS,) of amplitudes of the higher orders
+    points: tuple[_Point, ...]  # lengths and amplitudes of the field
+    weight: Float  # posterior probability (points, TERM_STEPS) of each combination
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Coefficients (n, 2, n_known + 2 FINE) of terms, sines and finer waves on both axes."""
@@ -132,7 +108,7 @@ class Structure:
 
     @property
     def length(self) -> float:
-        """Posterior mean correlation length of the field, weighed by variance, in half sides."""
+        """Posterior mean correlation length of the field, weighted by variance, in half sides."""
         by_point = self.weight.sum(axis=1)
         by_point = by_point * [np.square(p.amplitudes).sum() for p in self.points]
         return float(by_point @ [p.length for p in self.points] / by_point.sum())
@@ -151,25 +127,13 @@ def chip_structure(
     """Posterior of the coefficients of structure functions on the two axes of a chip.
 
     Length and amplitudes are those of both axes: what bends light or silicon bends it along both,
-    and few data tell little of each.  But the field may differ, as a pattern of columns does.
+    and few data determine little of each.  But the field may differ, as a pattern of columns does.
 
-    Parameters
-    ----------
-    functions : StructureFunctions
-    information : sequence of ndarray, shape (n_known, n_known)
-        Of the coefficients on each axis, with what the fit takes eliminated.
-    score : sequence of ndarray, shape (n_known,)
-        Gradient of the log-likelihood where they are zero, in the same way.
-    noise : float
-        Typical error of one star: no amplitude beyond a few of it is looked at.
-    higher_order, structure : float
-        Prior medians of the amplitudes, in the unit of the positions.
-    pairs : sequence of SharedVariance or None
-        What neighbouring stars tell of the field, on each axis.
-
-    Returns
-    -------
-    Structure
+    For each axis `information` (n_known, n_known) is that of the coefficients, and `score`
+    (n_known,) the gradient of the log-likelihood where they are zero, both with the part that the
+    fit absorbs eliminated; `pairs` is the evidence of neighbouring stars.  `noise` is the typical
+    error of one star, a few times which limits the amplitudes; `higher_order` and `structure` are
+    prior medians of the amplitudes, in the unit of the positions.
     """
     T = functions.n_terms
     scale = functions.decline()

@@ -1,8 +1,8 @@
 """Symmetric matrices of arrow shape: a dense border and many small blocks on the diagonal.
 
 The normal matrix of exposures with their own frames has this shape: parameters of different
-exposures meet only through the global ones.  Local blocks are eliminated by Schur complement, so
-that cost grows linearly with the number of exposures.
+exposures are coupled only through the global ones.  Local blocks are eliminated by Schur
+complement, so that cost grows linearly with the number of exposures.
 """
 
 from __future__ import annotations
@@ -24,17 +24,9 @@ Float = NDArray[Any]  # numpy's stubs lose float64 in its linear algebra
 class Arrow:
     """A symmetric matrix [[border, edge], [edge^T, diag(blocks)]].
 
-    Vectors that go with it are laid out as (global, local blocks, tail): the border belongs to the
-    first `n_global` and the last `n_tail` entries, the blocks to those between.
-
-    Parameters
-    ----------
-    border : ndarray, shape (b, b)
-        b = n_global + n_tail.
-    edge : ndarray, shape (n_blocks, b, q)
-    blocks : ndarray, shape (n_blocks, q, q)
-    n_tail : int
-        How many entries of the border stand behind the blocks.
+    Its vectors are laid out as (global, local blocks, tail): the border (b, b), b = n_global +
+    n_tail, belongs to the first `n_global` and the last `n_tail` entries, the blocks (n_blocks, q,
+    q) to those between; the edge is (n_blocks, b, q).
     """
 
     border: Float
@@ -44,7 +36,7 @@ class Arrow:
 
     @property
     def n_global(self) -> int:
-        """Entries before the blocks."""
+        """Number of entries before the blocks."""
         return len(self.border) - self.n_tail
 
     @property
@@ -74,7 +66,7 @@ class Arrow:
         return vector[..., border], vector[..., local].reshape(*vector.shape[:-1], n, q)
 
     def join(self, border_part: Float, local_part: Float) -> Float:
-        """The inverse of `split`."""
+        """Vectors (..., size) from border part and local part: the inverse of `split`."""
         border, local = self._indices
         out = np.empty((*border_part.shape[:-1], self.size))
         out[..., border] = border_part
@@ -82,20 +74,20 @@ class Arrow:
         return out
 
     def diagonal(self) -> Float:
-        """The diagonal, shape (size,)."""
+        """Diagonal (size,)."""
         return self.join(
             np.diag(self.border).copy(), np.einsum("nqq->nq", self.blocks).astype(float)
         )
 
     def without_tail(self) -> Arrow:
-        """The matrix without the rows and columns of the tail."""
+        """Matrix without the rows and columns of the tail."""
         if not self.n_tail:
             return self
         g = self.n_global
         return Arrow(self.border[:g, :g], self.edge[:, :g], self.blocks)
 
     def dense(self) -> Float:
-        """The full matrix, for small problems and tests."""
+        """Full matrix (size, size), for small problems and tests."""
         border, local = self._indices
         n, q = self.blocks.shape[:2]
         out = np.zeros((self.size, self.size))
@@ -108,7 +100,7 @@ class Arrow:
         return out
 
     def times(self, vectors: Float) -> Float:
-        """The matrix times vectors (..., size)."""
+        """Product (..., size) of the matrix with vectors."""
         b, l = self.split(vectors)
         top = b @ self.border + np.einsum("...nq,nbq->...b", l, self.edge)
         low = np.einsum("...b,nbq->...nq", b, self.edge) + np.einsum(
@@ -119,10 +111,7 @@ class Arrow:
     def factor(self) -> ArrowFactor:
         """Cholesky factors with the local blocks eliminated first.
 
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            When the matrix is not positive definite.
+        Raises numpy.linalg.LinAlgError when the matrix is not positive definite.
         """
         if len(self.blocks):
             chol_blocks = np.linalg.cholesky(self.blocks)
@@ -137,22 +126,12 @@ class Arrow:
 
 @dataclass(frozen=True, eq=False)
 class ArrowFactor:
-    """A factored positive definite `Arrow` H: solves, determinants and Gaussian draws.
-
-    Parameters
-    ----------
-    matrix : Arrow
-    chol_border : ndarray, shape (b, b)
-        Lower Cholesky factor of the Schur complement.
-    chol_blocks : ndarray, shape (n_blocks, q, q)
-    gain : ndarray, shape (n_blocks, q, b)
-        C^-1 B^T of each block.
-    """
+    """A factored positive definite `Arrow` H: solves, determinants and Gaussian draws."""
 
     matrix: Arrow
-    chol_border: Float
-    chol_blocks: Float
-    gain: Float
+    chol_border: Float  # lower Cholesky factor (b, b) of the Schur complement
+    chol_blocks: Float  # of each block (n_blocks, q, q)
+    gain: Float  # C^-1 B^T (n_blocks, q, b) of each block
 
     def solve(self, right: Float) -> Float:
         """H^-1 times vectors (..., size)."""
@@ -199,7 +178,7 @@ class ArrowFactor:
         return self.matrix.join(b @ self.chol_border, low)
 
     def variances(self) -> Float:
-        """The diagonal of H^-1, shape (size,), without the rest of it."""
+        """Diagonal (size,) of H^-1, computed without the rest of it."""
         root = self._inverse_border
         top = (root**2).sum(axis=0)
         spread = self.gain @ root.T

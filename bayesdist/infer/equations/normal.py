@@ -1,7 +1,7 @@
 """Normal equations as sums over groups of stars: streaming, mergeable, movable without the data.
 
-Within a group the model is one polynomial, so the data speak only through the moments of the basis
-functions.  Partial sums over any pieces of the data add.  Because positions are linear in the
+Within a group the model is one polynomial, so the data enter only through the moments of the basis
+functions.  Partial sums over any chunks of the data add.  Because positions are linear in the
 effective coefficients, the equations can be moved to other coefficients exactly, which is how
 Gauss-Newton over the exposure frames runs without another pass.
 """
@@ -26,40 +26,20 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Moments of weighted residuals about given effective coefficients.
+    """Moments of weighted residuals about given effective coefficients."""
 
-    Parameters
-    ----------
-    weight : ndarray, shape (G, 3, K, K)
-        sum of w phi phi^T for the axis pairs uu, uv, vv.
-    right : ndarray, shape (G, 2, K)
-        sum of phi (W r), r the residual at `about`.
-    about : ndarray, shape (G, 2, K)
-        Effective coefficients at which r is taken.
-    chi2 : float
-        sum of r^T W r.
-    cross : ndarray, shape (G, h, 2, K)
-        Mixed second derivatives with h further parameters.
-    scalars : ndarray
-        Further sums over the stars, which the pass that made the equations names.
-    groups : Groups
-    """
-
-    weight: Float
-    right: Float
-    about: Float
-    chi2: float
-    cross: Float
-    scalars: Float
+    weight: Float  # sum (G, 3, K, K) of w phi phi^T for the axis pairs uu, uv, vv
+    right: Float  # sum (G, 2, K) of phi (W r), r the residual at `about`
+    about: Float  # effective coefficients (G, 2, K) at which r is taken
+    chi2: float  # sum of r^T W r
+    cross: Float  # mixed second derivatives (G, h, 2, K) with h further parameters
+    scalars: Float  # further sums over the stars, named by the pass that made the equations
     groups: Groups
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
-        """Sum over both pieces of data, which may hold other groups.
+        """Sum over two chunks of data, which may have different groups.
 
-        Raises
-        ------
-        ValueError
-            When residuals of one group were taken at different coefficients.
+        ValueError when residuals of one group were taken at different coefficients.
         """
         if self.groups.same(other.groups):
             here = np.arange(len(self.groups))
@@ -90,14 +70,14 @@ class NormalEquations:
         )
 
     def moved(self, about: Float) -> NormalEquations:
-        """The same equations about other effective coefficients: exact, without the data."""
+        """Equations about other effective coefficients: exact, without the data."""
         step = about - self.about
         pull = self._apply(step)
         chi2 = self.chi2 - 2 * float((self.right * step).sum()) + float((pull * step).sum())
         return replace(self, right=self.right - pull, about=about, chi2=chi2)
 
     def with_cross(self, which: list[int]) -> NormalEquations:
-        """With some of the further parameters only."""
+        """Equations with only some of the further parameters."""
         return replace(self, cross=self.cross[:, which])
 
     def _apply(self, E: Float) -> Float:
@@ -107,19 +87,10 @@ class NormalEquations:
         return np.stack([u, v], axis=1)
 
     def assemble(self, model: DistortionModel, theta: Float) -> tuple[Arrow, Float]:
-        """Normal matrix and right-hand side in the model's parameters.
+        """Normal matrix and right-hand side (n_params,) in the model's parameters.
 
-        Parameters
-        ----------
-        model : DistortionModel
-        theta : ndarray, shape (n_params,)
-            Where the frames are linearised; `about` are its effective coefficients.
-
-        Returns
-        -------
-        matrix : Arrow
-            With the h further parameters as zero rows of its tail, but for `cross`.
-        right : ndarray, shape (n_params,)
+        Frames are linearised at `theta`, whose effective coefficients are `about`.  The matrix has
+        the h further parameters as zero rows of its tail, except for `cross`.
         """
         G, q, h = model.n_global, model.n_frame, self.cross.shape[1]
         n_blocks = len(model.local_blocks)
@@ -160,19 +131,9 @@ def least_squares(
 ) -> NormalEquations:
     """Normal equations of weighted least squares with rejection: one pass over the stars.
 
-    Parameters
-    ----------
-    stars : Stars
-    about : ndarray, shape (n_params,), or None
-        Where residuals are taken; None takes the data themselves.
-    test : ndarray, shape (n_params,), or None
-        Where the residuals are taken that decide on rejection.
-    chi2_limit, abs_limit, corner, power
-        See `kernel.least_squares_moments`, which also names the `scalars`.
-
-    Returns
-    -------
-    NormalEquations
+    Residuals are taken at `about` (n_params,), or None for the data themselves; those at `test`
+    decide on rejection.  The limits, `corner`, `power` and the `scalars` are those of
+    `kernel.least_squares_moments`.
     """
     moments = kernel.least_squares_moments(
         stars.pieces,
@@ -198,18 +159,8 @@ def least_squares(
 def mixture(stars: Stars, theta: Float, constants: Constants, em: bool = False) -> NormalEquations:
     """Gradient and Hessian of the mixture's log-likelihood: one pass over the stars.
 
-    Parameters
-    ----------
-    stars : Stars
-    theta : ndarray, shape (n_params,)
-    constants : Constants
-    em : bool
-        See `kernel.mixture_moments`, which also names the `scalars`.
-
-    Returns
-    -------
-    NormalEquations
-        `right` is the gradient by the effective coefficients.
+    `right` is the gradient by the effective coefficients; `em` and the `scalars` are those of
+    `kernel.mixture_moments`.
     """
     powers, order = stars.powers(theta), stars.model.order
     if circle := stars.circle(constants):

@@ -63,7 +63,7 @@ class GaussianPriors:
 
     @property
     def n_informative(self) -> int:
-        """How many parameters have a prior."""
+        """Number of parameters that have a prior."""
         return int((self.precision > 0).sum())
 
     def pull(self, theta: Float) -> Float:

@@ -1,4 +1,4 @@
-"""Do the data determine the parameters?  If not: which ones, by name, and why.
+"""Parameters that the data do not determine, by name, and the reason.
 
 Checked before anything is solved, because a degenerate least-squares problem still returns numbers.
 """
@@ -31,38 +31,19 @@ LEAST_COVERAGE = 0.25
 
 @dataclass(frozen=True)
 class NullSpace:
-    """Directions in parameter space that the data leave free.
-
-    Parameters
-    ----------
-    rank : int
-    n_params : int
-    condition : float
-        Ratio of the extreme eigenvalues of the normal matrix scaled to unit diagonal; infinite
-        where the rank is not full.
-    directions : tuple of tuple of str
-        Names of the parameters that make up each free direction, the largest part first.
-    """
+    """Directions in parameter space that the data leave free."""
 
     rank: int
     n_params: int
+    # ratio of the extreme eigenvalues of the normal matrix scaled to unit diagonal; infinite where
+    # the rank is not full
     condition: float
+    # names of the parameters in each free direction, largest component first
     directions: tuple[tuple[str, ...], ...]
 
 
 def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
-    """Rank, condition and named null directions of a normal matrix.
-
-    Parameters
-    ----------
-    matrix : Arrow
-    names : tuple of str
-        Names of its rows.
-
-    Returns
-    -------
-    NullSpace
-    """
+    """Rank, condition and null directions of a normal matrix, with the names of its rows."""
     scale = np.sqrt(matrix.diagonal())
     dead = scale == 0
     scale[dead] = 1.0
@@ -84,10 +65,8 @@ def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
 def require_full_rank(matrix: Arrow, model: DistortionModel, groups: Groups) -> NullSpace:
     """The null space, which must be empty.
 
-    Raises
-    ------
-    DegenerateError
-        Naming the parameters of the first free direction and, where it can be told, the reason.
+    DegenerateError with the parameters of the first free direction and, where it is known, the
+    reason.
     """
     space = null_space(matrix, model.names)
     if space.rank == space.n_params:
@@ -102,7 +81,7 @@ def require_full_rank(matrix: Arrow, model: DistortionModel, groups: Groups) -> 
 
 
 def _simpler_frames(matrix: Arrow, model: DistortionModel) -> str:
-    """The setting of the richest frames with which nothing is degenerate; empty where none are."""
+    """Setting of the richest frames with which nothing is degenerate; empty where there is none."""
     dense = matrix.dense()
     for kind in reversed(FRAME_KINDS[: FRAME_KINDS.index(model.frames)]):
         names = frame_names(kind)
@@ -159,20 +138,10 @@ def _reason(
 
 
 def check_coverage(model: DistortionModel, survey: Survey, n_priors: int = 0) -> None:
-    """Refuse data that cannot carry the model, with the plain reason.
+    """Raise DegenerateError for data that cannot determine the model, with the plain reason.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    survey : Survey
-    n_priors : int
-        Parameters with a prior: each is a number more.
-
-    Raises
-    ------
-    DegenerateError
-        Fewer numbers than parameters, too few stars in an exposure, stars on a line, or stars in
-        one corner of a chip.
+    That is: fewer numbers than parameters (each of `n_priors` priors is a number more), too few
+    stars in an exposure, stars on a line, or stars in one corner of a chip.
     """
     n = survey.n
     if 2 * n + n_priors < model.n_params:
@@ -211,7 +180,7 @@ def check_coverage(model: DistortionModel, survey: Survey, n_priors: int = 0) ->
             )
         try:
             covered = ConvexHull(found.corners / chip.size).volume
-        except QhullError:  # nearly collinear: no area to speak of
+        except QhullError:  # nearly collinear: no area
             covered = 0.0
         if covered < LEAST_COVERAGE:
             x, y = found.corners.T

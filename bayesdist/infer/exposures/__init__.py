@@ -1,1 +1,1 @@
-"""What varies from exposure to exposure: frames, chip offsets, trends."""
+"""Exposure-to-exposure variation: frames, chip offsets, trends."""

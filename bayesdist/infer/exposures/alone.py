@@ -1,4 +1,4 @@
-"""Every exposure by itself: its own polynomials, in the reference gauge, and their linear terms.
+"""Independent fits of every exposure, in the reference gauge, and their linear terms.
 
 The way of ACS ISR 2015-06 (sections 4.2 and 4.4): all chips of one exposure are fitted in the one
 system of the catalogue, rotated and shifted to the reference chip; the linear terms of all
@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import LinearFit, fit_linear
+from bayesdist.infer.equations.scaled import one_thread
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.transforms import (
     LinearTerms,
     ReferenceGauge,
@@ -34,7 +33,7 @@ __all__ = ["ExposureSolutions", "fit_exposures"]
 
 Float = NDArray[np.float64]
 
-HELD_WITHIN = 1e-6  # pixels: the sigma with which terms are held at a given value
+HELD_WITHIN = 1e-6  # pixels: the sigma with which terms are fixed at a given value
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ class ExposureSolutions:
     fits : tuple of LinearFit
         As fitted, in the system of the catalogue.
     skipped : dict of str to str
-        Exposures left out, and why.
+        Exposures left out, with the reason.
     """
 
     names: tuple[str, ...]
@@ -84,7 +83,7 @@ class ExposureSolutions:
         return tuple(view.gauge for view in self.views if view.gauge is not None)
 
     def terms(self, *labels: str) -> tuple[LinearTerms, ...]:
-        """Some of the linear terms of each exposure.
+        """Selected linear terms of each exposure.
 
         Raises
         ------
@@ -95,7 +94,7 @@ class ExposureSolutions:
         return tuple(LinearTerms(self.labels, v, c).select(*labels) for v, c in every)
 
     def series(self, *labels: str) -> tuple[Float, Float, Float]:
-        """Some of the linear terms against time.
+        """Selected linear terms against time.
 
         Parameters
         ----------
@@ -111,8 +110,7 @@ class ExposureSolutions:
         return self.epoch, np.array([t.values for t in some]), np.array([t.cov for t in some])
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_exposures(
     matches: MatchTable,
     model: DistortionModel,
@@ -121,30 +119,28 @@ def fit_exposures(
     high_order: Solution | None = None,
     skip: bool = False,
     priors: GaussianPriors | None = None,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
-    radial_weight: float = 1.0,
+    rejection: Rejection = DEFAULT_REJECTION,
 ) -> ExposureSolutions:
-    """Fit every exposure by itself.
+    """Fit every exposure independently.
 
     Parameters
     ----------
     matches : MatchTable
         With errors and epochs.
     model : DistortionModel
-        Its order, chips and unit are those of each exposure; frames and time dependence play no
-        part.
+        Its order, chips and unit are those of each exposure; frames and time dependence are
+        ignored.
     chip : int
         Number of the reference chip.
     high_order : Solution, optional
-        Of all exposures together: terms above the first order are held at its values, for a single
-        exposure with few stars hardly determines them.  What is wrong with them is then wrong in
-        all exposures alike, and is not in their covariance.
+        Of all exposures together: terms above the first order are fixed at its values, since a
+        single exposure with few stars hardly determines them.  Their error is then common to all
+        exposures, and is not in their covariance.
     skip : bool
-        Whether exposures that cannot be fitted are left out and counted; else they are an error.
+        True to leave out and count exposures that cannot be fitted; else they are an error.
     priors : GaussianPriors, optional
         On the parameters of one exposure: those of `model` without frames and time dependence.
-    clip_chi2, clip_abs, radial_weight
+    rejection : Rejection
         As of `fit_linear`.
 
     Returns
@@ -183,11 +179,6 @@ def fit_exposures(
             where="high_order",
             do="give a solution of the same order and chips",
         )
-    options: dict[str, Any] = {
-        "clip_chi2": clip_chi2,
-        "clip_abs": clip_abs,
-        "radial_weight": radial_weight,
-    }
     order = np.argsort(matches.exposure, kind="stable")
     codes, starts = np.unique(matches.exposure[order], return_index=True)
     names, epochs, fits, views, terms = [], [], [], [], []
@@ -200,9 +191,9 @@ def fit_exposures(
         try:
             _require_stars(table, alone, 3 if joint is not None else alone.n_terms)
             if joint is None:
-                fit = fit_linear(table, alone, priors=base, **options)
+                fit = fit_linear(table, alone, rejection=rejection, priors=base)
             else:
-                fit = _fit_held(table, alone, joint, epoch, chip, base, options)
+                fit = _fit_held(table, alone, joint, epoch, chip, base, rejection)
         except DegenerateError as error:
             where = f"exposure {name}" + (f", {error.where}" if error.where else "")
             if not skip:
@@ -234,7 +225,7 @@ def fit_exposures(
 
 
 def _require_stars(table: MatchTable, model: DistortionModel, least: int) -> None:
-    """Refuse an exposure with a chip that has fewer stars than terms to be fitted."""
+    """Raise DegenerateError for a chip of an exposure with fewer stars than terms to be fitted."""
     numbers = table.chip_number
     for chip in model.chips:
         n = int((numbers == chip.number).sum())
@@ -255,12 +246,12 @@ def _fit_held(
     epoch: float,
     chip: int,
     base: GaussianPriors,
-    options: dict[str, Any],
+    rejection: Rejection,
 ) -> LinearFit:
-    """The fit of one exposure with the terms above the first order held.
+    """Fit of one exposure with the terms above the first order fixed.
 
     They are known in the reference gauge, and the exposure has an orientation of its own.  It is
-    found from a linear map, then from the fit: the mean follows a change of what is held linearly.
+    found from a linear map, then from the fit: the mean is linear in the fixed values.
     """
     timed = joint.model.time is not None
     groups = joint.model.groups(
@@ -274,14 +265,15 @@ def _fit_held(
     sigma = HELD_WITHIN * (1.0 if model.unit == "pix" else model.pixel_size(known.ravel()))
 
     def held(angle: float) -> Float:
-        """What the high terms are in an exposure that the gauge turns by an angle."""
+        """Values of the fixed terms in an exposure that the gauge turns by an angle."""
         w = np.exp(-1j * angle) * (known[:, 0] + 1j * known[:, 1])
         return np.stack([w.real, w.imag], axis=1)[..., high].ravel()
 
     angle = _rotation(table, model, known)
     centre, precision = base.centre.copy(), base.precision.copy()
     centre[index], precision[index] = held(angle), sigma**-2
-    fit = fit_linear(table, model, priors=GaussianPriors(centre, precision), **options)
+    priors = GaussianPriors(centre, precision)
+    fit = fit_linear(table, model, rejection=rejection, priors=priors)
     gain = fit.cov[:, index] * sigma**-2
     for _ in range(20):
         found = reference_gauge(fit, chip).gauge
@@ -294,7 +286,7 @@ def _fit_held(
 
 
 def _rotation(table: MatchTable, model: DistortionModel, known: Float) -> float:
-    """The angle by which a gauge would turn (u, v), from a linear map of the joint solution."""
+    """Angle by which a gauge would turn (u, v), from a linear map of the joint solution."""
     bare = known.reshape(-1)
     w = model.predict(bare, table.x, table.y, chip=table.chip_number)
     A = np.column_stack([np.ones(len(table)), w])

@@ -1,10 +1,10 @@
-"""Where a chip lies, from exposures in which it moves by itself.
+"""Constant terms of a chip whose shift varies from exposure to exposure.
 
 The constant terms of a chip and the shifts of the chip in every exposure are seen only as their
-sums, which the data tell very well.  A fit that is to learn nothing of other parameters from these
-shifts gives them a wide prior (see `hierarchy`), and leaves the constants as open as that prior.
-Then what the constants are is settled here: the mean of the sums over the exposures, with the error
-that the scatter of the shifts gives a mean,
+sums, which the data determine very well.  A fit in which these shifts shall not constrain other
+parameters gives them a wide prior (see `hierarchy`), and leaves the constants as open as that
+prior.  The constants are determined here: as the mean of the sums over the exposures, with the
+error that the scatter of the shifts gives a mean,
 
     c -> c + G s + d      s -> s - X (G s + d)      d ~ N(0, tau^2 (X^T X)^-1)
 
@@ -32,27 +32,13 @@ AXES = ("u", "v")
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """One axis of one chip.
+    """One axis of one chip."""
 
-    Parameters
-    ----------
-    kind : int
-        Of its shifts, among the kinds of deviation.
-    constants : ndarray of int, shape (p,)
-        Where theta holds the constant term and its steps.
-    shifts : ndarray of int, shape (E,)
-        Where theta holds the shifts.
-    design : ndarray, shape (E, p)
-        X.
-    used : ndarray of bool, shape (E,)
-        Exposures whose shifts scatter by tau.
-    """
-
-    kind: int
-    constants: Int
-    shifts: Int
-    design: Float
-    used: NDArray[np.bool_]
+    kind: int  # of its shifts, among the kinds of deviation
+    constants: Int  # indices (p,) in theta of the constant term and its steps
+    shifts: Int  # indices (E,) in theta of the shifts
+    design: Float  # X (E, p)
+    used: NDArray[np.bool_]  # exposures (E,) whose shifts scatter by tau
 
     @property
     def inverse(self) -> Float:
@@ -61,14 +47,14 @@ class _Place:
         return np.asarray(np.linalg.inv(some.T @ some))
 
     def moved(self, theta: Float, d: Float) -> None:
-        """Settle parameters (..., D) in place, with given errors (..., p) of the constants."""
+        """Transform parameters (..., D) in place, with given errors (..., p) of the constants."""
         shifts = theta[..., self.shifts]
         step = shifts[..., self.used] @ self.design[self.used] @ self.inverse + d
         theta[..., self.constants] += step
         theta[..., self.shifts] -= step @ self.design.T
 
     def covariance(self, n: int, tau: float) -> Float:
-        """Of what d does to theta, shape (n, n)."""
+        """Covariance (n, n) of theta by the errors d of the constants."""
         by = np.zeros((n, len(self.constants)))
         by[self.constants] = np.eye(len(self.constants))
         by[self.shifts] = -self.design
@@ -77,15 +63,9 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """The step from shifts with a wide prior to constants that are means.
+    """Transformation from shifts with a wide prior to constants that are means."""
 
-    Parameters
-    ----------
-    places : tuple
-        One for each axis of every chip but the first.
-    """
-
-    places: tuple[_Place, ...]
+    places: tuple[_Place, ...]  # one for each axis of every chip but the first
 
     @classmethod
     def of(
@@ -96,18 +76,10 @@ class Settling:
         held: NDArray[np.bool_],
         outlying: NDArray[np.bool_],
     ) -> Settling:
-        """For the shifts of single chips among the kinds of deviation.
+        """Transformation for the shifts of single chips among the kinds of deviation.
 
-        Parameters
-        ----------
-        model : DistortionModel
-        kinds : sequence of str
-        groups : Groups
-            Of the data: which exposure has stars on which chip, and its epoch.
-        held : ndarray of bool, shape (D,)
-            Parameters with a prior of their own.
-        outlying : ndarray of bool, shape (E,)
-            Exposures that went wrong.
+        The groups of the data give the chips and the epoch of each exposure; `held` (D,) are
+        parameters with a prior of their own, `outlying` (E,) exposures that went wrong.
         """
         names = {name: k for k, name in enumerate(model.names)}
         places = []
@@ -141,21 +113,21 @@ class Settling:
         return cls(tuple(places))
 
     def mean(self, theta: Float) -> Float:
-        """Parameters (..., D), settled without an error of the constants."""
+        """Transformed parameters (..., D), without an error of the constants."""
         out = np.array(theta, float)
         for place in self.places:
             place.moved(out, np.zeros(len(place.constants)))
         return out
 
     def covariance(self, cov: Float, tau: Float) -> Float:
-        """Covariance (D, D) of settled parameters, where the scatter is tau (k,)."""
+        """Covariance (D, D) of transformed parameters, where the scatter is tau (k,)."""
         out = self.mean(self.mean(np.asarray(cov)).T)
         for place in self.places:
             out += place.covariance(len(out), float(tau[place.kind]))
         return np.asarray((out + out.T) / 2)
 
     def draws(self, theta: Float, tau: Float, rng: np.random.Generator) -> Float:
-        """Draws (n, D), settled with an error each; their scatter is tau (n, k)."""
+        """Transformed draws (n, D), with an error of the constants each, for scatter tau (n, k)."""
         out = np.array(theta, float)
         for place in self.places:
             root = np.linalg.cholesky(place.inverse)
@@ -164,7 +136,7 @@ class Settling:
         return out
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """As arrays by name, for a file."""
+        """Arrays by name, for a file."""
         return {
             f"settling.{k}.{name}": np.asarray(getattr(place, name))
             for k, place in enumerate(self.places)
@@ -173,7 +145,7 @@ class Settling:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Settling:
-        """What `to_arrays` gave, other arrays beside it."""
+        """Transformation from the arrays of `to_arrays`, among which may be others."""
         places: list[_Place] = []
         while f"settling.{len(places)}.kind" in arrays:
             of = f"settling.{len(places)}."

@@ -1,4 +1,4 @@
-"""Which frames bring the stars of several exposures together, where those of a model do not?"""
+"""Choice of frames that bring the stars of several exposures together, where a model's do not."""
 
 from __future__ import annotations
 
@@ -6,43 +6,36 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer.linear import fit_linear, residuals
+from bayesdist.infer.linear import Rejection, fit_linear, residuals
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
 
 __all__ = ["FrameChoice", "frames_that_help"]
 
-GAIN = 2.0  # by which the scatter must shrink
+GAIN = 2.0  # factor by which the scatter must shrink
 FITS = 3
 MEDIAN_LENGTH = 1.1774  # standard deviations, of the length of two normal numbers
-ALIKE = 1.1  # scatter of the frames that are taken, over the least of any
+ALIKE = 1.1  # largest scatter of the chosen frames, relative to the least of any
 
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """Frames that help.
+    """Recommended frames, with the scatter of the residuals by them and by the model's.
 
-    Parameters
-    ----------
-    frames : str
-    scatter, before : float
-        Median length of the residuals with these frames and with the model's, in the unit of u, v,
-        for the degrees of freedom that each leaves.
-    unit : str
-    instead_of : str
+    Both are median lengths in the unit of u, v, corrected for degrees of freedom.
     """
 
     frames: str
     scatter: float
-    before: float
+    before: float  # with the model's frames
     unit: str
     instead_of: str
 
     @property
     def sentence(self) -> str:
-        """What to do, and why."""
+        """Recommendation with its reason."""
         return (
             f"set model.frames = '{self.frames}', with which the residuals of the exposures scatter"
             f" by {self.scatter:.2g} {self.unit} in place of {self.before:.2g} with "
@@ -51,18 +44,10 @@ class FrameChoice:
 
 
 def frames_that_help(matches: MatchTable, model: DistortionModel) -> FrameChoice | None:
-    """The simplest frames with which stars scatter as little as with any, if that is far less.
+    """Simplest frames with which stars scatter as little as with any, if that is far less.
 
-    Parameters
-    ----------
-    matches : MatchTable
-        Errors are not used: all stars count alike.
-    model : DistortionModel
-
-    Returns
-    -------
-    FrameChoice or None
-        None for one exposure, and where no richer frames make the scatter half as large.
+    Errors are not used: all stars count alike.  None for one exposure, and where no richer frames
+    make the scatter half as large.
     """
     names = matches.exposure_names
     richer = FRAME_KINDS[FRAME_KINDS.index(model.frames) + 1 :]
@@ -71,7 +56,7 @@ def frames_that_help(matches: MatchTable, model: DistortionModel) -> FrameChoice
     found = {}
     for frames in (model.frames, *richer):
         one = replace(model, frames=frames, exposures=names)
-        if one.n_params > len(matches):  # what the frames take up would look like agreement
+        if one.n_params > len(matches):  # the part that the frames absorb would look like agreement
             continue
         try:
             found[frames] = _scatter(matches, one)
@@ -85,14 +70,14 @@ def frames_that_help(matches: MatchTable, model: DistortionModel) -> FrameChoice
 
 
 def _scatter(matches: MatchTable, model: DistortionModel) -> float:
-    """Median length of the residuals, for the degrees of freedom that the model leaves.
+    """Median length of the residuals, corrected for the model's degrees of freedom.
 
-    The first fit takes all pairs alike; in those that follow its scatter tells which are false.
+    The first fit weights all matches alike; in the next ones its scatter separates false ones.
     """
     median = 1.0
     for _ in range(FITS):
         sigma = np.full(len(matches), max(median / MEDIAN_LENGTH, np.finfo(float).tiny))
         table = replace(matches, sigma_u=sigma, sigma_v=sigma)
-        fit = fit_linear(table, model, clip_abs=None)
+        fit = fit_linear(table, model, rejection=Rejection(clip_abs=None))
         median = float(np.median(np.hypot(*residuals(fit, table).T)))
     return median * float(np.sqrt(2 * len(matches) / (2 * len(matches) - model.n_params)))

@@ -1,19 +1,19 @@
-"""All exposures jointly, with scale and shear of each scattered about the common polynomials.
+"""Joint fit of all exposures, with scale and shear of each scattered about the common polynomials.
 
     deviation k of exposure e ~ N(0, tau_k^2)     k: scale, shear_plus, shear_cross, and with
                                                   `chip_deviations` shift, rotation, scale and shear
                                                   of every chip but the first
 
 A telescope breathes: the linear terms of its exposures scatter by more than their formal errors,
-and a joint fit that does not know this believes in each star as if it were a new measurement of the
-detector.  The scatter tau is estimated with everything else.
+and a joint fit that ignores this takes each star as if it were a new measurement of the detector.
+The scatter tau is estimated with everything else.
 
-How the distance between chips goes with scale and shear is left open: it is no ruler, as it may
-drift by itself, and no measurement of its own (see `CAUTION`); where the chips lie is settled
-afterwards (see `Settling`).
+How the distance between chips changes with scale and shear is left open: it is no ruler, as it may
+drift by itself, and no measurement of its own (see `CAUTION`); the positions of the chips are
+computed afterwards (see `Settling`).
 
-One linear fit with a wide prior on the deviations is enough.  Its normal equations tell what the
-data alone say of them; tau, and what follows from any tau for all parameters, is then algebra (see
+One linear fit with a wide prior on the deviations is enough.  Its normal equations give the
+likelihood of the deviations; tau, and all parameters given tau, then follow by algebra (see
 `Scatter`).
 """
 
@@ -22,19 +22,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.exposures.scatter import Scatter
-from bayesdist.infer.linear import Clip, LinearFit, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, Clip, LinearFit, Rejection, fit_linear
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.transforms import reference_gauge
 from bayesdist.model import DistortionModel
@@ -43,13 +42,14 @@ __all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference"]
 
 Float = NDArray[np.float64]
 
-SCALE = 1e-4  # of the prior on tau: what velocity aberration does to the scale in a year
-# A focal plane that breathes moves its chips too: then the gap's deviations are those of scale and
-# shear over again, and taken as independent they would halve the error of a drift.  At four times
-# their scatter they take 3 % off it.
+SCALE = 1e-4  # of the prior on tau: variation of the scale by velocity aberration in a year
+# A focal plane that breathes moves its chips too: then the gap's deviations repeat those of scale
+# and shear, and taken as independent they would halve the error of a drift.  At four times their
+# scatter they reduce it by 3 %.
 CAUTION = 4.0
-MOST_OUTLYING = 0.2  # of the exposures: beyond, they are the rule
-LEAST_DETERMINED = 0.5  # deviations of a kind that the data must determine, out of E
+MOST_OUTLYING = 0.2  # fraction of the exposures beyond which they are the rule
+# smallest sum over E deviations of a kind of the parts that the data determine
+LEAST_DETERMINED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,24 +57,25 @@ class HierarchicalFit:
     """A joint solution of all exposures in which scale and shear of each may deviate.
 
     Draws and mean are over the posterior of tau.  So is the covariance, but for one simplification:
-    for its part within one tau stands that of the root mean square of tau.  Variances are linear in
-    tau^2 where the scatter rules, and more concave elsewhere, so that this errs to the safe side.
+    its part within one tau is computed at the root mean square of tau.  Variances are linear in
+    tau^2 where the scatter dominates, and more concave elsewhere, so that this errs to the safe
+    side.
 
     Parameters
     ----------
     fit : LinearFit
-        The linear fit with tau held at its root mean square.
+        The linear fit with tau fixed at its root mean square.
     scatter : Scatter
-        What the data say of tau.
+        Likelihood of the deviations and prior of tau.
     tau_draws : ndarray, shape (n, k)
         Draws of tau from its posterior.
     others : GaussianPriors
         The priors that were given.
     settling : Settling
-        What was done, in `fit` too, to the shifts of single chips.
+        Transformation, made in `fit` too, of the shifts of single chips.
     outlying : tuple of str
         Exposures whose deviations are far beyond the scatter of the others.  They are fitted with a
-        wide prior, and tau is not theirs.
+        wide prior, and do not enter tau.
     """
 
     fit: LinearFit
@@ -86,7 +87,7 @@ class HierarchicalFit:
 
     @property
     def index(self) -> NDArray[np.int64]:
-        """Where theta holds the deviations."""
+        """Indices in theta of the deviations."""
         return self.scatter.index
 
     @property
@@ -101,11 +102,11 @@ class HierarchicalFit:
 
     @property
     def clip(self) -> Clip:
-        """What was left out of the second pass."""
+        """Rule by which stars were left out of the second pass."""
         return self.fit.clip
 
     def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
-        """Which stars (N,) of a table were used."""
+        """Boolean mask (N,) of a table's stars that were used."""
         return self.fit.uses(matches)
 
     @property
@@ -122,7 +123,7 @@ class HierarchicalFit:
 
     @property
     def priors(self) -> GaussianPriors:
-        """The given priors and those of the deviations, as `sample` wants them."""
+        """Given priors and those of the deviations, as arguments for `sample`."""
         return _with_deviations(
             self.others, self.index, self.scatter.prior(_root_mean_square(self.tau_draws))
         )
@@ -150,9 +151,9 @@ class HierarchicalFit:
         """Posterior standard deviation of theta, shape (D,)."""
         return np.asarray(np.sqrt(np.diag(self.cov)))
 
-    @threadpool_limits.wrap(limits=1, user_api="blas")
+    @one_thread
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors (n, D): each with a tau of its own, and theta drawn with it."""
+        """Parameter vectors (n, D), each drawn given a tau of its own."""
         which = np.sort(rng.integers(len(self.tau_draws), size=n))
         theta = rng.standard_normal((n, len(self.fit.mean)))
         for t in np.unique(which):
@@ -192,11 +193,11 @@ def _with_deviations(
 
 
 def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -> DistortionModel:
-    """The model in gauge 'held', with polynomials that lie along the reference chip's axes.
+    """Model in gauge 'held', with polynomials along the reference chip's axes.
 
-    The first exposure's stars on that chip are fitted alone; where its reference pixel lies and how
-    it is turned is where the first exposure is held.  Frames then rotate about the reference pixel,
-    and scale, shear and drift are those of the detector, whatever the roll angles are.
+    The first exposure's stars on that chip are fitted alone; position and rotation of its reference
+    pixel fix the first exposure.  Frames then rotate about the reference pixel, and scale, shear
+    and drift are those of the detector, whatever the roll angles are.
 
     Parameters
     ----------
@@ -245,8 +246,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
     return replace(model, gauge="held", held=(*gauge.shift, -gauge.rotation), origin=(0.0, 0.0))
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_hierarchical(
     matches: Matches | Shards,
     model: DistortionModel,
@@ -257,8 +257,7 @@ def fit_hierarchical(
     pixel: float = 1.0,
     n_tau: int = 256,
     seed: int = 1,
-    clip_chi2: float = 25.0,
-    clip_abs: float | None = 2.0,
+    rejection: Rejection = DEFAULT_REJECTION,
     compute: Compute | None = None,
 ) -> HierarchicalFit:
     """Fit all exposures jointly, with the scatter of their scale and shear.
@@ -285,7 +284,8 @@ def fit_hierarchical(
         Draws of tau over which results are averaged.
     seed : int
         Of these draws.
-    clip_chi2, clip_abs, compute
+    rejection : Rejection
+    compute : Compute, optional
         As of `fit_linear`.
 
     Returns
@@ -310,10 +310,9 @@ def fit_hierarchical(
     half = max(max(chip.size) for chip in model.chips) / 2
     of_gap = np.array(["shift" in name for name in kinds])
     scales = scale * np.where(of_gap, half * pixel, 1.0)
-    options: dict[str, Any] = {"clip_chi2": clip_chi2, "clip_abs": clip_abs}
     with opened(model, matches, compute) as shards:
         wide = _with_deviations(others, index, scales[kind] ** -2)
-        first = fit_linear(shards, model, priors=wide, **options)
+        first = fit_linear(shards, model, rejection=rejection, priors=wide)
         limits = (first.clip.theta, first.clip.chi2_limit, first.clip.abs_limit)
         equations = shards.sum(least_squares, first.mean, *limits)
         matrix, right = equations.assemble(model, first.mean)
@@ -333,9 +332,8 @@ def fit_hierarchical(
         scatter = scatter.loosened(outlying[member])
         tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
         precision = scatter.prior(_root_mean_square(tau_draws))
-        fit = fit_linear(
-            shards, model, priors=_with_deviations(others, index, precision), **options
-        )
+        known = _with_deviations(others, index, precision)
+        fit = fit_linear(shards, model, rejection=rejection, priors=known)
         settling = Settling.of(model, kinds, equations.groups, others.precision > 0, outlying)
     fit = replace(
         fit,
@@ -347,9 +345,10 @@ def fit_hierarchical(
 
 
 def _outlying(scatter: Scatter, member: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which exposures (E,) went wrong: one after the other, the worst first, tau from the rest.
+    """Boolean mask (E,) of exposures that went wrong, removed one by one, the worst first.
 
-    None are named where they are more than a fifth: then they are the rule.
+    Tau is that of the remaining ones.  None are named where they are more than a fifth: then they
+    are the rule.
     """
     n = int(member.max()) + 1
     found = np.zeros(n, bool)
@@ -383,9 +382,9 @@ def _check(model: DistortionModel, has: list[str], kinds: tuple[str, ...]) -> No
 
 
 def _require_determined(scatter: Scatter, model: DistortionModel) -> None:
-    """Refuse data that hardly say more of a kind of deviation than its prior does."""
+    """Raise DegenerateError where data hardly constrain a kind of deviation more than its prior."""
     _, factor = scatter.posterior(scatter.scale / scatter.caution)
-    # of E deviations of a kind, so many are known from the data rather than from the prior
+    # part of each deviation that is known from the data rather than from the prior
     known = 1 - factor.variances()[scatter.index] / scatter.scale[scatter.kind] ** 2
     determined = np.bincount(scatter.kind, known)
     if (determined < LEAST_DETERMINED).any():

@@ -1,18 +1,18 @@
-"""The scatter of deviations, from what the data say of each of them.
+"""Scatter tau of deviations, from the likelihood of each of them.
 
 Deviations b ~ N(0, T), T = diag(tau^2) with one tau for each kind, among parameters theta of which
-the data say the quadratic form -1/2 d^T H d + r^T d, d = theta - theta_0.  Then, with P the
+the data determine the quadratic form -1/2 d^T H d + r^T d, d = theta - theta_0.  Then, with P the
 precision T^-1 where theta holds deviations and 0 elsewhere,
 
     log p(data | tau) = 1/2 [-log |H + P| - log |T| + q^T (H + P)^-1 q - b_0^T T^-1 b_0]
     q = r - P theta_0
 
 the restricted likelihood (REML: all that is not a deviation is integrated out, not maximised).  Its
-maximum is the fixed point tau_k^2 = mean over e of (b_ek^2 + var b_ek) of the EM algorithm.
-H has arrow shape, so that cost grows linearly with the number of exposures.
+maximum is the fixed point tau_k^2 = mean over e of (b_ek^2 + var b_ek) of the EM algorithm.  H has
+arrow shape, so that cost grows linearly with the number of exposures.
 
 An exposure that went wrong would make all others look worse than they are.  Its deviations may be
-called *loose*: they get a wide prior and say nothing of tau.
+*loose*: they get a wide prior and do not enter tau.
 """
 
 from __future__ import annotations
@@ -38,51 +38,31 @@ WIDENED = 0.9  # factor on the logarithm of the proposals' density
 LEAST_CURVATURE = 0.3
 LEAST_EFFICIENCY = 0.05  # effective fraction of the proposals; below, a chain is run
 PROPOSALS = 4  # for each draw of tau that is asked for
-BURN_IN, BETWEEN = 40, 3  # sweeps of a chain over all kinds, before the first draw and from then on
-SMALLEST, LARGEST = 1e-6, 1e3  # of the prior's scale: where the search for tau ends
+# sweeps of a chain over all kinds, before the first draw and between draws
+BURN_IN, BETWEEN = 40, 3
+SMALLEST, LARGEST = 1e-6, 1e3  # of the prior's scale: limits of the search for tau
 OUTLYING = 10.0  # times tau: scatter of the deviations of exposures that went wrong
 OUTLYING_FRACTION = 0.02  # of the exposures, expected to have gone wrong
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """What the data say of the deviations, and hence of their scatter.
+    """Likelihood of the deviations, and hence of their scatter."""
 
-    Parameters
-    ----------
-    kinds : tuple of str, length k
-        Kinds of deviation.
-    kind : ndarray of int, shape (m,)
-        Kind of each deviation.
-    index : ndarray of int, shape (m,)
-        Where theta holds the deviations.
-    matrix : Arrow
-        H, without the prior on the deviations.
-    right : ndarray, shape (D,)
-        r.
-    about : ndarray, shape (D,)
-        theta_0.
-    scale : ndarray, shape (k,)
-        Of the half-Student-t prior on each tau, with 4 degrees of freedom.
-    loose : ndarray of bool, shape (m,)
-        Which deviations have the prior N(0, scale^2).
-    caution : ndarray, shape (k,)
-        Factor, 1 or more, on tau in what follows from it for theta.  A kind that may be correlated
-        with others is kept from telling of them what it takes from its independence.
-    """
-
-    kinds: tuple[str, ...]
-    kind: NDArray[np.int64]
-    index: NDArray[np.int64]
-    matrix: Arrow
-    right: Float
-    about: Float
-    scale: Float
-    loose: NDArray[np.bool_]
+    kinds: tuple[str, ...]  # k kinds of deviation
+    kind: NDArray[np.int64]  # kind (m,) of each deviation
+    index: NDArray[np.int64]  # indices (m,) in theta of the deviations
+    matrix: Arrow  # H, without the prior on the deviations
+    right: Float  # r (D,)
+    about: Float  # theta_0 (D,)
+    scale: Float  # (k,) of the half-Student-t prior on each tau, with 4 degrees of freedom
+    loose: NDArray[np.bool_]  # mask (m,) of deviations that have the prior N(0, scale^2)
+    # factor (k,), 1 or more, on tau in all that follows from it for theta, so that a kind that may
+    # be correlated with others does not constrain them by an assumed independence
     caution: Float
 
     def precision(self, tau: Float) -> Float:
-        """Inverse variances (m,) of the deviations where tau is known."""
+        """Inverse variances (m,) of the deviations for known tau."""
         return np.asarray(np.where(self.loose, self.scale[self.kind], tau[self.kind]) ** -2)
 
     def prior(self, tau: Float) -> Float:
@@ -139,26 +119,16 @@ class Scatter:
         for k in range(len(out)):
             some = b[self.kind == k]
             spread = 1.4826 * np.median(np.abs(some - np.median(some)))
-            # the deviations are known against each other better than by themselves
+            # the deviations are determined better relative to each other than in total
             out[k] = max(spread, 0.1 * float(np.median(sigma[self.kind == k])))
         return np.minimum(out, self.scale)
 
     def odds(self, tau: Float, member: NDArray[np.int64]) -> Float:
-        """How much better "it went wrong" explains the deviations of each group.
+        """Log odds (n,) that a group of deviations went wrong: ten times the scatter of the others.
 
-        Parameters
-        ----------
-        tau : ndarray, shape (k,)
-            Of all that are not loose.
-        member : ndarray of int, shape (m,)
-            Group (exposure) of each deviation, from 0.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            Log odds of ten times the scatter against the scatter, 1 to 49 beforehand, by what all
-            others leave of the group.  The scatter is that of the others: a group that went wrong
-            raises tau, and would excuse itself.
+        They are 1 to 49 beforehand.  `member` (m,) is the group (exposure) of each deviation, from
+        0; `tau` (k,) that of all deviations that are not loose.  For each group the scatter is that
+        of the others: a group that went wrong raises tau, and would excuse itself.
         """
         precision = self.precision(tau)
         mean, factor = self._moments(precision)
@@ -174,7 +144,7 @@ class Scatter:
             columns[np.arange(len(at)), at] = 1.0
             cov = factor.solve(columns)[:, at]
             inverse = np.linalg.inv((cov + cov.T) / 2)
-            # what the data, and through them the other groups, say of this one
+            # likelihood of this group from the data and, through them, the other groups
             information = inverse - np.diag(precision[own])
             pull = inverse @ mean[at]
             mine = np.where(tight[own], squares[own], 0.0)
@@ -193,11 +163,11 @@ class Scatter:
         return out
 
     def loosened(self, loose: NDArray[np.bool_]) -> Scatter:
-        """The same with other loose deviations (m,)."""
+        """Scatter with other loose deviations (m,)."""
         return replace(self, loose=loose)
 
     def mode(self) -> Float:
-        """The most probable log tau, shape (k,)."""
+        """Most probable log tau (k,)."""
         low, high = np.log(SMALLEST * self.scale), np.log(LARGEST * self.scale)
         bounds = list(zip(low, high - 1e-6, strict=True))
         found = minimize(
@@ -211,12 +181,12 @@ class Scatter:
         return np.asarray(found.x)
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Draws of tau from its posterior, shape (n, k), of equal weight.
+        """Draws (n, k) of tau from its posterior, of equal weight.
 
         Importance sampling of log tau, resampled.  The kinds are proposed independently, each from
-        its density with the others at the mode, made a little wider: what one kind scatters mostly
-        says little of the others.  Where it says much, a Markov chain begins at the best of the
-        proposals.
+        its density with the others at the mode, made a little wider: the scatter of one kind mostly
+        depends little on the others.  Where it depends much, a Markov chain begins at the best of
+        the proposals.
         """
         proposals = self._proposals(self.mode())
         u = rng.uniform(size=(PROPOSALS * n, len(proposals)))
@@ -263,7 +233,7 @@ class Scatter:
         return out
 
     def _proposals(self, mode: Float) -> list[PiecewiseExponential]:
-        """A density of log tau for each kind, given the others at the mode."""
+        """Density of log tau for each kind, given the others at the mode."""
         out, step = [], 1e-3
         for k, e in enumerate(np.eye(len(mode))):
             up, down = (self.gradient(np.exp(mode + s * step * e))[k] for s in (1, -1))

@@ -1,8 +1,8 @@
-"""The drift of one solution in another: what a filter with few exposures takes from the reference.
+"""Drift of one solution in another, as for a filter with few exposures.
 
 ACS ISR 2015-06, section 4.4.4: the time dependence is derived in one filter and applied to all.
-Rates and steps are compared in the reference gauge, so that it does not matter how the catalogues
-or the first exposures of the two solutions lay.
+Rates and steps are compared in the reference gauge, so that the orientations of the two catalogues
+and first exposures do not matter.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.infer.equations.scaled import scaled_inverse, unit_diagonal
 from bayesdist.infer.transforms import Derived, Solution, reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.similarity import turned, turned_model
@@ -24,40 +25,18 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SharedDrift(Derived):
-    """A solution whose drift is that of another one.
-
-    Parameters
-    ----------
-    model : DistortionModel
-        Without frames.
-    mean : ndarray, shape (D,)
-    cov : ndarray, shape (D, D)
-    source : Solution
-        As it was, without frames.
-    reference : Solution
-        Whose drift it is.
-    gain : ndarray, shape (n_polynomial, n_tdd)
-        Change of the polynomials with the drift.
-    matrix : ndarray, shape (n_tdd, D')
-        From the reference in its gauge to the drift of this one.
-    """
+    """A solution, without frames, whose drift is that of another one."""
 
     model: DistortionModel
     mean: Float
     cov: Float
-    source: Solution
-    reference: Solution
-    gain: Float
-    matrix: Float
+    source: Solution  # the original solution, without frames
+    reference: Solution  # solution that gives the drift
+    gain: Float  # change of the polynomials with the drift (n_polynomial, n_tdd)
+    matrix: Float  # from the reference in its gauge to this drift (n_tdd, D')
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Parameter vectors (n, D): each draw of the source with a draw of the reference's drift.
-
-        Parameters
-        ----------
-        n : int
-        rng : numpy.random.Generator
-        """
+        """Parameter vectors (n, D): draws of the source with draws of the reference's drift."""
         theta = np.array(self.source.draws(n, rng), float)
         drift = np.asarray(self.reference.draws(n, rng), float) @ self.matrix.T
         k = self.model.n_polynomial
@@ -69,36 +48,18 @@ class SharedDrift(Derived):
 def with_drift_of(
     solution: Solution, reference: Solution, *, chip: int = 2, formal: Solution | None = None
 ) -> SharedDrift:
-    """Give a solution the drift of another one, and the polynomials that go with it.
+    """Solution with the drift of another one, and the polynomials that follow from it; no frames.
 
-    Parameters
-    ----------
-    solution : Solution
-        Its own data, or priors, must determine all of its drift.
-    reference : Solution
-    chip : int
-        Number of the reference chip.
-    formal : Solution, optional
-        Whose covariance tells how the polynomials go with the drift: the linear fit of a posterior,
-        as that of a few thousand draws is noisy.  The solution's own by default.
+    Its own data, or priors, must determine all of its drift.  `chip` is the number of the reference
+    chip.  The covariance of `formal` gives the change of the polynomials with the drift: the linear
+    fit of a posterior, as that of a few thousand draws is noisy; the solution's own by default.
 
-    Returns
-    -------
-    SharedDrift
-        Without frames.
-
-    Raises
-    ------
-    InputError
-        For solutions with other chips, units or reference dates, or without drift.
-    DegenerateError
-        When the covariance of the solution's drift is singular.
-
-    Notes
-    -----
     The polynomials follow as under a Gaussian posterior: given the drift they do not depend on what
-    the solution took its drift to be, neither from its data nor from a prior.  What its data say of
-    the drift is not used.
+    the solution took its drift to be, neither from its data nor from a prior.  The information of
+    its data about the drift is not used.
+
+    InputError for solutions with other chips, units or reference dates, or without drift;
+    DegenerateError when the covariance of the solution's drift is singular.
     """
     own = without_frames(solution)
     model = own.model
@@ -107,14 +68,12 @@ def with_drift_of(
     there, matrix = _in_gauge(reference, model, chip, gauge.rotation)
     k = model.n_polynomial
     cov = np.asarray(own.cov, float)
-    sigma = np.sqrt(np.diag(cov)[k:])
-    if not (sigma > 0).all():
+    if not (np.diag(cov)[k:] > 0).all():
         raise DegenerateError(
             "the solution's drift has no error", where="model.tdd", do="fit it, or give it a prior"
         )
     exact = cov if formal is None else np.asarray(without_frames(formal).cov, float)
-    scaled = exact[k:, k:] / np.outer(sigma, sigma)
-    gain = np.linalg.solve(scaled, (exact[:k, k:] / sigma).T).T / sigma
+    gain = exact[:k, k:] @ scaled_inverse(exact[k:, k:])
     drift = matrix @ np.asarray(there.mean, float)
     spread = matrix @ np.asarray(there.cov, float) @ matrix.T
     mean = np.array(own.mean, float)
@@ -132,41 +91,22 @@ def with_drift_of(
 def drift_priors(
     reference: Solution, model: DistortionModel, *, chip: int = 2
 ) -> dict[str, tuple[float, float]]:
-    """Priors on rates and steps from another solution, as independent ones may stand for them.
+    """Independent priors (mean, sigma) on a model's rates and steps, by name, from a reference.
 
-    Parameters
-    ----------
-    reference : Solution
-    model : DistortionModel
-        Whose drift is to have priors; its polynomials lie along the reference chip's axes, as
-        `held_in_reference` lays them.
-    chip : int
-        Number of the reference chip.
+    The model's polynomials lie along the reference chip's axes, as `held_in_reference` lays them.
+    InputError for solutions with other chips, units or reference dates, or without drift.
 
-    Returns
-    -------
-    dict of str to (mean, sigma)
-        By the names of the parameters.
-
-    Raises
-    ------
-    InputError
-        For solutions with other chips, units or reference dates, or without drift.
-
-    Notes
-    -----
     The reference's covariance S has strong correlations: chips drift together.  Independent priors
     of variances k diag(S), with k the largest eigenvalue of the correlation matrix, are nowhere
-    tighter than S: k diag(S) - S has no negative eigenvalue.  Whatever follows from them is stated
-    with an error that is too large rather than too small.  A rotation of the model against the
-    reference chip by some 1e-5, as the first exposure's error leaves it, changes a rate by 1e-5 of
-    another.
+    tighter than S: k diag(S) - S has no negative eigenvalue.  All that follows from them has an
+    error that is too large rather than too small.  A rotation of the model against the reference
+    chip by some 1e-5, as the first exposure's error leaves it, changes a rate by 1e-5 of another.
     """
     there, matrix = _in_gauge(reference, model, chip, 0.0)
     mean = matrix @ np.asarray(there.mean, float)
     cov = matrix @ np.asarray(there.cov, float) @ matrix.T
-    sigma = np.sqrt(np.diag(cov))
-    largest = float(np.linalg.eigvalsh(cov / np.outer(sigma, sigma))[-1])
+    correlation, sigma = unit_diagonal(cov)
+    largest = float(np.linalg.eigvalsh(correlation)[-1])
     names = model.names[model.n_polynomial : model.n_distortion]
     pairs = zip(mean.tolist(), (np.sqrt(largest) * sigma).tolist(), strict=True)
     return dict(zip(names, pairs, strict=True))
@@ -175,9 +115,9 @@ def drift_priors(
 def _in_gauge(
     reference: Solution, model: DistortionModel, chip: int, rotation: float
 ) -> tuple[Solution, Float]:
-    """The reference in its gauge, and the matrix (n_tdd, D') from there to the drift of a model.
+    """Reference in its gauge, and the matrix (n_tdd, D') from there to the drift of a model.
 
-    `rotation` is that which brings the model to the gauge.
+    `rotation` brings the model to the gauge.
     """
     _require_alike(reference.model, model)
     view = reference_gauge(reference, chip)
@@ -189,7 +129,7 @@ def _in_gauge(
 
 
 def _require_alike(reference: DistortionModel, model: DistortionModel) -> None:
-    """Drifts can be taken over between models of the same chips, unit, terms and dates only."""
+    """Raise InputError for drifts of models with different chips, units, terms or dates."""
     where = "model.tdd"
     if reference.time is None or model.time is None:
         raise InputError(

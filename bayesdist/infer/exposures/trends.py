@@ -1,4 +1,4 @@
-"""Do the deviations of exposures go with time, where they are taken to scatter at random?"""
+"""Test for trends in time of exposures' deviations, which are assumed to scatter at random."""
 
 from __future__ import annotations
 
@@ -10,28 +10,15 @@ __all__ = ["trend_p_values"]
 
 Float = NDArray[np.float64]
 
-FEWEST_FREE = 3  # degrees of freedom beside the lines
+FEWEST_FREE = 3  # degrees of freedom left by the lines
 
 
 def trend_p_values(values: Float, epoch: Float, breaks: ArrayLike = ()) -> Float:
-    """Probability (k,) of lines in time that are as steep by chance, for each kind of deviation.
+    """Probability (k,) of lines in time as steep by chance, for each kind of deviation (E, k).
 
-    An F test of a line in each segment against a constant, with the scatter of the exposures about
-    the lines for its noise: that is all noise that deviations have.
-
-    Parameters
-    ----------
-    values : ndarray, shape (E, k)
-        Deviations of exposures.
-    epoch : ndarray, shape (E,)
-        Decimal years.
-    breaks : array_like
-        Dates at which segments begin.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        1 where there are too few exposures.
+    An F test of a line in each segment against a constant.  Its noise is the scatter of the
+    exposures about the lines, which has all noise of the deviations.  `breaks` are the dates at
+    which segments begin; 1 where there are too few exposures.
     """
     segment = np.searchsorted(np.asarray(breaks, float), epoch, side="right")
     constant = (segment[:, None] == np.unique(segment)).astype(float)

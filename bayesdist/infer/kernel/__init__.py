@@ -1,7 +1,7 @@
-"""The fused passes over the stars, compiled: the only place that knows numba.
+"""Compiled passes over the stars: the only package that uses numba.
 
 Polynomials are evaluated on the fly by Horner's rule from the effective coefficients, so that no
-design matrix is read from memory.  Sums are taken over fixed pieces of the data and therefore do
+design matrix is read from memory.  Sums are taken over fixed chunks of the data and therefore do
 not depend on the number of threads.
 """
 
@@ -9,7 +9,6 @@ from bayesdist.infer.kernel.cache import kept_by_content
 
 with kept_by_content():
     from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
-    from bayesdist.infer.kernel.circle import circle_terms
     from bayesdist.infer.kernel.likelihood import log_likelihood
     from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
     from bayesdist.infer.kernel.moments import (
@@ -46,7 +45,6 @@ __all__ = [
     "UNIFORM",
     "Constants",
     "Moments",
-    "circle_terms",
     "eliminate_stars",
     "least_squares_moments",
     "linearised",

@@ -1,4 +1,4 @@
-"""How the stars are cut into pieces, and when a second thread pays."""
+"""Chunks into which the stars are cut, and the number of threads for them."""
 
 from __future__ import annotations
 
@@ -22,10 +22,7 @@ THREADS_PAY = 200_000  # evaluations of a star below which one thread is faster
 def pieces_of(starts: Int, size: int) -> Int:
     """Pieces (n, 3) of (group, first star, end), none larger than `size` or across two groups.
 
-    Parameters
-    ----------
-    starts : ndarray of int, shape (G + 1,)
-    size : int
+    `starts` (G + 1,) are the first stars of the groups.
     """
     first = [np.arange(a, b, size) for a, b in pairwise(starts)]
     group = np.repeat(np.arange(len(first)), [len(f) for f in first])
@@ -36,7 +33,7 @@ def pieces_of(starts: Int, size: int) -> Int:
 
 @contextmanager
 def threads_for(evaluations: float) -> Iterator[None]:
-    """One thread where more would wait for each other longer than they work."""
+    """Context with one thread where more would wait for each other longer than they work."""
     threads = nb.get_num_threads()
     nb.set_num_threads(threads if evaluations > THREADS_PAY else 1)
     try:

@@ -1,7 +1,7 @@
-"""Where compiled code is kept: by the content of all sources of the kernel.
+"""Cache folder of compiled code, by the content of all sources of the kernel.
 
 numba looks at the file of the function that it compiles, not at those of the functions that this
-one calls; after a change in one of them it would go on with the old code.
+one calls; after a change in one of them it would use the old code.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ __all__ = ["kept_by_content"]
 
 @contextmanager
 def kept_by_content() -> Iterator[None]:
-    """Functions that are declared inside use a cache folder of their own.
+    """Context in which declared functions use a cache folder by the content of the sources.
 
-    Where that cannot be made, or the user has set NUMBA_CACHE_DIR, numba's own choice stands.
+    Where that cannot be made, or the user has set NUMBA_CACHE_DIR, numba's own choice is used.
     """
     here = Path(__file__).parent
     digest = hashlib.sha256()

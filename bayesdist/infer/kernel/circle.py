@@ -1,4 +1,4 @@
-"""The probability that a Gaussian falls in a circle, with the derivatives that Newton steps need.
+"""Probability that a Gaussian falls in a circle, with the derivatives that Newton steps need.
 
 With a Gaussian of variances A, B about the origin and a circle of radius R about d, points on the
 circle are (x, y) = d + R (cos t, sin t), and q = (x^2/A + y^2/B) / 2.  The field that points away
@@ -10,9 +10,9 @@ over its edge,
 
 and derivatives by d are integrals over the edge of the Gaussian and its derivatives; those by the
 variances follow from dZ/dA = (1/2) d^2Z/dd_u^2.  Integrands are periodic and entire, so that equal
-steps in t converge faster than any power: some thirty nodes do for a circle of four sigma.
+steps in t converge faster than any power: some thirty nodes are enough for a circle of four sigma.
 
-Outside the circle the parts of E cancel, all but an exponentially small rest.  There 1/q, whose
+Outside the circle the parts of E cancel except for an exponentially small rest.  There 1/q, whose
 integral is zero then, is left out, and the largest e^-q is taken out of the sum.
 """
 
@@ -27,15 +27,15 @@ from numpy.typing import NDArray
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import FAST
 
-__all__ = ["NODES", "circle_terms", "inside", "log_circle", "nodes_for", "slopes"]
+__all__ = ["NODES", "inside", "log_circle", "nodes_for", "slopes"]
 
 Float = NDArray[np.float64]
 
 SURE = 8.6**2  # squared errors from the edge within which the probability is 1 to the last digit
-# squared error over radius that is the least the edge can resolve; steeper ones are blurred to it,
-# which concerns stars within a few such errors of their edge
+# smallest resolved squared error over radius; steeper edges are blurred to it, which concerns stars
+# within a few such errors of their edge
 STEEP = 512.0**-2
-CANCELLED = 1e3  # sum of moduli over the sum, from which on the rest is taken by itself
+CANCELLED = 1e3  # sum of moduli over the sum, above which the rest is computed separately
 EDGE = 0.02  # q below which E is a series
 
 COUNTS = (
@@ -46,7 +46,7 @@ MOST = COUNTS[-1]
 
 
 def _table() -> tuple[NDArray[np.int64], NDArray[np.int64], Float, Float]:
-    """Numbers of nodes, where each set of them begins, and their cosines and sines."""
+    """Numbers of nodes, the first of each set of them, and their cosines and sines."""
     angles = np.concatenate([2 * np.pi * np.arange(n) / n for n in COUNTS])
     begin = np.concatenate([[0], np.cumsum(COUNTS)[:-1]]).astype(np.int64)
     return np.array(COUNTS, np.int64), begin, np.cos(angles), np.sin(angles)
@@ -59,7 +59,7 @@ NODES = _table()
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def inside(du, dv, A, B, R):
-    """Whether the Gaussian lies in the circle but for less than the last digit."""
+    """True if all but less than the last digit of the Gaussian lies in the circle."""
     d2 = du * du + dv * dv
     room = R - math.sqrt(d2)
     return room > 0.0 and room * room > SURE * max(A, B)
@@ -67,7 +67,7 @@ def inside(du, dv, A, B, R):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def nodes_for(du, dv, A, B, R, counts):
-    """Which set of nodes resolves the integrand."""
+    """Index of the smallest set of nodes that resolves the integrand."""
     bend = R * math.sqrt(du * du / (A * A) + dv * dv / (B * B)) + R * R * abs(1.0 / A - 1.0 / B)
     wanted = 9.0 + 7.2 * math.sqrt(bend)
     if du * du + dv * dv > R * R:
@@ -80,7 +80,7 @@ def nodes_for(du, dv, A, B, R, counts):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _total(values, n):
-    """Sum of the first n, a multiple of four."""
+    """Sum of the first n values, n a multiple of four."""
     total = 0.0
     for s in range(0, n, 4):
         total += (values[s] + values[s + 1]) + (values[s + 2] + values[s + 3])
@@ -89,7 +89,7 @@ def _total(values, n):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _flux(e, away):
-    """What a node adds to the sum: E(e) times the way out."""
+    """Contribution of a node to the sum: E(e) times the way out."""
     series = 1.0 - e * (1.0 / 2 - e * (1.0 / 6 - e * (1.0 / 24 - e * (1.0 / 120 - e / 720))))
     safe = max(e, EDGE)
     return away * (series if e < EDGE else (1.0 - exp_negative(-safe)) / safe)
@@ -97,7 +97,7 @@ def _flux(e, away):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work):
-    """Logarithm of the probability, where the Gaussian's centre lies in the circle.
+    """Logarithm of the probability where the Gaussian's centre lies in the circle.
 
     No term is negative.
     """
@@ -111,7 +111,7 @@ def _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _exponents(du, dv, A, B, R, n, first, cosine, sine, q):
-    """q at the nodes, and the least of them."""
+    """Write q at the nodes to `q`; the least of them."""
     half_a, half_b = 0.5 / A, 0.5 / B
     least = math.inf
     for k in range(n):
@@ -124,7 +124,7 @@ def _exponents(du, dv, A, B, R, n, first, cosine, sine, q):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work):
-    """Logarithm of the probability, where it does not, from q at the nodes."""
+    """Logarithm of the probability where the centre is not in the circle, from q at the nodes."""
     scale = R / (2.0 * n * math.sqrt(A * B))
     for k in range(n):
         work[k] = _flux(q[k], R + du * cosine[first + k] + dv * sine[first + k])
@@ -159,16 +159,17 @@ def log_circle(du, dv, A, B, R, nodes, q, work):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def slopes(du, dv, A, B, R, nodes, q, work, out):
-    """`log_circle` and its derivatives, into out (10,).
+    """Write `log_circle` and its derivatives to out (10,).
 
-    The logarithm; its derivatives by u, v; uu, uv, vv; by a variance that is added on both axes;
-    by that and u, by that and v; and twice by that.
+    The logarithm; its derivatives by u, v; uu, uv, vv; by a variance that is added on both axes; by
+    that and u, by that and v; and twice by that.
     """
     for m in range(10):
         out[m] = 0.0
     if inside(du, dv, A, B, R):
         return
-    free_a, free_b = 1.0, 1.0  # whether the variance is what it is said to be
+    # 0 where the variance is at its limit and does not depend on the jitter
+    free_a, free_b = 1.0, 1.0
     if A < STEEP * R * R:
         A, free_a = STEEP * R * R, 0.0
     if B < STEEP * R * R:
@@ -207,36 +208,3 @@ def slopes(du, dv, A, B, R, nodes, q, work, out):
     out[0], out[1], out[2] = log_z, u, v
     out[3], out[4], out[5] = uu - u * u, uv - u * v, vv - v * v
     out[6], out[7], out[8], out[9] = t, tu - t * u, tv - t * v, tt - t * t
-
-
-@nb.njit(cache=True, nogil=True, fastmath=FAST)
-def _each(du, dv, A, B, R, nodes, out):
-    q, work = np.empty(MOST), np.empty(MOST)
-    for s in range(len(du)):
-        slopes(du[s], dv[s], A[s], B[s], R, nodes, q, work, out[s])
-
-
-def circle_terms(du: Float, dv: Float, A: Float, B: Float, radius: float) -> Float:
-    """Logarithm of the probability that Gaussians fall in circles, and its derivatives (N, 10).
-
-    Parameters
-    ----------
-    du, dv : ndarray, shape (N,)
-        Centres of the circles, seen from those of the Gaussians.
-    A, B : ndarray, shape (N,)
-        Variances in u and v.
-    radius : float
-        Of the circles.
-
-    Returns
-    -------
-    ndarray, shape (N, 10)
-        The logarithm; its derivatives by the centre's u, v; uu, uv, vv; by a variance that is added
-        on both axes; by that variance and u, by it and v; twice by it.
-    """
-    du, dv, A, B = (
-        np.ascontiguousarray(a, float) for a in np.broadcast_arrays(*np.atleast_1d(du, dv, A, B))
-    )
-    out = np.empty((len(du), 10))
-    _each(du, dv, A, B, float(radius), NODES, out)
-    return out

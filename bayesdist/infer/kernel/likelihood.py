@@ -1,4 +1,4 @@
-"""Log-likelihood of all stars for many parameter vectors: the pass that sampling consists of."""
+"""Log-likelihood of all stars for many parameter vectors: the pass of which sampling consists."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["log_likelihood"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-SCRATCH = 16_000_000  # bytes of partial sums held at a time
+SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
@@ -71,23 +71,10 @@ def log_likelihood(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Log-likelihood of all stars for many parameter vectors.
+    """Log-likelihood (D,) of all stars for D parameter vectors.
 
-    Parameters
-    ----------
-    blocks : ndarray of int, shape (n, 3)
-        `pieces_of` size `BLOCK`.
-    columns : tuple of ndarray, shape (N,)
-        X, Y, u, v, var_u, var_v.
-    coef : ndarray, shape (D, G, 2, K)
-        Effective coefficients of the scaled powers X^i Y^j.
-    order : int
-    constants : Constants
-        Arrays of length D.
-
-    Returns
-    -------
-    ndarray, shape (D,)
+    `blocks` (n, 3) are `pieces_of` size `BLOCK`; `columns` (N,) are X, Y, u, v, var_u, var_v;
+    `coef` (D, G, 2, K) are effective coefficients of the scaled powers X^i Y^j.
     """
     rows, coef = packed(constants), np.ascontiguousarray(coef)
     out = np.empty(len(coef))

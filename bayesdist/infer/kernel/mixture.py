@@ -1,7 +1,7 @@
-"""The mixture of one star as the passes need it: constants of a parameter vector, and densities.
+"""Mixture of one star in the passes: constants of a parameter vector, and densities.
 
-Densities are kept in units of 1 / (2 pi unit2), unit2 a typical variance, so that they are numbers
-of order one and the product of eight stays in range.
+Densities are in units of 1 / (2 pi unit2), unit2 a typical variance, so that they are numbers of
+order one and the product of eight stays in range.
 """
 
 from __future__ import annotations
@@ -29,33 +29,18 @@ LEAST, MOST = 1e-100, 1e100
 
 
 class Constants(NamedTuple):
-    """What the mixture is at some parameter vectors.
+    """Constants of the mixture at D parameter vectors."""
 
-    Parameters
-    ----------
-    j2 : ndarray, shape (D,)
-        Squared jitter.
-    log_f, log_1_f : ndarray, shape (D,)
-    out : ndarray, shape (D,)
-        Variance of Gaussian outliers, or area of the match circle.
-    kind : int
-        `NO_OUTLIERS`, `GAUSSIAN` or `UNIFORM`.
-    unit2 : float
-        A typical variance.
-    radius : float
-        Of the circle about nominal positions in which stars were matched; 0 where there is none.
-    """
-
-    j2: Float
+    j2: Float  # squared jitter (D,)
     log_f: Float
     log_1_f: Float
-    out: Float
-    kind: int
-    unit2: float
-    radius: float = 0.0
+    out: Float  # variance of Gaussian outliers, or area of the match circle (D,)
+    kind: int  # `NO_OUTLIERS`, `GAUSSIAN` or `UNIFORM`
+    unit2: float  # a typical variance
+    radius: float = 0.0  # of the match circle about nominal positions; 0 without one
 
     def of(self, rows: slice) -> Constants:
-        """Those of some of the parameter vectors."""
+        """Constants of some of the parameter vectors."""
         j2, log_f, log_1_f, out = (c[rows] for c in self[:4])
         return Constants(j2, log_f, log_1_f, out, self.kind, self.unit2, self.radius)
 
@@ -64,7 +49,7 @@ def packed(constants: Constants) -> Float:
     """Rows (D, 7) for the compiled loops.
 
     j^2; heights of the core (for unit variances) and of the outliers; half the inverse variance of
-    the outliers; what is added to their half chi-square; f; their inverse variance.
+    the outliers; the constant added to their half chi-square; f; their inverse variance.
     """
     j2, log_f, log_1_f, out = (np.atleast_1d(c) for c in constants[:4])
     f = np.exp(log_f)
@@ -103,7 +88,7 @@ def log_of_product(density, n, work):
         for s in range(LANES):
             mantissa *= work[s]
         total = math.log(mantissa) + exponent * 0.6931471805599453
-    else:  # extreme errors or fractions: each star by itself
+    else:  # extreme errors or fractions: each star alone
         for s in range(n):
             total += math.log(density[s])
     return total

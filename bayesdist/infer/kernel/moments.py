@@ -26,8 +26,8 @@ __all__ = ["PIECE", "Moments", "least_squares_moments", "mixture_moments"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-PIECE = 4096  # stars whose sums are kept apart, for the sake of the threads
-EVALUATIONS = 10  # what the sums of one star cost, in likelihood evaluations
+PIECE = 4096  # stars whose sums are separate, to be shared among threads
+EVALUATIONS = 10  # cost of the sums of one star, in likelihood evaluations
 
 N_LEAST, N_MIXTURE = 9, 10  # scalar sums of the two passes
 N_HYPER = 3  # log j, logit f, log s_out
@@ -35,28 +35,17 @@ N_HYPER = 3  # log j, logit f, log s_out
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over the stars of each group.
+    """Sums over the stars of each group."""
 
-    Parameters
-    ----------
-    weight : ndarray, shape (G, 3, K, K)
-        sum of w phi phi^T for the axis pairs uu, uv, vv.
-    right : ndarray, shape (G, 2, K)
-        sum of phi times minus the gradient by the model.
-    cross : ndarray, shape (G, 3, 2, K)
-        Mixed second derivatives with log j, logit f, log s_out; zero in least squares.
-    scalars : ndarray, shape (n,)
-        Sums over all groups: see the functions.
-    """
-
-    weight: Float
-    right: Float
+    weight: Float  # sum (G, 3, K, K) of w phi phi^T for the axis pairs uu, uv, vv
+    right: Float  # sum (G, 2, K) of phi times minus the gradient by the model
+    # mixed second derivatives (G, 3, 2, K) with log j, logit f, log s_out; zero in least squares
     cross: Float
-    scalars: Float
+    scalars: Float  # sums over all groups: see the functions
 
 
 def _powers(order: int) -> tuple[Int, Int]:
-    """Exponents i, j of all terms to a total order, by total order, then falling i."""
+    """Exponents i, j of all terms to a total order, by total order, then descending i."""
     i, j = np.array([(t - j, j) for t in range(order + 1) for j in range(t + 1)]).T
     return i, j
 
@@ -66,7 +55,7 @@ def product_table(order: int) -> Float:
     """Legendre coefficients (K, K, M) of the products of two basis functions.
 
     phi_k phi_l = sum_m T[k, l, m] P_i(X) P_j(Y), with (i, j) in the order of the moments: by total
-    order up to 2 `order`, then falling i.
+    order up to 2 `order`, then descending i.
     """
     top = 2 * order
     one = np.zeros((order + 1, order + 1, top + 1))
@@ -234,7 +223,7 @@ def _mixture(pieces, X, Y, u, v, var_u, var_v, coef, order, row, unit2, em):
 
 
 def _by_group(sums: Float, pieces: Int) -> Float:
-    """Moments (G, columns, M) of each group from those of its pieces, which stand in a row."""
+    """Moments (G, columns, M) of each group from those of its consecutive pieces."""
     first = np.flatnonzero(np.diff(pieces[:, 0], prepend=-1))
     return np.asarray(np.add.reduceat(sums, first, axis=0))
 
@@ -253,29 +242,15 @@ def least_squares_moments(
 ) -> Moments:
     """Normal equations of weighted least squares with rejection.
 
-    Parameters
-    ----------
-    pieces : ndarray of int, shape (n, 3)
-        `pieces_of` size `PIECE`.
-    columns : tuple of ndarray, shape (N,)
-        X, Y, u, v, var_u, var_v.
-    about, test : ndarray, shape (G, 2, K)
-        Effective coefficients of the scaled powers: where residuals are taken, and where those are
-        taken that decide on rejection.
-    order : int
-    chi2_limit, abs_limit : float
-        Stars with more than either are left out.
-    corner : float
-        Factor on the inverse variance in the corners, rising as the square of the radius.
-    power : int
-        1, or 2 for the squared weights that a sandwich covariance needs.
+    `pieces` (n, 3) are `pieces_of` size `PIECE`; `columns` (N,) are X, Y, u, v, var_u, var_v.
+    Residuals are taken at the effective coefficients `about` (G, 2, K) of the scaled powers, and
+    those at `test` decide on rejection: stars beyond either limit are left out.  `corner` is a
+    factor on the inverse variance in the corners, rising as the square of the radius; `power` is 1,
+    or 2 for the squared weights of a sandwich covariance.
 
-    Returns
-    -------
-    Moments
-        Its scalars: stars used; stars beyond `abs_limit`; chi-square of those used; their squared
-        residuals in u and in v; squared residuals of those left out; the weighted chi-square;
-        residuals in u and v of those used.
+    Scalars: stars used; stars beyond `abs_limit`; chi-square of those used; their squared residuals
+    in u and in v; squared residuals of those left out; the weighted chi-square; residuals in u and
+    v of those used.
     """
     K = (order + 1) * (order + 2) // 2
     rules = np.array([chi2_limit, min(abs_limit, 1e150) ** 2, corner, float(power)])
@@ -299,26 +274,16 @@ def mixture_moments(
     *,
     em: bool = False,
 ) -> Moments:
-    """Gradient and Hessian of the mixture's log-likelihood.
+    """Gradient and Hessian of the mixture's log-likelihood at one parameter vector.
 
-    Parameters
-    ----------
-    pieces, columns, order
-        As in `least_squares_moments`.
-    coef : ndarray, shape (G, 2, K)
-        Effective coefficients of the scaled powers.
-    constants : Constants
-        Of one parameter vector.
-    em : bool
-        Weights of the expectation-maximisation step, which are never negative, in place of the
-        Hessian; `cross` is zero then.
+    `coef` (G, 2, K) are effective coefficients of the scaled powers; `pieces`, `columns` and
+    `order` as in `least_squares_moments`.  With `em` the weights are those of the
+    expectation-maximisation step, which are never negative, in place of the Hessian, and `cross` is
+    zero.
 
-    Returns
-    -------
-    Moments
-        Its scalars: the log-likelihood; its derivatives by log j and, for logit f, the expected
-        number of outliers, then by log s_out; minus the Hessian by log j, logit f, log s_out: jj,
-        jf, js, ff, fs, ss.
+    Scalars: the log-likelihood; its derivatives by log j and, for logit f, the expected number of
+    outliers, then by log s_out; minus the Hessian by log j, logit f, log s_out: jj, jf, js, ff, fs,
+    ss.
     """
     K = (order + 1) * (order + 2) // 2
     with threads_for(EVALUATIONS * len(columns[0])):

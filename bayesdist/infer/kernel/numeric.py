@@ -33,7 +33,7 @@ def from_bits(typingctx: Any, x: Any) -> Any:
     )
 
 
-LOWEST = -700.0  # exp of less is 1e-304: nothing beside the larger branch of a mixture
+LOWEST = -700.0  # exp of less is 1e-304: negligible compared with the larger branch of a mixture
 ROUND = 6755399441055744.0  # 1.5 * 2^52: adding it leaves the nearest integer in the low bits
 LOG2_E = 1.4426950408889634
 # ln 2 in two parts, the first with trailing zeros, so that n times it is exact (Cody and Waite)
@@ -41,8 +41,8 @@ LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 
 
 # By LLVM, not by numba: inside a loop that may reorder its sums, adding and subtracting ROUND must
-# stay what it is.  And always: a function that is called stands twice among the compiled code, and
-# which one is taken, hence the last bit of a sum, would depend on whether the cache was warm.
+# stay as it is. And always: a function that is called is compiled twice, and which version is used,
+# hence the last bit of a sum, would depend on whether the cache was warm.
 @nb.njit(cache=True, forceinline=True, fastmath={"contract"})
 def exp_negative(x):
     """exp(x) for x <= 0, within two units of the last digit; below -700 as at -700."""

@@ -1,7 +1,7 @@
-"""Where on the sky a model has detections, and where on the detector it has stars.
+"""Sky positions of detections by a model, and detector positions of stars.
 
 Polynomials are sums of powers of scaled pixels, by Horner's rule, or of Legendre products; terms
-are sorted by total order, then by falling power of x.
+are sorted by total order, then by descending power of x.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["legendre", "linearised", "positions", "powers"]
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def legendre(x, y, order, px, py, phi):
-    """All basis functions of one position, by total order, then by falling power of x."""
+    """All basis functions of one position, by total order, then by descending power of x."""
     px[0] = py[0] = 1.0
     if order > 0:
         px[1], py[1] = x, y
@@ -46,7 +46,7 @@ def powers(coef, order, x, y):
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def positions(group, X, Y, coef, order):
-    """Places (N, 2) of detections from coefficients (G, 2, K) of the scaled powers."""
+    """Sky positions (N, 2) of detections from coefficients (G, 2, K) of the scaled powers."""
     out = np.empty((len(X), 2))
     for i in nb.prange(len(X)):
         out[i, 0] = powers(coef[group[i], 0], order, X[i], Y[i])
@@ -56,29 +56,15 @@ def positions(group, X, Y, coef, order):
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def linearised(group, seen_X, seen_Y, X, Y, places, coef, by_X, by_Y, half, order):
-    """Where stars lie on the detector by a solution, and the plane about it.
+    """Positions of stars on the detector by a solution, and the linearised model about them.
 
-    Parameters
-    ----------
-    group : ndarray of int, shape (N,)
-    seen_X, seen_Y, X, Y : ndarray, shape (N,)
-        Scaled positions of the detections, and where their stars lie as far as is known.
-    places : ndarray, shape (N, 2)
-        Of the stars on the sky.
-    coef, by_X, by_Y : ndarray, shape (G, 2, K)
-        Coefficients of the scaled powers, of the model and of its derivatives by X and by Y.
-    half : ndarray, shape (G, 2)
-        What X = 1 and Y = 1 are in pixels.
-    order : int
+    Scaled positions of the detections are `seen_X`, `seen_Y` (N,), those of their stars as far as
+    known X, Y (N,), and the stars' sky positions `places` (N, 2).  `coef`, `by_X`, `by_Y` (G, 2, K)
+    are coefficients of the scaled powers, of the model and of its derivatives by X and by Y; `half`
+    (G, 2) is the size of X = 1 and Y = 1 in pixels.
 
-    Returns
-    -------
-    X, Y : ndarray, shape (N,)
-        One step of Newton's further.
-    offset : ndarray, shape (N, 2)
-        J times the pixels from there to the detection.
-    W : ndarray, shape (N, 3)
-        uu, uv, vv of the inverse of J J^T.
+    Returns X, Y (N,) one Newton step further; the offset (N, 2), J times the pixels from there to
+    the detection; and W (N, 3), uu, uv, vv of the inverse of J J^T.
     """
     n = len(X)
     new_X, new_Y, offset, W = np.empty(n), np.empty(n), np.empty((n, 2)), np.empty((n, 3))

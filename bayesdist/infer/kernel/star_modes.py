@@ -1,22 +1,23 @@
-"""One star whose place is unknown: its most probable place, and its log density there.
+"""One star of unknown position: its most probable position, and its log density there.
 
-The residual of detection i is r = z - S p: its place z on the sky as the model has it, less that of
-its star, S the derivative of a star's place by its parameters p (position, then motion, then
-parallax).  Errors are round on the detector: with W = (J J^T)^-1, J the derivative of z by the
-pixel, r^T W r is in square pixels.
+The residual of detection i is r = z - S p: its sky position z by the model, less that of its star,
+S the derivative of a star's position by its parameters p (position, then motion, then parallax).
+Errors are round on the detector: with W = (J J^T)^-1, J the derivative of z by the pixel, r^T W r
+is in square pixels.
 
     log p = sum_i log[ (1 - f) / (2 pi s_i^2) exp(-r^T W r / (2 s_i^2)) + f / (pi R^2) ]
 
 with s_i^2 the detection's variance, jitter included, in square pixels.  With e_i the exponential
-and o_i what false detections are beside it, the membership is e_i / (e_i + o_i), and the logarithms
-are those of products: a detection takes one exponential.
+and o_i the term of false detections, the membership is e_i / (e_i + o_i), and the logarithms are
+those of products: a detection takes one exponential.
 
 The detections of a star are one array (ROWS, n), a row for each quantity: sums over them are then
 vector instructions.
 
-Where it is doubtful which detections are of the star, p has several modes, which come and go as z
-changes, and an expansion about one of them jumps.  The product over the detections is then written
-out: each choice of members is one Gaussian in p, whose integral is known, and these are added.
+Where it is doubtful which detections belong to the star, p has several modes, which come and go as
+z changes, and an expansion about one of them jumps.  The product over the detections is then
+written out: each choice of members is one Gaussian in p, whose integral is known, and these are
+added.
 """
 
 from __future__ import annotations
@@ -51,22 +52,22 @@ __all__ = [
 
 MOST_STAR = 5  # parameters of a star
 MOST_STEPS = 60
-CLOSE = 1e-8  # decrement at which one more step of Newton's is the last
-STILL = 1e-6  # square of the step, in errors, by which it may be so
+CLOSE = 1e-8  # decrement at which one more Newton step is the last
+STILL = 1e-6  # square of that step, in errors, at most
 NEAR = 1.0  # decrement below which the curvature of the mixture is used
-RANGE = 1e150  # of products whose logarithm is taken
+RANGE = 1e150  # of products before their logarithm is taken
 
-# of the detections of a star: place on the sky, W (uu, uv, vv), variance, e + o
+# rows of a star's detections: sky position, W (uu, uv, vv), variance, e + o
 PLACE_U, PLACE_V, UU, UV, VV, VAR, TERM = range(7)
 ROWS = 7
 
-# what a detection is, where the members of its star are chosen
+# state of a detection, where the members of its star are chosen
 MEMBER, DOUBTFUL, FALSE = range(3)
 
 
 @nb.njit(cache=True, forceinline=True)
 def own_rows(W, var, a, e):
-    """Detections a..e of a star, (ROWS, e - a), but for their places."""
+    """Detections a..e of a star, (ROWS, e - a), without their positions."""
     own = np.empty((ROWS, e - a))
     for i in range(a, e):
         own[UU, i - a], own[UV, i - a], own[VV, i - a] = W[i, 0], W[i, 1], W[i, 2]
@@ -93,7 +94,7 @@ def cholesky(A, q):
 
 @nb.njit(cache=True, forceinline=True)
 def _solve(L, b, q):
-    """Solve L L^T x = b in place; the squared length of L^-1 b."""
+    """Solve L L^T x = b in place and return the squared length of L^-1 b."""
     decrement = 0.0
     for i in range(q):
         for k in range(i):
@@ -109,7 +110,7 @@ def _solve(L, b, q):
 
 @nb.njit(cache=True, forceinline=True)
 def design(S, q, i, time, factor):
-    """Derivative (2, q) of a star's place by its parameters at the date of detection i."""
+    """Derivative (2, q) of a star's position by its parameters at the date of detection i."""
     S[0, 0] = S[1, 1] = 1.0
     S[0, 1] = S[1, 0] = 0.0
     if q >= 4:
@@ -121,7 +122,7 @@ def design(S, q, i, time, factor):
 
 @nb.njit(cache=True, forceinline=True)
 def residual(i, own, S, p, q):
-    """W times the residual, and its square in pixels."""
+    """W times the residual, and its square in square pixels."""
     ru, rv = own[PLACE_U, i], own[PLACE_V, i]
     for k in range(q):
         ru -= S[0, k] * p[k]
@@ -132,13 +133,13 @@ def residual(i, own, S, p, q):
 
 @nb.njit(cache=True, forceinline=True)
 def far_odds(log_core, log_out):
-    """Density of false detections over that of true ones, but for s^2 / e."""
+    """Density of false detections over that of true ones, without the factor s^2 / e."""
     return 2.0 * math.pi * math.exp(log_out - log_core)
 
 
 @nb.njit(cache=True, forceinline=True)
 def membership(odds, square, s2):
-    """Probability that a detection is its star's; `odds` as of `far_odds`."""
+    """Probability that a detection belongs to its star; `odds` as of `far_odds`."""
     near = exp_negative(-0.5 * square / s2)
     return near / (near + odds * s2)
 
@@ -155,7 +156,7 @@ def add_curvature(A, S, q, h0, h1, h2):
 
 @nb.njit(cache=True, forceinline=True)
 def hessian(i, own, wu, wv, s2, w, observed):
-    """Curvature (3 numbers) of a detection by its place: of the mixture, or with its EM weight."""
+    """Curvature (3 numbers) of a detection by position: of the mixture, or with its EM weight."""
     core = w / s2
     tie = w * (1.0 - w) / (s2 * s2) if observed else 0.0
     return (
@@ -167,7 +168,7 @@ def hessian(i, own, wu, wv, s2, w, observed):
 
 @nb.njit(cache=True, forceinline=True)
 def _start(centre, precision, p, A, b):
-    """What is known of a star beforehand: curvature, gradient, log density."""
+    """Prior of a star: curvature, gradient, log density."""
     value = 0.0
     for k in range(len(p)):
         b[k] = 0.0
@@ -180,7 +181,7 @@ def _start(centre, precision, p, A, b):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
 def _sums(own, j2, odds, pu, pv, share):
-    """Curvature and gradient of a star that stands still at (pu, pv); `share` as of `_expanded`."""
+    """Curvature and gradient of a star without motion at (pu, pv); `share` as of `_expanded`."""
     u, v, uu, uv, vv = own[PLACE_U], own[PLACE_V], own[UU], own[UV], own[VV]
     var, term = own[VAR], own[TERM]
     a00 = a10 = a11 = b0 = b1 = 0.0
@@ -203,9 +204,9 @@ def _sums(own, j2, odds, pu, pv, share):
 
 @nb.njit(cache=True)
 def _expanded(own, j2, odds, time, factor, centre, precision, p, S, A, b, observed):
-    """Log density of what is known of one star, gradient b and lower half of the curvature A."""
+    """Log density of one star with its prior, gradient b and lower half of the curvature A."""
     q, value = len(p), _start(centre, precision, p, A, b)
-    if q == 2:  # most stars stand still
+    if q == 2:  # most stars have no motion
         a00, a10, a11, b0, b1 = _sums(own, j2, odds, p[0], p[1], 1.0 if observed else 0.0)
         A[0, 0] += a00
         A[1, 0] += a10
@@ -230,7 +231,7 @@ def _expanded(own, j2, odds, time, factor, centre, precision, p, S, A, b, observ
 
 @nb.njit(cache=True)
 def _log_density(own, j2, log_core):
-    """Of the detections of a star, from the terms of its last expansion."""
+    """Log density of the detections of a star, from the terms of its last expansion."""
     value, product, n = 0.0, 1.0, own.shape[1]
     scale = own[VAR, 0] + j2  # keeps products near one
     for i in range(n):
@@ -245,12 +246,11 @@ def _log_density(own, j2, log_core):
 def to_mode(own, j2, log_core, log_out, time, factor, centre, precision, p, S, A, b, seen, least):
     """Move p to the mode of one star; leaves the factor of the curvature there in A.
 
-    own: as of `own_rows`, with places.
-    `least` is the root of the least curvature that its place may have: a star without members has
-    less, and stays where it is.
+    own: as of `own_rows`, with positions.  `least` is the root of the least curvature that its
+    position may have: a star without members has less, and is not moved.
 
     Returns the log density, and whether the curvature is the mixture's, or with EM weights: as
-    asked by `seen`, or in need.
+    requested by `seen`, or where necessary.
     """
     q, observed, failed, value, left = len(p), True, False, 0.0, 1.0
     odds = far_odds(log_core, log_out)
@@ -269,7 +269,7 @@ def to_mode(own, j2, log_core, log_out, time, factor, centre, precision, p, S, A
             return value + _log_density(own, j2, log_core), observed
         for k in range(q):
             p[k] += b[k]
-        # a step may be long and gain little; the curvature is another one where it ends
+        # a step may be long and gain little; the curvature at its end is different
         moved = own[UU, 0] * b[0] ** 2 + 2.0 * own[UV, 0] * b[0] * b[1] + own[VV, 0] * b[1] ** 2
         if left < CLOSE and moved < STILL * (own[VAR, 0] + j2):
             if observed == seen:  # the last step changes the curvature by next to nothing
@@ -286,9 +286,10 @@ def to_mode(own, j2, log_core, log_out, time, factor, centre, precision, p, S, A
 
 @nb.njit(cache=True, forceinline=True)
 def log_root(A, q, least):
-    """Half the log determinant of the curvature whose factor A is.
+    """Half the log determinant of the curvature with the factor A.
 
-    Without members a star may be anywhere; it is not, for its detections lie in one circle.
+    Without members a star's position would be unlimited; it is not, for its detections lie in one
+    circle.
     """
     total = 0.0
     for k in range(q):
@@ -298,15 +299,15 @@ def log_root(A, q, least):
 
 @nb.njit(cache=True)
 def summed_over_members(own, state, j2, log_core, log_out, centre, precision, p, doubtful, least):
-    """Log density of a star that stands still, its place integrated out, of all choices of members.
+    """Log density of a star without motion, integrated over position and summed over members.
 
-    own: as of `own_rows`, with places.
+    own: as of `own_rows`, with positions.
     state (n,): MEMBER, DOUBTFUL or FALSE; 2^k choices of k doubtful ones are added.
-    p (2,): a place near by, from which places are counted.
-    doubtful (k or more, 7): scratch, for what each would add.
-    least: as of `to_mode`; without members and knowledge the star is somewhere in the match circle.
+    p (2,): a position near by, relative to which positions are taken.
+    doubtful (k or more, 7): scratch, for the contribution of each.
+    least: as of `to_mode`; without members and prior the star is somewhere in the match circle.
 
-    The same up to a factor of 2 pi as the expansion about a mode has it: density less `log_root`.
+    Apart from a factor of 2 pi it equals the expansion about a mode: density less `log_root`.
     """
     log_norm = log_core - math.log(2.0 * math.pi)
     du, dv = centre[0] - p[0], centre[1] - p[1]
@@ -353,7 +354,7 @@ def summed_over_members(own, state, j2, log_core, log_out, centre, precision, p,
 
 @nb.njit(cache=True, forceinline=True)
 def _one_member(own, i, j2, log_norm, p):
-    """Curvature, gradient at p, square there and log of the norm of one member."""
+    """Curvature, gradient and square at p, and log of the norm, of one member."""
     s2 = own[VAR, i] + j2
     u, v = own[PLACE_U, i] - p[0], own[PLACE_V, i] - p[1]
     c00, c10, c11 = own[UU, i] / s2, own[UV, i] / s2, own[VV, i] / s2

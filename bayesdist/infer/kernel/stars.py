@@ -1,4 +1,4 @@
-"""Passes that leave a number for each star: residuals, and probabilities of being an outlier."""
+"""Passes that give a number for each star: residuals, and outlier probabilities."""
 
 from __future__ import annotations
 
@@ -36,15 +36,8 @@ def _residuals(blocks, X, Y, u, v, coef, order, out):
 def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) -> Float:
     """Data minus model (N, 2).
 
-    Parameters
-    ----------
-    blocks : ndarray of int, shape (n, 3)
-        `pieces_of` size `BLOCK`.
-    columns : tuple of ndarray, shape (N,)
-        X, Y, u, v and more.
-    coef : ndarray, shape (G, 2, K)
-        Effective coefficients of the scaled powers.
-    order : int
+    `blocks` (n, 3) are `pieces_of` size `BLOCK`; `columns` (N,) are X, Y, u, v and more; `coef` (G,
+    2, K) are effective coefficients of the scaled powers.
     """
     out = np.empty((len(columns[0]), 2))
     with threads_for(len(out)):
@@ -84,20 +77,9 @@ def _memberships(blocks, X, Y, u, v, var_u, var_v, coef, order, rows, unit2, out
 def memberships(
     blocks: Int, columns: tuple[Float, ...], coef: Float, order: int, constants: Constants
 ) -> Float:
-    """Probability of being an outlier and log-likelihood of each star, averaged over draws.
+    """Outlier probability, log-likelihood and its square (3, N) of each star, averaged over draws.
 
-    Parameters
-    ----------
-    blocks, columns, order
-        As in `residuals`.
-    coef : ndarray, shape (D, G, 2, K)
-    constants : Constants
-        Arrays of length D.
-
-    Returns
-    -------
-    ndarray, shape (3, N)
-        Probability; mean log-likelihood; mean of its square.
+    `coef` (D, G, 2, K) and the constants are those of D draws; other arguments as in `residuals`.
     """
     out = np.empty((3, len(columns[0])))
     with threads_for(4 * out.shape[1] * len(coef)):

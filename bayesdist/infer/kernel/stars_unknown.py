@@ -1,6 +1,6 @@
-"""Detections of stars whose positions are unknown: these are solved for, and eliminated, in a pass.
+"""Detections of stars of unknown position, which is solved for, and eliminated, in one pass.
 
-Detections are sorted by star.  The model is taken where the star lies by a solution at hand, at
+Detections are sorted by star.  The model is evaluated at the star's position by a current solution,
 the pixel x', and not where it was detected: z = z(x') + J (x - x').  J may then be constant, for
 z(x') - S p is as small as the solution is good.  At the detection itself it would be as large as
 the error is, and a model that made pixels smaller would make errors smaller.
@@ -33,15 +33,15 @@ from bayesdist.infer.kernel.star_modes import (
 
 __all__ = ["MOST_DOUBTFUL", "eliminate_stars", "log_marginals", "weighted_stars"]
 
-MOST_DOUBTFUL = 6  # detections of a star whose membership is added up
-PIECES = 8  # whose sums are kept apart, whatever the number of threads
+MOST_DOUBTFUL = 6  # most detections of a star over whose membership is summed
+PIECES = 8  # number of separate sums, whatever the number of threads
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=FAST)
 def weighted_stars(
     starts, z, W, var, j2, log_core, log_out, time, factor, centre, precision, least, stars
 ):
-    """Move stars (n, q) to their modes, given places z (N, 2); memberships (N,)."""
+    """Move stars (n, q) to their modes for sky positions z (N, 2); memberships (N,)."""
     n, q = stars.shape
     member, odds = np.zeros(len(z)), far_odds(log_core, log_out)
     for s in nb.prange(n):
@@ -70,13 +70,14 @@ def log_marginals(
 ):  # fmt: skip
     """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
 
-    Over all choices of members where some are doubtful: state (N,), as of `summed_over_members`.
+    Summed over all choices of members where some are doubtful: state (N,), as of
+    `summed_over_members`.
 
-    middles (S, 2), share (N,): a star goes where its detections go on the mean, these weighted, and
-    lies at `stars` where the mean is `middles`.
+    middles (S, 2), share (N,): a star moves with the weighted mean of its detections, and lies at
+    `stars` where that mean is `middles`.
     coef (G, 2, K, D): of the Legendre products, draws last: one detection takes them together.
-    rows (D, 3): squared jitter, log of the core's share, log density of outliers.
-    least: root of the least curvature that a star's place may have.
+    rows (D, 3): squared jitter, log of the core's fraction, log density of outliers.
+    least: root of the least curvature that a star's position may have.
     """
     q, K, n_draws = stars.shape[1], coef.shape[2], len(rows)
     sums = np.zeros((PIECES, n_draws))
@@ -142,15 +143,16 @@ def eliminate_stars(
 ):  # fmt: skip
     """Sums of a second-order expansion over stars first..last, these moved to their modes.
 
-    Besides what `log_marginals` takes: coef (G, 2, K) of the Legendre products, and of each group
-    its chip (G,), the linear part (G, 2, 2) of its frame, the derivatives (G, m, 2, K) by its other
-    parameters and which these are (G, m), -1 for none; `seen`: curvature of the mixture itself.
+    In addition to the arguments of `log_marginals`: coef (G, 2, K) of the Legendre products, and of
+    each group its chip (G,), the linear part (G, 2, 2) of its frame, the derivatives (G, m, 2, K)
+    by its other parameters and the indices of these (G, m), -1 for none; `seen`: curvature of the
+    mixture itself.
 
     Returns direct (P, chips, 3, K, K), edge (P, G, m, 2, K), own (P, G, m, m): curvature by
     coefficients (uu, uv, vv, lower halves), by these and the rest, by the rest; pull_direct (P,
-    chips, 2, K), pull_own (P, G, m): gradients; scalars (P, 4): log density, sums of w, of
-    w (1 - w), and of w times the squared normalised residual; rows (S q, D): L^-1 B of each star;
-    factors (S, q, q): L.
+    chips, 2, K), pull_own (P, G, m): gradients; scalars (P, 4): log density, sums of w, of w (1 -
+    w), and of w times the squared normalised residual; rows (S q, D): L^-1 B of each star; factors
+    (S, q, q): L.
     """
     q, K, m, odds = stars.shape[1], coef.shape[2], extra.shape[1], far_odds(log_core, log_out)
     n_chips, n_groups = chip.max() + 1, len(coef)
@@ -208,7 +210,7 @@ def eliminate_stars(
                 scalars[piece, 3] += w * square / s2
                 gu, gv = -w * wu / s2, -w * wv / s2
                 M = linear[g]
-                # H M, M^T H M and the gradient by what stands before the frame
+                # H M, M^T H M and the gradient by coefficients before the frame
                 a0, a1 = h0 * M[0, 0] + h1 * M[1, 0], h0 * M[0, 1] + h1 * M[1, 1]
                 b0, b1 = h1 * M[0, 0] + h2 * M[1, 0], h1 * M[0, 1] + h2 * M[1, 1]
                 t0 = M[0, 0] * a0 + M[1, 0] * b0
@@ -247,8 +249,8 @@ def eliminate_stars(
                     for l in range(K):
                         rows[row + k, at_u + l] += c0 * phi[l]
                         rows[row + k, at_u + K + l] += c1 * phi[l]
-            # of the same terms as the rows, or what detections leave free would not be free: that
-            # of the last step but one is not exactly the same
+            # of these terms exactly, else directions that detections leave free would not be free:
+            # those of the last step but one are slightly different
             same = cholesky(A, q)
             for k in range(q):
                 for l in range(k + 1):
@@ -256,7 +258,7 @@ def eliminate_stars(
                         factors[s - first, k, l] = A[k, l]
                     else:
                         A[k, l] = factors[s - first, k, l]
-            # L^-1 of them: what elimination subtracts is their square
+            # L^-1 of them: elimination subtracts their square
             for k in range(q):
                 for l in range(k):
                     below = A[k, l]

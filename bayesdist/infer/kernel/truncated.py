@@ -1,4 +1,4 @@
-"""The passes over stars that are matched only within a circle about a nominal position.
+"""Passes over stars that are matched only within a circle about a nominal position.
 
     p(r | matched) = (1 - f) N(r) / Z + f p_out(r) / Z_out
 
@@ -6,8 +6,8 @@ Z and Z_out are the probabilities of either part to fall in the circle, which de
 position, on the jitter and on the scale of the outliers: see `circle`.  f is the fraction of false
 matches among those in the circle.  Uniform outliers fill the circle, and their Z_out is 1.
 
-These passes stand beside those without a circle, which stay as fast as they are: here a star costs
-an integral.
+These passes are separate from those without a circle, which stay as fast as they are: here a star
+costs an integral.
 """
 
 from __future__ import annotations
@@ -43,17 +43,14 @@ __all__ = [
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-SCRATCH = 16_000_000  # bytes of partial sums held at a time
-INTEGRAL = 30  # what a star costs, in likelihood evaluations without a circle
+SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
+INTEGRAL = 30  # cost of a star, in likelihood evaluations without a circle
 N_TERMS = 21  # columns and scalars of one star
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _parts(ru, rv, du, dv, au, av, row, gaussian, radius, nodes, q, work):
-    """Densities of both parts, and what was taken out of them: half a chi-square.
-
-    In the unit of `mixture`.
-    """
+    """Densities of both parts, in the unit of `mixture`, and half the chi-square taken out."""
     q_in = 0.5 * (ru * ru / au + rv * rv / av)
     q_in += log_circle(du, dv, au, av, radius, nodes, q, work)
     q_out = (ru * ru + rv * rv) * row[3] + row[4]
@@ -178,9 +175,9 @@ def _memberships(
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _star(ru, rv, du, dv, au, av, row, gaussian, wavering, radius, nodes, q, work, zc, zo, out):
-    """What one star gives: 11 columns of `mixture_moments`, then its 10 scalars.
+    """Write the terms of one star to out (21,): 11 columns and 10 scalars of `mixture_moments`.
 
-    Of `out` (21,).  `wavering` is 1, or 0 at fixed memberships.
+    `wavering` is 1, or 0 at fixed memberships.
     """
     nodes = nodes
     j2, f, w = row[0], row[5], row[6]
@@ -366,20 +363,10 @@ def truncated_log_likelihood(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Log-likelihood of all stars for many parameter vectors.
+    """Log-likelihood (D,) of all stars for D parameter vectors.
 
-    Parameters
-    ----------
-    blocks, columns, coef, order
-        As in `log_likelihood`.
-    offsets : tuple of ndarray, shape (N,)
-        Nominal position minus data, in u and v.
-    constants : Constants
-        Arrays of length D; the radius is that of the circle.
-
-    Returns
-    -------
-    ndarray, shape (D,)
+    `offsets` (N,) are nominal position minus data, in u and v; the radius of the constants is that
+    of the circle; other arguments as in `log_likelihood`.
     """
     rows, coef = packed(constants), np.ascontiguousarray(coef)
     out = np.empty(len(coef))
@@ -412,19 +399,9 @@ def truncated_memberships(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Probability of being an outlier and log-likelihood of each star, averaged over draws.
+    """Outlier probability, log-likelihood and its square (3, N) of each star, averaged over draws.
 
-    Parameters
-    ----------
-    blocks, columns, coef, order, constants
-        As in `memberships`; the radius of the constants is that of the circle.
-    offsets : tuple of ndarray, shape (N,)
-        Nominal position minus data, in u and v.
-
-    Returns
-    -------
-    ndarray, shape (3, N)
-        Probability; mean log-likelihood; mean of its square.
+    `offsets` (N,) are nominal position minus data, in u and v; other arguments as in `memberships`.
     """
     out = np.empty((3, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[1] * len(coef)):
@@ -454,22 +431,12 @@ def truncated_moments(
     *,
     em: bool = False,
 ) -> Moments:
-    """Gradient and Hessian of the mixture's log-likelihood.
+    """Gradient and Hessian of the mixture's log-likelihood, with the scalars of `mixture_moments`.
 
-    Parameters
-    ----------
-    pieces, columns, coef, order, constants
-        As in `mixture_moments`; the radius of the constants is that of the circle.
-    offsets : tuple of ndarray, shape (N,)
-        Nominal position minus data, in u and v.
-    em : bool
-        Curvature at fixed memberships, in place of the Hessian; `cross` is zero then.  It is the
-        covariance of a truncated Gaussian times two inverse variances, and never negative.
-
-    Returns
-    -------
-    Moments
-        With the scalars of `mixture_moments`.
+    `offsets` (N,) are nominal position minus data, in u and v; other arguments as in
+    `mixture_moments`.  With `em` the curvature is that at fixed memberships, in place of the
+    Hessian, and `cross` is zero.  It is the covariance of a truncated Gaussian times two inverse
+    variances, and never negative.
     """
     K = (order + 1) * (order + 2) // 2
     with threads_for(INTEGRAL * len(columns[0])):
@@ -504,22 +471,10 @@ def truncated_scores(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Gradient of each star's log-likelihood by the model's u and v, and its curvature.
+    """Gradient of each star's log-likelihood by u and v, and minus its uu, uv, vv curvature (5, N).
 
-    Parameters
-    ----------
-    blocks, columns, order
-        As in `residuals`.
-    offsets : tuple of ndarray, shape (N,)
-        Nominal position minus data, in u and v.
-    coef : ndarray, shape (G, 2, K)
-    constants : Constants
-        Of one parameter vector.
-
-    Returns
-    -------
-    ndarray, shape (5, N)
-        The gradient; minus the second derivatives uu, uv, vv.
+    `offsets` (N,) are nominal position minus data, in u and v; `coef` is (G, 2, K), for the
+    constants of one parameter vector; other arguments as in `residuals`.
     """
     out = np.empty((5, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[1]):

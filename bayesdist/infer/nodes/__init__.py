@@ -1,6 +1,6 @@
-"""Look-up tables from residuals: node values, their errors, and how the polynomial goes with them.
+"""Look-up tables from residuals: node values, their errors, and the polynomial that goes with them.
 
-`field_table` takes the nodes for a Gaussian random field, `binned_table` is the way of ACS ISR
+`field_table` models the nodes as a Gaussian random field, `binned_table` is the way of ACS ISR
 2015-06; `fit_with_tables` runs either in turn with the polynomial fit.
 """
 

@@ -1,8 +1,8 @@
-"""Polynomial and look-up tables in turn, until both stand still.
+"""Polynomial and look-up tables fitted in turn, until both converge.
 
 Each round corrects the pixels by the tables of the last one, fits the polynomial, and makes the
 tables anew from *all* that the polynomial leaves: residuals, with the last tables' own shifts added
-back.  Nothing is smoothed twice, and where the rounds end is the joint solution of both.
+back.  Nothing is smoothed twice, and the rounds end at the joint solution of both.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ Float = NDArray[np.float64]
 Fit = Callable[[MatchTable, DistortionModel], LinearFit]
 
 LIKELY = 0.5  # stars that are less likely true matches are left out
-SEARCHED = 2  # rounds that look for hyperparameters; later ones hold them, so that rounds converge
+SEARCHED = 2  # rounds that optimise hyperparameters; later ones fix them, so that rounds converge
 
 
 @dataclass(frozen=True)
 class Round:
-    """What one round did.
+    """Statistics of one round.
 
     Parameters
     ----------
@@ -75,35 +75,18 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class Alternated:
-    """Polynomial and tables of the matches of one filter.
+    """Polynomial and tables of the matches of one filter."""
 
-    Parameters
-    ----------
-    filter : str
-        Of the tables; '' for the detector's.
-    fit : LinearFit
-        The polynomial, fitted last, with these tables held.
-    tables : tuple of LookupTable
-        One for each chip.
-    posteriors : tuple of TablePosterior
-        The same with all that is known of them; empty for binned tables.
-    trust : Trust
-        Of the matches, in their order.
-    progress : tuple of Round
-    converged : bool
-        Whether the tables moved less than the tolerance in the last round.
-    """
-
-    filter: str
-    fit: LinearFit
-    tables: tuple[LookupTable, ...]
-    posteriors: tuple[TablePosterior, ...]
-    trust: Trust
+    filter: str  # of the tables; '' for the detector's
+    fit: LinearFit  # the polynomial, fitted last, with these tables fixed
+    tables: tuple[LookupTable, ...]  # one for each chip
+    posteriors: tuple[TablePosterior, ...]  # of the tables; empty for binned ones
+    trust: Trust  # of the matches, in their order
     progress: tuple[Round, ...]
-    converged: bool
+    converged: bool  # the tables moved less than the tolerance in the last round
 
 
-# all large matrices are factored here, one by one: see `field_table`
+# all large matrices are factored here, one at a time: see `field_table`
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def alternate(
     matches: MatchTable,
@@ -119,30 +102,12 @@ def alternate(
     fit: Fit = fit_linear,
     report: Callable[[Round], None] | None = None,
 ) -> Alternated:
-    """Fit the polynomial and the tables of one set of matches.
+    """Polynomial and tables of one set of matches, at raw pixels and with errors.
 
-    Parameters
-    ----------
-    matches : MatchTable
-        At raw pixels, with errors.
-    model : DistortionModel
-    beneath : sequence of LookupTable
-        Tables that are applied first and held.
-    filter : str
-        Filter of the new tables; '' for the detector's.
-    method, rounds, tolerance, step, smoothness, fit, report
-        As `fit_with_tables`.
-
-    Returns
-    -------
-    Alternated
-
-    Raises
-    ------
-    InputError
-        For an unknown method, no rounds, or a tolerance that is not positive.
-    DegenerateError
-        When the data do not determine the polynomial.
+    Tables `beneath` are applied first and fixed; `filter` is that of the new tables, '' for the
+    detector's; other arguments as in `fit_with_tables`.  InputError for an unknown method, no
+    rounds, or a tolerance that is not positive; DegenerateError when the data do not determine the
+    polynomial.
     """
     if method not in ("field", "binned"):
         raise InputError(f"there is no method {method!r} for tables", do="choose field or binned")
@@ -160,7 +125,7 @@ def alternate(
     progress: list[Round] = []
 
     def solved(pixel: float) -> LinearFit:
-        """The polynomial with the tables held; `pixel` is the size of one in u, v."""
+        """Polynomial fit for fixed tables; `pixel` is the size of one in u, v."""
         if trust is None:
             return fit(on_the_chips(moved, model), model)
         jitter = np.full(len(x), trust.jitter)
@@ -247,13 +212,13 @@ def alternate(
 
 
 def with_columns(matches: MatchTable, **changes: Any) -> MatchTable:
-    """The same matches with some columns replaced."""
+    """Matches with some columns replaced."""
     columns = {one.name: getattr(matches, one.name) for one in fields(matches)}
     return MatchTable.of_distinct_rows(**(columns | changes))
 
 
 def on_the_chips(matches: MatchTable, model: DistortionModel) -> MatchTable:
-    """Without the few stars at the rim that a table has moved off the chip.
+    """Matches without the few at the edge that a table has moved off the chip.
 
     There the polynomial is not defined.  They count in the tables all the same.
     """
@@ -270,7 +235,7 @@ def inside_chips(matches: MatchTable, model: DistortionModel) -> NDArray[np.bool
 
 
 def _trusted(matches: MatchTable, trust: Trust, jitter: Float) -> MatchTable:
-    """The likely true matches, with errors that make the polynomial's weights those of the tables.
+    """Likely true matches, with errors that give the polynomial the weights of the tables.
 
     A star of probability p counts p times: its variance is divided by p.
     """

@@ -1,4 +1,4 @@
-"""A look-up table the report's way: bins, iterative sigma clipping, smoothing.
+"""Look-up table after ACS ISR 2015-06: bins, iterative sigma clipping, smoothing.
 
 ACS ISR 2015-06, section 4.3.1: residuals are averaged in bins of 64 x 64 pixels with iterative
 sigma clipping, then each grid point is smoothed with a 5 x 5 quadratic kernel.
@@ -22,7 +22,7 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 PASSES = 20  # of the clipping, at most
-OWN_SCATTER = 5  # stars from which on a bin's own scatter is its error
+OWN_SCATTER = 5  # stars from which on a bin's error is from its own scatter
 
 
 def binned_table(
@@ -37,22 +37,22 @@ def binned_table(
     filter: str = "",
     step: tuple[float, float] = STEP,
 ) -> LookupTable:
-    """Clipped means in bins, smoothed.
+    """Table of clipped means in bins, smoothed.
 
     Parameters
     ----------
     x, y : array_like, shape (N,)
         Raw pixels.
     shift : array_like, shape (N, 2)
-        What has to be added to them, pixels.
+        Corrections to be added to them, pixels.
     chip : Chip
     order : int, optional
-        Take off the part that a polynomial of this order describes; left in by default, as in the
+        Subtract the part that a polynomial of this order describes; left in by default, as in the
         report.
     clip : float
         Stars beyond this many standard deviations of their bin's, on either axis, are left out.
     smooth : bool
-        Whether the 5 x 5 kernel is applied: `quadratic_smoother`.
+        True to apply the 5 x 5 kernel: `quadratic_smoother`.
     filter : str
     step : tuple of float
         Size of the bins, pixels.
@@ -60,8 +60,8 @@ def binned_table(
     Returns
     -------
     LookupTable
-        With the standard error of each node, by propagation of the errors of the bins' means.  It
-        knows nothing of what smoothing takes off the pattern itself.  A node with no star within
+        With the standard error of each node, propagated from the errors of the bins' means.  It
+        does not include what smoothing removes of the pattern itself.  A node with no star within
         the kernel is zero, and the rms of the others is its error.
 
     Raises
@@ -108,7 +108,7 @@ def binned_table(
 
 
 def _clipped(bins: Int, r: Float, n: int, clip: float) -> NDArray[np.bool_]:
-    """Which stars (N,) are left when clipping changes nothing any more."""
+    """Boolean mask (N,) of the stars left when clipping changes nothing any more."""
     centre, scale = _robust(bins, r, n)
     kept: NDArray[np.bool_] = np.ones(len(r), bool)
     for _ in range(PASSES):
@@ -121,7 +121,7 @@ def _clipped(bins: Int, r: Float, n: int, clip: float) -> NDArray[np.bool_]:
 
 
 def _robust(bins: Int, r: Float, n: int) -> tuple[Float, Float]:
-    """Median and scaled median absolute deviation (n, 2): where the clipping begins."""
+    """Median and scaled median absolute deviation (n, 2), from which the clipping starts."""
     centre, scale = np.zeros((n, 2)), np.zeros((n, 2))
     for a in (0, 1):
         centre[:, a] = _medians(bins, r[:, a], n)
@@ -142,7 +142,7 @@ def _medians(bins: Int, values: Float, n: int) -> Float:
 
 
 def _moments(bins: Int, r: Float, n: int) -> tuple[Int, Float, Float]:
-    """Stars (n,), mean and standard deviation (n, 2) of each bin; zero where undefined."""
+    """Number (n,), mean and standard deviation (n, 2) of stars in a bin; zero where undefined."""
     count = np.bincount(bins, minlength=n)
     mean, square = np.zeros((n, 2)), np.zeros((n, 2))
     for a in (0, 1):

@@ -1,6 +1,6 @@
-"""How rough and how large the pattern is: the marginal likelihood of the field's hyperparameters.
+"""Marginal likelihood of the field's hyperparameters: roughness and size of the pattern.
 
-With the polynomial integrated out (REML) the stars leave of each axis a rough estimate of the node
+With the polynomial integrated out (REML) the stars give on each axis a rough estimate of the node
 values, d = B b, that scatters about the truth with covariance B.  The truth is a field with
 covariance C, so d is Gaussian with covariance C + B: one Cholesky factor for each set of
 hyperparameters, however many the stars.
@@ -27,48 +27,34 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 # A bin without stars is given one observation of zero, 1e4 times worse than the typical bin's: it
-# says nothing of a pattern of any size and keeps B finite.  (The posterior needs no such help.)
+# does not constrain a pattern of any size and keeps B finite. (The posterior needs no such help.)
 EMPTY = 1e-8
-TILE = 16  # nodes: the search begins on independent tiles of the chip
+TILE = 16  # nodes: the search starts on independent tiles of the chip
 LOG_LENGTH = (np.log(2.0), 1.0)  # prior of log(length / step): mean, standard deviation
 SETTLED = 0.02  # gain in log density at which the search stops
-RULED_OUT = 10.0  # so much worse on the tiles, a smoothness is not looked at again
+RULED_OUT = 10.0  # a smoothness so much worse on the tiles is not tried again
 
 
 @dataclass(frozen=True, eq=False)
 class FittedField:
-    """Hyperparameters of one axis at their most probable values.
-
-    Parameters
-    ----------
-    prior : Matern
-    covariance : ndarray, shape (2, 2)
-        Of log amplitude and log length, from the curvature there.
-    log_evidence : dict of float to float
-        Log marginal likelihood of each smoothness, at its own best amplitude and length, up to a
-        constant that they share.  Those that the first, cheap search rules out are left out.
-    """
+    """Hyperparameters of one axis at their most probable values."""
 
     prior: Matern
-    covariance: Float
+    covariance: Float  # of log amplitude and log length (2, 2), from the curvature there
+    # log marginal likelihood by smoothness, at its own best amplitude and length, up to a common
+    # constant; without those that the first, cheap search rules out
     log_evidence: dict[float, float]
 
     @property
     def log_sigma(self) -> tuple[float, float]:
-        """Standard errors of log amplitude and log length: relative errors."""
+        """Standard errors of log amplitude and log length, which are relative errors."""
         a, b = np.sqrt(np.diag(self.covariance))
         return float(a), float(b)
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Marginal likelihood of the hyperparameters of one axis.
-
-    Parameters
-    ----------
-    grid : NodeGrid
-    sums : NodeSums
-    """
+    """Marginal likelihood of the hyperparameters of one axis."""
 
     grid: NodeGrid
     sums: NodeSums
@@ -99,7 +85,7 @@ class Evidence:
 
     @cached_property
     def _tiles(self) -> Int:
-        """Nodes (T, m) of equal tiles that cover the chip but for a margin."""
+        """Nodes (T, m) of equal tiles that cover the chip except for a margin."""
         ny, nx = self.grid.shape
         my, mx = min(TILE, ny), min(TILE, nx)
         nodes = np.arange(ny * nx).reshape(ny, nx)
@@ -108,14 +94,14 @@ class Evidence:
 
     @cached_property
     def _tile_parts(self) -> tuple[Int, Float, Float]:
-        """Lags of a tile (m, m), and B (T, m, m) and rough values (T, m) of all."""
+        """Lags of a tile (m, m), and B (T, m, m) and rough values (T, m) of all tiles."""
         tiles = self._tiles
         lag = self.grid.lag[np.ix_(tiles[0], tiles[0])]
         noise = self.noise[tiles[:, :, None], tiles[:, None, :]]
         return lag, noise, self.rough[tiles]
 
     def tiled_log_likelihood(self, prior: Matern) -> float:
-        """The same of the tiles, each by itself: a good start at a hundredth of the cost."""
+        """Log marginal likelihood of independent tiles: a good start at a hundredth of the cost."""
         lag, noise, rough = self._tile_parts
         by_lag = prior.amplitude**2 * prior.correlation(self.grid.lags)
         by_lag[0] += prior.amplitude**2 * NUGGET
@@ -126,9 +112,9 @@ class Evidence:
     def log_prior(self, prior: Matern) -> float:
         """Log prior density of log amplitude and log length, up to a constant.
 
-        That of the amplitude itself rises in proportion to it: this keeps the most probable value
-        from zero, where it would claim certainty (Chung et al. 2013, Psychometrika 78, 685).  The
-        length is a few steps, give or take: it matters only where there is hardly any pattern.
+        The density of the amplitude itself rises in proportion to it: this keeps the most probable
+        value from zero, where it would claim certainty (Chung et al. 2013, Psychometrika 78, 685).
+        The length is about a few steps: it matters only where there is hardly any pattern.
         """
         mean, sd = LOG_LENGTH
         step = float(np.sqrt(np.prod(self.grid.step)))
@@ -137,7 +123,7 @@ class Evidence:
 
     @cached_property
     def start(self) -> tuple[float, float]:
-        """Log amplitude and log length to begin with, from the scatter of the rough values."""
+        """Starting log amplitude and log length, from the scatter of the rough values."""
         noise = np.diag(self.noise)
         known = noise < 100 * np.median(noise)
         excess = np.mean(self.rough[known] ** 2) - np.mean(noise[known])
@@ -146,19 +132,9 @@ class Evidence:
 
 
 def fitted_field(evidence: Evidence, smoothness: Sequence[float], *, thorough: bool) -> FittedField:
-    """The most probable amplitude, length and smoothness.
+    """Most probable amplitude, length and smoothness of the given ones.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    smoothness : sequence of float
-        Those to choose from.
-    thorough : bool
-        Go on from the tiles to the whole chip.
-
-    Returns
-    -------
-    FittedField
+    If `thorough` the whole chip is used after the tiles.
     """
 
     def density(nu: float, whole: bool) -> Callable[[Float], float]:
@@ -195,17 +171,9 @@ def fitted_field(evidence: Evidence, smoothness: Sequence[float], *, thorough: b
 
 
 def refined_field(evidence: Evidence, earlier: FittedField) -> FittedField:
-    """The most probable amplitude and length, sought from where nearly the same data had them.
+    """Most probable amplitude and length, starting from those of nearly the same data.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    earlier : FittedField
-        Its smoothness is kept, and so are the differences of the log evidence.
-
-    Returns
-    -------
-    FittedField
+    The smoothness of `earlier`, and the differences of its log evidence, are used again.
     """
     nu = earlier.prior.smoothness
 
@@ -225,7 +193,7 @@ def _prior(point: Float, nu: float) -> Matern:
 
 
 def _bounds(evidence: Evidence) -> list[tuple[float, float]]:
-    """Of log amplitude and log length: far beyond what a grid can show."""
+    """Bounds of log amplitude and log length: far beyond the range that a grid can show."""
     amplitude, _ = evidence.start
     step = np.log(np.sqrt(np.prod(evidence.grid.step)))
     extent = np.log(max(evidence.grid.chip.size))
@@ -238,7 +206,7 @@ def _summit(
     """Maximum of a smooth function of two variables, the covariance there, and its value.
 
     Newton's method on differences, of half a standard error where that is known: a few steps from a
-    good start, and the curvature comes with it.
+    good start, and the curvature is obtained too.
     """
     x = np.asarray(start, float)
     h = np.full(2, 0.1) if covariance is None else _widths(covariance)
@@ -251,7 +219,7 @@ def _summit(
         cross = corner - ends[0, 0] - ends[1, 0] + f
         curvature[0, 1] = curvature[1, 0] = cross / (h[0] * h[1])
         values, vectors = np.linalg.eigh(-curvature)
-        # uphill even where the curvature is of the wrong sign
+        # uphill even where the curvature has the wrong sign
         values = np.maximum(np.abs(values), 1e-3 * np.abs(values).max() + 1e-6)
         covariance = (vectors / values) @ vectors.T
         step = covariance @ slope
@@ -270,7 +238,7 @@ def _widths(covariance: Float) -> Float:
 
 def _cholesky(matrix: Float) -> Float:
     """Lower factor of a symmetric matrix, which is overwritten."""
-    # the transpose of a C array is what LAPACK wants, and the matrix is symmetric
+    # the transpose of a C array has the order of LAPACK, and the matrix is symmetric
     L, failed = scipy.linalg.lapack.dpotrf(matrix.T, lower=1, clean=1, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("the matrix is not positive definite")

@@ -1,4 +1,4 @@
-"""A look-up table as a Gaussian random field, measured by every star through bilinear weights."""
+"""Look-up table as a Gaussian random field, measured by every star through bilinear weights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["checked_stars", "field_table"]
 
 Float = NDArray[np.float64]
 
-STEADY = 1e-5  # change of the stars' typical variance that no error of the jitter can tell
+STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
 ROUNDS = 6
 
 
@@ -42,14 +42,14 @@ def field_table(
     earlier: TablePosterior | None = None,
     hold: bool = False,
 ) -> TablePosterior:
-    """The posterior of a table from the residuals of one chip.
+    """Posterior of a table from the residuals of one chip.
 
         shift = W d + polynomial + noise,  noise variance = quoted variance + jitter^2
 
     The node values d are a Matern field without its polynomial part.  The polynomial is integrated
     out under a flat prior, so that a table from the residuals of any earlier polynomial fit is the
     table of the joint solution.  Amplitude, length and smoothness maximise the marginal likelihood,
-    for each axis by itself: a defect of columns is seen in x alone, and a common value would save
+    separately for each axis: a defect of columns is seen in x alone, and a common value would save
     no time.
 
     Parameters
@@ -57,7 +57,7 @@ def field_table(
     x, y : array_like, shape (N,)
         Raw pixels.
     shift : array_like, shape (N, 2)
-        What has to be added to them, pixels: see `pixel_shifts`.
+        Corrections to be added to them, pixels: see `pixel_shifts`.
     variance : array_like, shape (N, 2)
         Square of its error, square pixels.
     chip : Chip
@@ -72,9 +72,9 @@ def field_table(
     smoothness : sequence of float
         Matern smoothness to choose from.
     earlier : TablePosterior, optional
-        The table of nearly the same stars, of an earlier round: the search begins there.
+        Table of nearly the same stars from an earlier round, at which the search starts.
     hold : bool
-        Take the hyperparameters of the earlier table and do not look for better ones.
+        True to take the hyperparameters of the earlier table unchanged.
 
     Returns
     -------
@@ -83,8 +83,8 @@ def field_table(
     Raises
     ------
     InputError
-        For arrays of other shapes, values that are not finite, an unknown smoothness, or nothing
-        to hold.
+        For arrays of other shapes, values that are not finite, an unknown smoothness, or `hold`
+        without an earlier table.
     DegenerateError
         When the stars do not determine the polynomial.
     """
@@ -132,7 +132,7 @@ def field_table(
     mean = np.stack([axis.mean for axis in axes])
     sigma = np.stack([axis.sigma for axis in axes])
     table = grid.table(mean, sigma, filter=filter)
-    # of j where it is large beside its error, of how large it can be where it is zero
+    # standard error of j where j is large; where it is zero, its possible size
     jitter = float(np.sqrt(j2))
     spread = float(np.sqrt(j2 + error)) - jitter
     return TablePosterior(table, grid, axes, jitter, spread, float(w.sum()))
@@ -148,11 +148,8 @@ def checked_stars(
 ) -> tuple[Float, Float, Float, Float, Float]:
     """Stars as arrays of float64.
 
-    Raises
-    ------
-    InputError
-        For other shapes, no stars, values that are not finite, variances that are not positive, or
-        weights outside 0..1.
+    InputError for other shapes, no stars, values that are not finite, variances that are not
+    positive, or weights outside 0..1.
     """
     where = f"look-up table of chip {chip.number}"
     px = np.atleast_1d(np.asarray(x, float))
@@ -197,7 +194,7 @@ def _residual(
     sums: Sequence[NodeSums],
     nodes: Sequence[Float],
 ) -> Float:
-    """What node values of both axes, and the polynomials that go with them, leave of the shifts."""
+    """Shifts minus node values of both axes and the polynomials that go with them."""
     values = np.stack(nodes, axis=1)
     polynomial = np.stack([s.polynomial_of(d) for s, d in zip(sums, nodes, strict=True)], axis=1)
     out = np.empty_like(shift)
@@ -210,6 +207,6 @@ def _residual(
 
 
 def _n_rough(evidence: Evidence) -> float:
-    """Parameters of a fit without smoothing."""
+    """Number of parameters of a fit without smoothing."""
     sums = evidence.sums
     return len(sums.polynomial) + float((sums.information * evidence.noise).sum())

@@ -1,4 +1,4 @@
-"""The matches of one filter and a model of their exposures."""
+"""Matches of one filter and a model of their exposures."""
 
 from __future__ import annotations
 
@@ -18,25 +18,10 @@ __all__ = ["matches_of_filter"]
 def matches_of_filter(
     matches: MatchTable, model: DistortionModel | Mapping[str, DistortionModel], filter: str
 ) -> tuple[MatchTable, DistortionModel]:
-    """The matches of one filter, and a model for them.
+    """Matches of one filter, and a model with their exposures.
 
-    Parameters
-    ----------
-    matches : MatchTable
-    model : DistortionModel or dict of str to DistortionModel
-        A model for all filters is cut to the exposures that this one has.
-    filter : str
-
-    Returns
-    -------
-    matches : MatchTable
-        Its exposures are the model's.
-    model : DistortionModel
-
-    Raises
-    ------
-    InputError
-        When a dict of models lacks the filter, or the exposure that holds the gauge is missing.
+    A model for all filters is cut to the exposures of this one.  InputError when a dict of models
+    lacks the filter, or the exposure that fixes the gauge is missing.
     """
     some = matches.select(matches.filter == matches.filter_names.index(filter))
     if not isinstance(model, DistortionModel):

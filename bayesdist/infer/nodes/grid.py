@@ -1,8 +1,8 @@
-"""The nodes of one chip's look-up table, and the part of it that the polynomial already describes.
+"""Nodes of one chip's look-up table, and the part of it that the polynomial already describes.
 
-A table and a polynomial of the pixel overlap: what one takes the other gives.  The overlap goes to
-the polynomial: node values are orthogonal to every polynomial of the model's order, summed over the
-nodes, each of which stands for an equal piece of the detector.
+A table and a polynomial of the pixel overlap: a common part can be in either.  It goes to the
+polynomial: node values are orthogonal to every polynomial of the model's order, summed over the
+nodes, each of which represents an equal part of the detector.
 """
 
 from __future__ import annotations
@@ -29,23 +29,12 @@ STEP = (64.0, 64.0)  # pixels: the grid of D2IMFILE and NPOLFILE
 class NodeGrid:
     """Nodes at the centres of equal bins of a chip.
 
-    Parameters
-    ----------
-    chip : Chip
-    order : int
-        Of the polynomial that goes with the table.
-    step : tuple of float
-        Size of a bin along x and y, pixels.
-
-    Raises
-    ------
-    InputError
-        When there are too few nodes to hold anything beside the polynomial.
+    InputError when there are too few nodes to represent more than the polynomial.
     """
 
     chip: Chip
-    order: int
-    step: tuple[float, float] = STEP
+    order: int  # of the polynomial that goes with the table
+    step: tuple[float, float] = STEP  # size of a bin along x and y, pixels
 
     def __post_init__(self) -> None:
         if not min(self.step) > 0:
@@ -62,7 +51,7 @@ class NodeGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Nodes along y and x: (ny, nx)."""
+        """Number of nodes along y and x: (ny, nx)."""
         nx, ny = (
             int(np.ceil(n / s - 1e-9)) for n, s in zip(self.chip.size, self.step, strict=True)
         )
@@ -70,7 +59,7 @@ class NodeGrid:
 
     @property
     def n_nodes(self) -> int:
-        """Nodes of one axis."""
+        """Number of nodes of one axis."""
         ny, nx = self.shape
         return ny * nx
 
@@ -80,13 +69,7 @@ class NodeGrid:
         return PolynomialBasis(self.order, self.chip.size, self.chip.reference_pixel)
 
     def table(self, values: Float, sigma: Float | None = None, *, filter: str = "") -> LookupTable:
-        """A table on these nodes.
-
-        Parameters
-        ----------
-        values, sigma : ndarray, shape (2, n_nodes) or (2, ny, nx)
-        filter : str
-        """
+        """Table with values and errors (2, n_nodes) or (2, ny, nx) on these nodes."""
         shape = (2, *self.shape)
         first = (self.step[0] + 1) / 2, (self.step[1] + 1) / 2
         spread = None if sigma is None else np.reshape(sigma, shape)
@@ -95,7 +78,7 @@ class NodeGrid:
 
     @cached_property
     def blank(self) -> LookupTable:
-        """The table of zeros: it knows the weights of the nodes at any pixel."""
+        """Table of zeros, which has the weights of the nodes at any pixel."""
         return self.table(np.zeros((2, self.n_nodes)))
 
     @cached_property
@@ -116,7 +99,7 @@ class NodeGrid:
 
     @cached_property
     def lag(self) -> Int:
-        """For each pair of nodes (n_nodes, n_nodes) the entry of `lags` that tells them apart."""
+        """Entry of `lags` for each pair of nodes (n_nodes, n_nodes)."""
         ny, nx = self.shape
         row, column = np.divmod(np.arange(ny * nx), nx)
         along_y = np.abs(row[:, None] - row)

@@ -1,4 +1,4 @@
-"""The error of the stars beyond the quoted one, once the table and the polynomial are taken off."""
+"""Error of the stars in excess of the quoted one, after the table and the polynomial."""
 
 from __future__ import annotations
 
@@ -16,23 +16,10 @@ def jitter_variance(
 ) -> tuple[float, float]:
     """Most probable variance of the jitter, shared by both axes, and its standard error.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (N, 2)
-    variance : ndarray, shape (N, 2)
-        Quoted.
-    weight : ndarray, shape (N,)
-        Probability of being a true match.
-    n_effective : float
-        Parameters that the residuals were fitted with, both axes together.
+    From residuals (N, 2), their quoted variances (N, 2) and the probabilities (N,) of true matches;
+    `n_effective` is the number of fitted parameters, both axes together.  The variance is 0 where
+    the quoted errors are right or too large.
 
-    Returns
-    -------
-    variance, error : float
-        The variance is 0 where the quoted errors are right or too large.
-
-    Notes
-    -----
     The derivative of the marginal likelihood, with the variance of the fitted values spread over
     the stars as their information is: exact for equal errors.
     """

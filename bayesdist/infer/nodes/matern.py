@@ -1,4 +1,4 @@
-"""The random field that node values are drawn from, before anything is measured."""
+"""Prior of the node values: a Matern random field."""
 
 from __future__ import annotations
 
@@ -15,28 +15,18 @@ Float = NDArray[np.float64]
 
 SMOOTHNESS = (0.5, 1.5, 2.5)
 
-# Share of the variance that each node has for itself: a field that is very smooth on the grid has a
-# covariance that no computer can factor.  1e-9 is 3e-5 of the amplitude.
+# Fraction of the variance that each node has independently: a field that is very smooth on the grid
+# has a covariance that no computer can factor. 1e-9 is 3e-5 of the amplitude.
 NUGGET = 1e-9
 
 
 @dataclass(frozen=True)
 class Matern:
-    """Stationary Gaussian random field (Rasmussen and Williams 2006, Equation 4.14).
+    """Stationary Gaussian random field (Rasmussen and Williams 2006, Equation 4.14)."""
 
-    Parameters
-    ----------
-    amplitude : float
-        Standard deviation, pixels.
-    length : float
-        Correlation length, pixels.
-    smoothness : float
-        1/2, 3/2 or 5/2: a rough field, one with a slope, one with a curvature.
-    """
-
-    amplitude: float
-    length: float
-    smoothness: float
+    amplitude: float  # standard deviation, pixels
+    length: float  # correlation length, pixels
+    smoothness: float  # 1/2, 3/2 or 5/2: a rough field, one with a slope, one with a curvature
 
     def correlation(self, distance: Float) -> Float:
         """Correlation of two points at a distance in pixels."""

@@ -1,4 +1,4 @@
-"""Residuals of (u, v) as shifts of the pixel: what a look-up table has to add to (x, y)."""
+"""Residuals of (u, v) as pixel shifts, which a look-up table has to add to (x, y)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FOLDED = 1e-6  # area of a pixel's image over the square of its sides
 
 
 class Solved(Protocol):
-    """A model with values."""
+    """A model with parameter values."""
 
     @property
     def model(self) -> DistortionModel: ...
@@ -57,7 +57,7 @@ def pixel_jacobian(
     exposure: ArrayLike | None = None,
     chip: ArrayLike | None = None,
 ) -> Float:
-    """Derivatives of (u, v) by the pixel.
+    """Derivatives of (u, v) with respect to the pixel.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def _evaluated(
 
 
 def pixel_shifts(solution: Solved, matches: MatchTable) -> PixelShifts:
-    """Residuals of matches, brought to the detector by the inverse of the local Jacobian.
+    """Residuals of matches, mapped to the detector by the inverse of the local Jacobian.
 
     Parameters
     ----------

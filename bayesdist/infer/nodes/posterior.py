@@ -1,4 +1,4 @@
-"""What is known of a look-up table: node values, their covariance, draws, errors in between."""
+"""Posterior of a look-up table: node values, their covariance, draws, errors in between."""
 
 from __future__ import annotations
 
@@ -18,29 +18,17 @@ __all__ = ["AxisField", "TablePosterior", "axis_posterior"]
 
 Float = NDArray[np.float64]
 
-BLOCK = 2048  # pixels whose rows over all nodes are held at once
+BLOCK = 2048  # pixels whose rows over all nodes are in memory at once
 
 
 @dataclass(frozen=True, eq=False)
 class AxisField:
-    """Posterior of the node values of one axis: Gaussian, the polynomial being integrated out.
+    """Posterior of the node values of one axis: Gaussian, the polynomial being integrated out."""
 
-    Parameters
-    ----------
-    mean : ndarray, shape (n,)
-        Pixels.
-    root : ndarray, shape (n, n)
-        R with R R^T the covariance.
-    field : FittedField
-        Hyperparameters.
-    sums : NodeSums
-        What the stars say.
-    """
-
-    mean: Float
-    root: Float
-    field: FittedField
-    sums: NodeSums
+    mean: Float  # (n,) pixels
+    root: Float  # R (n, n) with R R^T the covariance
+    field: FittedField  # hyperparameters
+    sums: NodeSums  # normal equations of the stars
 
     @property
     def sigma(self) -> Float:
@@ -54,17 +42,17 @@ class AxisField:
 
     @property
     def polynomial(self) -> Float:
-        """Polynomial (K,) that goes with the mean: what the polynomial fit has still to change."""
+        """Polynomial (K,) that goes with the mean: change that the polynomial fit still needs."""
         return self.sums.polynomial_of(self.mean)
 
     @property
     def n_effective(self) -> float:
-        """Parameters, nodes and polynomial, that the stars determine."""
+        """Number of parameters, nodes and polynomial, that the stars determine."""
         nodes = float((self.sums.informed(self.root) * self.root).sum())
         return len(self.sums.polynomial) + nodes
 
     def gain(self, rows: Float) -> Float:
-        """How much of an error beneath this table it takes up: rows (N, n) times S A, (N, n)."""
+        """Part of an error beneath this table that it absorbs: rows (N, n) times S A, (N, n)."""
         return self.sums.informed(self.root @ (self.root.T @ rows.T)).T
 
 
@@ -86,7 +74,7 @@ class TablePosterior:
     jitter_sigma : float
         Its standard error, pixels.
     n_stars : float
-        Stars, each counted by its weight.
+        Number of stars, each counted by its weight.
     """
 
     table: LookupTable
@@ -98,7 +86,7 @@ class TablePosterior:
 
     @property
     def priors(self) -> tuple[Matern, Matern]:
-        """The fields that the two planes are drawn from."""
+        """Prior fields of the two planes."""
         return self.axes[0].field.prior, self.axes[1].field.prior
 
     @property
@@ -133,10 +121,10 @@ class TablePosterior:
         x, y : array_like, shape (N,)
             Raw pixels.
         refitted : bool
-            What the errors of the table leave after the polynomial has followed them.  The square
-            of this, and the square of the formal error of a polynomial that was fitted with the
-            table held, add up to the error of the whole: exactly, not only where the two hardly
-            know of each other.
+            True for the part that is left after the polynomial has followed the table's errors.
+            Its square, and the square of the formal error of a polynomial that was fitted with the
+            table fixed, add up to the total variance: exactly, not only where the two are nearly
+            independent.
 
         Returns
         -------
@@ -171,18 +159,6 @@ class TablePosterior:
 def axis_posterior(grid: NodeGrid, sums: NodeSums, field: FittedField) -> AxisField:
     """Posterior of the node values of one axis at given hyperparameters.
 
-    Parameters
-    ----------
-    grid : NodeGrid
-    sums : NodeSums
-    field : FittedField
-
-    Returns
-    -------
-    AxisField
-
-    Notes
-    -----
     With d = L z, z ~ N(0, 1) and L the polynomial-free part of the Cholesky factor of the prior,
     the precision of z is 1 + L^T A L: never singular, whatever bins are empty.
     """
@@ -194,6 +170,6 @@ def axis_posterior(grid: NodeGrid, sums: NodeSums, field: FittedField) -> AxisFi
     root = scipy.linalg.solve_triangular(
         np.linalg.cholesky(M), L.T, lower=True, overwrite_b=True, check_finite=False
     ).T
-    # the prior's factor carries rounding of 1e-16 of its size into the polynomial space
+    # the prior's factor has rounding errors of 1e-16 of its size in the polynomial space
     root = grid.without_polynomials(root)
     return AxisField(root @ (root.T @ sums.marginal_right), root, field, sums)

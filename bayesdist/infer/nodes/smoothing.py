@@ -2,7 +2,7 @@
 
 The value of a node becomes that of the quadratic surface through the 25 values around it, all of
 equal weight.  Away from edges and empty bins this is their fixed kernel, 27/175 in the middle.
-Near an edge or an empty bin the surface is fitted to what values there are.
+Near an edge or an empty bin the surface is fitted to the values that exist.
 """
 
 from __future__ import annotations
@@ -18,22 +18,16 @@ __all__ = ["HALF_WIDTH", "quadratic_smoother"]
 Float = NDArray[np.float64]
 
 HALF_WIDTH = 2  # nodes: a window of 5 x 5
-ENOUGH = 1.5  # values for each coefficient of the surface: the 3 x 3 of a corner bear a quadratic
+# values for each coefficient of the surface: the 3 x 3 of a corner determine a quadratic
+ENOUGH = 1.5
 
 
 def quadratic_smoother(filled: NDArray[np.bool_]) -> scipy.sparse.csr_array:
-    """The linear map from node values to smooth ones.
+    """Sparse linear map (n_nodes, n_nodes) from node values to smooth ones.
 
-    Parameters
-    ----------
-    filled : ndarray of bool, shape (ny, nx)
-        Which nodes have a value.
-
-    Returns
-    -------
-    sparse array, shape (n_nodes, n_nodes)
-        Columns of empty nodes are zero.  A node whose window holds few values gets a plane or their
-        mean; one whose window holds none gets a row of zeros.
+    `filled` (ny, nx) marks nodes with a value; columns of empty nodes are zero.  A node whose
+    window holds few values gets a plane or their mean; one whose window holds none gets a row of
+    zeros.
     """
     ny, nx = filled.shape
     rows, columns, entries = [], [], []

@@ -1,8 +1,8 @@
-"""All that the stars say about the nodes and the polynomial of one chip: sums over the stars.
+"""Normal equations of the nodes and the polynomial of one chip: sums over the stars.
 
     r = W d + Phi c + noise        r: shifts of the pixel, W: bilinear weights, Phi: polynomials
 
-The sums are small whatever the number of stars, and each star is looked at once.
+The sums are small whatever the number of stars, and each star is read once.
 """
 
 from __future__ import annotations
@@ -27,27 +27,13 @@ BLOCK = 65_536  # stars at once: their polynomials take 11 MB at order 5
 
 @dataclass(frozen=True, eq=False)
 class NodeSums:
-    """Normal equations of one axis.
+    """Normal equations of one axis."""
 
-    Parameters
-    ----------
-    nodes : sparse array, shape (n, n)
-        W^T N^-1 W: nine entries in a row.
-    cross : ndarray, shape (K, n)
-        Phi^T N^-1 W.
-    polynomial : ndarray, shape (K, K)
-        Phi^T N^-1 Phi.
-    right : ndarray, shape (n,)
-        W^T N^-1 r.
-    right_polynomial : ndarray, shape (K,)
-        Phi^T N^-1 r.
-    """
-
-    nodes: scipy.sparse.csr_array
-    cross: Float
-    polynomial: Float
-    right: Float
-    right_polynomial: Float
+    nodes: scipy.sparse.csr_array  # W^T N^-1 W (n, n), nine entries in a row
+    cross: Float  # Phi^T N^-1 W (K, n)
+    polynomial: Float  # Phi^T N^-1 Phi (K, K)
+    right: Float  # W^T N^-1 r (n,)
+    right_polynomial: Float  # Phi^T N^-1 r (K,)
 
     def __add__(self, other: NodeSums) -> NodeSums:
         return NodeSums(
@@ -65,12 +51,12 @@ class NodeSums:
 
     @cached_property
     def absorbed(self) -> Float:
-        """What the polynomial takes up of each node, (K, n): its response is minus this."""
+        """Part (K, n) of each node that the polynomial absorbs; its response is minus this."""
         return scipy.linalg.cho_solve(self._factor, self.cross)
 
     @cached_property
     def polynomial_root(self) -> Float:
-        """R (K, K) with R R^T the covariance of the polynomial where the nodes are held."""
+        """R (K, K) with R R^T the covariance of the polynomial for fixed nodes."""
         L, _ = self._factor
         return scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True).T
 
@@ -85,12 +71,12 @@ class NodeSums:
         return self.right - self.absorbed.T @ self.right_polynomial
 
     def informed(self, values: Float) -> Float:
-        """Information about the nodes, the polynomial being free, times values (n, ...)."""
+        """Information about the nodes, for a free polynomial, times values (n, ...)."""
         return self.nodes @ values - self.cross.T @ (self.absorbed @ values)
 
     @cached_property
     def information(self) -> Float:
-        """Information about the nodes (n, n), the polynomial being free to follow them."""
+        """Information (n, n) about the nodes, for a polynomial that is free to follow them."""
         return self.nodes.toarray() - self.cross.T @ self.absorbed
 
 
@@ -106,24 +92,9 @@ def node_sums(
 ) -> tuple[NodeSums, NodeSums]:
     """Sums over the stars of one chip, for x and for y.
 
-    Parameters
-    ----------
-    grid : NodeGrid
-    x, y : ndarray, shape (N,)
-        Raw pixels.
-    shift : ndarray, shape (N, 2)
-        What has to be added to them.
-    precision : ndarray, shape (N, 2)
-        Inverse variances; zero for a star that does not count.
-
-    Returns
-    -------
-    tuple of NodeSums
-
-    Raises
-    ------
-    DegenerateError
-        When the stars do not determine the polynomial.
+    `shift` (N, 2) is to be added to the raw pixels x, y (N,); `precision` (N, 2) are inverse
+    variances, zero for a star that does not count.  DegenerateError when the stars do not determine
+    the polynomial.
     """
     total: tuple[NodeSums, NodeSums] | None = None
     for start in range(0, len(x), BLOCK):

@@ -20,7 +20,7 @@ __all__ = ["TableFit", "held_sigma"]
 
 Float = NDArray[np.float64]
 
-BLOCK = 1024  # positions whose derivatives are held at once
+BLOCK = 1024  # positions whose derivatives are in memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class TableFit:
     Parameters
     ----------
     base : str
-        Filter that the detector's tables come from.  What is the base filter's own is in them: one
-        filter alone cannot tell it from the detector's.
+        Filter that the detector's tables come from.  They contain the base filter's own pattern:
+        one filter alone cannot separate it from the detector's.
     parts : dict of str to Alternated
         By filter, the base filter first.  The tables of the base filter are the detector's, unless
         these were given.
@@ -50,16 +50,16 @@ class TableFit:
 
     @property
     def progress(self) -> tuple[Round, ...]:
-        """All rounds."""
+        """Rounds of all filters."""
         return tuple(one for part in self.parts.values() for one in part.progress)
 
     @property
     def converged(self) -> bool:
-        """Whether all tables stand still."""
+        """True if all tables converged."""
         return all(part.converged for part in self.parts.values())
 
     def part(self, filter: str | None = None) -> Alternated:
-        """What belongs to a filter (the base filter by default).
+        """Polynomial and tables of a filter (the base filter by default).
 
         Raises
         ------
@@ -152,10 +152,10 @@ class TableFit:
 
         Notes
         -----
-        The formal covariance of the fit is that of the polynomial with the tables held.  The part
-        of the tables is what their errors leave after the polynomial has followed them, so that
-        the sum is the variance of the joint solution.  The error of the detector's table counts in
-        another filter only as far as that filter's own table does not take it up.
+        The formal covariance of the fit is that of the polynomial for fixed tables.  The tables
+        contribute the part of their errors that is left after the polynomial has followed them, so
+        that the sum is the variance of the joint solution.  The error of the detector's table
+        counts in another filter only as far as that filter's own table does not absorb it.
         """
         part, model = self.part(filter), self.part(filter).fit.model
         x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
@@ -186,8 +186,8 @@ class TableFit:
         Returns
         -------
         ndarray, shape (N, 2)
-            In the unit of u, v: what is left after the polynomial has followed the tables.  Of
-            held tables (`held_sigma`) nothing is taken to be followed.
+            In the unit of u, v: the part left after the polynomial has followed the tables.  It
+            is not assumed to follow held tables (`held_sigma`).
 
         Raises
         ------
@@ -237,21 +237,10 @@ class TableFit:
 
 
 def held_sigma(tables: Sequence[LookupTable], x: ArrayLike, y: ArrayLike, *, chip: int) -> Float:
-    """Standard error of the shift by held tables, from the errors of their nodes alone.
+    """Standard error (N, 2), pixels, of the shift by held tables, from the errors of their nodes.
 
-    Parameters
-    ----------
-    tables : sequence of LookupTable
-        The detector's.
-    x, y : array_like, shape (N,)
-        Raw pixels.
-    chip : int
-
-    Returns
-    -------
-    ndarray, shape (N, 2)
-        Pixels; zero where the chip has no table, or the table no errors.  With the nodes'
-        covariance unknown this is its upper bound: neighbouring nodes are taken to err together.
+    Zero where the chip has no table, or the table no errors.  With the nodes' covariance unknown
+    this is its upper bound: the errors of neighbouring nodes are taken as fully correlated.
     """
     x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
     for table in tables:
@@ -263,7 +252,7 @@ def held_sigma(tables: Sequence[LookupTable], x: ArrayLike, y: ArrayLike, *, chi
 def _blocks(
     n: int, chip: int, epoch: ArrayLike | None, exposure: ArrayLike | None
 ) -> Iterator[tuple[slice, dict[str, Any]]]:
-    """Pieces of n positions, with what `DistortionModel.predict` wants to know of each."""
+    """Chunks of n positions, with the arguments of `DistortionModel.predict` for each."""
     dates = None if epoch is None else np.broadcast_to(np.asarray(epoch, float), (n,))
     frames = None if exposure is None else np.broadcast_to(np.asarray(exposure), (n,))
     for start in range(0, n, BLOCK):

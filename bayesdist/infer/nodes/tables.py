@@ -1,8 +1,8 @@
 """Detector and filter tables of a whole calibration.
 
 ACS ISR 2015-06, section 4.3: the detector's table comes from a base filter whose own irregularities
-are the smallest, and is then held; each other filter has its own polynomial, and a table of what
-the two leave.  Detector's tables that are known from elsewhere are held in the same way.
+are the smallest, and is then fixed; each other filter has its own polynomial, and a table of the
+residuals of both.  Detector's tables that are known from elsewhere are fixed in the same way.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ def fit_with_tables(
     filters : sequence of str, optional
         Other filters that get a polynomial and tables of their own; all by default.
     detector : sequence of LookupTable, optional
-        The detector's tables, where they are known: they are held, and the base filter gets tables
+        The detector's tables, where they are known: they are fixed, and the base filter gets tables
         of its own as the others do.
     method : str
         'field': a Gaussian random field, with the covariance of its nodes; 'binned': clipped means
         in bins, smoothed, as ACS ISR 2015-06.  Either is made orthogonal to the polynomial.
     rounds : int
-        At most, for each filter.
+        Largest number, for each filter.
     tolerance : float
         Change of every node, pixels, below which the rounds end.
     step : tuple of float
@@ -75,12 +75,12 @@ def fit_with_tables(
     Returns
     -------
     TableFit
-        `converged` says whether the tables stand still.
+        `converged` is True if the tables converged.
 
     Raises
     ------
     InputError
-        For an unknown filter or method, a gauge that needs an exposure that a filter lacks, or a
+        For an unknown filter or method, a gauge whose exposure a filter lacks, or a
         table of a filter among the detector's.
     DegenerateError
         When the matches of a filter do not determine its model.

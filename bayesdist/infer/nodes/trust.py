@@ -1,7 +1,7 @@
-"""How far each star is to be trusted: the outlier mixture on residuals that are given.
+"""Probability of each star to be a true match: the outlier mixture on given residuals.
 
-The mixture of `bayesdist.infer.stars.mixture`, with its priors, fitted by EM.  It sees residuals
-only, so that the polynomial and the tables can be fitted in turn with the weights that it gives.
+The mixture of `bayesdist.infer.stars.mixture`, with its priors, fitted by EM.  It uses residuals
+only, so that the polynomial and the tables can be fitted in turn with its weights.
 """
 
 from __future__ import annotations
@@ -18,46 +18,26 @@ __all__ = ["Trust", "fitted_trust"]
 
 Float = NDArray[np.float64]
 
-SAMPLE = 200_000  # stars that the mixture's three numbers are estimated from
+SAMPLE = 200_000  # stars from which the mixture's three numbers are estimated
 STEPS = 200
-WIDER = 3.0  # least standard deviation of false matches over that of true ones
+WIDER = 3.0  # smallest ratio of the standard deviations of false matches and true ones
 SETTLED = 1e-3  # relative change of the expected number of false matches
 
 
 @dataclass(frozen=True, eq=False)
 class Trust:
-    """Which stars are true matches.
+    """Outlier mixture of the matches, with the probability of each to be true."""
 
-    Parameters
-    ----------
-    probability : ndarray, shape (N,)
-        Of being a true match.
-    fraction : float
-        Of false matches.
-    jitter : float
-        Error beyond the quoted one, in the unit of the residuals.
-    outlier_scale : float
-        Standard deviation of false matches on each axis.
-    """
-
-    probability: Float
-    fraction: float
-    jitter: float
-    outlier_scale: float
+    probability: Float  # of each star (N,) to be a true match
+    fraction: float  # of false matches
+    jitter: float  # error in excess of the quoted one, in the unit of the residuals
+    outlier_scale: float  # standard deviation of false matches on each axis
 
 
 def fitted_trust(residual: Float, variance: Float) -> Trust:
-    """The mixture's most probable values, and each star's membership at them.
+    """Most probable values of the mixture, and each star's membership at them.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (N, 2)
-    variance : ndarray, shape (N, 2)
-        Square of the quoted errors.
-
-    Returns
-    -------
-    Trust
+    From residuals (N, 2) and the squares of their quoted errors (N, 2).
     """
     every = max(1, len(residual) // SAMPLE)
     some, var = residual[::every], variance[::every]
@@ -66,7 +46,7 @@ def fitted_trust(residual: Float, variance: Float) -> Trust:
     rate = OUTLIER_SHAPE * OUTLIER_MODE**2 * scale2
     r2 = (some**2).sum(axis=1)
 
-    seen = float(np.median(r2)) / (2 * np.log(2))  # of a round Gaussian, whatever lies far out
+    seen = float(np.median(r2)) / (2 * np.log(2))  # for a round Gaussian, insensitive to outliers
     f, j2, out2 = 0.05, max(seen - scale2, 0.0), OUTLIER_MODE**2 * max(seen, scale2)
     before = np.inf
     for _ in range(STEPS):

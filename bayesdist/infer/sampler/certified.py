@@ -1,9 +1,9 @@
 """Sampling with few passes: a surrogate from pilots, its certificate, and an exact second stage.
 
 The surrogate (`certificate`) is a proposal better than the one that it was made from.  As long as
-it fits the time its draws are therefore accepted or refused by exact evaluations: delayed
-acceptance, of which rejection from the first proposal is the first stage.  Beyond that its draws
-stand for the posterior, as an approximation with a certificate.
+there is time its draws are therefore accepted or rejected by exact evaluations: delayed acceptance,
+of which rejection from the first proposal is the first stage.  Beyond that its draws represent the
+posterior, as an approximation with a certificate.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
+from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.proposal import GridProposal, Random
 from bayesdist.infer.density.target import Target
+from bayesdist.infer.posterior.certificate import Certificate
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
-from bayesdist.infer.sampler.convergence import diagnose
+from bayesdist.infer.sampler.ensembles import Whitening
 from bayesdist.infer.sampler.lookahead import Page, pilot_page
 from bayesdist.infer.sampler.move_schedule import Plan, expected_passes
-from bayesdist.infer.sampler.surrogate import Certificate, Surrogate, certify, draw_surrogate
-from bayesdist.infer.sampler.whitening import Whitening
+from bayesdist.infer.sampler.surrogate import Surrogate, certify, draw_surrogate
 
 __all__ = ["PILOTS", "SECOND_STAGES", "SurrogateProposal", "has_second_stage", "run_certified"]
 
@@ -30,33 +31,22 @@ Float = NDArray[np.float64]
 
 SECOND_STAGES = ("auto", "always", "never")
 PILOTS = 400  # passes that the certificate costs
-AFFORDABLE = (
-    1e11  # evaluations of a star, four minutes on two cores, that the second stage may cost
-)
-LEAST_DRAWS = 1000  # approximate draws of each ensemble: they cost no pass
+AFFORDABLE = 1e11  # evaluations of a star that the second stage may cost, four minutes on two cores
+LEAST_DRAWS = 1000  # approximate draws of each ensemble, which need no pass
 KEY = (1_000_000,)  # of the pilots' random numbers
 
 
 @dataclass(frozen=True, eq=False)
 class SurrogateProposal:
-    """The surrogate as a proposal: q exp(g), to be drawn from and evaluated.
+    """Surrogate as a proposal: q exp(g), to be drawn from and evaluated."""
 
-    Parameters
-    ----------
-    first : GridProposal
-        q.
-    whitening : Whitening
-    surrogate : Surrogate
-        g.
-    """
-
-    first: GridProposal
+    first: GridProposal  # q
     whitening: Whitening
-    surrogate: Surrogate
+    surrogate: Surrogate  # g
 
     @property
     def best(self) -> Node:
-        """As of the first proposal."""
+        """Best node of the first proposal."""
         return self.first.best
 
     def draw(self, n: int, rng: Random) -> Float:
@@ -64,7 +54,7 @@ class SurrogateProposal:
         return self.accepted(n, rng)[0]
 
     def accepted(self, n: int, rng: Random) -> tuple[Float, float]:
-        """Points (n, D), and the share of the first proposal's that was accepted."""
+        """Points (n, D), and the fraction of the first proposal's that was accepted."""
         return draw_surrogate(self.first.draw, self.whitening.to_white, self.surrogate, n, rng)
 
     def log_density(self, psi: Float) -> Float:
@@ -73,15 +63,9 @@ class SurrogateProposal:
 
 
 def has_second_stage(choice: str, passes: int, n_stars: int) -> bool:
-    """Whether exact evaluations follow the surrogate.
+    """True if exact evaluations follow the surrogate.
 
-    Parameters
-    ----------
-    choice : str
-        Of `SECOND_STAGES`.
-    passes : int
-        That they are expected to take.
-    n_stars : int
+    `choice` is one of `SECOND_STAGES`; `passes` is their expected number.
     """
     affordable = float(passes) * n_stars <= AFFORDABLE
     return choice == "always" or (choice == "auto" and affordable)
@@ -90,30 +74,12 @@ def has_second_stage(choice: str, passes: int, n_stars: int) -> bool:
 def run_certified(
     target: Target, proposal: GridProposal, settings: Settings, second_stage: str = "auto"
 ) -> tuple[Chains, Certificate, bool]:
-    """Draws by way of a surrogate.
+    """Chains by way of a surrogate, its certificate, and True if a second stage made them exact.
 
-    Parameters
-    ----------
-    target : Target
-    proposal : GridProposal
-    settings : Settings
-    second_stage : str
-        'always', 'never', or 'auto': where the passes that it is expected to take are affordable.
-
-    Returns
-    -------
-    chains : Chains
-    certificate : Certificate
-    exact : bool
-        Whether the second stage made the draws exact; otherwise they have converged only when the
-        certificate is granted.
-
-    Raises
-    ------
-    InputError
-        For an unknown second stage, and as `certify`.
-    DegenerateError, NotConvergedError
-        As `run_chains` and `draw_surrogate`.
+    The second stage is 'always', 'never', or 'auto': where its expected passes are affordable.
+    Without it the draws have converged only when the certificate is granted.  InputError for an
+    unknown second stage, and as `certify`; DegenerateError and NotConvergedError as `run_chains`
+    and `draw_surrogate`.
     """
     if second_stage not in SECOND_STAGES:
         raise InputError(
@@ -136,7 +102,7 @@ def run_certified(
 
     passes = expected_passes(len(target.names), s.n_stars, s.limits, E)
     if has_second_stage(second_stage, passes, s.n_stars):
-        # a surrogate that is no good is no better proposal either
+        # a poor surrogate is no better proposal either
         chains = run_chains(target, better if certificate.granted else proposal, s)
         method = f"delayed acceptance ({chains.plan.method} second stage)"
         plan = replace(chains.plan, method=method)

@@ -1,8 +1,8 @@
-"""Chains until they have converged: pilot, plan, blocks, verdicts, and the way back.
+"""Chains until convergence: pilot, plan, blocks, verdicts, and a restart if the proposal is poor.
 
 The proposal is judged by the importance weights of everything that was proposed, again after every
-block.  When it turns out worse than the pilot said, the chains start again with moves that do not
-depend on it.
+block.  When it is worse than the pilot showed, the chains start again with moves that do not depend
+on it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
+from bayesdist.infer.convergence import (
+    LEAST_PER_WALKER,
+    Convergence,
+    Limits,
+    diagnose,
+)
 from bayesdist.infer.density.importance import (
     Quality,
     draws_per_effective,
@@ -23,14 +29,8 @@ from bayesdist.infer.density.importance import (
 )
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.sampler.blocks import Block
-from bayesdist.infer.sampler.convergence import (
-    LEAST_PER_WALKER,
-    Convergence,
-    Limits,
-    diagnose,
-)
-from bayesdist.infer.sampler.ensembles import Ensembles
+from bayesdist.infer.sampler.checkpoints import Block
+from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
 from bayesdist.infer.sampler.lookahead import pilot_page
 from bayesdist.infer.sampler.move_schedule import (
     EFFICIENT,
@@ -45,38 +45,22 @@ from bayesdist.infer.sampler.move_schedule import (
     plan_moves,
     walkers_for,
 )
-from bayesdist.infer.sampler.whitening import Whitening
 
 __all__ = ["Chains", "Settings", "run_chains"]
 
 Float = NDArray[np.float64]
 
-LEAST_ROWS = 10  # rows of a chain that diagnostics make sense of
-MIX_STEPS = 500  # by which Crank-Nicolson moves must have brought every walker around
+LEAST_ROWS = 10  # rows of a chain that diagnostics need at least
+MIX_STEPS = 500  # by which Crank-Nicolson moves must have mixed every walker
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the user decides.
+    """Settings of a sampling run."""
 
-    Parameters
-    ----------
-    seeds : tuple of int
-        One for each ensemble.
-    n_stars : int
-        What a pass costs.
-    walkers : int or None
-        Of one ensemble; None leaves it to the plan.
-    limits : Limits
-    max_steps, checkpoint_every : int
-    folder : path or None
-    fingerprint : str
-    progress : callable or None
-    """
-
-    seeds: tuple[int, ...]
-    n_stars: int
-    walkers: int | None = None
+    seeds: tuple[int, ...]  # one for each ensemble
+    n_stars: int  # cost of a pass
+    walkers: int | None = None  # of one ensemble; None leaves it to the plan
     limits: Limits = field(default_factory=Limits)
     max_steps: int = 20_000
     checkpoint_every: int = 200
@@ -87,30 +71,15 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """Draws after warm-up, and how they came about.
+    """Draws after warm-up, and statistics of the run."""
 
-    Parameters
-    ----------
-    psi : ndarray, shape (ensembles, steps kept, walkers, D)
-    log_prob : ndarray, shape (ensembles, steps kept, walkers)
-    verdict : Convergence
-    plan : Plan
-    steps : int
-        Of each ensemble, everything counted.
-    warmup : int
-        Steps that were dropped.
-    passes : int
-        Evaluations of the posterior density.
-    acceptance : float
-    """
-
-    psi: Float
-    log_prob: Float
+    psi: Float  # (ensembles, steps stored, walkers, D)
+    log_prob: Float  # (ensembles, steps stored, walkers)
     verdict: Convergence
     plan: Plan
-    steps: int
-    warmup: int
-    passes: int
+    steps: int  # of each ensemble, in all
+    warmup: int  # steps that were dropped
+    passes: int  # evaluations of the posterior density
     acceptance: float
 
 
@@ -156,24 +125,8 @@ class _History:
 def run_chains(target: Target, proposal: Proposal, settings: Settings) -> Chains:
     """Sample until the targets are met or the steps are used up.
 
-    Parameters
-    ----------
-    target : Target
-        Or anything else with `log_density`, `names` and `n_theta`.
-    proposal : Proposal
-        Or anything else with `draw`, `log_density` and `best`.
-    settings : Settings
-
-    Returns
-    -------
-    Chains
-
-    Raises
-    ------
-    DegenerateError
-        When hardly a proposal falls inside the support.
-    InputError
-        For checkpoints that cannot be read or written.
+    DegenerateError when hardly a proposal falls inside the support; InputError for checkpoints that
+    cannot be read or written.
     """
     s, E = settings, len(settings.seeds)
     W = s.walkers or walkers_for(s.n_stars)
@@ -216,9 +169,9 @@ def _plan(target: Target, quality: Quality, s: Settings) -> Plan:
 def _drawn_ahead(
     target: Target, runs: Ensembles, s: Settings, passes: int
 ) -> tuple[Chains | None, Quality, int, int]:
-    """Pure independence: the chains, or None when the proposal turned out worse than the pilot.
+    """Chains by pure independence, or None when the proposal is worse than the pilot showed.
 
-    Also the quality of the proposal as it is known then, and the passes and steps made.
+    Also the quality of the proposal as known then, and the passes and steps made.
     """
     pilot, W, total = runs.pilot, runs.plan.walkers, len(s.seeds) * runs.plan.walkers
     first = pilot.psi.shape[1] // W - 1
@@ -239,7 +192,7 @@ def _drawn_ahead(
             passes += int((~np.isnan(weights[-1])).sum())
         if s.progress is not None:
             s.progress(stretch.end, s.max_steps)
-        # judged at each block, whatever the targets are: a resumed run may have others
+        # judged at each block for any targets: a resumed run may have others
         quality = quality_of(np.concatenate(weights, axis=1))
         last = stretch.end == s.max_steps
         if not _plan(target, quality, s).independent and not last:
@@ -269,9 +222,9 @@ def _distrusted(verdict: Convergence, quality: Quality) -> Convergence:
 def _state_dependent(
     target: Target, runs: Ensembles, s: Settings, quality: Quality, passes: int, begin: int
 ) -> tuple[Chains | None, int, int]:
-    """Moves that are evaluated as they come; the first half of them is warm-up.
+    """Chains by moves that are evaluated one by one, or None when Crank-Nicolson moves do not mix.
 
-    The chains, or None when Crank-Nicolson moves get nowhere; the passes and steps made.
+    The first half of the steps is warm-up.  Also the passes and steps made.
     """
     if s.max_steps - begin < 10 * runs.plan.thin:  # too few steps to leave any out
         runs = replace(runs, plan=replace(runs.plan, thin=1))
@@ -288,7 +241,7 @@ def _state_dependent(
             s.progress(stretch.end, s.max_steps)
         warmup, last = history.rows // 2, stretch.end + plan.thin > s.max_steps
         made = total * (history.rows - warmup)
-        # at the same step whatever the targets are, as a resumed run may have others
+        # at the same step for any targets, as a resumed run may have others
         trial = not plan.coupled and stretch.begin < begin + MIX_STEPS <= stretch.end
         if made < max(wanted, total * LEAST_ROWS) and not last and not trial:
             continue

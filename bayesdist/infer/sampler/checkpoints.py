@@ -1,32 +1,37 @@
-"""Arrays that a resumed run takes up again, in files that say to what they belong."""
+"""Checkpoint files of arrays for resumed runs, each with the fingerprint of its run.
+
+The steps of a chain are stored block by block.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 
-__all__ = ["new_hdf5", "read_arrays", "write_arrays"]
+__all__ = ["Block", "Walkers", "block_path", "read_arrays", "write_arrays"]
+
+Float = NDArray[np.float64]
+
+BLOCK_ARRAYS = ("coords", "log_prob", "accepted", "log_weights")
+END_ARRAYS = ("log_q", "random_keys", "random_state")
 
 
 @contextmanager
-def new_hdf5(path: Path) -> Iterator[h5py.File]:
-    """A file to be filled, which appears whole or not at all.
+def _new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Context with a file to be filled, which is written whole or not at all.
 
     It is made in memory: where a disk is full, HDF5 fails again as it closes its file, and may end
-    the process.
-
-    Raises
-    ------
-    InputError
-        When the system refuses to write.
+    the process.  InputError when the system refuses to write.
     """
     with atomic_path(path) as temporary:
         with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
@@ -39,22 +44,11 @@ def new_hdf5(path: Path) -> Iterator[h5py.File]:
 def read_arrays(
     path: Path, fingerprint: str, names: Sequence[str] | None = None, *, do: str
 ) -> dict[str, NDArray[Any]]:
-    """What `write_arrays` kept.
+    """Arrays by name from a file of `write_arrays`.
 
-    Parameters
-    ----------
-    path : Path
-    fingerprint : str
-        Of data and settings.
-    names : sequence of str, optional
-        Arrays that must be there; all that are by default.
-    do : str
-        Advice for a file that cannot be read.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read, or belongs to other data or settings.
+    `fingerprint` is that of data and settings; `names` are required, by default those in the file;
+    `do` is advice for a file that cannot be read.  InputError when it cannot, or belongs to other
+    data or settings.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -72,8 +66,52 @@ def read_arrays(
 
 
 def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Keep arrays by name; the file appears whole or not at all."""
-    with new_hdf5(path) as file:
+    """Write arrays by name to a file, whole or not at all."""
+    with _new_hdf5(path) as file:
         for name, values in arrays.items():
             file[name] = values
         file.attrs["fingerprint"] = fingerprint
+
+
+@dataclass(frozen=True, eq=False)
+class Walkers:
+    """State of an ensemble."""
+
+    coords: Float  # (walkers, D) psi where proposals are drawn ahead, otherwise whitened
+    log_prob: Float
+    log_q: Float  # log proposal density (walkers,); NaN where no move needs it
+    random: tuple  # state of emcee's random numbers, from `numpy.random.RandomState.get_state`
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Some steps of one ensemble."""
+
+    coords: Float  # (steps stored, walkers, D) in the coordinates of `Walkers`
+    log_prob: Float  # (steps stored, walkers)
+    accepted: Float  # number (walkers,) of accepted moves of each walker among the steps stored
+    # log importance weights (proposals,) of proposals drawn ahead; NaN outside the support
+    log_weights: Float
+    end: Walkers  # after the last step
+
+    def write(self, path: Path, mark: str) -> None:
+        """Write the block to a file; `mark` identifies the run."""
+        arrays = {name: getattr(self, name) for name in BLOCK_ARRAYS}
+        _, keys, *state = self.end.random
+        end = (self.end.log_q, keys, np.array(state))
+        write_arrays(path, mark, arrays | dict(zip(END_ARRAYS, end, strict=True)))
+
+    @classmethod
+    def read(cls, path: Path, mark: str) -> Block:
+        """Block from a file; InputError when it cannot be read, or has another mark."""
+        do = "delete it and resume: its steps are run again"
+        kept = read_arrays(path, mark, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
+        log_q, keys, (position, has_gauss, gauss) = (kept.pop(name) for name in END_ARRAYS)
+        random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
+        end = Walkers(kept["coords"][-1], kept["log_prob"][-1], log_q, random)
+        return cls(**kept, end=end)
+
+
+def block_path(folder: Path, ensemble: int, end: int) -> Path:
+    """File of the block of an ensemble (from 0) that ends at a step."""
+    return folder / f"chain-{ensemble + 1}-{end:06d}.h5"

@@ -6,9 +6,9 @@ Three moves, all built on `emcee.moves.MHMove` or taken from emcee:
 - preconditioned Crank-Nicolson: q = sqrt(1 - b^2) x + b xi, corrected for its reference measure;
 - differential evolution (`emcee.moves.DEMove`), which needs no good proposal.
 
-Independence alone needs no walker to know what is proposed to it.  Then all proposals of a block
-are evaluated in one sweep over the data and numbered; emcee walks over the numbers, and what it
-asks of a number -- its log density, the ratio of proposal densities -- is looked up.
+Proposals of independence alone do not depend on the walkers.  Then all proposals of a block are
+evaluated in one pass over the data and numbered; emcee walks over the numbers, and log density and
+ratio of proposal densities of a number are looked up.
 
 `emcee.moves.DESnookerMove` is never used: in emcee 3.1.6 its acceptance factor is wrong.
 """
@@ -28,21 +28,55 @@ from numpy.typing import NDArray
 from bayesdist.errors import InputError
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.sampler.blocks import Block, Walkers, block_path, read_block, write_block
+from bayesdist.infer.equations.arrow import ArrowFactor
+from bayesdist.infer.sampler.checkpoints import Block, Walkers, block_path
 from bayesdist.infer.sampler.lookahead import Page, draw_page
 from bayesdist.infer.sampler.move_schedule import Plan, Stretch
-from bayesdist.infer.sampler.whitening import Whitening
 
-__all__ = ["Ensembles", "replay"]
+__all__ = ["Ensembles", "Whitening", "replay"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-START_PAGES = 20  # further pages of proposals in which walkers look for a start
+START_PAGES = 20  # further pages of proposals that are searched for starts of walkers
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Coordinates in which the posterior is close to a standard Gaussian."""
+
+    centre: Float
+    factor: ArrowFactor  # of the curvature of the distortion parameters
+    scale: Float  # standard deviations (h,) of the hyperparameters
+
+    @classmethod
+    def of(cls, target: Target, proposal: Proposal, draws: Float) -> Whitening:
+        """Whitening by the proposal's best node, and by the hyperparameters of draws (n, D)."""
+        n = target.n_theta
+        factor = proposal.best.factor.matrix.without_tail().factor()
+        hyper = draws[:, n:]
+        centre = np.concatenate([proposal.best.mode[:n], np.nanmean(hyper, axis=0)])
+        return cls(centre, factor, np.nanstd(hyper, axis=0))
+
+    @property
+    def n_theta(self) -> int:
+        """Number of distortion parameters."""
+        return self.factor.matrix.size
+
+    def to_psi(self, w: Float) -> Float:
+        """Sampled coordinates (n, D) from whitened ones."""
+        n = self.n_theta
+        parts = [self.factor.colour(w[:, :n]), w[:, n:] * self.scale]
+        return self.centre + np.concatenate(parts, axis=1)
+
+    def to_white(self, psi: Float) -> Float:
+        """Whitened coordinates (n, D) from sampled ones."""
+        n, shift = self.n_theta, psi - self.centre
+        return np.concatenate([self.factor.whiten(shift[:, :n]), shift[:, n:] / self.scale], axis=1)
 
 
 class _Replay:
-    """Proposals by number: first where the walkers stand, then those of each step in turn."""
+    """Proposals by number: first the positions of the walkers, then those of each step in turn."""
 
     def __init__(self, start: Walkers, page: Page, ensemble: int) -> None:
         log_prob, log_q = page.log_prob[ensemble], page.log_q[ensemble]
@@ -53,7 +87,7 @@ class _Replay:
         self.used = len(start.coords)
 
     def propose(self, numbers: Float, random: np.random.RandomState) -> tuple[Float, Float]:
-        """The next proposals, and the log ratio of the densities with which they are proposed."""
+        """Next proposals, and the log ratio of their proposal densities."""
         old = self._index(numbers)
         new = np.arange(self.used, self.used + len(old))
         self.used += len(old)
@@ -69,18 +103,9 @@ class _Replay:
 
 
 def replay(start: Walkers, page: Page, ensemble: int) -> Block:
-    """Metropolis-Hastings over proposals that have been evaluated.
+    """Block of Metropolis-Hastings steps over proposals that have been evaluated.
 
-    Parameters
-    ----------
-    start : Walkers
-    page : Page
-        Proposals (ensembles, steps * walkers, D), step after step.
-    ensemble : int
-
-    Returns
-    -------
-    Block
+    The page has proposals (ensembles, steps * walkers, D), step after step.
     """
     known, W = _Replay(start, page, ensemble), len(start.coords)
     sampler = emcee.EnsembleSampler(
@@ -125,48 +150,23 @@ def _crank_nicolson(step: float) -> MHMove:
 
 @dataclass(frozen=True, eq=False)
 class Ensembles:
-    """Independent ensembles that advance block by block and leave a file for each block.
-
-    Parameters
-    ----------
-    target : Target
-    proposal : Proposal
-    pilot : Page
-        The first proposals of each ensemble.
-    whitening : Whitening
-        Coordinates of moves that depend on the state.
-    plan : Plan
-    seeds : tuple of int
-        One for each ensemble.
-    folder : Path or None
-        Where the blocks go; None keeps them in memory.
-    fingerprint : str
-        Of data and settings; kept in each block.
-    """
+    """Independent ensembles that advance block by block and write a file for each block."""
 
     target: Target
     proposal: Proposal
-    pilot: Page
-    whitening: Whitening
+    pilot: Page  # first proposals of each ensemble
+    whitening: Whitening  # coordinates of moves that depend on the state
     plan: Plan
-    seeds: tuple[int, ...]
-    folder: Path | None = None
-    fingerprint: str = ""
+    seeds: tuple[int, ...]  # one for each ensemble
+    folder: Path | None = None  # for the blocks; None keeps them in memory
+    fingerprint: str = ""  # of data and settings; stored in each block
 
     # -- where the walkers start ------------------------------------------------------------------
 
     def starts(self) -> tuple[list[Walkers], NDArray[np.bool_], int]:
-        """First states of the ensembles, from the pilot.
+        """First states from the pilot, mask (ensembles, n) of used proposals, number of new ones.
 
         Where the pilot is too short for so many walkers, further proposals are evaluated.
-
-        Returns
-        -------
-        states : list of Walkers
-        taken : ndarray of bool, shape (ensembles, n)
-            Which pilot proposals they took.
-        n_further : int
-            Further proposals that were evaluated.
         """
         pages, W = [self.pilot], self.plan.walkers
         while (fewest := min(len(_usable(pages, e)) for e in range(len(self.seeds)))) < W:
@@ -191,26 +191,16 @@ class Ensembles:
     # -- steps ------------------------------------------------------------------------------------
 
     def advance(self, states: Sequence[Walkers], stretch: Stretch, rest: Page) -> list[Block]:
-        """One block of every ensemble, read from its file or run.
+        """One block of every ensemble from its state at `stretch.begin`, read from a file or run.
 
-        Parameters
-        ----------
-        states : sequence of Walkers
-            At step `stretch.begin`.
-        stretch : Stretch
-        rest : Page
-            Pilot proposals that were not taken as starts, for the first steps.
-
-        Returns
-        -------
-        list of Block
+        `rest` are pilot proposals that were not taken as starts, for the first steps.
         """
         paths: list[Path | None] = [None] * len(self.seeds)
         if self.folder is not None:
             paths = [block_path(self.folder, e, stretch.end) for e in range(len(self.seeds))]
         mark = f"{self.fingerprint} {self.plan.method} {stretch.begin}"
-        known = [read_block(p, mark) if p is not None and p.exists() else None for p in paths]
-        # always for all ensembles, so that the very same numbers come out when some are known
+        known = [Block.read(p, mark) if p is not None and p.exists() else None for p in paths]
+        # always for all ensembles, so that the numbers do not depend on how many are known already
         page = None
         if self.plan.independent and any(block is None for block in known):
             page = self._page(stretch, rest)
@@ -220,12 +210,12 @@ class Ensembles:
                 steps = stretch.end - stretch.begin
                 block = self._walk(states[e], steps) if page is None else replay(states[e], page, e)
                 if path is not None:
-                    write_block(path, mark, block)
+                    block.write(path, mark)
             out.append(block)
         return out
 
     def psi(self, block: Block) -> Float:
-        """Sampled coordinates (steps kept, walkers, D) of a block."""
+        """Sampled coordinates (steps stored, walkers, D) of a block."""
         if self.plan.independent:
             return block.coords
         flat = block.coords.reshape(-1, block.coords.shape[-1])
@@ -269,5 +259,5 @@ class Ensembles:
 
 
 def _usable(pages: Sequence[Page], ensemble: int) -> Int:
-    """Proposals of an ensemble with a density above zero, numbered through the pages."""
+    """Numbers, through the pages, of an ensemble's proposals with a density above zero."""
     return np.flatnonzero(np.isfinite(np.concatenate([p.log_prob[ensemble] for p in pages])))

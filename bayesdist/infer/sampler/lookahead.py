@@ -1,8 +1,8 @@
 """Independence proposals, drawn and evaluated many at a time.
 
-They do not depend on where the walkers are, so that one sweep over the data serves many steps of
-all ensembles.  Each ensemble has its own stream of random numbers for each page of proposals, which
-makes what is drawn independent of how it is evaluated.
+They do not depend on the walkers, so that one pass over the data serves many steps of all
+ensembles.  Each ensemble has its own stream of random numbers for each page of proposals, which
+makes the draws independent of how they are evaluated.
 """
 
 from __future__ import annotations
@@ -27,20 +27,12 @@ ROWS = 8192  # proposals evaluated at a time
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """Proposals of all ensembles and what is known of them.
+    """Proposals of all ensembles with their densities."""
 
-    Parameters
-    ----------
-    psi : ndarray, shape (ensembles, n, D)
-    log_prob : ndarray, shape (ensembles, n)
-        Log posterior density; NaN outside the support, where it was not evaluated.
-    log_q : ndarray, shape (ensembles, n)
-        Log proposal density.
-    """
-
-    psi: Float
+    psi: Float  # (ensembles, n, D)
+    # log posterior density (ensembles, n); NaN outside the support, where it was not evaluated
     log_prob: Float
-    log_q: Float
+    log_q: Float  # log proposal density (ensembles, n)
 
     @property
     def log_weights(self) -> Float:
@@ -53,11 +45,11 @@ class Page:
         return int((~np.isnan(self.log_prob)).sum())
 
     def __getitem__(self, rows: slice) -> Page:
-        """Some of the proposals of each ensemble."""
+        """Page with some of the proposals of each ensemble."""
         return Page(self.psi[:, rows], self.log_prob[:, rows], self.log_q[:, rows])
 
     def without(self, taken: NDArray[np.bool_], n: int) -> Page:
-        """The first n proposals of each ensemble that are not among those taken."""
+        """Page of the first n proposals of each ensemble that are not among those taken."""
         rows = np.array([np.flatnonzero(~t)[:n] for t in taken])
         each = np.arange(len(rows))[:, None]
         return Page(self.psi[each, rows], self.log_prob[each, rows], self.log_q[each, rows])
@@ -71,20 +63,10 @@ def draw_page(
     n: int,
     n_used: int | None = None,
 ) -> Page:
-    """Draw and evaluate a page of proposals.
+    """Page of n proposals of each ensemble, drawn and evaluated.
 
-    Parameters
-    ----------
-    target : Target
-    proposal : Proposal
-    seeds : sequence of int
-        One for each ensemble.
-    key : tuple of int
-        Of the page; with the seed it fixes the random numbers.
-    n : int
-        Proposals of each ensemble.
-    n_used : int, optional
-        Those that are wanted: the first of them, the same whatever this number.
+    `key` of the page and the ensemble's seed fix the random numbers.  Only the first `n_used` are
+    returned; they do not depend on this number.
     """
     psi = _drawn(proposal, seeds, key, n)[:, :n_used]
     flat = psi.reshape(-1, psi.shape[-1])
@@ -112,29 +94,10 @@ def pilot_page(
     name: str = "pilot",
     key: tuple[int, ...] = (0,),
 ) -> Page:
-    """The first page, which judges the proposal and then starts the chains.
+    """First page, which judges the proposal and then starts the chains.
 
-    A file keeps what its evaluation gave; the proposals themselves are drawn again.
-
-    Parameters
-    ----------
-    target : Target
-    proposal : Proposal
-    seeds : sequence of int
-    n : int
-        Proposals of each ensemble.
-    folder : path, optional
-    fingerprint : str
-        Of data and settings.
-    name : str
-        Of its file.
-    key : tuple of int
-        As in `draw_page`.
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read or written, or belongs to other data or settings.
+    A file stores the result of its evaluation; the proposals themselves are drawn again.
+    InputError when the file cannot be read or written, or belongs to other data or settings.
     """
     path = None if folder is None else folder / f"chain-0-{name}.h5"
     if path is not None and path.exists():

@@ -1,7 +1,7 @@
-"""How to sample: moves, walkers, and the steps at which blocks end and convergence is judged.
+"""Schedule of sampling: moves, walkers, and the steps at which blocks end and are judged.
 
 All of it follows from the number of stars, from the importance weights and from the settings, never
-from measured times: a run that is repeated or resumed takes the same way.
+from measured times: a run that is repeated or resumed makes identical steps.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from bayesdist.infer.sampler.convergence import LEAST_PER_WALKER, Convergence, Limits
+from bayesdist.infer.convergence import LEAST_PER_WALKER, Convergence, Limits
 
 __all__ = [
     "EFFICIENT",
@@ -31,50 +31,37 @@ __all__ = [
 ]
 
 FIRST_CHECK = 50  # steps after which state-dependent moves are first judged
-PILOT = 512  # proposals that judge the proposal, at least
+PILOT = 512  # smallest number of proposals that judge the proposal
 MOST_PILOT = 4096
 WORTH = 40_000_000  # evaluations of one star that cost about as much as one diagnosis: 0.1 s
-DEAR = 200_000  # stars above which passes are counted singly
+DEAR = 200_000  # stars above which passes are counted one by one
 FEWEST_WALKERS, MOST_WALKERS = 8, 64
 
 EFFICIENT, USABLE = 0.5, 0.05  # importance efficiency
 LONGEST_TAIL = 0.7  # Pareto k
-NO_MEAN = 1.0  # Pareto k beyond which weights have no mean: the proposal has lost the posterior
-PROBATION = 2048  # proposals before which k scatters too much (by about 0.2 at 512) to condemn one
+NO_MEAN = 1.0  # Pareto k beyond which weights have no mean: the proposal misses the posterior
+PROBATION = 2048  # proposals below which k scatters too much (by about 0.2 at 512) to reject one
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How to sample, chosen from the quality of the proposal and never from its acceptance.
+    """Plan of sampling, chosen from the quality of the proposal and never from its acceptance."""
 
-    Parameters
-    ----------
-    method : str
-        What the report calls it.
-    weights : tuple of float
-        Shares of independence, Crank-Nicolson and differential evolution.
-    walkers : int
-        Walkers of one ensemble.
-    step : float
-        b of the Crank-Nicolson move.
-    thin : int
-        Every so many steps are kept: moves that go slowly would only fill the memory.
-    """
-
-    method: str
+    method: str  # name in reports
+    # fractions of independence, Crank-Nicolson and differential evolution
     weights: tuple[float, float, float]
-    walkers: int
-    step: float
-    thin: int = 1
+    walkers: int  # of one ensemble
+    step: float  # b of the Crank-Nicolson move
+    thin: int = 1  # one in so many steps is stored: slow moves would only fill the memory
 
     @property
     def independent(self) -> bool:
-        """Whether no proposal depends on where the walkers are: they can be drawn ahead."""
+        """True if no proposal depends on the walkers, so that they can be drawn ahead."""
         return self.weights[0] == 1.0
 
     @property
     def coupled(self) -> bool:
-        """Whether the walkers of an ensemble influence each other."""
+        """True if the walkers of an ensemble influence each other."""
         return self.weights[2] > 0
 
 
@@ -86,32 +73,20 @@ def plan_moves(
     walkers: int | None = None,
     n_proposals: int = PROBATION,
 ) -> Plan:
-    """Choose the moves from the importance efficiency and the Pareto k of the proposal.
+    """Moves chosen from the importance efficiency and the Pareto k of the proposal.
 
-    Acceptance plays no part: it looks fine on proposals that miss a tail.
-
-    Parameters
-    ----------
-    efficiency, k : float
-    n_params, n_stars : int
-    walkers : int, optional
-        Overrides the number of walkers.
-    n_proposals : int
-        From which efficiency and k are known.  While they are few, a k above its limit is looked
-        into by further proposals: they cost less than the other moves.
-
-    Returns
-    -------
-    Plan
+    Acceptance is not used: it looks fine on proposals that miss a tail.  `n_proposals` gave
+    efficiency and k; while they are few, a k above its limit is checked by further proposals, which
+    cost less than the other moves.
     """
     step = min(0.5, 2.0 / np.sqrt(n_params))
-    dear = n_stars > DEAR  # every step counts, and there will be few of them
+    dear = n_stars > DEAR  # every step counts, and there are few of them
     if efficiency > EFFICIENT and (k < LONGEST_TAIL or n_proposals < PROBATION):
         return Plan("independence", (1.0, 0.0, 0.0), walkers or walkers_for(n_stars), step)
-    # local moves make up for a tail that the proposal reaches too seldom
+    # local moves compensate for a tail that the proposal reaches too seldom
     if efficiency > USABLE and (k < NO_MEAN or n_proposals < PROBATION):
         return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, step, 1 if dear else 5)
-    # emcee's red-blue moves want two walkers for each parameter
+    # emcee's red-blue moves need two walkers for each parameter
     least = max(2 * (n_params + 1), 32)
     walkers, thin = max(walkers or 0, least), 1 if dear else 10
     return Plan("DE + pCN + independence", (0.2, 0.3, 0.5), walkers, step, thin)
@@ -121,27 +96,27 @@ def plan_moves(
 
 
 def _worth(n_stars: int) -> int:
-    """Passes that cost about as much as one diagnosis."""
+    """Number of passes that cost about as much as one diagnosis."""
     return int(min(WORTH // max(n_stars, 1), MOST_PILOT))
 
 
 def walkers_for(n_stars: int) -> int:
     """Walkers of one ensemble of independence chains.
 
-    Many where a pass is cheap, so that emcee's loop is shared by many; few where it is dear, as
-    each walker needs a start, a warm-up and five effective draws.
+    Many where a pass is cheap, so that emcee's loop is shared by many; few where it is expensive,
+    as each walker needs a start, a warm-up and five effective draws.
     """
     return int(np.clip(_worth(n_stars) // 64, FEWEST_WALKERS, MOST_WALKERS))
 
 
 def pilot_steps(ensembles: int, walkers: int) -> int:
-    """Steps that the pilot proposals last, after one of them for each walker's start."""
+    """Steps for which the pilot's proposals suffice, after one of them for each walker's start."""
     return max(15, -(-PILOT // (ensembles * walkers)) - 1)
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Steps from `begin` to `end`; `full` is where it would end if `max_steps` did not cut it."""
+    """Steps from `begin` to `end`; without the limit `max_steps` they would end at `full`."""
 
     begin: int
     end: int
@@ -149,10 +124,10 @@ class Stretch:
 
 
 def ladder(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[Stretch]:
-    """Blocks of the independence plan, whatever the targets are.
+    """Blocks of the independence plan, independent of the targets.
 
-    The pilot is cut into pieces of `every` steps at most; then blocks grow with what has been
-    made, by 1/8 where passes are dear and 1/4 where they are cheap, up to `every`.
+    The pilot is cut into pieces of `every` steps at most; then blocks grow with the steps made, by
+    1/8 where passes are expensive and 1/4 where they are cheap, up to `every`.
     """
     growth = 1 / 8 if n_stars > DEAR else 1 / 4
     begin = 0
@@ -177,15 +152,7 @@ def _chance_rhat(limits: Limits, n_params: int, ensembles: int) -> float:
 
 
 def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walkers: int) -> float:
-    """Draws after warm-up at which convergence is first judged.
-
-    Parameters
-    ----------
-    limits : Limits
-    cost : float
-        Draws for one effective draw.
-    n_params, ensembles, walkers : int
-    """
+    """Draws after warm-up at the first check of convergence; `cost` is draws per effective draw."""
     slack = 1.05 + 3 / np.sqrt(max(limits.ess, 1.0))  # the estimate of the ESS scatters
     return max(
         slack * cost * limits.ess,
@@ -195,16 +162,9 @@ def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walk
 
 
 def next_check(made: int, verdict: Convergence, n_stars: int, walkers: int) -> float:
-    """Draws at which to judge again, from how far the last verdict was from its targets.
+    """Draws at which to judge again, from the distance of the last verdict from its targets.
 
-    Parameters
-    ----------
-    made : int
-        Draws that were judged.
-    verdict : Convergence
-    n_stars : int
-    walkers : int
-        Of all ensembles together.
+    `made` draws were judged; `walkers` are those of all ensembles together.
     """
     ess = max(min(verdict.ess_bulk_min, verdict.ess_tail_min), 1e-3)
     lacking = max(
@@ -212,12 +172,12 @@ def next_check(made: int, verdict: Convergence, n_stars: int, walkers: int) -> f
         LEAST_PER_WALKER * walkers / ess,
         (verdict.rhat_max - 1) / max(verdict.limits.rhat - 1, 1e-6),
     )
-    # a little early: looking once more costs less than passes that were not needed
+    # a little early: another check costs less than passes that were not needed
     return max(made + _worth(n_stars), min(0.85 * lacking, 2.0) * made)
 
 
 def expected_passes(n_params: int, n_stars: int, limits: Limits, ensembles: int = 4) -> int:
-    """Passes of a run with a good proposal, pilot, start and warm-up included."""
+    """Passes of a run with a good proposal, including pilot, start and warm-up."""
     walkers = walkers_for(n_stars)
     draws = first_check(limits, 1.1, n_params, ensembles, walkers)
     draws = max(draws, 1.1 * _chance_rhat(limits, n_params, ensembles))
@@ -231,7 +191,7 @@ def expected_passes(n_params: int, n_stars: int, limits: Limits, ensembles: int 
 def boundaries(every: int, max_steps: int, thin: int = 1) -> Iterator[int]:
     """Steps at which blocks end: 50, 100, 200, ... then every `every` steps up to `max_steps`.
 
-    All are multiples of `thin`, so that every row that is kept stands for as many steps.
+    All are multiples of `thin`, so that every stored row represents as many steps.
     """
     last, end = max_steps - max_steps % thin, 0
     while end < last:

@@ -1,4 +1,4 @@
-"""From a linear fit to a posterior: mode, proposal, ensembles, and the decision when to stop."""
+"""From a linear fit to a posterior: mode, proposal, ensembles, and the stopping rule."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError
+from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.grid import build_proposal
-from bayesdist.infer.density.memberships import count_outliers
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Chains, Settings, run_chains
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.sampler.convergence import Limits
-from bayesdist.infer.sampler.surrogate import Certificate
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.stars.stars import Stars
@@ -34,12 +34,11 @@ __all__ = ["sample"]
 Float = NDArray[np.float64]
 
 METHODS = ("exact", "certified")
-FORMAT = 2  # of the checkpoints
-ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may give other bits
+FORMAT = 3  # of the checkpoints
+ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may compute other bits
 
 
-# matrices here are small: more BLAS threads only get in each other's way
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def sample(
     fit: LinearFit,
     matches: Matches | Shards,
@@ -64,7 +63,7 @@ def sample(
     Parameters
     ----------
     fit : LinearFit
-        Of the same matches; it seeds the search for the mode.
+        Of the same matches; the search for the mode starts there.
     matches : MatchTable, PartitionedMatches or Shards
         All stars: none is clipped.
     outliers : OutlierMixture, optional
@@ -85,11 +84,11 @@ def sample(
     method : str
         'exact', or 'certified': by way of a surrogate that costs few passes.
     second_stage : str
-        With 'certified': whether exact evaluations accept or refuse the surrogate's draws
-        ('always', 'never'), or do so where that is affordable ('auto'); see `certified`.
+        With 'certified': exact evaluations accept or reject the surrogate's draws always
+        ('always'), never ('never'), or where that is affordable ('auto'); see `certified`.
     folder : path, optional
-        Where checkpoints are kept.  Blocks found there are read instead of run, so that a killed
-        run goes on bit for bit.
+        For checkpoints.  Blocks found there are read instead of run, so that a killed run is
+        resumed bit for bit.
     progress : callable, optional
         Called with (steps made, `max_steps`).
     compute : Compute, optional
@@ -98,7 +97,7 @@ def sample(
     Returns
     -------
     Posterior
-        `convergence.converged` says whether the targets were reached.
+        `convergence.converged` is True if the targets were reached.
 
     Raises
     ------
@@ -183,7 +182,7 @@ def _posterior(
 
 
 def _fingerprint(target: Target, *settings: object) -> str:
-    """What must not change between a run and its resumption."""
+    """Fingerprint of everything that must not change between a run and its resumption."""
     digest = hashlib.sha256()
     digest.update("".join(target.shards.sum(_digest)).encode())
     digest.update(repr([(name, metadata.version(name)) for name in ENGINES]).encode())
@@ -210,7 +209,7 @@ def _digest(stars: Stars) -> tuple[str]:
 def _proposal(
     target: Target, fit: LinearFit, folder: Path | None, fingerprint: str
 ) -> GridProposal:
-    """The proposal, kept in a file so that a resumed run has the very same one."""
+    """Proposal, stored in a file so that a resumed run has exactly this one."""
     path = None if folder is None else folder / "chain-0-proposal.h5"
     if path is not None and path.exists():
         arrays = read_arrays(path, fingerprint, do="start again with --force")

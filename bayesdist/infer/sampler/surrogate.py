@@ -1,16 +1,16 @@
-"""Draws that cost no pass over the data, and a certificate of how good they are.
+"""Draws without a pass over the data, and a certificate of their quality.
 
-With many stars the proposal q is so close to the posterior p that the log importance weight
-log p - log q is small and smooth.  A few hundred exact weights (pilots) are regressed on features
-of low order, g, and the surrogate is s = q exp(g).  Pilots that took no part in the regression
-then say how far s is from p.
+With many stars the proposal q is so close to the posterior p that the log importance weight log p -
+log q is small and smooth.  A few hundred exact weights (pilots) are regressed on features of low
+order, g, and the surrogate is s = q exp(g).  Pilots that were not used in the regression then show
+how far s is from p.
 
 **What is certified.**  With d = log p - log s, known up to a constant, and expectations over s,
 
     chi2(p || s) = E[e^2d] / E[e^d]^2 - 1,
 
-and for any function f of the parameters, because E_p f - E_s f = E_s[(p/s - 1) (f - E_s f)],
-Cauchy and Schwarz give
+and for any function f of the parameters, because E_p f - E_s f = E_s[(p/s - 1) (f - E_s f)], Cauchy
+and Schwarz give
 
     |E_p f - E_s f| <= sd_s(f) sqrt(chi2),        total variation <= sqrt(chi2) / 2.
 
@@ -18,12 +18,12 @@ So every mean, also that of a square or of the indicator of an interval, is off 
 sqrt(chi2) of its own standard deviation.  The pilots are draws of q, hence E[.] is a mean weighted
 by e^g.
 
-**What is not.**  The inequality is exact, chi2 is an estimate.  Its upper limit allows for what
-the pilots could have missed: three more of them (the rule of three: a region of more than 3/n of
-q's probability is hit with 95 %), each with twice the worst remainder seen.  Normal theory or the
-bootstrap are too low here, since remainders have the tails of a cubic.  All figures are those of
-the region that the pilots reach.  Of the outermost tails of q and of what lies beyond, such as a
-second mode far away, nothing is said.
+**What is not.**  The inequality is exact, chi2 is an estimate.  Its upper limit allows for what the
+pilots could have missed: three more of them (the rule of three: a region of more than 3/n of q's
+probability is hit with 95 %), each with twice the worst remainder seen.  Normal theory or the
+bootstrap are too low here, since remainders have the tails of a cubic.  All values hold for the
+region that the pilots reach.  The outermost tails of q and all beyond, such as a second mode far
+away, are not covered.
 """
 
 from __future__ import annotations
@@ -38,12 +38,13 @@ from numpy.polynomial import hermite_e
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError, NotConvergedError
+from bayesdist.infer.convergence import importance_efficiency
+from bayesdist.infer.convergence import pareto_k as tail_shape
 from bayesdist.infer.density.proposal import Random
-from bayesdist.infer.sampler.convergence import importance_efficiency
-from bayesdist.infer.sampler.convergence import pareto_k as tail_shape
+from bayesdist.infer.posterior.certificate import Certificate
 from bayesdist.infer.sampler.move_schedule import EFFICIENT, LONGEST_TAIL
 
-__all__ = ["Certificate", "Surrogate", "certify", "draw_surrogate"]
+__all__ = ["Surrogate", "certify", "draw_surrogate"]
 
 Float = NDArray[np.float64]
 
@@ -52,8 +53,8 @@ LEAST_TRAINING = 20
 LEAST_HELD_OUT = 100  # fewer leave more than 3 % of the probability unseen
 MOST_REMAINDER = 0.1
 MOST_SHIFT = 0.1  # posterior standard deviations: the Monte-Carlo error of 100 draws
-MISSED = 3  # pilots, by the rule of three
-MISSED_FACTOR = 2.0  # by how much an unseen remainder may exceed the worst that was seen
+MISSED = 3  # pilots that may have been missed, by the rule of three
+MISSED_FACTOR = 2.0  # factor by which an unseen remainder may exceed the worst that was seen
 ROUNDING = 1e-6  # of log densities of 1e7 and more
 LARGEST = 300.0  # of a log weight: its square must not overflow
 BATCH = 4096  # proposals drawn at a time; draws depend on it
@@ -67,29 +68,20 @@ STRENGTHS = np.geomspace(1e-9, 1e5, 43)  # of the ridge, for each pilot
 class Surrogate:
     """Approximate log importance weight, as a bounded function of whitened coordinates.
 
-    Its features are orthonormal (Hermite) polynomials under the proposal: up to third degree in
-    the hyperparameters u; S = sum_k (t_k^2 - 1) over the coefficients t, with S u and S^2, since
-    the hyperparameters scale the errors of all coefficients together; and each t_k by itself.
+    Its features are orthonormal (Hermite) polynomials under the proposal: up to third degree in the
+    hyperparameters u; S = sum_k (t_k^2 - 1) over the coefficients t, with S u and S^2, since the
+    hyperparameters scale the errors of all coefficients together; and each t_k separately.  The
+    hyperparameters u = root @ (w - centre) have mean zero and unit covariance.
 
-    Parameters
-    ----------
-    n_hyper : int
-        h: the last h coordinates are hyperparameters.
-    centre : ndarray, shape (h,)
-    root : ndarray, shape (h, h)
-        Hyperparameters u = root @ (w - centre) have mean zero and unit covariance.
-    constant : float
-    coefficients : ndarray, shape (p,)
-    lower, upper : float
-        Bounds of the log weight.  A cubic has none, and q exp(cubic) would be no density; `upper`
-        also is the exact envelope of rejection sampling.
+    The log weight has bounds: a cubic has none, and q exp(cubic) would be no density; `upper` also
+    is the exact envelope of rejection sampling.
     """
 
-    n_hyper: int
-    centre: Float
-    root: Float
+    n_hyper: int  # h: the last h coordinates are hyperparameters
+    centre: Float  # (h,)
+    root: Float  # (h, h)
     constant: float
-    coefficients: Float
+    coefficients: Float  # (p,)
     lower: float
     upper: float
 
@@ -101,75 +93,6 @@ class Surrogate:
         return np.clip(value, self.lower, self.upper)
 
 
-@dataclass(frozen=True)
-class Certificate:
-    """How far the surrogate s is from the posterior p, by pilots it was not made from.
-
-    Parameters
-    ----------
-    n_train, n_held_out : int
-        Pilots, each of them one pass over the data.
-    n_outside : int
-        Pilots where the posterior density is zero.
-    raw_sd : float
-        Standard deviation of log p - log q: without a surrogate.
-    remainder_sd : float
-        The same of log p - log s, over the pilots held out.
-    remainder_max : float
-        The largest of them, with p and s normalised.
-    raw_efficiency : float
-        Effective share of draws of q, weighted by p / q; over all pilots.
-    efficiency : float
-        The same of draws of s, weighted by p / s; over the pilots held out: 1 / (1 + chi2).
-    pareto_k : float
-        Tail of p / q: where it is heavy, q misses a part of p that no pilot shows.
-    chi2, chi2_upper : float
-        chi2(p || s): estimate and upper limit (module docstring).
-    mean_shift_bound : float
-        No posterior mean is off by more than this many standard deviations; from `chi2_upper`.
-    tv_bound : float
-        Bound of the total variation: no probability is off by more; from `chi2_upper`.
-    unseen : float
-        Largest probability under q of a region that all held-out pilots missed (95 %).
-    reasons : tuple of str
-        Why it is refused; empty when it is granted.
-    """
-
-    n_train: int
-    n_held_out: int
-    n_outside: int
-    raw_sd: float
-    remainder_sd: float
-    remainder_max: float
-    raw_efficiency: float
-    efficiency: float
-    pareto_k: float
-    chi2: float
-    chi2_upper: float
-    mean_shift_bound: float
-    tv_bound: float
-    unseen: float
-    reasons: tuple[str, ...]
-
-    @property
-    def granted(self) -> bool:
-        """Whether draws of the surrogate may stand for the posterior."""
-        return not self.reasons
-
-    @property
-    def statement(self) -> str:
-        """What it says and what it does not, in words."""
-        if not self.granted:
-            return f"certificate refused: {'; '.join(self.reasons)}"
-        return (
-            f"approximate, with certificate: by {self.n_held_out} exact evaluations that took no "
-            f"part in the approximation, no posterior mean is off by more than "
-            f"{self.mean_shift_bound:.2g} of its standard deviation; regions that hold less than "
-            f"{self.unseen:.2g} of the proposal's probability, such as a separate mode, "
-            f"may have been missed"
-        )
-
-
 def certify(
     white: Float,
     log_weights: Float,
@@ -179,33 +102,15 @@ def certify(
     held_out: float = 0.5,
     pareto_k: float | None = None,
 ) -> tuple[Surrogate, Certificate]:
-    """Fit the surrogate to some of the pilots and judge it by the others.
+    """Surrogate fitted to some of the pilots, and its certificate by the others.
 
-    Parameters
-    ----------
-    white : ndarray, shape (n, D)
-        Draws of the proposal q, independent and inside its support, in coordinates that are about
-        standard normal under q.
-    log_weights : ndarray, shape (n,)
-        Exact log p - log q, up to a constant; minus infinity where p is zero.
-    n_hyper : int
-        The last `n_hyper` coordinates are hyperparameters.
-    rng : numpy.random.Generator
-        Splits the pilots.
-    held_out : float
-        Share of the pilots that are kept for the certificate.
-    pareto_k : float, optional
-        Of the raw weights, where it is known; found from all pilots by default.
+    `white` (n, D) are independent draws of the proposal q inside its support, in coordinates about
+    standard normal under q, the last `n_hyper` of them hyperparameters; `log_weights` (n,) are
+    exact log p - log q, up to a constant, minus infinity where p is zero.  `rng` splits the pilots,
+    of which a fraction `held_out` is for the certificate; `pareto_k` of the raw weights is found
+    from all pilots by default.
 
-    Returns
-    -------
-    surrogate : Surrogate
-    certificate : Certificate
-
-    Raises
-    ------
-    InputError
-        For arrays that do not fit together, pilots that are not finite, or too few of them.
+    InputError for arrays that do not fit together, pilots that are not finite, or too few of them.
     """
     white, log_weights = np.asarray(white, float), np.asarray(log_weights, float)
     n = len(log_weights)
@@ -233,7 +138,7 @@ def certify(
         )
     surrogate = _fit(white[train], log_weights[train], n_hyper)
     if pareto_k is None:
-        # the tail of rounding errors tells nothing
+        # the tail of rounding errors means nothing
         flat = np.ptp(log_weights[np.isfinite(log_weights)]) < ROUNDING
         pareto_k = float("-inf") if flat else tail_shape(log_weights)
     guess = surrogate.log_weight(white[test])
@@ -247,31 +152,15 @@ def draw_surrogate(
     n: int,
     rng: Random,
 ) -> tuple[Float, float]:
-    """Independent draws of the surrogate, all of weight one, by rejection from the proposal.
+    """Independent draws (n, D) of the surrogate by rejection, and the fraction accepted.
 
-    The surrogate is bounded, so its bound is an envelope and the draws follow it exactly; resampled
-    draws would repeat themselves.  Draws of one generator begin alike, however many there are.
+    The surrogate is bounded, so its bound is an envelope and the draws, all of weight one, follow
+    it exactly; resampled draws would repeat themselves.  Draws of one generator begin alike,
+    however many there are.
 
-    Parameters
-    ----------
-    propose : callable
-        (m, rng) -> draws of q (m, D); rows that are not finite are outside the support.
-    whiten : callable
-        Draws (m, D) -> whitened coordinates (m, D), as those of the pilots.
-    surrogate : Surrogate
-    n : int
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    draws : ndarray, shape (n, D)
-    acceptance : float
-        Share of the proposals that was accepted.
-
-    Raises
-    ------
-    NotConvergedError
-        When next to no proposal is accepted.
+    `propose` (m, rng) gives draws of q (m, D), whose rows are not finite outside the support;
+    `whiten` maps draws to the coordinates of the pilots.  NotConvergedError when next to no
+    proposal is accepted.
     """
     kept: list[Float] = []
     n_kept = tried = 0
@@ -338,7 +227,7 @@ def _fit(white: Float, log_weights: Float, n_hyper: int) -> Surrogate:
 
 
 def _ridge(core: Float, linear: Float, y: Float) -> Float:
-    """Ridge coefficients, the strength and that of the linear terms chosen by leave-one-out."""
+    """Ridge coefficients, whose two strengths (core, linear terms) are chosen by leave-one-out."""
     n = len(y)
     y = y - y.mean()
     core, linear = core - core.mean(axis=0), linear - linear.mean(axis=0)
@@ -351,7 +240,7 @@ def _ridge(core: Float, linear: Float, y: Float) -> Float:
             left = strength / (values + strength)
             free = U**2 @ left - 1 / n  # of each residual; the constant is fitted too
             if free.min() < 1e-6:
-                continue  # a pilot that decides its own value says nothing about others
+                continue  # a pilot that determines its own value gives no information about others
             error = float((((U @ (left * along)) / free) ** 2).sum())
             if error < least:
                 dual = U @ (along / (values + strength))
@@ -376,7 +265,7 @@ def _judge(
     d = remainder - top - np.log(weight @ np.exp(remainder - top))  # E_s[e^d] = 1
     worst = float(np.abs(d[finite]).max())
     chi2 = _chi2(weight, d)
-    # what was not seen, at the weight of an average pilot
+    # the unseen part, at the weight of an average pilot
     n = len(exact)
     share = MISSED / (n + MISSED)
     missed = min(MISSED_FACTOR * worst, LARGEST)
@@ -421,5 +310,5 @@ def _chi2(weight: Float, d: Float) -> float:
     """Variance of e^d over its squared mean, for weights that add up to one."""
     b = np.exp(d)
     mean = weight @ b
-    # centred: E[b^2] - 1 would lose all figures where the remainder is 1e-8
+    # centred: E[b^2] - 1 would lose all digits where the remainder is 1e-8
     return float(weight @ (b - mean) ** 2 / mean**2)

@@ -6,17 +6,17 @@ is left are the parameters of a `DistortionModel`.
     problem     detections sorted by star, linearised about a solution
     normal      one pass: normal equations with the stars eliminated, or log densities of draws
     solve       the mode of everything together
-    gauge       what detections leave free, by name, and what fixes it
+    gauge       directions that detections leave free, by name, and what fixes them
     moves       of the whole sky, as changes of the parameters
-    settled     the mode, and what counts as free there: one decision
-    information what is known beside them: commanded offsets, ties, priors
-    references  stars whose places are known
-    tangent     the exposures' tangent planes, taken to one
-    start       where the search begins
+    settled     the mode, and the directions that are free there: one decision
+    information from other sources: commanded offsets, ties, priors
+    references  stars of known position
+    tangent     the exposures' tangent planes, mapped to one
+    start       start of the search
     calibrate   grouping and solving in turn
     errors      of detections, by magnitude
     target, proposal, sampling      the posterior
-    relative    what is known whatever the gauge
+    relative    solutions without their gauge
     catalogue   the stars
 """
 

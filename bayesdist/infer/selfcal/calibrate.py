@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.friends import Friends, friends_of_friends
+from bayesdist.data.matching.friends import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
 from bayesdist.infer.selfcal.errors import scatter_by_magnitude
 from bayesdist.infer.selfcal.gauge import Gauge
@@ -26,11 +26,11 @@ __all__ = ["SelfCalibration", "self_calibrate"]
 Float = NDArray[np.float64]
 
 MOST_ROUNDS = 12
-SHRINK = 0.5  # of the linking length from round to round, at most
-REACH = 12.0  # errors that a linking length has to span
-SETTLED = 1e-3  # share of the detections that may change their star,
-FEWEST = 4  # or so many: two at the edge of the linking length, each with its successor
-ALIKE = 0.02  # change of the number of detections that leaves the errors as they were
+SHRINK = 0.5  # smallest factor on the linking length from round to round
+REACH = 12.0  # errors below which the linking length does not shrink
+SETTLED = 1e-3  # fraction of the detections that may change their star,
+FEWEST = 4  # or this number: two at the edge of the linking length, each with its successor
+ALIKE = 0.02  # change of the number of detections by which the errors hardly change
 GUESS = 0.02  # pixels: error where none is quoted, until it is measured
 
 References = Callable[[Problem, Float], StarPriors]
@@ -38,7 +38,7 @@ References = Callable[[Problem, Float], StarPriors]
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """A solution and how it came about.
+    """A solution with its gauge and the last grouping of detections.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class SelfCalibration:
     friends : Friends
         Of the last round; its `star` is of the detections given.
     detections : Detections
-        With star codes and errors, on one tangent plane where that is asked for.
+        With star codes and errors, on one tangent plane where that is requested.
     magnitude_errors : tuple of ndarray, or None
         Magnitudes and errors in pixels, where these were measured.
     rounds : int
@@ -89,11 +89,11 @@ def self_calibrate(
     theta : ndarray, shape (D,)
         A start by which detections of a star lie closer than `start_radius`.
     knowledge : callable, optional
-        What is known beside the detections, linearised at parameters (D,).
+        Information from other sources than the detections, linearised at parameters (D,).
     match_radius : float
-        Linking length of the last round, pixels: how far false detections reach.
+        Linking length of the last round, pixels: the largest distance of false detections.
     start_radius : float, optional
-        Of the first one.
+        Linking length of the first round.
     least : int
         Fewest detections of a star.
     motion, parallax_factors
@@ -101,13 +101,13 @@ def self_calibrate(
     dilation : ndarray, shape (E,), optional
         VAFACTOR of each exposure.
     jitter : float, optional
-        Held at this, pixels.
+        Fixed value, pixels.
     references : callable, optional
-        What is known of the stars of a problem at parameters (D,) beforehand.
+        Priors of the stars of a problem at parameters (D,).
     plane : TangentPlane, optional
-        To which the tangent planes of all exposures are taken; the sky counts as flat by default.
+        To which the tangent planes of all exposures are mapped; the sky counts as flat by default.
     rounds : int
-        At most so many.
+        Largest number of rounds.
     log : callable, optional
         Called with a sentence for each round.
 
@@ -120,7 +120,7 @@ def self_calibrate(
     InputError, DegenerateError
         As `prepared` and `solve`.
     NotSettledError
-        When the groups go on changing.
+        When the groups do not converge.
     """
     theta = np.array(theta, float)
     knowledge = knowledge or Information.none
@@ -186,10 +186,10 @@ def self_calibrate(
 
 
 def _still(problem: Problem, solution: Solution) -> Mixture | None:
-    """The mixture of the last round, where this one has nearly the same detections to begin with.
+    """Mixture of the last round, if this round starts with nearly the same detections.
 
-    New ones may lie far from where the solution has them, and so do stars that move, which begin at
-    rest: then errors have to begin large.
+    New ones may lie far from their positions by the solution, and so do stars with motions, which
+    start at rest: then the first errors have to be large.
     """
     same = abs(len(problem) / len(solution.problem) - 1.0) < ALIKE
     return solution.mixture if same and problem.n_star == 2 else None
@@ -209,7 +209,7 @@ def _with_errors(
 
 
 def _changed(before: Friends, after: Friends) -> int:
-    """How many detections follow another one in their star than before.
+    """Number of detections that follow another one in their star than before.
 
     Codes of stars would not do: they shift where a star comes or goes.
     """
@@ -217,7 +217,7 @@ def _changed(before: Friends, after: Friends) -> int:
 
 
 def _previous(star: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each detection, the one before it in its star, or -1."""
+    """Index of the previous detection (N,) of the same star, or -1."""
     order = np.argsort(star, kind="stable")
     same = (star[order[1:]] == star[order[:-1]]) & (star[order[1:]] >= 0)
     out = np.full(len(star), -1)

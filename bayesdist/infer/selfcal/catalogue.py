@@ -27,11 +27,11 @@ class StarCatalogue:
     cov : ndarray, shape (S, q, q)
         With the errors of distortion and frames, in the gauge of the solution.
     own : ndarray, shape (S, q, q)
-        Without these: of the star's own detections alone.
+        Without these: by the star's own detections alone.
     n : ndarray of int, shape (S,)
         Detections.
     n_members : ndarray, shape (S,)
-        Expected number of those that are the star's.
+        Expected number of true detections among these.
     epoch : float
     unit : str
     """
@@ -51,8 +51,8 @@ class StarCatalogue:
 def star_catalogue(solution: Solution, cov: Float | None = None) -> StarCatalogue:
     """Stars at their modes, with Laplace covariances.
 
-    The covariance of a star is that of its own detections for a known distortion, and what the
-    error of the distortion adds: A^-1 + A^-1 B Sigma B^T A^-1.
+    The covariance of a star is that by its own detections for a known distortion, plus that by
+    the error of the distortion: A^-1 + A^-1 B Sigma B^T A^-1.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""What a self-calibration leaves out, estimated from its residuals with the stars eliminated.
+"""Discrepancy of a self-calibration, estimated from its residuals with the stars eliminated.
 
-As for matched stars (`bayesdist.infer.discrepancy`), with this difference: stars follow what
-detections have in common, and through them axes and chips hang together.  So the structure on all
-of them has one posterior, with amplitudes and a correlation length in common.
+As for matched stars (`bayesdist.infer.discrepancy`), with this difference: stars follow the common
+part of their detections, which couples axes and chips.  So the structure on all of them has one
+posterior, with amplitudes and a correlation length in common.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 DRAWS = 2000
-MOST_DETECTIONS = 60_000  # that are asked for structure
-MOST_EXPOSURES = 150  # whose deviations are told apart
+MOST_DETECTIONS = 60_000  # from which structure is estimated, at most
+MOST_EXPOSURES = 150  # whose single deviations are estimated
 MOST_SINES = 700  # of all axes and chips: their information is decomposed
 
 
@@ -46,24 +46,10 @@ def selfcal_discrepancy(
     exposures: bool = True,
     n_draws: int = DRAWS,
 ) -> Discrepancy:
-    """Estimate what a self-calibration leaves out, with priors on its size.
+    """Discrepancy of a self-calibration at its mode, with priors on its size.
 
-    Parameters
-    ----------
-    solution : Solution
-        The mode, with its stars.
-    rng : numpy.random.Generator
-    priors : DiscrepancyPriors, optional
-    structure : bool
-        Whether there is structure beyond the model.
-    exposures : bool
-        Whether single exposures deviate.
-    n_draws : int
-
-    Returns
-    -------
-    Discrepancy
-        In the gauge of the solution: parameters that it holds have no errors.
+    In the gauge of the solution: parameters that it fixes have no errors.  `structure` beyond the
+    model and deviations of single `exposures` can be left out.
     """
     priors, model = priors or DiscrepancyPriors(), solution.problem.model
     working = scores_of_detections(solution)
@@ -90,7 +76,7 @@ def selfcal_discrepancy(
     N, score, taken = eliminated(columns, flat, stars, working=working)
     left = without_parameters(solution, N, score)
     S, score = left.information, left.score
-    # what the fit of all detections makes of a unit of each function
+    # effect of a unit of each function on the fit of all detections
     D, all_of_them = model.n_params, len(solution.problem) / len(problem)
     taken = cov @ taken[:, D:] * all_of_them
 
@@ -146,7 +132,7 @@ def _structure(
     n: int,
     rng: np.random.Generator,
 ) -> tuple[dict[int, ChipStructure], Float, list[dict[str, object]]]:
-    """Structure by chip number, what it does to the parameters (n, D), and its sizes."""
+    """Structure by chip number, its effect on the parameters (n, D), and its sizes."""
     problem, model = solution.problem, solution.problem.model
     pixel = model.pixel_size(solution.theta)
     S, score, taken = sums
@@ -166,5 +152,5 @@ def _structure(
         out[chip.number], sizes = chip_structure(chip, one, waves, pair, [posterior] * 2)
         rows += sizes
         known += [axis[:, : one.n_known] for axis in pair]
-    # the fit takes structure for polynomials; the truth lies on the other side
+    # the fit absorbs structure into polynomials; the truth lies on the other side
     return out, -np.concatenate(known, axis=1) @ taken.T, rows

@@ -1,14 +1,14 @@
 """Information and scores of parameters and of further functions, with the stars eliminated.
 
 A detection is displaced by the parameters, by functions over its chip and by deviations of its
-exposure; its star follows.  With Z the derivatives of places by all of these, S those by a star's
-own parameters, H the curvature and g the gradient of each detection,
+exposure; its star follows.  With Z the derivatives of positions by all of these, S those by a
+star's own parameters, H the curvature and g the gradient of each detection,
 
     N = sum Z^T H Z - sum_s T^T A^-1 T        T = sum S^T H Z,  A = sum S^T H S + prior
     score = sum Z^T g - sum_s T^T A^-1 b      b = sum S^T g - pull of the prior
 
 where the second sums go over the stars, and those within over the detections of each.  Polynomials
-and functions over a chip are dense columns, and what belongs to single exposures sparse ones.
+and functions over a chip are dense columns, parameters of single exposures sparse ones.
 """
 
 from __future__ import annotations
@@ -45,24 +45,16 @@ __all__ = [
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-DETECTIONS = 8192  # gone through at a time
-UNKNOWN = 1e-10  # relative curvature below which a combination of numbers is not known
+DETECTIONS = 8192  # in memory at a time
+UNKNOWN = 1e-10  # relative curvature below which a combination of numbers is undetermined
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """What displaces detections: parameters, functions over chips, deviations of exposures.
+    """Displacements of detections by parameters, functions over chips and deviations of exposures.
 
     In this order they are the columns of all matrices; functions of one chip after the other, those
-    along u before those along v.
-
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (D,)
-    functions : mapping of int to StructureFunctions
-        By the code of a chip; none by default.
-    deviations : DeviationColumns, optional
+    along u before those along v.  `functions` are by the code of a chip; none by default.
     """
 
     problem: Problem
@@ -72,7 +64,7 @@ class Columns:
 
     @cached_property
     def structure(self) -> Structure:
-        """How places depend on the parameters."""
+        """Dependence of positions on the parameters."""
         return Structure.at(self.problem, self.theta)
 
     @property
@@ -85,37 +77,37 @@ class Columns:
         return self.functions[chip].n_known if chip in self.functions else 0
 
     def values(self, chip: int, rows: Int) -> Float:
-        """Values (n, n_functions) of these at some detections on the chip."""
+        """Values (n, n_functions) of the functions at some detections on the chip."""
         if chip not in self.functions:
             return np.zeros((len(rows), 0))
         return self.functions[chip].evaluate(self.problem.X[rows], self.problem.Y[rows])
 
     @cached_property
     def widths(self) -> tuple[int, ...]:
-        """Dense columns of each chip along one axis."""
+        """Number of dense columns of each chip along one axis."""
         K, chips = self.problem.model.n_terms, range(len(self.problem.model.chips))
         return tuple(K + self.n_functions(c) for c in chips)
 
     @cached_property
     def n_sparse(self) -> int:
-        """Parameters that are no polynomials, and deviations."""
+        """Number of parameters that are no polynomials, and of deviations."""
         others = self.n_params - self.problem.model.n_polynomial
         return others + (0 if self.deviations is None else len(self.deviations))
 
     def dense(self, chip: int, axis: int) -> slice:
-        """Where the dense columns of a chip and axis stand inside: polynomials, then functions."""
+        """Internal slice of the dense columns of a chip and axis: polynomials, then functions."""
         first = 2 * sum(self.widths[:chip]) + axis * self.widths[chip]
         return slice(first, first + self.widths[chip])
 
     @property
     def sparse(self) -> slice:
-        """Where the sparse columns stand inside."""
+        """Internal slice of the sparse columns."""
         first = 2 * sum(self.widths)
         return slice(first, first + self.n_sparse)
 
     @cached_property
     def order(self) -> Int:
-        """Which column inside each column is."""
+        """Internal index of each column."""
         K, chips = self.problem.model.n_terms, range(len(self.widths))
         inside = [np.arange(self.sparse.stop)[self.dense(c, a)] for c in chips for a in (0, 1)]
         others = np.arange(self.sparse.start, self.sparse.stop)
@@ -125,7 +117,7 @@ class Columns:
 
     @cached_property
     def centre(self) -> Float:
-        """Mean place of all exposures along the axes of the polynomials."""
+        """Mean position of all exposures along the axes of the polynomials."""
         assert self.deviations is not None
         p, out = self.problem, []
         phi = np.zeros((1, p.model.n_terms))
@@ -136,46 +128,31 @@ class Columns:
 
 
 def even_stars(problem: Problem, most: int) -> Int:
-    """Stars that are asked: all, or every k-th, so that there are no more detections than `most`.
+    """Stars to be used: all, or every k-th, so that there are no more detections than `most`.
 
-    A part of the stars says less than all of them, and nothing wrong.
+    A part of the stars is less informative than all of them, and unbiased.
     """
     return np.arange(0, problem.n_stars, int(np.ceil(len(problem) / most)))
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Some stars with their n detections.
+    """Some stars with their n detections."""
 
-    Parameters
-    ----------
-    stars, rows : slice
-        Which they are in the problem.
-    star : ndarray of int, shape (n,)
-        Which of these stars each detection is of.
-    by_star : ndarray, shape (n, 2, q)
-        Places by the parameters of their stars.
-    frame : ndarray, shape (n, 2, 2)
-        From the axes of the polynomials to those of the sky.
-    dense : tuple of (ndarray of int, ndarray)
-        Of each chip: which detections are on it, and the values of its columns.
-    sparse : csr_array, shape (2 n, n_sparse)
-        Displacements along u and v, in turn.
-    """
-
-    stars: slice
-    rows: slice
-    star: Int
-    by_star: Float
-    frame: Float
+    stars: slice  # in the problem
+    rows: slice  # of the detections, in the problem
+    star: Int  # which of these stars each detection (n,) belongs to
+    by_star: Float  # derivatives (n, 2, q) of positions by the parameters of their stars
+    frame: Float  # matrix (n, 2, 2) from the axes of the polynomials to those of the sky
+    # for each chip, the detections on it, and the values of its columns
     dense: tuple[tuple[Int, Float], ...]
-    sparse: csr_array
+    sparse: csr_array  # displacements along u and v, in turn (2 n, n_sparse)
 
     def __len__(self) -> int:
         return len(self.star)
 
     def of_stars(self, values: Float) -> csr_array:
-        """Matrix that sums values (n, q, k) of the detections over their stars, (S q, n k)."""
+        """Matrix (S q, n k) that sums values (n, q, k) of the detections over their stars."""
         n, q, k = values.shape
         row = np.repeat(self.star[:, None] * q + np.arange(q), k)
         column = np.repeat(np.arange(n)[:, None] * k, q, axis=1)[..., None] + np.arange(k)
@@ -184,7 +161,7 @@ class Piece:
 
 
 def pieces(columns: Columns) -> Iterator[Piece]:
-    """Go over the detections, some stars at a time."""
+    """Iterator over the detections in chunks of some stars."""
     p, structure = columns.problem, columns.structure
     n_sparse_params = columns.n_params - p.model.n_polynomial
     bases = [p.model.basis(chip.number) for chip in p.model.chips]
@@ -241,46 +218,25 @@ def pieces(columns: Columns) -> Iterator[Piece]:
 
 @dataclass(frozen=True, eq=False)
 class StarSums:
-    """What the stars of a piece take.
+    """Parts of the information and score of a piece that its stars absorb."""
 
-    Parameters
-    ----------
-    rows : ndarray, shape (S q, columns)
-        A^-1/2 T, by columns inside.
-    right : ndarray, shape (S q,)
-        A^-1/2 b.
-    """
-
-    rows: Float
-    right: Float
+    rows: Float  # A^-1/2 T (S q, columns), by internal columns
+    right: Float  # A^-1/2 b (S q,)
 
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """What is left of further columns when the free parameters are eliminated as well.
-
-    Parameters
-    ----------
-    information : ndarray, shape (n, n)
-    score : ndarray, shape (n,)
-    gain : ndarray, shape (D, n)
-        How the parameters follow the columns; zero for held ones.
-    """
+    """Information (n, n) and score (n,) of further columns, free parameters eliminated too."""
 
     information: Float
     score: Float
-    gain: Float
+    gain: Float  # response (D, n) of the parameters to the columns; zero for fixed ones
 
 
 def without_parameters(solution: Solution, N: Float, score: Float) -> Remainder:
-    """Columns beside the parameters, these eliminated as the solution has them.
+    """Columns other than the parameters, these eliminated as free in the solution, with its priors.
 
-    Parameters
-    ----------
-    solution : Solution
-        Which parameters are free, and what is known of them beside the detections.
-    N, score : ndarray
-        As of `eliminated`.
+    N and `score` are those of `eliminated`.
     """
     D, free, known = len(solution.theta), solution.free, solution.information
     A = N[np.ix_(free, free)] + known.precision[np.ix_(free, free)]
@@ -301,16 +257,7 @@ def star_sums(
 ) -> StarSums:
     """Sums over the detections of each star of a piece.
 
-    Parameters
-    ----------
-    columns : Columns
-    piece : Piece
-    scores : DetectionScores
-        Of its detections.
-    pull : ndarray, shape (S, q)
-        Gradient of what is known of its stars beforehand.
-    precision : ndarray, shape (S, q, q)
-        Of that.
+    `pull` (S, q) is the gradient and `precision` (S, q, q) the precision of the stars' priors.
     """
     S, q = pull.shape
     S_H = np.swapaxes(piece.by_star, 1, 2) @ scores.curvature  # (n, q, 2)
@@ -337,24 +284,10 @@ def eliminated(
     *,
     working: DetectionScores | None = None,
 ) -> tuple[Float, Float, Float]:
-    """Information and score of all columns with the stars eliminated.
+    """Information (n, n) and score (n,) of all columns with the stars (S, q) eliminated.
 
-    Parameters
-    ----------
-    columns : Columns
-    scores : DetectionScores
-        Of all detections of its problem.
-    stars : ndarray, shape (S, q)
-        Where the stars lie.
-    working : DetectionScores, optional
-        Of the likelihood that the solution was made with, where that is another one.
-
-    Returns
-    -------
-    information : ndarray, shape (n, n)
-    score : ndarray, shape (n,)
-    taken : ndarray, shape (D, n)
-        Information of parameters and all columns by the working likelihood.
+    The third result (D, n) is the information of parameters and all columns by the `working`
+    likelihood, that of the solution, where it differs from that of the scores.
     """
     p, n = columns.problem, columns.sparse.stop
     total, score = np.zeros((n, n)), np.zeros(n)
@@ -392,7 +325,7 @@ def eliminated(
 
 
 def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float) -> None:
-    """Add Z^T H Z of a piece to N, by columns inside; `left` may lack the dense functions."""
+    """Add Z^T H Z of a piece to N, by internal columns; `left` may lack the dense functions."""
     H_M = H @ piece.frame
     weight = np.swapaxes(piece.frame, 1, 2) @ H_M
     n, others = len(piece), left.n_sparse
@@ -426,7 +359,7 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
 
 
 def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
-    """Sums (n,) of Z^T g over a piece, by columns inside."""
+    """Sums (n,) of Z^T g over a piece, by internal columns."""
     out = np.zeros(columns.sparse.stop)
     turned = np.einsum("nab,na->nb", piece.frame, gradient)
     for code, (here, values) in enumerate(piece.dense):
@@ -437,7 +370,7 @@ def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
 
 
 def _inverse_roots(matrices: Float) -> Float:
-    """R with R^T R the inverse of each matrix (S, q, q), without what is not known."""
+    """R with R^T R the inverse of each matrix (S, q, q), without undetermined directions."""
     scale = np.sqrt(np.maximum(np.einsum("sqq->sq", matrices), 1e-300))
     values, vectors = np.linalg.eigh(matrices / (scale[:, :, None] * scale[:, None, :]))
     good = values > UNKNOWN

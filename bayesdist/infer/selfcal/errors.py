@@ -1,4 +1,4 @@
-"""Errors of the detections by magnitude, from how they scatter about their stars."""
+"""Errors of the detections by magnitude, from their scatter about their stars."""
 
 from __future__ import annotations
 
@@ -13,38 +13,26 @@ __all__ = ["scatter_by_magnitude"]
 
 Float = NDArray[np.float64]
 
-LEAST = 200  # detections of a bin
+LEAST = 200  # smallest number of detections in a bin
 MOST_BINS = 20
 
 
 def scatter_by_magnitude(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float, mag: Float
 ) -> tuple[Float, Float]:
-    """Error on one axis by magnitude.
+    """Median magnitude of each bin (bins,), and error on one axis there in pixels (bins,).
 
-    A star is placed by its own detections; what they scatter less for that is put back.
-
-    Parameters
-    ----------
-    problem : Problem
-    theta, mixture, stars
-        A solution.
-    mag : ndarray, shape (N,)
-        In the order of the problem.
-
-    Returns
-    -------
-    middles, sigma : ndarray, shape (bins,)
-        Median magnitude of each bin, and error in pixels.
+    A star's position is that of its own detections; the scatter is corrected for this.  `mag` (N,)
+    is in the order of the problem.
     """
     w = memberships(problem, theta, mixture, stars)
     precision = w / (problem.var + mixture.jitter**2)
     total = np.bincount(problem.star, precision, minlength=problem.n_stars)[problem.star]
-    # of each axis a star costs q / 2 numbers, shared by weight
+    # on each axis a star takes q / 2 degrees of freedom, shared by weight
     left = 1.0 - np.minimum(precision / np.maximum(total, 1e-300) * problem.n_star / 2, MOST_TAKEN)
     square = problem.squares(theta, stars)
     n_bins = int(np.clip(len(mag) // LEAST, 1, MOST_BINS))
-    # equal magnitudes, as of lists without any, leave fewer bins
+    # equal magnitudes, as in lists without any, leave fewer bins
     edges = np.unique(np.quantile(mag, np.linspace(0, 1, n_bins + 1)))
     n_bins = max(len(edges) - 1, 1)
     bin_of = np.clip(np.searchsorted(edges, mag, side="right") - 1, 0, n_bins - 1)

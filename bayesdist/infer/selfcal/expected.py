@@ -1,7 +1,7 @@
-"""What exposures would tell before any is taken: the Fisher information at a truth.
+"""Information of exposures before any is taken: the Fisher information at a truth.
 
-Where stars fall is all that matters: residuals enter the curvature of the log density only through
-memberships, and here every detection lies on its star.
+Only the positions of the stars matter: residuals enter the curvature of the log density only
+through memberships, and here every detection lies on its star.
 """
 
 from __future__ import annotations
@@ -23,48 +23,28 @@ __all__ = ["ExpectedSolution", "expected_solution"]
 
 Float = NDArray[np.float64]
 
-BOUNDED = 1e-3  # of a free direction that others may leave of it and still describe it
+BOUNDED = 1e-3  # fraction of a free direction that the others may leave unexplained
 NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)
 
 
 @dataclass(frozen=True, eq=False)
 class ExpectedSolution:
-    """A solution as it would come out, without noise: its mean is the truth.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    mean : ndarray, shape (D,)
-        The truth.
-    cov : ndarray, shape (D, D)
-        Zero for what the gauge holds.
-    gauge : Gauge
-    problem : Problem
-        The detections that would be used, sorted by star.
-    """
+    """Expected solution without noise: its mean is the truth."""
 
     model: DistortionModel
-    mean: Float
-    cov: Float
+    mean: Float  # the truth (D,)
+    cov: Float  # (D, D) zero for parameters that the gauge fixes
     gauge: Gauge
-    problem: Problem
+    problem: Problem  # detections that would be used, sorted by star
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
         """Parameter vectors (n, D)."""
         return np.asarray(rng.multivariate_normal(self.mean, self.cov, n, method="eigh"))
 
     def up_to(self, directions: Float) -> Float | None:
-        """Covariance (D, D) of what is left when some directions do not count.
+        """Covariance (D, D) without the errors along directions (D, d), as of `gauge_free_matrix`.
 
-        Parameters
-        ----------
-        directions : ndarray, shape (D, d)
-            As of `gauge_free_matrix`.
-
-        Returns
-        -------
-        ndarray, or None
-            None where other directions are open than these: then nothing bounds the errors.
+        None where other directions are open than these: then nothing bounds the errors.
         """
         S = gauge_free_matrix(self.model, self.mean, directions)
         open_ = self.gauge.open
@@ -88,25 +68,13 @@ def expected_solution(
     *,
     least: int = 2,
 ) -> ExpectedSolution:
-    """The covariance that a self-calibration would have, its stars marginalised.
+    """Covariance that a self-calibration would have, its stars marginalised.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    truth : ndarray, shape (D,)
-    detections : Detections
-        Where stars fall, with their codes and errors; no noise.
-    information : Information
-        What will be known beside them.
-    least : int
-        Fewest detections of a star.
-
-    Raises
-    ------
-    InputError
-        When no star is seen often enough.
+    `detections` have the positions of stars, their codes and errors, and no noise; `information` is
+    that from other sources; `least` is the fewest detections of a star.  InputError when no star is
+    seen often enough.
     """
-    # false detections are not drawn, so that their reach does not matter
+    # false detections are not drawn, so that their largest distance does not matter
     problem = prepared(model, detections, truth, match_radius=1.0, least=least)
     stars = problem.mean_places(truth)
     problem = problem.at(truth, stars)

@@ -1,4 +1,4 @@
-"""How far stars follow their detections: what that takes of residuals, and of patterns in them."""
+"""Response of stars to their detections: the part of residuals and their patterns it absorbs."""
 
 from __future__ import annotations
 
@@ -17,41 +17,27 @@ __all__ = ["MOST_TAKEN", "Following", "following", "places_by_star", "taken_by_s
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-MOST_TAKEN = 0.99  # of a residual's variance: a star of as many numbers as detections takes it all
-LOOSE = 1e-9  # relative curvature below which a combination of a star's numbers is not known
+# of a residual's variance: a star with as many parameters as detections absorbs it all
+MOST_TAKEN = 0.99
+LOOSE = 1e-9  # relative curvature below which a combination of a star's parameters is undetermined
 
 
 @dataclass(frozen=True, eq=False)
 class Following:
-    """Some stars with their n detections, in pixels of the detector.
+    """Some stars with their n detections, in pixels of the detector."""
 
-    Parameters
-    ----------
-    rows : slice
-        Their detections, in the order of the problem.
-    star : ndarray of int, shape (n,)
-        Which of these stars each detection is of.
-    member : ndarray, shape (n,)
-        Probability to be the star's.
-    weight : ndarray, shape (n,)
-        Inverse variance of each axis, times that.
-    residual : ndarray, shape (n, 2)
-        Detection minus star.
-    ties : ndarray, shape (n, q, 2)
-        L^-1 B: B is the curvature of the log density by the star's parameters and the detection's
-        pixels, L L^T that by the star's parameters alone.
-    """
-
-    rows: slice
-    star: Int
-    member: Float
-    weight: Float
-    residual: Float
+    rows: slice  # detections, in the order of the problem
+    star: Int  # which of these stars each detection (n,) belongs to
+    member: Float  # probability (n,) to belong to the star
+    weight: Float  # inverse variance (n,) of each axis, times that probability
+    residual: Float  # detection minus star (n, 2)
+    # L^-1 B (n, q, 2): B is the curvature of the log density by the star's parameters and the
+    # detection's pixels, L L^T that by the star's parameters alone
     ties: Float
 
 
 def following(solution: Solution) -> Iterator[Following]:
-    """Go over the stars of a solution, some at a time."""
+    """Iterator over the stars of a solution, some at a time."""
     p, theta, mixture = solution.problem, solution.theta, solution.mixture
     members = memberships(p, theta, mixture, solution.stars)
     weights = members / (p.var + mixture.jitter**2)
@@ -71,10 +57,7 @@ def following(solution: Solution) -> Iterator[Following]:
 
 
 def taken_by_stars(solution: Solution) -> Float:
-    """Share (N,) of the variance of each detection that its star takes out of the residual.
-
-    At most `MOST_TAKEN`.
-    """
+    """Fraction (N,) of each detection's variance that its star absorbs, at most `MOST_TAKEN`."""
     out = np.empty(len(solution.problem))
     for some in following(solution):
         square = np.sum(some.ties**2, axis=(1, 2))
@@ -83,7 +66,7 @@ def taken_by_stars(solution: Solution) -> Float:
 
 
 def _inverse_roots(matrices: Float) -> Float:
-    """L^-1 of A = L L^T, (S, q, q); what hardly has curvature gets some, as it says nothing."""
+    """L^-1 of A = L L^T, (S, q, q); undetermined directions get some curvature."""
     scale = np.sqrt(np.einsum("sqq->sq", matrices))
     scaled = matrices / (scale[:, :, None] * scale[:, None, :])
     scaled += LOOSE * np.eye(matrices.shape[1])
@@ -91,7 +74,7 @@ def _inverse_roots(matrices: Float) -> Float:
 
 
 def places_by_star(problem: Problem, rows: slice) -> Float:
-    """Places of detections by the parameters of their stars, (n, 2, q)."""
+    """Derivatives (n, 2, q) of positions of detections by the parameters of their stars."""
     n, q, unit = rows.stop - rows.start, problem.n_star, np.eye(2)
     out = np.broadcast_to(unit, (n, 2, 2))
     if q >= 4:

@@ -1,9 +1,9 @@
-"""What detections alone cannot tell: directions in which the solution is free, and their names.
+"""Directions in which detections alone leave the solution free, and their names.
 
-Stars that move as the model moves leave every residual as it is.  A linear map of the whole sky is
+Stars that move as the model moves leave every residual unchanged.  A linear map of the whole sky is
 such a move as far as the exposures can follow it: shift, rotation and scale always, skew where all
-exposures have one roll angle.  Which directions are free is found from the curvature at hand, and
-they are named by the moves that can be written down.
+exposures have one roll angle.  Free directions are found from the current curvature, and they are
+named by the moves that can be written down.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 NULL = 1e-10  # of the largest eigenvalue: no information
-ROUNDING = 1e-13  # of the largest eigenvalue: less is nothing but rounding
+ROUNDING = 1e-13  # of the largest eigenvalue: less is only rounding
 FREE_PIX = 10.0  # error at the detector's edge above which a direction counts as free
 WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as nearly free
-FAR = 3.0  # times the final error: what knows a direction no better than this does not fix it
-EXPLAINED = 1e-2  # share of a free direction that its names may leave out
+FAR = 3.0  # times the final error: information no better than this does not fix a direction
+EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
 LEAST_PIVOT = 0.02
-HIDDEN = 1e-5  # of a property that lies along directions of which nothing is known: it is free
+HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is free
 
 
 @dataclass(frozen=True, eq=False)
 class NamedDirection:
-    """A property of the solution, and how far it is known.
+    """A property of the solution, and its error.
 
     Parameters
     ----------
@@ -55,11 +55,11 @@ class NamedDirection:
         with its name before: 'WFC1.shift_u', 'WFC1.rotation', ...
     unit : str
     sigma : float
-        From the detections alone; infinite where these say nothing.
+        From the detections alone; infinite where these do not determine it.
     sigma_fixed : float
-        With what is known beside them; infinite where the gauge holds it by convention.
+        With information from other sources; infinite where the gauge fixes it by convention.
     edge_pix : float
-        What one unit of it is at the edge of the detector, pixels.
+        Displacement by one unit of it at the edge of the detector, pixels.
     """
 
     name: str
@@ -70,41 +70,32 @@ class NamedDirection:
 
     @property
     def free(self) -> bool:
-        """Whether the detections say nothing about it."""
+        """True if the detections do not determine it."""
         return not np.isfinite(self.sigma)
 
     @property
     def weak(self) -> bool:
-        """Whether they say next to nothing."""
+        """True if the detections hardly determine it."""
         return self.free or self.sigma * self.edge_pix > WEAK_PIX
 
     @property
     def by_detections(self) -> bool:
-        """Whether nothing that is known beside the detections makes it much better."""
+        """True if no other information makes it much better known than the detections."""
         known = np.isfinite(self.sigma) and np.isfinite(self.sigma_fixed)
         return bool(known and self.sigma < FAR * self.sigma_fixed)
 
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """What counts as free and what is held by convention, as a solution carries it along.
+    """Directions taken as free and parameters fixed by convention, stored with a solution.
 
-    How much is known of a direction depends on where it is asked, and near a limit two answers
-    would differ: then parameters would be held, and so have no error, that nothing calls free.
-
-    Parameters
-    ----------
-    n_null : int
-        Directions that the detections leave free.
-    n_open : int
-        Of those, what is free even with what is known beside the detections.
-    held : ndarray of int, shape (n_open,)
-        Parameters that are held.
+    The error of a direction depends on where it is evaluated, and near a limit two answers would
+    differ: then parameters would be fixed, and so have no error, that belong to no free direction.
     """
 
-    n_null: int
-    n_open: int
-    held: Int
+    n_null: int  # directions that the detections leave free
+    n_open: int  # of those, directions that are free even with information from other sources
+    held: Int  # parameters (n_open,) that are fixed
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,15 +107,15 @@ class Gauge:
     null : ndarray, shape (D, d)
         Basis of the directions that detections leave free.
     open : ndarray, shape (D, k)
-        Of those, what is free even with what is known beside the detections.
+        Of those, directions that are free even with information from other sources.
     held : ndarray of int, shape (k,)
-        Parameters that are held, so that the others are determined.
+        Parameters that are fixed, so that the others are determined.
     directions : tuple of NamedDirection
     unnamed : tuple of str
-        Parameters that stand out in free directions which the names do not describe.
+        Largest parameters in free directions which the names do not describe.
     weakest : ndarray, shape (w, 2)
         Of each nearly free combination of parameters: its error in pixels, and index of the
-        parameter that stands out in it.
+        largest parameter in it.
     spread : float
         Largest difference of two roll angles, radians, a half turn counted as none.
     whole : tuple of str
@@ -146,7 +137,7 @@ class Gauge:
 
     @property
     def decision(self) -> Decision:
-        """What counts as free, and what is held."""
+        """Number of free directions, and the fixed parameters."""
         return Decision(self.null.shape[1], self.open.shape[1], self.held)
 
     @property
@@ -156,9 +147,9 @@ class Gauge:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What cannot be known, why, and what fixes it."""
+        """Sentences on each undetermined property, its reason and what fixes it."""
         out, free = list[str](), set(self.free_names)
-        # what cannot be told from a skew of the sky is said at once
+        # the degeneracy with a skew of the sky is reported at once
         skew = {"skew_plus", "skew_cross"}
         told = set(POINTS) | (skew if skew & set(self.whole) else set())
         if skew <= told and skew <= free and self.spread < SAME_ROLL:
@@ -220,17 +211,9 @@ def find_gauge(
 ) -> Gauge:
     """Free directions of a problem at a solution.
 
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (D,)
-    curvature : ndarray, shape (D, D)
-        Of the detections, with EM weights: never indefinite but by rounding.
-    information : Information
-    known : ndarray, shape (D, D), optional
-        Curvature with what is known of the stars beforehand; the same by default.
-    decision : Decision, optional
-        What counts as free; decided here by default.
+    `curvature` (D, D) is that of the detections, with EM weights: indefinite only by rounding.
+    `known` (D, D) includes the priors of the stars; it equals `curvature` by default.  Without a
+    `decision` on the free directions it is made here.
     """
     model = problem.model
     years = float(np.ptp(problem.groups.epoch)) or 1.0
@@ -251,7 +234,7 @@ def find_gauge(
     known_moves = np.stack(  # in pixels at the edge
         [row / scale for row in (named | moving).values()], axis=1
     )
-    # a spin bends the paths of stars that move, by next to nothing
+    # a spin bends the paths of stars that move, negligibly
     loose = alone.vectors[:, alone.values < WEAK_PIX**-2]
     weak = np.flatnonzero(alone.values[alone.n :] < WEAK_PIX**-2) + alone.n
     weakest = np.array(
@@ -289,7 +272,7 @@ def _rates_of(problem: Problem, theta: Float) -> dict[str, Float]:
 
 
 def _within(row: Float, null: Float) -> bool:
-    """Whether a move is one of the free directions."""
+    """True if a move is one of the free directions."""
     left = row - null @ (null.T @ row)
     return bool(np.linalg.norm(left) < EXPLAINED * np.linalg.norm(row))
 
@@ -304,7 +287,7 @@ class _Spectrum:
 
     @classmethod
     def of(cls, scaled: Float, n: int | None) -> _Spectrum:
-        """Spectrum of an information (D, D); decides how many are free where that is not said."""
+        """Spectrum of an information (D, D); by default it decides how many directions are free."""
         values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
         least = max(NULL * float(values[-1]), FREE_PIX**-2)
         return cls(values, vectors, int((values < least).sum()) if n is None else n)
@@ -317,8 +300,8 @@ class _Spectrum:
     def sigma(self, row: Float, edge_pix: float) -> float:
         """Error of a property, `row` (D,) times the parameters; infinite where it is free.
 
-        A direction that is free though something is known of it is not quite one move of the sky:
-        properties in which it has next to no part are known in spite of it.
+        A direction that is free though some information on it exists is not exactly one move of the
+        sky: properties in which it has next to no part are determined in spite of it.
         """
         along = self.vectors.T @ row
         unknown = self.values < ROUNDING * self.values[-1]
@@ -333,7 +316,7 @@ class _Spectrum:
 
 
 def _pivots(model: DistortionModel, null: Float) -> Int:
-    """Parameters whose holding leaves nothing free: of the lowest degrees, where these serve."""
+    """Parameters that leave nothing free once fixed: of the lowest degrees, where possible."""
     d = null.shape[1]
     if not d:
         return np.zeros(0, np.int64)
@@ -356,7 +339,7 @@ def _pivots(model: DistortionModel, null: Float) -> Int:
         size = np.abs(np.diag(R))
         take = rows[order[: int((size > LEAST_PIVOT).sum())]]
         held += list(take)
-        # what is still free once these are held
+        # still free once these are fixed
         _, s, Vt = np.linalg.svd(null[held])
         left = null @ Vt[int((s > 1e-9).sum()) :].T
     return np.array(sorted(held), np.int64)
@@ -378,7 +361,7 @@ def _directions(
 
 
 def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ...]:
-    """Parameters that stand out in what of the free directions no move of the sky describes."""
+    """Largest parameters in the part of the free directions that no move of the sky describes."""
     if not null.shape[1]:
         return ()
     Q, _ = np.linalg.qr(np.concatenate([known, _chip_moves(model)], axis=1))
@@ -392,7 +375,7 @@ def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ..
 
 
 def _chip_moves(model: DistortionModel) -> Float:
-    """Shifts and linear maps (D, n) of each further chip, which no star may tie to the first."""
+    """Shifts and linear maps (D, n) of each further chip, free if no star ties it to the first."""
     starts = [
         model.coefficient_slice(c.number, axis).start for c in model.chips[1:] for axis in (0, 1)
     ]

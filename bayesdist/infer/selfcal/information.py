@@ -1,4 +1,4 @@
-"""What is known of the solution beside the detections: it fixes what these leave open.
+"""Information from other sources than the detections, which fixes free directions.
 
 Every piece is Gaussian in the parameters, linearised at a solution.
 """
@@ -39,12 +39,12 @@ class Information:
 
     @classmethod
     def none(cls, reference: Float) -> Information:
-        """Nothing is known."""
+        """Information without any content."""
         D = len(reference)
         return cls(reference, np.zeros((D, D)), np.zeros(D))
 
     def __add__(self, other: Information) -> Information:
-        """Both; the pieces are independent."""
+        """Sum of two independent pieces."""
         shift = self.reference - other.reference
         return Information(
             self.reference,
@@ -57,13 +57,13 @@ class Information:
         return np.asarray(self.right - self.precision @ (theta - self.reference))
 
     def log_density(self, theta: Float) -> Float:
-        """Of parameter vectors (..., D), up to a constant."""
+        """Log density of parameter vectors (..., D), up to a constant."""
         d = theta - self.reference
         return np.asarray(d @ self.right - 0.5 * np.einsum("...d,...d->...", d @ self.precision, d))
 
 
 def tie(reference: Float, row: Float, value: float, sigma: float) -> Information:
-    """One measured linear combination of the parameters.
+    """Information of one measured linear combination of the parameters.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def pointing_information(
     group: NDArray[np.int64] | None = None,
     pixels: Sequence[tuple[int, float, float]] | None = None,
 ) -> Information:
-    """Commanded offsets: where the reference pixel of the first chip is on the sky.
+    """Information of commanded offsets: sky positions of the first chip's reference pixel.
 
     The pointings of a group of exposures have one unknown origin and independent errors.
 
@@ -101,7 +101,7 @@ def pointing_information(
     group : ndarray of int, shape (E,), optional
         Exposures with the same guide stars; all of them by default.
     pixels : sequence of (int, float, float), optional
-        Chip number, x and y of some pixels: their mean place is what is pointed, in place of the
+        Chip number, x and y of some pixels: their mean position is pointed, in place of the
         reference pixel.
     """
     E, first = len(model.exposures), model.chips[0]
@@ -120,7 +120,7 @@ def pointing_information(
         here = np.flatnonzero(known & (group == one))
         weight = np.diag(sigma[here] ** -2.0)
         mean = weight.sum(axis=1)
-        weight -= np.outer(mean, mean) / mean.sum()  # the origin is not known
+        weight -= np.outer(mean, mean) / mean.sum()  # the origin is unknown
         for axis in range(2):
             J = rows[here, axis]
             precision += J.T @ weight @ J
@@ -131,21 +131,11 @@ def pointing_information(
 def frame_information(
     model: DistortionModel, theta: Float, name: str, values: Float, sigma: float
 ) -> Information:
-    """One property of the exposures' frames, known but for a zero point that all share.
+    """Information on one property of the exposures' frames ('rotation', 'scale').
 
-    Commanded rolls, each with its error, or scales that scatter about one.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-        At which it is linearised.
-    name : str
-        A parameter of the frames: 'rotation', 'scale'.
-    values : ndarray, shape (E,)
-        NaN where there is none; the first exposure's is that of the polynomials.
-    sigma : float
-        Error of each.
+    Commanded rolls, each with its error, or scales that scatter about one; the zero point that all
+    share stays free.  `values` (E,) are NaN where there is none; the first exposure's is that of
+    the polynomials.
     """
     known = np.flatnonzero(np.isfinite(values))
     rows, now = np.zeros((len(known), model.n_params)), np.zeros(len(known))

@@ -36,7 +36,7 @@ POINTS = ("zero_point_u", "zero_point_v")
 
 
 def parameter_scale(model: DistortionModel, theta: Float, years: float = 1.0) -> Float:
-    """What a pixel at the edge of the detector is in each parameter, (D,)."""
+    """Change (D,) of each parameter that equals a pixel at the edge of the detector."""
     pixel = model.pixel_size(theta)
     half = max(max(c.size) for c in model.chips) / 2
     out = np.empty(model.n_params)
@@ -85,14 +85,7 @@ def moves(model: DistortionModel, theta: Float) -> dict[str, Float]:
 def rates(model: DistortionModel, theta: Float, years: Float) -> dict[str, Float]:
     """Moves of the whole sky that grow with time, as changes (D,) of the exposures' frames.
 
-    Stars follow them where they have motions.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-    years : ndarray, shape (E,)
-        Since the first exposure.
+    Stars follow them where they have motions; `years` (E,) are since the first exposure.
     """
     out = {name: np.zeros(model.n_params) for name in RATES}
     for e in range(1, len(model.exposures)):
@@ -124,7 +117,7 @@ def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
         out[name] = places[first.number][axis]
     out |= _parts(maps[first.number])
     for chip in model.chips[1:]:
-        # where the other chip lies when the first one has been brought back
+        # position of the other chip when the first one has been moved back
         G = maps[first.number]
         gap = np.array([places[chip.number][a] - places[first.number][a] for a in (0, 1)])
         between = gap @ theta
@@ -137,14 +130,14 @@ def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
 
 
 def _sky_map(model: DistortionModel, theta: Float, chip: int) -> Float:
-    """Rows (2, 2, D) of the linear map of the sky that a change of the chip's linear part is."""
+    """Rows (2, 2, D) of the linear map of the sky that a change of the chip's linear part makes."""
     G = linear_part(model, chip)
     now = G @ theta
     return np.asarray(np.einsum("abd,bc->acd", G, np.linalg.inv(now)))
 
 
 def _place(model: DistortionModel, chip: int) -> Float:
-    """Rows (2, D) of where a chip's reference pixel lies."""
+    """Rows (2, D) of the position of a chip's reference pixel."""
     at = model.basis(chip).monomial_matrix[0]
     out = np.zeros((2, model.n_params))
     for axis in range(2):

@@ -35,27 +35,19 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STARS = 4096  # eliminated at a time
-SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is thought of
-SCRATCH = 2_000_000  # bytes of coefficients of draws at a time: what a core has near it
+SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is considered
+SCRATCH = 2_000_000  # bytes of coefficients of draws at a time: the cache of a core
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """How detections scatter about their stars.
+    """Distribution of detections about their stars."""
 
-    Parameters
-    ----------
-    jitter : float
-        Pixels, in addition to the quoted errors.
-    fraction : float
-        Share of false detections.
-    """
-
-    jitter: float = 0.0
-    fraction: float = 0.01
+    jitter: float = 0.0  # pixels, in addition to the quoted errors
+    fraction: float = 0.01  # of false detections
 
     def constants(self, log_outlier: float) -> tuple[float, float, float]:
-        """Squared jitter, log of the core's share, log density of false detections."""
+        """Squared jitter, log of the core's fraction, log density of false detections."""
         with np.errstate(divide="ignore"):
             shares = np.log([1.0 - self.fraction, self.fraction])
         return self.jitter**2, float(shares[0]), float(max(shares[1] + log_outlier, -1e300))
@@ -63,30 +55,20 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """How places on the sky depend on the parameters, linearised at a solution.
+    """Dependence of sky positions on the parameters, linearised at a solution.
 
     By the coefficients of a chip's polynomials, M (kron) phi; by everything else, `extra` phi.
-
-    Parameters
-    ----------
-    coef : ndarray, shape (G, 2, K)
-        Effective coefficients.
-    linear : ndarray, shape (G, 2, 2)
-        M.
-    extra : ndarray, shape (G, m, 2, K)
-        Derivatives by drift and frames; zero where a group has fewer than m of them.
-    columns : ndarray of int, shape (G, m)
-        Which parameters these are; -1 for none.
     """
 
-    coef: Float
-    linear: Float
+    coef: Float  # effective coefficients (G, 2, K)
+    linear: Float  # M (G, 2, 2)
+    # derivatives (G, m, 2, K) by drift and frames; zero where a group has fewer than m of them
     extra: Float
-    columns: Int
+    columns: Int  # indices (G, m) of these parameters; -1 for none
 
     @classmethod
     def at(cls, problem: Problem, theta: Float) -> Structure:
-        """That of a problem at theta (D,)."""
+        """Structure of a problem at theta (D,)."""
         groups, K = problem.groups, problem.model.n_terms
         found = problem.effective_jacobian(theta)
         m = max(len(columns) for columns, _ in found) - 2 * K
@@ -102,49 +84,24 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """Second-order expansion of the log density at a solution, the stars eliminated.
+    """Second-order expansion of the log density at a solution, the stars eliminated."""
 
-    Parameters
-    ----------
-    value : float
-        Log density with the stars integrated out (Laplace), up to a constant.
-    gradient : ndarray, shape (D,)
-        At the stars' modes.
-    curvature : ndarray, shape (D, D)
-        Minus the Hessian.
-    stars : ndarray, shape (S, q)
-        Modes.
-    n_members : float
-        Expected number of detections that are of their stars.
-    n_doubtful : float
-        Sum of w (1 - w) over them.
-    chi2 : float
-        Sum of w times the squared normalised residual.
-    """
-
-    value: float
-    gradient: Float
-    curvature: Float
-    stars: Float
-    n_members: float
-    n_doubtful: float
-    chi2: float
+    value: float  # log density with the stars integrated out (Laplace), up to a constant
+    gradient: Float  # (D,) at the stars' modes
+    curvature: Float  # minus the Hessian (D, D)
+    stars: Float  # modes (S, q)
+    n_members: float  # expected number of true detections
+    n_doubtful: float  # sum of w (1 - w) over the detections
+    chi2: float  # sum of w times the squared normalised residual
 
 
 def expand(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float, *, observed: bool = True
 ) -> Expansion:
-    """One pass over the detections.
+    """Expansion at theta (D,) by one pass over the detections.
 
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (D,)
-    mixture : Mixture
-    stars : ndarray, shape (S, q)
-        Where the search for their modes begins.
-    observed : bool
-        Curvature of the mixture itself; otherwise with EM weights, which is never indefinite.
+    The search for the stars' modes starts at `stars` (S, q).  If `observed` the curvature is that
+    of the mixture itself; otherwise that with EM weights, which is never indefinite.
     """
     structure, D = Structure.at(problem, theta), problem.model.n_params
     curvature, gradient = np.zeros((D, D)), np.zeros(D)
@@ -168,15 +125,9 @@ def expand(
 def eliminated_rows(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float
 ) -> Iterator[tuple[slice, Float, Float]]:
-    """What ties stars to the distortion, some stars at a time.
+    """Coupling of stars to the distortion, some stars at a time.
 
-    Yields
-    ------
-    stars : slice
-    rows : ndarray, shape (n, q, D)
-        L^-1 B of each star, A = L L^T.
-    factors : ndarray, shape (n, q, q)
-        L.
+    Yields the stars, L^-1 B (n, q, D) of each, A = L L^T, and L (n, q, q).
     """
     structure, D, q = Structure.at(problem, theta), problem.model.n_params, problem.n_star
     first = 0
@@ -232,7 +183,7 @@ def _assemble(
 
 
 def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:
-    """Probability (N,) that a detection is its star's."""
+    """Probability (N,) that a detection belongs to its star."""
     p = problem
     j2, log_core, log_out = mixture.constants(p.log_outlier)
     return np.asarray(
@@ -256,27 +207,16 @@ def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) 
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
-    """Modes of the stars at a solution, and how they follow their detections from there.
-
-    Parameters
-    ----------
-    stars : ndarray, shape (S, q)
-    share : ndarray, shape (N,)
-        Weight of each detection in the place of its star; they add to 1.
-    middles : ndarray, shape (S, 2)
-        Mean places of the detections at the solution, so weighted.
-    state : ndarray of int, shape (N,)
-        Whether a detection is a member, is not, or doubtful: `kernel.MEMBER` and so on.
-    """
+    """Modes of the stars at a solution, and their response to their detections from there."""
 
     stars: Float
-    share: Float
-    middles: Float
-    state: NDArray[np.int8]
+    share: Float  # weight (N,) of each detection in the position of its star; they add to 1
+    middles: Float  # weighted mean positions (S, 2) of the detections at the solution
+    state: NDArray[np.int8]  # of each detection (N,): `kernel.MEMBER`, `DOUBTFUL` or `FALSE`
 
     @classmethod
     def at(cls, problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Anchor:
-        """That of a problem at theta (D,), where `stars` are the modes."""
+        """Anchor of a problem at theta (D,), where `stars` are the modes."""
         p, z = problem, problem.places(theta)
         member = memberships(problem, theta, mixture, stars)
         weight = member / (p.var + mixture.jitter**2) * (p.W[:, 0] + p.W[:, 2])
@@ -288,9 +228,10 @@ class Anchor:
 
 
 def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
-    """Which memberships are to be added up: those of stars that stand still.
+    """States (N,) of detections; doubtful memberships are summed over, for stars without motion.
 
-    All of a star of few detections if one is doubtful: another one may have the members right.
+    All detections of a star with few are doubtful if one is: another one may have the right
+    members.
     """
     out = np.where(member > 0.5, kernel.MEMBER, kernel.FALSE).astype(np.int8)
     if problem.n_star > 2:
@@ -309,25 +250,15 @@ def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
 
 
 def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: Anchor) -> Float:
-    """Log density of parameter vectors, the stars integrated out (Laplace), up to a constant.
+    """Log densities (n,) of theta (n, D), the stars integrated out (Laplace), up to a constant.
 
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (n, D)
-    mixtures : ndarray, shape (n, 2)
-        Jitter in pixels, share of false detections.
-    anchor : Anchor
-        Of a solution near by: where the search for the stars' modes begins.
-
-    Returns
-    -------
-    ndarray, shape (n,)
+    `mixtures` (n, 2) are jitter in pixels and fraction of false detections; the search for the
+    stars' modes starts from the anchor, of a solution near by.
     """
     p = problem
     rows = np.array([Mixture(j, f).constants(p.log_outlier) for j, f in mixtures])
     out = np.empty(len(theta))
-    # a multiple of eight: what a vector instruction takes
+    # a multiple of eight, as in a vector instruction
     step = max(8, SCRATCH // (16 * p.model.n_terms * len(p.groups)) // 8 * 8)
     for a in range(0, len(theta), step):
         some = slice(a, a + step)

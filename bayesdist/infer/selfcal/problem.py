@@ -1,4 +1,4 @@
-"""Detections sorted by star, with all that a pass over them needs."""
+"""Detections sorted by star, with all arrays that a pass over them needs."""
 
 from __future__ import annotations
 
@@ -19,89 +19,52 @@ __all__ = ["LEAST_DETECTIONS", "MOTIONS", "Problem", "StarPriors", "prepared"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-LEAST_DETECTIONS = 2  # of a star that says anything about the distortion
+LEAST_DETECTIONS = 2  # of a star that gives information about the distortion
 MOTIONS = {"none": 2, "proper_motion": 4, "parallax": 5}
-VAGUE = (
-    1e-12  # precision, in the unit of u, v, that keeps a star's matrix positive and says nothing
-)
+# precision, in the unit of u, v, that makes a star's matrix positive and is no information
+VAGUE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class StarPriors:
-    """What is known of the stars beforehand: reference stars with their errors.
-
-    Parameters
-    ----------
-    centre : ndarray, shape (S, q)
-    precision : ndarray, shape (S, q, q)
-        Zero for stars of which nothing is known.
-    """
+    """Gaussian priors of the stars: reference stars with their errors."""
 
     centre: Float
-    precision: Float
+    precision: Float  # (S, q, q) zero for stars without a prior
 
     @classmethod
     def none(cls, n: int, q: int) -> StarPriors:
-        """Nothing is known of any star."""
+        """Priors without information on any star."""
         return cls(np.zeros((n, q)), np.tile(VAGUE * np.eye(q), (n, 1, 1)))
 
     @property
     def informed(self) -> NDArray[np.bool_]:
-        """Of which stars (S,) something is known."""
+        """Boolean mask (S,) of stars with a prior."""
         return np.asarray(np.trace(self.precision, axis1=1, axis2=2) > 10 * VAGUE)
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Detections sorted by star.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    groups : Groups
-        Of equal effective coefficients; `index` is that of each detection here.
-    starts : ndarray of int, shape (S + 1,)
-        First detection of each star.
-    seen : ndarray, shape (2, N)
-        Scaled positions of the detections.
-    X, Y : ndarray, shape (N,)
-        Scaled positions at which the model is taken: where the star lies by a solution at hand.
-    offset : ndarray, shape (N, 2)
-        From there to the detection, on the sky.
-    W : ndarray, shape (N, 3)
-        uu, uv, vv of the matrix that turns residuals on the sky into squared pixels.
-    var : ndarray, shape (N,)
-        Square of the quoted errors, square pixels.
-    time : ndarray, shape (N,)
-        Years since `epoch0`; empty where stars do not move.
-    factor : ndarray, shape (N, 2)
-        Parallax factors; empty where there is no parallax.
-    priors : StarPriors
-    rows : ndarray of int, shape (N,)
-        Which detection of the input each one is.
-    match_radius : float
-        Within which detections were taken for one star, pixels: the reach of false ones.
-    epoch0 : float
-        Date of the stars' positions.
-    dilation : ndarray, shape (E,), optional
-        Known scale of the sky in each exposure, about the frames' origin: VAFACTOR.
-    """
+    """Detections sorted by star."""
 
     model: DistortionModel
-    groups: Groups
-    starts: Int
-    seen: Float
+    groups: Groups  # of equal effective coefficients; `index` is that of each detection here
+    starts: Int  # first detection (S + 1,) of each star
+    seen: Float  # scaled positions (2, N) of the detections
+    # scaled position (N,) of the star by a current solution, at which the model is evaluated
     X: Float
     Y: Float
-    offset: Float
+    offset: Float  # (N, 2) from there to the detection, on the sky
+    # (N, 3) uu, uv, vv of the matrix that converts residuals on the sky into squared pixels
     W: Float
-    var: Float
-    time: Float
-    factor: Float
+    var: Float  # square (N,) of the quoted errors, square pixels
+    time: Float  # years (N,) since `epoch0`; empty where stars do not move
+    factor: Float  # parallax factors (N, 2); empty without parallax
     priors: StarPriors
-    rows: Int
-    match_radius: float
-    epoch0: float = 0.0
+    rows: Int  # input row (N,) of each detection
+    match_radius: float  # pixels: largest distance of detections of one star, and of false ones
+    epoch0: float = 0.0  # date of the stars' positions
+    # known scale (E,) of the sky in each exposure, about the frames' origin: VAFACTOR
     dilation: Float | None = None
 
     def __len__(self) -> int:
@@ -109,7 +72,7 @@ class Problem:
 
     @property
     def columns(self) -> tuple[Int | Float, ...]:
-        """What the compiled passes take of detections and stars, in their order."""
+        """Arrays of detections and stars for the compiled passes, in their order."""
         return (
             *(self.starts, self.groups.index, self.X, self.Y, self.offset, self.W, self.var),
             *(self.time, self.factor, self.priors.centre, self.priors.precision),
@@ -122,22 +85,22 @@ class Problem:
 
     @property
     def n_star(self) -> int:
-        """Parameters of a star."""
+        """Number of parameters of a star."""
         return self.priors.centre.shape[1]
 
     @property
     def counts(self) -> Int:
-        """Detections of each star."""
+        """Number of detections of each star (S,)."""
         return np.asarray(np.diff(self.starts), np.int64)
 
     @cached_property
     def star(self) -> Int:
-        """Which star each detection is of."""
+        """Star (N,) of each detection."""
         return np.repeat(np.arange(self.n_stars), self.counts)
 
     @property
     def log_outlier(self) -> float:
-        """Log density of a false detection per square pixel, without the share of such."""
+        """Log density of a false detection per square pixel, without the fraction of such."""
         return -float(np.log(np.pi * self.match_radius**2))
 
     @cached_property
@@ -147,7 +110,7 @@ class Problem:
 
     @cached_property
     def least_root(self) -> float:
-        """Root of the curvature at which a star may be anywhere in its match circle."""
+        """Root of the curvature of a star whose position is unknown within its match circle."""
         return float(np.sqrt(2.0) / (self.match_radius * self.pixel))
 
     @cached_property
@@ -173,7 +136,7 @@ class Problem:
         return out
 
     def effective_jacobian(self, theta: Float) -> list[tuple[Int, Float]]:
-        """Derivatives of these, as `DistortionModel.effective_jacobian`."""
+        """Derivatives of `effective`, as in `DistortionModel.effective_jacobian`."""
         found = self.model.effective_jacobian(theta, self.groups)
         return [(columns, k * d) for (columns, d), k in zip(found, self._factors, strict=True)]
 
@@ -183,7 +146,7 @@ class Problem:
         return basis.to_scaled_powers(self.effective(theta))
 
     def places(self, theta: Float) -> Float:
-        """Where on the sky the model has each detection, (N, 2)."""
+        """Sky position (N, 2) of each detection by the model."""
         found = kernel.positions(
             self.groups.index, self.X, self.Y, self.powers(theta), self.model.order
         )
@@ -206,7 +169,7 @@ class Problem:
         return by_X, by_Y
 
     def jacobians(self, theta: Float, rows: slice) -> Float:
-        """Places of some detections by their pixels, (n, 2, 2)."""
+        """Derivatives (n, 2, 2) of positions of some detections by their pixels."""
         g, order = self.groups.index[rows], self.model.order
         columns = [
             kernel.positions(g, self.X[rows], self.Y[rows], by, order) / self._half[g, k, None]
@@ -215,7 +178,7 @@ class Problem:
         return np.stack(columns, axis=2)
 
     def star_places(self, stars: Float) -> Float:
-        """Where on the sky the star of each detection is at its date, (N, 2)."""
+        """Sky position (N, 2) of the star of each detection at its date."""
         out = stars[self.star, :2]
         if self.n_star >= 4:
             out = out + stars[self.star, 2:4] * self.time[:, None]
@@ -231,13 +194,13 @@ class Problem:
         )
 
     def middles(self, theta: Float) -> Float:
-        """Mean place (S, 2) of each star's detections."""
+        """Mean position (S, 2) of each star's detections."""
         z = self.places(theta)
         sums = [np.bincount(self.star, z[:, axis]) / self.counts for axis in (0, 1)]
         return np.stack(sums, axis=1)
 
     def mean_places(self, theta: Float) -> Float:
-        """Stars (S, q) at the means of their detections: where a search may begin."""
+        """Stars (S, q) at the means of their detections, as start of a search."""
         out = np.zeros((self.n_stars, self.n_star))
         out[:, :2] = self.middles(theta)
         return out
@@ -256,10 +219,10 @@ class Problem:
         return np.asarray((ordered[low] + ordered[high]) / 2)
 
     def found_again(self, theta: Float, stars: Float) -> Float:
-        """Stars (S, q), those that have left all their detections back at the mean of these."""
+        """Stars (S, q), those far from all their detections moved back to the mean of these."""
         middles, places = self.middles(theta), self.star_places(stars)
         sums = [np.bincount(self.star, places[:, axis]) / self.counts for axis in (0, 1)]
-        # what a star may lie off is what its least curvature stands for: the match circle
+        # the match circle, for which a star's least curvature stands, limits its offset
         reach = np.sqrt(2.0) / self.least_root
         lost = np.hypot(*(np.stack(sums, axis=1) - middles).T) > reach
         if not lost.any():
@@ -270,7 +233,7 @@ class Problem:
         return out
 
     def at(self, theta: Float, stars: Float) -> Problem:
-        """The same, linearised about a solution: theta (D,) and stars (S, q)."""
+        """Problem linearised about a solution: theta (D,) and stars (S, q)."""
         groups, half = self.groups, self._half
         by_X, by_Y = self._slopes(theta)
         X, Y, offset, W = kernel.linearised(
@@ -288,7 +251,7 @@ class Problem:
         return replace(self, X=X, Y=Y, offset=offset, W=W)
 
     def of_stars(self, which: Int) -> Problem:
-        """The same with some of the stars only, by their numbers in ascending order."""
+        """Problem with some of the stars only, by their numbers in ascending order."""
         counts = self.counts[which]
         starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         rows = np.repeat(self.starts[which] - starts[:-1], counts) + np.arange(starts[-1])
@@ -309,7 +272,7 @@ class Problem:
         )
 
     def with_sigma(self, sigma: Float) -> Problem:
-        """The same with other errors (N,), in the order of this object."""
+        """Problem with other errors (N,), in the order of this object."""
         return replace(self, var=sigma**2)
 
 
@@ -329,33 +292,15 @@ def prepared(
     dilation: Float | None = None,
     least: int = LEAST_DETECTIONS,
 ) -> Problem:
-    """Sort detections for the passes.
+    """Problem from detections, sorted for the passes.
 
-    Parameters
-    ----------
-    model : DistortionModel
-        Its exposures are those of the detections.
-    detections : Detections
-        With star codes; those without, and stars with too few detections, are left out.
-    theta : ndarray, shape (n_params,)
-        A solution that is good enough for the size and shape of pixels on the sky.
-    match_radius : float
-        Pixels.
-    motion : str
-        What a star's parameters are: one of `MOTIONS`.
-    epoch0 : float, optional
-        Date of the stars' positions; the mean of the exposures' by default.
-    parallax_factors : ndarray, shape (E, 2), optional
-        Of each exposure, along u and v; needed by 'parallax'.
-    dilation : ndarray, shape (E,), optional
-        VAFACTOR of each exposure.
-    least : int
-        Fewest detections of a star.
+    Detections without star codes, and stars with fewer than `least` detections, are left out; the
+    model's exposures are those of the detections.  `theta` is good enough for the size and shape of
+    pixels on the sky; `match_radius` is in pixels; `motion`, one of `MOTIONS`, gives the parameters
+    of a star; `epoch0` is the date of the stars' positions, the mean of the exposures' by default;
+    `parallax_factors` (E, 2), along u and v, are needed by 'parallax'; `dilation` (E,) is VAFACTOR.
 
-    Raises
-    ------
-    InputError
-        When no star is left, for a motion without dates, or parallax without factors.
+    InputError when no star is left, for a motion without dates, or parallax without factors.
     """
     q = MOTIONS[motion]
     counts = np.bincount(detections.star[detections.star >= 0], minlength=1)

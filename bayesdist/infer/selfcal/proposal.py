@@ -1,7 +1,7 @@
-"""The proposal of a self-calibration: Laplace approximations at several jitters.
+"""Proposal of a self-calibration: Laplace approximations at several jitters.
 
-The same proposal as for matched stars (`GridProposal`), with nodes that are found in few passes:
-with the stars eliminated a pass is dear, and many detections leave the jitter little room.
+As for matched stars (`GridProposal`), but with nodes that are found in few passes: with the stars
+eliminated a pass is expensive, and many detections leave the jitter little room.
 """
 
 from __future__ import annotations
@@ -21,22 +21,19 @@ __all__ = ["propose"]
 
 Float = NDArray[np.float64]
 
-DROP = 18.0  # how far below the top (in log density) the nodes reach
+DROP = 18.0  # distance (in log density) below the top to which the nodes extend
 MOST_NODES, FEWEST_NODES = 25, 9
 CLOSE = 1e-4  # decrement at which a node is found
 MOST_STEPS = 12
 MOST_TURNS = 10  # in each of which the mesh of log j is narrowed by seven: to 1e-8
-FLAT = 0.02  # change of the log density beyond which the jitter is felt
+FLAT = 0.02  # change of the log density beyond which the jitter has an effect
 LEAST = 1e-3  # of the median error: no jitter
 
 
 def propose(target: SelfTarget) -> GridProposal:
-    """Nodes over all but 1e-8 of the posterior of the jitter.
+    """Proposal with nodes over all but 1e-8 of the posterior of the jitter.
 
-    Raises
-    ------
-    DegenerateError
-        When a node has no mode.
+    DegenerateError when a node has no mode.
     """
     split = Split(
         target.n_theta, target.mixture.hyper, tuple(k for k in target.mixture.hyper if k == "j")
@@ -50,11 +47,10 @@ def propose(target: SelfTarget) -> GridProposal:
 
 
 def _share(target: SelfTarget, split: Split, at: Float) -> tuple[float, float]:
-    """Cube root of the share of false detections where it is most probable, and its curvature.
+    """Cube root of the most probable fraction of false detections, and its curvature.
 
-    From the density with the stars integrated out: at their modes the share would come out too
-    small, for a detection that may be false leaves its star more room.  It hardly depends on the
-    jitter.
+    From the density with the stars integrated out: at their modes the fraction would be biased low,
+    for a detection that may be false leaves its star more room.  It hardly depends on the jitter.
     """
     solution = target.solution
     n = len(target.problem)
@@ -77,7 +73,7 @@ def _share(target: SelfTarget, split: Split, at: Float) -> tuple[float, float]:
 
 
 def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
-    """Where on log j the nodes go, and its top, from the density along it, all else held."""
+    """Nodes in log j, and the most probable one, from the density along it, all else fixed."""
     solution = target.solution
     rest = solution.theta[solution.free]
     f = solution.mixture.fraction
@@ -101,7 +97,7 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
     fine = np.linspace(mesh[begin], mesh[end], 400)
     open_end = begin == 0 and mesh[0] <= low + 1e-9
     if open_end:
-        # at the left end is nothing but the prior's tail: one node in it is enough
+        # at the left end is only the prior's tail: one node in it is enough
         likelihood = value - value[0] - (mesh - mesh[0])
         felt = np.flatnonzero(np.abs(likelihood) > FLAT)
         if len(felt):
@@ -112,7 +108,7 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
 
 
 def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) -> Node:
-    """Mode and curvature of everything else at one jitter; the share's are given."""
+    """Node with mode and curvature of everything else at one jitter, for a given fraction."""
     solution, problem, free = target.solution, target.problem, target.solution.free
     theta, stars = solution.theta.copy(), solution.stars
     held = float(np.exp(at[0])) if len(at) else float(target.jitter or 0.0)

@@ -1,4 +1,4 @@
-"""Reference stars: some of the stars have places that are known, with errors and motions."""
+"""Reference stars: stars of known position, with errors and motions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.linear_map import LEAST, LinearMap, iterated_map
+from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 
@@ -17,21 +17,21 @@ __all__ = ["ReferenceStars"]
 
 Float = NDArray[np.float64]
 
-FEWEST = 2  # reference stars that fix place, rotation and scale
-FAR = 5.0  # times the median distance from the map: no reference star, but a neighbour
-CLOSE = 0.01  # pixels: what no distance is too small for
+FEWEST = 2  # reference stars that fix position, rotation and scale
+FAR = 5.0  # times the median distance from the map: not the reference star, but a neighbour
+CLOSE = 0.01  # pixels: smallest median distance in this limit
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceStars:
-    """What a catalogue says of the stars of a problem.
+    """Catalogue that gives priors to the stars of a problem.
 
     Parameters
     ----------
     catalog : ReferenceCatalog
         With errors, on the plane and in the unit of the solution.
     radius : float
-        Within which a star is taken for a reference star, pixels.
+        Largest distance, in pixels, of a star from its reference star.
     """
 
     catalog: ReferenceCatalog
@@ -40,9 +40,9 @@ class ReferenceStars:
     def __call__(self, problem: Problem, theta: Float) -> StarPriors:
         """Priors of the stars of a problem at a solution theta (D,).
 
-        The stars are laid onto the catalogue by a linear map first: what detections leave open
-        must not decide who is who.  A star that lies far from its reference star, as the others
-        lie, has none.
+        The stars are mapped to the catalogue by a linear map first: free directions must not decide
+        the identification.  A star that lies far from its reference star, compared with the others,
+        has none.
 
         Raises
         ------
@@ -69,7 +69,7 @@ class ReferenceStars:
                 precision[rows, axis, axis] += sigma**-2.0
                 continue
             # at its own epoch a catalogue's positions and motions are independent; here, years
-            # later, a place is the one plus so many times the other
+            # later, a position is the one plus years times the other
             sigma = getattr(self.catalog, f"sigma_{name}")[which]
             motion = getattr(self.catalog, f"sigma_pm_{name}")[which]
             years = (
@@ -86,7 +86,7 @@ class ReferenceStars:
     def _pairs(
         self, problem: Problem, catalog: ReferenceCatalog, places: Float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Stars and their reference stars."""
+        """Numbers of stars and of their reference stars."""
         radius = self.radius * problem.pixel
         known = np.column_stack([catalog.u, catalog.v])
         middle = places.mean(axis=0)
@@ -97,7 +97,7 @@ class ReferenceStars:
         distance, nearest = tree.query(moved, distance_upper_bound=radius)
         near = np.isfinite(distance)
         limit = FAR * max(float(np.median(distance[near])), CLOSE * radius) if near.any() else 0.0
-        if near.sum() > LEAST:
+        if near.sum() > MIN_PAIRS:
             near &= distance <= limit
         # of two stars the nearer one
         order = np.flatnonzero(near)[np.argsort(distance[near], kind="stable")]

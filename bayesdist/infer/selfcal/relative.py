@@ -1,8 +1,8 @@
-"""What is known whatever the gauge: a solution without its errors along free directions.
+"""Gauge-free solutions: without their errors along free directions.
 
 Two solutions of the same detections in different gauges differ by a move along directions that
 detections leave free.  Of every error the part that such a move over the detector describes best is
-taken away (an S-transformation: Baarda 1973; Teunissen 1985); what is left has every gauge.
+removed (an S-transformation: Baarda 1973; Teunissen 1985); the rest is common to all gauges.
 """
 
 from __future__ import annotations
@@ -23,22 +23,11 @@ Float = NDArray[np.float64]
 
 
 def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Float:
-    """Matrix (D, D) that takes from a change of the parameters what the free directions make of it.
+    """Matrix S (D, D) that removes from a change of the parameters its part along free directions.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    theta : ndarray, shape (D,)
-        The solution.
-    null : ndarray, shape (D, d)
-        Free directions: `Gauge.null`.
-
-    Returns
-    -------
-    ndarray, shape (D, D)
-        S with S null = 0: the positions of all chips in the first exposure that S d makes are those
-        of d without the combination of free directions that is nearest to them, by least squares
-        over the area of the chips.
+    S null = 0, `null` (D, d) being `Gauge.null`: the positions of all chips in the first exposure
+    that S d makes are those of d without the combination of free directions that is nearest to
+    them, by least squares over the area of the chips.
     """
     D = model.n_params
     if not null.shape[1]:
@@ -61,7 +50,7 @@ def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Floa
 
 
 def gauge_free(solution: LinearFit | Posterior, null: Float) -> LinearFit | Posterior:
-    """A solution whose errors are those of relative positions on the detector.
+    """Solution whose errors are those of relative positions on the detector.
 
     Parameters
     ----------

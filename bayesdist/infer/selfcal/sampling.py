@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError
+from bayesdist.infer.convergence import Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.sampler.chains import Settings, run_chains
-from bayesdist.infer.sampler.convergence import Limits
 from bayesdist.infer.selfcal.normal import memberships
 from bayesdist.infer.selfcal.proposal import propose
 from bayesdist.infer.selfcal.solve import Solution
@@ -24,7 +24,7 @@ __all__ = ["sample_selfcal"]
 
 Float = NDArray[np.float64]
 
-# what a detection costs in a pass, in matched stars: its star's mode is found anew each time
+# cost of a detection in a pass, in matched stars: its star's mode is found anew each time
 DEARER = 60
 
 
@@ -44,13 +44,13 @@ def sample_selfcal(
     folder: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
-    """Sample distortion, frames, jitter and share of false detections.
+    """Sample distortion, frames, jitter and fraction of false detections.
 
     Parameters
     ----------
     solution : Solution
     jitter : float, optional
-        Held at this, in pixels; sampled by default.
+        Fixed value, in pixels; sampled by default.
     fraction_prior : tuple of float
         As `OutlierMixture`.
     jitter_scale : float, optional
@@ -61,7 +61,7 @@ def sample_selfcal(
     Returns
     -------
     Posterior
-        Parameters that the gauge holds have the same value in all draws and are not judged.  The
+        Parameters that the gauge fixes have one value in all draws and are not judged.  The
         jitter is in pixels.
 
     Raises
@@ -127,7 +127,7 @@ def sample_selfcal(
 
 
 def _fingerprint(solution: Solution, *settings: object) -> str:
-    """What must not change between a run and its resumption."""
+    """Fingerprint of everything that must not change between a run and its resumption."""
     p, digest = solution.problem, hashlib.sha256()
     for column in (p.seen, p.var, p.starts, p.groups.index, solution.theta):
         digest.update(np.ascontiguousarray(column).data)

@@ -1,4 +1,4 @@
-"""Covariance of a self-calibration by how its detections scatter, star by star."""
+"""Covariance of a self-calibration by the scatter of its detections, star by star."""
 
 from __future__ import annotations
 
@@ -13,23 +13,17 @@ __all__ = ["sandwich", "star_scores"]
 
 Float = NDArray[np.float64]
 
-# A star that determines a parameter alone has no residual; its squared score says nothing.
+# A star that alone determines a parameter has no residual: its squared score is uninformative.
 LEAST_FREE = 0.1
 
 
 def sandwich(solution: Solution, scores: DetectionScores) -> Float:
-    """Covariance (D, D) of the parameters whatever the errors of single stars are; 0 for held ones.
+    """Covariance (D, D) of the parameters, valid for any errors of single stars; 0 for fixed ones.
 
     The detections of a star share its position, so that their scores are added up.  Each sum is
     divided by one minus the leverage of the star's detections (HC3 of MacKinnon and White 1985,
     Journal of Econometrics 29, 305, with stars for observations): a jackknife over stars, to first
     order.
-
-    Parameters
-    ----------
-    solution : Solution
-    scores : DetectionScores
-        Of its detections.
     """
     p, free = solution.problem, solution.free
     columns = Columns(p, solution.theta)
@@ -48,7 +42,7 @@ def sandwich(solution: Solution, scores: DetectionScores) -> Float:
         whole = np.einsum("nab,naf,nbf->n", here.curvature, moved, moved, optimize=True)
         leverage = np.bincount(piece.star, whole, S)
         leverage -= np.sum((sums.rows @ inside) ** 2, axis=1).reshape(S, q).sum(axis=1)
-        # of as many numbers as its detections have beside its own
+        # per degree of freedom of its detections, in excess of the star's own parameters
         number = 2 * np.bincount(piece.star, here.curvature[:, 0, 0] > 0, S) - q
         mean = np.clip(leverage / np.maximum(number, 1), 0.0, 1 - LEAST_FREE)
         psi = star_scores(columns, piece, here.gradient) / (1 - mean)[:, None]
@@ -65,7 +59,7 @@ def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:
     S = piece.stars.stop - piece.stars.start
     out = np.zeros((S, columns.sparse.stop))
     turned = np.einsum("nab,na->nb", piece.frame, gradient)
-    # of one number for each star
+    # one value for each star
     for code, (here, values) in enumerate(piece.dense):
         for axis in (0, 1):
             summed = piece.of_stars(turned[:, None, axis, None])[:, here] @ values
@@ -75,7 +69,7 @@ def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:
 
 
 def _displacements(columns: Columns, piece: Piece, root: Float) -> Float:
-    """Displacements (n, 2, f) of detections by some changes (columns inside, f)."""
+    """Displacements (n, 2, f) of detections by some changes (internal columns, f)."""
     out = np.zeros((len(piece), 2, root.shape[1]))
     for code, (here, values) in enumerate(piece.dense):
         for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""What single detections say of the places that the model gives them, at a solution."""
+"""Scores of single detections by their sky positions in the model, at a solution."""
 
 from __future__ import annotations
 
@@ -20,25 +20,19 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DetectionScores:
-    """Gradient and curvature of the log density of each detection by its place on the sky.
+    """Gradient and curvature of the log density of each detection by its sky position."""
 
-    Parameters
-    ----------
-    gradient : ndarray, shape (N, 2)
-    curvature : ndarray, shape (N, 2, 2)
-        Minus the second derivatives; zero where it is open whether a detection is its star's, so
-        that every sum is that of a possible likelihood.
-    """
-
-    gradient: Float
+    gradient: Float  # (N, 2)
+    # minus the second derivatives (N, 2, 2); zero where a detection may or may not belong to its
+    # star, so that every sum is that of a possible likelihood
     curvature: Float
 
     def at(self, rows: slice | NDArray[np.bool_]) -> DetectionScores:
-        """Those of some detections."""
+        """Scores of some detections."""
         return DetectionScores(self.gradient[rows], self.curvature[rows])
 
     def flattened(self, excess: Float) -> DetectionScores:
-        """Those of a likelihood whose variances are larger by factors (N,)."""
+        """Scores of a likelihood whose variances are larger by factors (N,)."""
         return DetectionScores(
             self.gradient / excess[:, None], self.curvature / excess[:, None, None]
         )
@@ -53,7 +47,7 @@ def scores_of_detections(solution: Solution) -> DetectionScores:
     inverse = 1.0 / (p.var + mixture.jitter**2)
     pulled = inverse[:, None] * np.einsum("nab,nb->na", W, r)
     H = (member * inverse)[:, None, None] * W
-    # by how much the membership turns with the place
+    # derivative of the membership by position
     H -= (member * (1 - member))[:, None, None] * (pulled[:, :, None] * pulled[:, None, :])
     good = (H[:, 0, 0] > 0) & (np.linalg.det(H) > 0)
     return DetectionScores(-member[:, None] * pulled, np.where(good[:, None, None], H, 0.0))
@@ -62,8 +56,8 @@ def scores_of_detections(solution: Solution) -> DetectionScores:
 def score_excess(solution: Solution, scores: DetectionScores) -> Float:
     """Ratio (N,) of the variance of the scores to their curvature, by blocks of the detector.
 
-    Stars take a part of the residuals of their detections, which is given back; ratios of blocks
-    are drawn towards their mean as for matched stars.
+    Stars absorb a part of the residuals of their detections, for which the ratios are corrected;
+    those of blocks are shrunk to their mean as for matched stars.
     """
     p = solution.problem
     free = 1.0 - taken_by_stars(solution)

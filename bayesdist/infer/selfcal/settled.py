@@ -1,9 +1,9 @@
-"""The mode, and what is held by convention: one decision, of which both know.
+"""The mode together with the parameters fixed by convention, as one decision.
 
-What the detections leave free is found at a solution, and a solution needs to know what is held.
-With the errors of a start more seems free than at the mode; where rolls hardly differ the two
-answers are different ones.  So the question is asked again at the mode, and the answer goes with
-the solution to everything that rests on it.
+Free directions are found at a solution, and a solution needs the fixed parameters.  With the errors
+of a start more seems free than at the mode; where rolls hardly differ the two answers differ.  So
+the question is asked again at the mode, and the answer is stored with the solution for all later
+uses.
 """
 
 from __future__ import annotations
@@ -37,28 +37,12 @@ def solved_in_gauge(
     mixture: Mixture | None = None,
     jitter: float | None = None,
 ) -> Solution:
-    """The mode of a problem with what is held by convention, as it counts there.
+    """Mode of a problem, with the parameters fixed by convention as decided there.
 
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (D,)
-        Where to begin.
-    knowledge : callable
-        What is known beside the detections, linearised at parameters (D,).
-    stars, mixture, jitter
-        As `solve`.
-
-    Returns
-    -------
-    Solution
-        With its decision.  Where the detections know more at the mode than at the start, that is
-        fitted; where it then turns out to be free after all, it stays held.
-
-    Raises
-    ------
-    DegenerateError, NotSettledError
-        As `solve`.
+    The search starts at theta (D,); `knowledge` gives information from other sources than the
+    detections, linearised at parameters (D,).  Where the detections determine more at the mode than
+    at the start, that is fitted; where it then turns out to be free after all, it stays fixed.
+    DegenerateError and NotSettledError as `solve`.
     """
     information = knowledge(theta)
 
@@ -93,23 +77,17 @@ def solved_in_gauge(
         if at_mode.held.size > gauge.held.size:
             return solution
         solution = freer
-    # as many are held: which parameters these are is a matter of choice
+    # as many are fixed: the choice of the parameters is arbitrary
     return replace(solution, decision=replace(at_mode.decision, held=gauge.held))
 
 
 def gauge_of(
     problem: Problem, theta: Float, information: Information, solution: Solution | None = None
 ) -> Gauge:
-    """What the detections of a problem leave free, and what fixes it.
+    """Free directions of a problem, and what fixes them.
 
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (D,)
-    information : Information
-    solution : Solution, optional
-        Of the problem; before there is one, stars lie at the means of their detections.  What it
-        has decided to be free counts as free.
+    Before there is a solution, stars lie at the means of their detections.  The solution's decision
+    on the free directions is used.
     """
     decision = None if solution is None else solution.decision
     if solution is None:
@@ -125,7 +103,7 @@ def gauge_of(
 def curvatures(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float
 ) -> tuple[Float, Float]:
-    """Curvature (D, D) of the detections alone, and with what is known of the stars beforehand."""
+    """Curvature (D, D) by the detections alone, and with the priors of the stars."""
     known = expand(problem, theta, mixture, stars, observed=False).curvature
     if not problem.priors.informed.any():
         return known, known

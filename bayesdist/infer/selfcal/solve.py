@@ -21,14 +21,14 @@ Int = NDArray[np.int64]
 MOST_PASSES = 80
 CLOSE = 1e-5  # decrement (expected gain in log density) at which the mode is found
 NEAR = 1.0  # decrement below which the curvature of the mixture is used
-SETTLED = 1e-4  # relative change of errors and of the share of false detections
+SETTLED = 1e-4  # relative change of errors and of the fraction of false detections
 LEAST_SHARE = 1e-5
-START = 3.0  # of the robust scatter: errors begin as large as this, so that no star is lost
+START = 3.0  # times the robust scatter: errors begin as large as this, so that no star is lost
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A mode.
+    """Mode of a self-calibration.
 
     Parameters
     ----------
@@ -37,13 +37,13 @@ class Solution:
     theta : ndarray, shape (D,)
     stars : ndarray, shape (S, q)
     mixture : Mixture
-        Errors by moments; share of false detections at its mode.
+        Errors by moments; fraction of false detections at its mode.
     free : ndarray of int, shape (F,)
-        Parameters that were fitted; the others are held by the gauge.
+        Parameters that were fitted; the others are fixed by the gauge.
     expansion : Expansion
     information : Information
     decision : Decision, optional
-        What counts as free; None where only `free` was said.
+        Directions taken as free; None where only `free` was given.
     """
 
     problem: Problem
@@ -57,13 +57,13 @@ class Solution:
 
     @property
     def precision(self) -> Float:
-        """Curvature (F, F) of the free parameters, with what is known beside the detections."""
+        """Curvature (F, F) of the free parameters, with information from other sources."""
         total = self.expansion.curvature + self.information.precision
         return np.asarray(total[np.ix_(self.free, self.free)])
 
     @property
     def cov(self) -> Float:
-        """Covariance (D, D); zero for what is held."""
+        """Covariance (D, D); zero for fixed parameters."""
         precision = self.precision
         scale = 1.0 / np.sqrt(np.diag(precision))
         # a square of roots stays positive where a nearly free direction dwarfs all others
@@ -84,31 +84,12 @@ def solve(
     mixture: Mixture | None = None,
     jitter: float | None = None,
 ) -> Solution:
-    """Newton's method with the stars eliminated in each pass.
+    """Mode by Newton's method with the stars eliminated in each pass.
 
     Errors begin as large as the scatter of the start and shrink with it, so that a start that is
-    far off loses no star.
-
-    Parameters
-    ----------
-    problem : Problem
-    theta : ndarray, shape (D,)
-        Where to begin.
-    free : ndarray of int
-        Parameters that are fitted.
-    information : Information
-    stars : ndarray, shape (S, q), optional
-    mixture : Mixture, optional
-        Where to begin; found by default.
-    jitter : float, optional
-        Held at this; fitted by default.
-
-    Raises
-    ------
-    DegenerateError
-        When the free parameters are not determined.
-    NotSettledError
-        When it does not converge.
+    far off loses no star.  `jitter` is fitted by default; so are `stars` (S, q) and `mixture`,
+    which are starting values.  DegenerateError when the parameters `free` are not determined;
+    NotSettledError when it does not converge.
     """
     stars = problem.median_places(theta) if stars is None else stars
     problem = problem.at(theta, stars)
@@ -168,7 +149,7 @@ def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
 
 
 def wide_mixture(problem: Problem, theta: Float, stars: Float) -> Mixture:
-    """Errors as large as a start is wrong."""
+    """Mixture with errors as large as those of a start."""
     square = problem.squares(theta, stars)
     # the median of r^2 is 1.386 sigma^2
     return Mixture(START * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)
@@ -177,7 +158,7 @@ def wide_mixture(problem: Problem, theta: Float, stars: Float) -> Mixture:
 def _mixture(
     problem: Problem, mixture: Mixture, found: Expansion, n_free: int, jitter: float | None
 ) -> Mixture:
-    """Share of false detections by EM, and the jitter by which chi-square is as it should be."""
+    """Mixture with the fraction of false detections by EM, and the jitter by chi-square."""
     n = len(problem)
     share = float(np.clip((n - found.n_members) / n, LEAST_SHARE, 0.9))
     if jitter is not None:

@@ -1,4 +1,4 @@
-"""Where a self-calibration begins: a known distortion, or none, and exposures that lie on the sky.
+"""Start of a self-calibration: a known distortion, or none, and exposures that lie on the sky.
 
 A start is good enough when detections of a star come to lie within the first linking length.
 """
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from bayesdist.data.linear_map import LinearMap
-from bayesdist.data.mutual import MutualFrames
+from bayesdist.data.matching.frames import MutualFrames
+from bayesdist.data.matching.linear_map import LinearMap
 from bayesdist.model import Chip, DistortionModel, PolynomialBasis
 
 __all__ = ["chips_side_by_side", "fitted_polynomials", "start_parameters", "undistorted"]
@@ -23,18 +23,9 @@ Start = Callable[[Float, Float, int], Float]
 
 
 def undistorted(chips: Sequence[Chip], pixel: float) -> Start:
-    """Pixels of every chip about its own reference pixel, and nothing else.
+    """Start of pixels about each chip's reference pixel: x, y and chip number to positions (N, 2).
 
-    Parameters
-    ----------
-    chips : sequence of Chip
-    pixel : float
-        Size of a pixel in the unit of u, v.
-
-    Returns
-    -------
-    callable
-        From x, y and the number of a chip to positions (N, 2).
+    `pixel` is the size of a pixel in the unit of u, v.
     """
     reference = {chip.number: chip.reference_pixel for chip in chips}
 
@@ -47,22 +38,11 @@ def undistorted(chips: Sequence[Chip], pixel: float) -> Start:
 def chips_side_by_side(
     start: Start, chips: Sequence[Chip], frames: MutualFrames, exposure: Int, number: Int
 ) -> Start:
-    """A start in which the chips lie to each other as their stars say.
+    """Start in which the relative positions of the chips are those of their stars.
 
-    Parameters
-    ----------
-    start : callable
-        Of each chip by itself.
-    chips : sequence of Chip
-    frames : MutualFrames
-        Of lists, each of one chip of one exposure.
-    exposure, number : ndarray of int, shape (lists,)
-        Exposure and chip of each list.
-
-    Returns
-    -------
-    callable
-        On the plane of the first chip; a chip that no exposure has beside the first one stays.
+    `start` is that of each chip alone; `frames` are those of lists, each of one chip of one
+    exposure, with exposure and chip number (lists,).  On the plane of the first chip; a chip that
+    no exposure has together with the first one stays.
     """
     maps = {}
     for chip in chips[1:]:
@@ -96,14 +76,7 @@ def fitted_polynomials(
 ) -> Float:
     """Legendre coefficients (chips, 2, K) of a start, by quadrature over each chip.
 
-    Parameters
-    ----------
-    start : callable
-        From x, y and the number of a chip to positions (N, 2).
-    chips : sequence of Chip
-    order : int
-    onto : LinearMap, optional
-        Applied to the positions.
+    `start` maps x, y and the number of a chip to positions (N, 2), `onto` is applied to these.
     """
     nodes, weights = leggauss(4 * (order + 1))
     out = []
@@ -123,16 +96,10 @@ def fitted_polynomials(
 def start_parameters(
     model: DistortionModel, coefficients: Float, frames: MutualFrames, middles: Float
 ) -> Float:
-    """Parameters (D,) at which exposures lie as they were found to.
+    """Parameters (D,) for exposures with the given frames onto the plane of the first exposure.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    coefficients : ndarray, shape (chips, 2, K)
-    frames : MutualFrames
-        Onto the plane of the first exposure.
-    middles : ndarray, shape (E, 2)
-        Of each exposure's detections on its own plane: there the frame is exact.
+    The frame is exact at `middles` (E, 2), the middle of each exposure's detections on its own
+    plane.
     """
     theta = np.zeros(model.n_params)
     for chip, of_chip in zip(model.chips, coefficients, strict=True):

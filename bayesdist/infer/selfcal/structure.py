@@ -1,18 +1,17 @@
-"""Posterior of what polynomials leave out, amplitudes marginalised.
+"""Posterior of the structure outside polynomials, amplitudes marginalised.
 
-With what the fit has taken eliminated, the data speak of the coefficients z of the structure's
-functions through a score s and an information S, so that for amplitudes eta
+With the part that the fit absorbs eliminated, the data determine the coefficients z of the
+structure's functions through a score s and an information S, so that for amplitudes eta
 
     z | eta   ~ N((S + P)^-1 s, (S + P)^-1)             P = P(eta), the prior precision
     log p(eta | data) = log p(eta) + (s^T (S + P)^-1 s - log|S + P| + log|P|) / 2
 
 The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
-are gone through on a grid that is refined where the density is.  In the eigenvectors of the sines'
+are integrated on a grid that is refined where the density is.  In the eigenvectors of the sines'
 information, in units of their prior at one length, every amplitude is a sum.
 
-Axes and chips about which the data speak separately have posteriors of their own.  Where they do
-not, as in a self-calibration, whose stars tie them together, they have one, with amplitudes and a
-length in common.
+Axes and chips with independent likelihoods have posteriors of their own.  Where they are coupled,
+as by the stars of a self-calibration, they have one, with amplitudes and a length in common.
 """
 
 from __future__ import annotations
@@ -30,7 +29,8 @@ __all__ = ["StructurePosterior", "structure_posterior"]
 
 Float = NDArray[np.float64]
 
-LENGTHS = np.geomspace(0.08, 0.6, 5)  # of the field, in longer half sides; all alike beforehand
+# of the field, in longer half sides; all equally probable beforehand
+LENGTHS = np.geomspace(0.08, 0.6, 5)
 STEPS = 8  # of the amplitude, before the grid is refined
 HALVINGS = 2
 NEGLIGIBLE = 12.0  # in log density, below the largest
@@ -39,32 +39,19 @@ TERM_STEPS = 24  # of the amplitude of the higher orders
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """What the data say of the sines, in units of their prior at one length and unit amplitude.
-
-    Parameters
-    ----------
-    length : float
-    scale : ndarray, shape (n,)
-        Standard deviations of the sines' coefficients.
-    values, vectors : ndarray, shape (n,), (n, n)
-        Eigenvalues and eigenvectors of their information.
-    score : ndarray, shape (n,)
-        Along the eigenvectors.
-    tied : ndarray, shape (n, T)
-        What ties them to the terms.
-    """
+    """Likelihood of the sines, in units of their prior at one length and unit amplitude."""
 
     length: float
-    scale: Float
-    values: Float
-    vectors: Float
-    score: Float
-    tied: Float
+    scale: Float  # standard deviations (n,) of the sines' coefficients
+    values: Float  # eigenvalues (n,) of their information
+    vectors: Float  # eigenvectors (n, n)
+    score: Float  # along the eigenvectors (n,)
+    tied: Float  # coupling (n, T) to the terms
 
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """One length and amplitude of the field, and what follows for all amplitudes of the terms."""
+    """One length and amplitude of the field, and the likelihood of all amplitudes of the terms."""
 
     field: _Field
     amplitude: float
@@ -75,30 +62,18 @@ class _Point:
 
     @property
     def precision(self) -> Float:
-        """Of the sines, along their eigenvectors."""
+        """Precision of the sines, along their eigenvectors."""
         return np.asarray(self.field.values + self.amplitude**-2)
 
 
 @dataclass(frozen=True, eq=False)
 class StructurePosterior:
-    """Posterior of the structure on one or several axes and chips.
+    """Posterior of the structure on one or several axes and chips."""
 
-    Parameters
-    ----------
-    blocks : tuple of StructureFunctions
-        Of each axis of each chip.
-    terms_amplitude : ndarray, shape (TERM_STEPS,)
-        Amplitudes of the higher orders that are gone through.
-    points : tuple
-        Lengths and amplitudes of the field.
-    weight : ndarray, shape (points, TERM_STEPS)
-        Posterior probability of each combination.
-    """
-
-    blocks: tuple[StructureFunctions, ...]
-    terms_amplitude: Float
-    points: tuple[_Point, ...]
-    weight: Float
+    blocks: tuple[StructureFunctions, ...]  # of each axis of each chip
+    terms_amplitude: Float  # grid (TERM_STEPS,) of amplitudes of the higher orders
+    points: tuple[_Point, ...]  # lengths and amplitudes of the field
+    weight: Float  # posterior probability (points, TERM_STEPS) of each combination
 
     def draws(self, n: int, rng: np.random.Generator) -> list[Float]:
         """Coefficients (n, n_known + 2 FINE) of terms, sines and finer waves of each block."""
@@ -141,7 +116,7 @@ class StructurePosterior:
 
     @property
     def length(self) -> float:
-        """Posterior mean correlation length of the field, weighed by variance, in half sides."""
+        """Posterior mean correlation length of the field, weighted by variance, in half sides."""
         by_point = self.weight.sum(axis=1) * [p.amplitude**2 for p in self.points]
         return float(by_point @ [p.field.length for p in self.points] / by_point.sum())
 
@@ -157,22 +132,11 @@ def structure_posterior(
 ) -> StructurePosterior:
     """Posterior of the coefficients of structure functions.
 
-    Parameters
-    ----------
-    blocks : sequence of StructureFunctions
-        Of each axis of each chip that the data speak of together.
-    information : ndarray, shape (m, m)
-        Of the coefficients of all blocks, one after the other, with what the fit takes eliminated.
-    score : ndarray, shape (m,)
-        Gradient of the log-likelihood where they are zero, in the same way.
-    noise : float
-        Typical error of one star: no amplitude beyond a few of it is looked at.
-    higher_order, structure : float
-        Prior medians of the amplitudes, in the unit of the positions.
-
-    Returns
-    -------
-    StructurePosterior
+    `blocks` are those of each axis of each chip with a joint likelihood; `information` (m, m) is
+    that of the coefficients of all blocks, and `score` (m,) the gradient of the log-likelihood
+    where they are zero, both with the part that the fit absorbs eliminated.  `noise` is the typical
+    error of one star, a few times which limits the amplitudes; `higher_order` and `structure` are
+    prior medians of the amplitudes, in the unit of the positions.
     """
     is_term = np.concatenate([np.arange(one.n_known) < one.n_terms for one in blocks])
     at, of = np.flatnonzero(is_term), np.flatnonzero(~is_term)
@@ -234,7 +198,7 @@ def structure_posterior(
 
 
 def _refined(grid, points, tops, least, field, at_point):  # type: ignore[no-untyped-def]
-    """The grid with a point in the middle of each interval that has some of the density."""
+    """Grid with a point in the middle of each interval that has some of the density."""
     new_grid, new_points = grid[:1], points[:1]
     for k in range(1, len(grid)):
         if max(tops[k - 1], tops[k]) > least and abs(tops[k] - tops[k - 1]) > 0.3:

@@ -26,24 +26,12 @@ def chip_structure(
     coefficients: Sequence[Float],
     posteriors: Sequence[StructurePosterior],
 ) -> tuple[ChipStructure, list[dict[str, object]]]:
-    """Structure on a chip, and its sizes on each axis.
+    """Structure on a chip, and its sizes on each axis for summaries.
 
-    Parameters
-    ----------
-    chip : Chip
-    functions : StructureFunctions
-    waves : ndarray, shape (FINE, 2)
-        Of what is finer than the functions.
-    coefficients : sequence of ndarray, shape (n, m)
-        Draws along u, and along v.
-    posteriors : sequence of StructurePosterior
-        From which they are.
-
-    Returns
-    -------
-    ChipStructure, list of dict
-        For each axis: the chip, the axis, the amplitude and length of the field, the rms over the
-        chip of the draws, on the mean of their squares and their median.
+    `waves` (FINE, 2) are those of structure finer than the functions; `coefficients` (n, m) are
+    draws along u, and along v, from the posteriors.  Sizes: the chip, the axis, the amplitude and
+    length of the field, the rms over the chip of the draws, by the mean of their squares and by
+    their median.
     """
     found = ChipStructure(functions, waves, np.stack(coefficients, axis=1))
     here = found.evaluate(*_even_points())

@@ -1,9 +1,9 @@
 """Exposures on the sky: each has its own tangent plane, and frames join these as if it were flat.
 
 A camera maps the plane that touches the sky where it points.  The planes of two exposures are not
-one shifted and turned: what differs grows with the square of the position and with the offset.
-Offsets are those of the solution at hand, so that the difference is known, and detections are moved
-by it to where they would have been seen on one plane.
+related by a shift and a rotation: the difference grows with the square of the position and with the
+offset.  Offsets are those of the current solution, so that the difference is known, and detections
+are moved by it to the pixels at which they would be on one plane.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.tangent import ARCSEC
+from bayesdist.data.sky.tangent import ARCSEC
 from bayesdist.model import DistortionModel
 
 __all__ = ["TangentPlane", "places_of"]
@@ -27,28 +27,28 @@ TURNS = 3  # of Newton's method, each of which leaves a hundredth or less
 
 @dataclass(frozen=True, eq=False)
 class TangentPlane:
-    """The plane on which u and v are, common to all exposures.
+    """Plane of u and v, common to all exposures.
 
     Parameters
     ----------
     unit_arcsec : float
         Size of the unit of u and v.
     point : tuple of float, optional
-        Where it touches the sky, in u and v; the origin of the frames by default.
+        Point of contact with the sky, in u and v; the origin of the frames by default.
     """
 
     unit_arcsec: float
     point: tuple[float, float] | None = None
 
     def displacements(self, model: DistortionModel, theta: Float, flat: Float, e: int) -> Float:
-        """What takes positions of an exposure to this plane.
+        """Displacements (N, 2) from positions of an exposure to this plane.
 
         Parameters
         ----------
         model : DistortionModel
         theta : ndarray, shape (D,)
         flat : ndarray, shape (N, 2)
-            Where the frame of the exposure has them: exact at the origin of the frames, which is
+            Positions by the frame of the exposure: exact at the origin of the frames, which is
             where the exposure's own plane touches the sky.
         e : int
             Code of the exposure.
@@ -64,13 +64,13 @@ class TangentPlane:
         q = (flat - touches) / radian
         c = 1.0 / np.sqrt(1.0 + p @ p)
         s = c * p
-        # the rotation that takes the one point of contact to the other, and turns nothing else
+        # the rotation that maps one point of contact to the other, and turns nothing else
         along = (q @ s)[:, None]
         exact = (q - s * along / (1.0 + c) + s) / (c - along)
         return np.asarray(radian * (exact - p - q))
 
     def onto_it(self, model: DistortionModel, detections: Detections, theta: Float) -> Detections:
-        """Detections where they would have been seen, were all exposures' planes this one.
+        """Detections at the pixels where they would be if all exposures' planes were this one.
 
         Parameters
         ----------
@@ -83,7 +83,7 @@ class TangentPlane:
         Returns
         -------
         Detections
-            At the pixels that the frames alone take to the position on this plane.
+            At the pixels that the frames alone map to the position on this plane.
         """
         flat = places_of(model, detections, theta)
         moved = np.empty_like(flat)
@@ -103,7 +103,7 @@ class TangentPlane:
 def places_of(
     model: DistortionModel, detections: Detections, theta: Float, dilation: Float | None = None
 ) -> Float:
-    """Where on the sky the model has each detection, (N, 2)."""
+    """Sky position (N, 2) of each detection by the model."""
     when = None
     if model.time is not None and detections.epoch is not None:
         when = detections.epoch[detections.exposure]

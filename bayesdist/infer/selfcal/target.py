@@ -1,4 +1,4 @@
-"""The posterior density of a self-calibration, the stars integrated out."""
+"""Posterior density of a self-calibration, the stars integrated out."""
 
 from __future__ import annotations
 
@@ -22,23 +22,13 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class SelfTarget:
-    """Density of psi = (free parameters, log j, logit f); j in pixels.
+    """Density of psi = (free parameters, log j, logit f); j in pixels."""
 
-    Parameters
-    ----------
-    solution : Solution
-        The mode; parameters that it holds stay there.
-    jitter : float, optional
-        Held at this; sampled by default.
-    fraction_prior : tuple of float
-        Parameters (a, b) of the Beta prior of the share of false detections.
-    jitter_scale : float, optional
-        Of the prior of the jitter, in pixels; by default the typical error of a detection.
-    """
-
-    solution: Solution
-    jitter: float | None = None
+    solution: Solution  # the mode; parameters that it fixes stay there
+    jitter: float | None = None  # fixed value; sampled by default
+    # (a, b) of the Beta prior of the fraction of false detections
     fraction_prior: tuple[float, float] = (1.0, 9.0)
+    # of the prior of the jitter, in pixels; by default the typical error of a detection
     jitter_scale: float | None = None
 
     @property
@@ -48,12 +38,12 @@ class SelfTarget:
 
     @property
     def information(self) -> Information:
-        """What is known beside the detections."""
+        """Information from other sources than the detections."""
         return self.solution.information
 
     @cached_property
     def mixture(self) -> OutlierMixture:
-        """Uniform false detections, in pixels."""
+        """Mixture with uniform false detections, in pixels."""
         radius = self.problem.match_radius
         return OutlierMixture(
             "uniform", radius, self.jitter, self.fraction_prior, self.jitter_scale
@@ -61,7 +51,7 @@ class SelfTarget:
 
     @cached_property
     def hyper(self) -> Hyper:
-        """Priors of jitter and share of false detections."""
+        """Priors of jitter and fraction of false detections."""
         return self.mixture.bind(self.problem.sigma)
 
     @property
@@ -87,7 +77,7 @@ class SelfTarget:
         return out
 
     def mixtures(self, hyper: Float) -> Float:
-        """Jitter and share of false detections (n, 2) of sampled coordinates."""
+        """Jitter and fraction of false detections (n, 2) of sampled coordinates."""
         values = self.hyper.values(hyper)
         j = values.get("j", np.full(len(hyper), self.jitter or 0.0))
         return np.stack([j, values["f"]], axis=1)

@@ -9,7 +9,6 @@ from bayesdist.infer.series.heldout import HeldOut, block_folds, exposure_folds,
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.results import Change, Prediction
 from bayesdist.infer.series.series import Series
-from bayesdist.infer.series.straight import StraightLines, straight_lines
 from bayesdist.infer.series.verdict import Verdict, default_candidates, describe
 
 __all__ = [
@@ -23,7 +22,6 @@ __all__ = [
     "Prediction",
     "Series",
     "SeriesPosterior",
-    "StraightLines",
     "Verdict",
     "block_folds",
     "compare",
@@ -34,5 +32,4 @@ __all__ = [
     "fit_series",
     "held_out",
     "serial_correlation",
-    "straight_lines",
 ]

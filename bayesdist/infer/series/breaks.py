@@ -1,10 +1,10 @@
-"""Dates of breaks that are to be found: draws given everything but the course's parameters.
+"""Draws of unknown dates of breaks, given everything but the course's parameters.
 
 The prior of a date is uniform over the span of the series, each segment keeping some exposures.
-Between two neighbouring exposures the date is free, so that a candidate is a gap and a place in it.
+Between two neighbouring exposures the date is free, so that a candidate is a gap and a date in it.
 A date is drawn anew among itself and some candidates from a fixed density, each weighted with
 likelihood times prior over that density; the exchange of the present date and a candidate leaves
-the joint density of all as it is, so that the posterior stays (as in Tjelmeland 2004).
+the joint density of all unchanged, so that the posterior stays (as in Tjelmeland 2004).
 """
 
 from __future__ import annotations
@@ -28,12 +28,7 @@ FROM_PRIOR = 0.25
 
 
 class BreakMoves:
-    """Moves of the dates of breaks.
-
-    Parameters
-    ----------
-    design : Design
-    """
+    """Moves of the dates of breaks."""
 
     def __init__(self, design: Design) -> None:
         self.count = design.course.find
@@ -45,7 +40,7 @@ class BreakMoves:
         self._seen = np.zeros_like(self.density)
 
     def possible(self, breaks: Float) -> NDArray[np.bool_]:
-        """Whether dates (..., B) rise and leave each segment enough exposures."""
+        """Boolean mask (...) of ascending dates (..., B) with enough exposures in each segment."""
         place = np.searchsorted(self.epoch, breaks)
         shape = (*breaks.shape[:-1], 1)
         edges = np.concatenate([np.zeros(shape, int), place, np.full(shape, len(self.epoch))], -1)
@@ -72,7 +67,7 @@ class BreakMoves:
         return breaks
 
     def scan(self, breaks: Float, likelihood: Likelihood, rng: np.random.Generator) -> Float:
-        """New dates (C, B) among all gaps, one break after the other; what is seen is kept."""
+        """New dates (C, B) among all gaps, one break after the other; stores the likelihoods."""
         for b in range(self.count):
             gap = np.broadcast_to(np.arange(len(self.width)), (len(breaks), len(self.width)))
             trial = self._trial(breaks, b, self._at(gap, rng))
@@ -85,7 +80,7 @@ class BreakMoves:
         return breaks
 
     def learn(self) -> None:
-        """Take what the scans have seen for the density of candidates; it is fixed from now on."""
+        """Set the density of candidates from the stored scans; it is fixed from now on."""
         total = self._seen.sum(axis=1, keepdims=True)
         self.density = (1 - FROM_PRIOR) * self._seen / total + FROM_PRIOR * self.prior
 

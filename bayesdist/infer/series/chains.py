@@ -1,4 +1,4 @@
-"""Many chains side by side: where they start, how they warm up, and what they leave behind."""
+"""Many chains in parallel: start, warm-up, and draws."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.sampler.convergence import Convergence, Limits, diagnose
+from bayesdist.infer.convergence import Convergence, Limits, diagnose
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.gibbs import sweep
 from bayesdist.infer.series.problem import Problem, State, break_likelihood
@@ -19,60 +19,43 @@ __all__ = ["Draws", "Engine", "run"]
 
 Float = NDArray[np.float64]
 
-ENSEMBLES = 4  # the chains are judged in as many lots
+ENSEMBLES = 4  # the chains are judged in as many groups
 SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps
-# the scatter needs further moves above this share of the formal errors in the variance, and with
-# this many exposures of which it is not clear whether they lie off
+# the scatter needs further moves above this fraction of the formal errors in the variance, and with
+# this many exposures that may or may not lie off
 FORMAL_SHARE, UNCLEAR = 0.25, 1.0
 EQUAL_WEIGHTS = np.zeros(25)  # no proposal, no importance weights
 
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """What a sweep needs besides the state, fixed after the warm-up.
-
-    Parameters
-    ----------
-    problem : Problem
-    walk : RandomWalk or None
-    moves : BreakMoves or None
-    """
+    """Problem and moves of a sweep, fixed after the warm-up."""
 
     problem: Problem
     walk: RandomWalk | None
     moves: BreakMoves | None
 
     def step(self, state: State, rng: np.random.Generator, kept: Float | None = None) -> State:
-        """The next draw."""
+        """Next state of all chains."""
         return sweep(self.problem, state, rng, kept=kept, walk=self.walk, moves=self.moves)
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Draws of T sweeps of C chains, in units of the spread.
+    """Draws of T sweeps of C chains, in units of the spread."""
 
-    Parameters
-    ----------
-    b : ndarray, shape (C, T, k, p)
-    sigma : ndarray, shape (C, T, k, k)
-    fraction, kappa2 : ndarray, shape (C, T)
-    breaks : ndarray, shape (C, T, B)
-    drift : ndarray, shape (C, T, k)
-    outlier_probability : ndarray, shape (E,)
-    """
-
-    b: Float
-    sigma: Float
-    fraction: Float
-    kappa2: Float
-    breaks: Float
-    drift: Float
-    outlier_probability: Float
+    b: Float  # (C, T, k, p)
+    sigma: Float  # (C, T, k, k)
+    fraction: Float  # (C, T)
+    kappa2: Float  # (C, T)
+    breaks: Float  # (C, T, B)
+    drift: Float  # (C, T, k)
+    outlier_probability: Float  # (E,)
 
     def state(self, draws: slice) -> State:
-        """Some draws, of all chains one after another, as if chains stood there.
+        """State of some draws, of all chains one after another, as if chains were there.
 
-        Memberships are not kept.
+        It has no memberships.
         """
 
         def some(values: Float) -> Float:
@@ -92,7 +75,7 @@ class Draws:
         )
 
     def judged(self, problem: Problem, limits: Limits) -> Convergence:
-        """Convergence of everything that is reported."""
+        """Convergence of every reported quantity."""
         n_chains, n_steps = self.fraction.shape
         names = problem.series.coefficients
         k = len(names)
@@ -131,7 +114,7 @@ def starting_state(
     """Chains that start far apart in the scatter and in the outliers.
 
     The scatter starts from differences of successive exposures, which breaks and slopes hardly
-    touch.
+    affect.
     """
     k, n = problem.y.shape
     order = np.argsort(problem.series.epoch, kind="stable")
@@ -180,7 +163,7 @@ def warm_up(
 
 
 def _further_moves(problem: Problem, seen: list[State]) -> RandomWalk | None:
-    """Random-walk steps, where exact draws alone would creep."""
+    """Random-walk steps, where exact draws alone would mix slowly."""
     sigma = np.concatenate([s.sigma for s in seen], axis=-1)
     formal = np.median(np.diagonal(problem.formal), axis=0)
     intrinsic = np.median(np.diagonal(sigma), axis=0)
@@ -202,21 +185,9 @@ def run(
     most: int,
     limits: Limits,
 ) -> tuple[Engine, State, Draws, Convergence]:
-    """Warm up, then draw until the limits are reached or the draws are used up.
+    """Warm up, then draw until the limits are reached or `most` sweeps are drawn.
 
-    Parameters
-    ----------
-    problem : Problem
-    rng : numpy.random.Generator
-    chains, warmup, sweeps : int
-        Chains; sweeps to warm up; sweeps to draw before convergence is judged, each time.
-    most : int
-        Sweeps to draw at most.
-    limits : Limits
-
-    Returns
-    -------
-    Engine, State, Draws, Convergence
+    `warmup` sweeps warm the chains up; convergence is judged after every `sweeps` draws.
     """
     engine, state = warm_up(problem, chains, warmup, rng)
     states: list[State] = []

@@ -1,9 +1,9 @@
-"""Which course the exposures carry: by how well each predicts exposures that it has not seen.
+"""Choice of the course of a series, by predictive densities of held-out exposures.
 
 A difference counts where it is at least 4 and at least as many of its standard errors as Student's
 t needs for 95 %: below 4 standard errors are too small themselves (Sivula et al. 2020).  Where the
-exposures hang together in time, whole blocks of them are held out: an exposure's neighbours would
-give it away, and an irregular drift would pass for a line.
+exposures are correlated in time, whole blocks of them are held out: an exposure's neighbours would
+predict it, and an irregular drift would pass for a line.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ Int = NDArray[np.int64]
 
 LEAST_DIFFERENCE = 4.0
 CONFIDENCE = 0.95
-# lag-1 correlation, in its standard errors, from which exposures are taken to hang together
+# lag-1 correlation, in its standard errors, from which exposures count as correlated
 SERIAL = 2.33
 LEAST_BLOCKS, CORRELATION_LENGTHS = 6, 3
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Courses of one series, and how each predicts what it has not seen.
+    """Courses of one series, with their predictions of held-out exposures.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class Comparison:
 
     @property
     def single(self) -> bool:
-        """Whether exposures count as independent of each other."""
+        """True if exposures count as independent of each other."""
         return self.scheme in ("exposures", "each")
 
     def difference(self, a: int, b: int) -> tuple[float, float]:
@@ -75,7 +75,7 @@ class Comparison:
         return float(each.sum()), float(np.sqrt(len(items)) * items.std(ddof=1))
 
     def beats(self, a: int, b: int) -> bool:
-        """Whether course a predicts better than course b beyond doubt."""
+        """True if course a predicts significantly better than course b."""
         value, error = self.difference(a, b)
         n = len(self.scores[a].fold)
         n = n if self.single else len(np.unique(self.scores[a].fold))
@@ -84,14 +84,14 @@ class Comparison:
 
     @property
     def best(self) -> int:
-        """Place of the course with the best score."""
+        """Index of the course with the best score."""
         return int(np.argmax([s.total for s in self.scores]))
 
     @property
     def carried(self) -> int:
-        """Place of the simplest course that beats the constant and that the best does not beat.
+        """Index of the simplest course that beats the constant and that the best does not beat.
 
-        The constant's place where nothing beats it.  A break that was found, and not given, has to
+        The constant's index where nothing beats it.  A break that was found, and not given, has to
         predict held-out exposures better than drifts without one: a break can follow any drift.
         """
         constant = next(i for i, c in enumerate(self.courses) if c.kind == "constant")
@@ -104,11 +104,11 @@ class Comparison:
         return constant
 
     def table(self) -> Table:
-        """One row for each course, the best first.
+        """Table with one row for each course, the best first.
 
         Columns: course, score, its difference to the best with standard error, Monte-Carlo error,
-        share of measurements in the 68 % and 95 % predictive intervals, and whether the posterior
-        converged.
+        fraction of measurements in the 68 % and 95 % predictive intervals, and convergence of the
+        posterior.
         """
         order = sorted(range(len(self.courses)), key=lambda i: -self.scores[i].total)
         gaps = [self.difference(i, self.best) for i in order]
@@ -136,25 +136,25 @@ def compare(
     folds: str | Int = "auto",
     seed: int = 1,
 ) -> Comparison:
-    """Compare courses by what they say of exposures that they have not seen.
+    """Compare courses by their predictive densities of held-out exposures.
 
     Parameters
     ----------
     series : Series
     candidates : sequence of Course
         The constant is added, and to every course with breaks and slopes the one without slopes:
-        without them a slope could not be told from nothing.
+        without them a slope could not be distinguished from none.
     folds : str or ndarray of int, shape (E,)
-        'exposures': in 30 lots, neighbours in different ones; 'each': one by one; 'blocks':
+        'exposures': in 30 groups, neighbours in different ones; 'each': one by one; 'blocks':
         successive ones together; 'auto': exposures, or blocks where the residuals of every course
-        but the drifting ones are correlated in time; or which to hold out together.
+        but the drifting ones are correlated in time; or codes of those to be held out together.
     seed : int
 
     Returns
     -------
     Comparison
-        Without courses whose one break, at whichever date, gains less likelihood from the very
-        exposures that it is fitted to than held-out ones would have to show.
+        Without courses whose one break, at any date, gains less likelihood from the very exposures
+        that it is fitted to than held-out ones would have to show.
     """
     courses, posteriors = _fitted(series, _completed(candidates), seed)
     found = [serial_correlation(p) for p in posteriors if p.course.kind not in ("spline", "wander")]
@@ -187,9 +187,9 @@ def compare(
 def _fitted(
     series: Series, candidates: tuple[Course, ...], seed: int
 ) -> tuple[tuple[Course, ...], tuple[SeriesPosterior, ...]]:
-    """Courses, and the posterior of each, but for breaks that cannot be carried."""
+    """Courses, and the posterior of each, without breaks that cannot be significant."""
     fitted = {c: fit_series(series, c, seed=seed) for c in candidates if c.find != 1}
-    # no course of these, carried or not, can be beaten by a break that gains less over each
+    # no course of these can be beaten by a break that gains less over each
     plain = [p for c, p in fitted.items() if not (c.n_breaks or c.drifts)]
     for course in candidates:
         if course.find == 1 and max(_gain(course, p) for p in plain) >= LEAST_DIFFERENCE:
@@ -199,7 +199,7 @@ def _fitted(
 
 
 def _gain(course: Course, plain: SeriesPosterior) -> float:
-    """Log likelihood that a break gains over a course without one, at the best date of all.
+    """Gain in log likelihood of a break over a course without one, at the best date of all.
 
     With the scatter about the course without a break, or as much less as the chi-square is less,
     and exposures that lie off it counted little or in full, whichever gains most.
@@ -233,7 +233,7 @@ def _explained(problem: Problem, precision: Float, columns: Float) -> Float:
 
 
 def _completed(candidates: Sequence[Course]) -> tuple[Course, ...]:
-    """With what a claim has to be measured against, the simplest first."""
+    """Courses with those that a claim has to be compared with, the simplest first."""
     out = list(dict.fromkeys(candidates))
     groups = out[0].groups if out else "offsets"
     if not any(c.kind == "constant" for c in out):
@@ -264,7 +264,7 @@ def _folds(series: Series, scheme: str, breaks: tuple[float, ...], correlation: 
 def serial_correlation(posterior: SeriesPosterior) -> float:
     """Correlation of the residuals of successive exposures, the mean over the coefficients.
 
-    Exposures that lie off count as little as they are believed.  Without correlation it scatters
+    Exposures that lie off are weighted down by their probability.  Without correlation it scatters
     by at most 1 / sqrt(E).
     """
     series = posterior.series

@@ -1,11 +1,11 @@
-"""Deviations that successive exposures share, for predictions beyond the series.
+"""Correlated deviations of successive exposures, for predictions beyond the series.
 
-Beside a course of few columns each coefficient deviates by a first-order (Ornstein-Uhlenbeck)
-process of variance a^2 and memory tau, and each exposure by a scatter of its own.  The course's
-parameters are integrated out; memory, total variance and the process's fraction of it are summed
-over a grid with the weight of their marginal likelihood.  A memory far longer than the series makes
-a random walk, a fraction of nothing the scatter alone.  Closed forms throughout: nothing to
-converge.
+In addition to a course of few columns each coefficient deviates by a first-order
+(Ornstein-Uhlenbeck) process of variance a^2 and memory tau, and each exposure by an independent
+scatter.  The course's parameters are integrated out; memory, total variance and the process's
+fraction of it are summed over a grid with the weight of their marginal likelihood.  A memory far
+longer than the series makes a random walk, a fraction of zero the scatter alone.  Closed forms
+throughout: nothing to converge.
 """
 
 from __future__ import annotations
@@ -29,31 +29,21 @@ MOST = 300  # exposures, or means of successive ones
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """What is said of a coefficient at M epochs: normal distributions with weights.
+    """Prediction of a coefficient at M epochs: a mixture of P normal distributions."""
 
-    Parameters
-    ----------
-    weight : ndarray, shape (P,)
-        Of each process.
-    means, variances : ndarray, shape (P, M)
-        Of course and shared deviation.
-    own : ndarray, shape (P,)
-        Variance that each exposure has for itself, beside its formal one.
-    """
-
-    weight: Float
-    means: Float
-    variances: Float
-    own: Float
+    weight: Float  # of each process (P,)
+    means: Float  # of course and correlated deviation (P, M)
+    variances: Float  # of course and correlated deviation (P, M)
+    own: Float  # independent variance (P,) of each exposure, in addition to its formal one
 
     @property
     def mean(self) -> Float:
-        """Over all processes, (M,)."""
+        """Mean (M,) over all processes."""
         return self.weight @ self.means
 
     @property
     def variance(self) -> Float:
-        """Over all processes, (M,)."""
+        """Variance (M,) over all processes."""
         return self.weight @ (self.variances + (self.means - self.mean) ** 2)
 
     def drawn(self, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -63,36 +53,17 @@ class Shared:
 
 @dataclass(frozen=True, eq=False)
 class Correlated:
-    """One coefficient's deviations: what a grid of processes says of them.
-
-    Parameters
-    ----------
-    epoch : ndarray, shape (E,)
-    y : ndarray, shape (E,)
-        In units of the spread.
-    noise : ndarray, shape (E,)
-        Formal variances.
-    columns : ndarray, shape (E, p)
-        Of the course.
-    count : ndarray, shape (E,)
-        Exposures that each of these is the mean of.
-    """
+    """Correlated deviations of one coefficient, over a grid of processes."""
 
     epoch: Float
-    y: Float
-    noise: Float
-    columns: Float
-    count: Float
+    y: Float  # (E,) in units of the spread
+    noise: Float  # formal variances (E,)
+    columns: Float  # of the course (E, p)
+    count: Float  # number (E,) of exposures of which each of these is the mean
 
     @classmethod
     def of(cls, epoch: Float, y: Float, noise: Float, columns: Float) -> Correlated:
-        """Of single exposures; where they are very many, means of successive ones stand for them.
-
-        Parameters
-        ----------
-        epoch, y, noise, columns
-            As for `Correlated`.
-        """
+        """Deviations of single exposures, or of means of successive ones if they are very many."""
         order = np.argsort(epoch, kind="stable")
         lots = np.array_split(order, min(len(order), MOST))
         mean = [np.stack([values[lot].mean(axis=0) for lot in lots]) for values in (epoch, y)]
@@ -102,17 +73,7 @@ class Correlated:
         return cls(mean[0], mean[1], of_mean, rows, count)
 
     def predict(self, epoch: Float, columns: Float) -> Shared:
-        """Course and shared deviation at other epochs.
-
-        Parameters
-        ----------
-        epoch : ndarray, shape (M,)
-        columns : ndarray, shape (M, p)
-
-        Returns
-        -------
-        Shared
-        """
+        """Course and correlated deviation at other epochs (M,), with the course's columns there."""
         points = self._grid()
         solved = [self._at(*point, epoch, columns) for point in points]
         log_weight = np.array([one[0] for one in solved])

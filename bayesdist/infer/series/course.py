@@ -1,8 +1,8 @@
-"""How a coefficient may run with time: constant, lines, steps, kinks, smooth or irregular drift.
+"""Courses of a coefficient with time: constant, lines, steps, kinks, smooth or irregular drift.
 
 A course is linear in its parameters once the dates of its breaks are known; its columns are the
-same for every coefficient of a series.  R is the reference date of a segment, as RDATE in
-Equation 3 of ACS ISR 2015-06.
+same for every coefficient of a series.  R is the reference date of a segment, as RDATE in Equation
+3 of ACS ISR 2015-06.
 
     constant    a
     line        a + b (t - R)
@@ -28,23 +28,23 @@ PLAIN = ("constant", "line", "spline", "wander")
 BROKEN = ("step", "line+step", "piecewise", "lines")
 KINDS = ("constant", "line", "step", "line+step", "piecewise", "lines", "spline", "wander")
 SLOPED = ("line", "line+step", "piecewise", "lines", "spline")
-# exposures that a segment must have: with given breaks, and where the breaks are to be found
+# fewest exposures of a segment: with given breaks, and where the breaks are to be found
 LEAST = {"step": 1, "line+step": 1, "piecewise": 2, "lines": 3}
 LEAST_FOUND = 5
 
 
 @dataclass(frozen=True)
 class Course:
-    """One way of running with time.
+    """One form of dependence on time.
 
     Parameters
     ----------
     kind : str
         One of `KINDS`.
     breaks : tuple of float
-        Dates at which a new segment begins, rising, decimal years.
+        Dates at which a new segment begins, ascending, decimal years.
     find : int
-        How many breaks are to be found, where none are given.
+        Number of breaks to be found, where none are given.
     reference : tuple of float
         Reference date of each segment; one date serves all.  By default the mean date of the
         segment's exposures, or of all where the breaks are to be found.
@@ -54,7 +54,7 @@ class Course:
     Raises
     ------
     InputError
-        For an unknown kind, breaks that do not rise, or breaks where the kind has none or needs
+        For an unknown kind, breaks that do not ascend, or breaks where the kind has none or needs
         some, and a wrong number of reference dates.
     """
 
@@ -99,17 +99,17 @@ class Course:
 
     @property
     def n_breaks(self) -> int:
-        """Breaks, given or to be found."""
+        """Number of breaks, given or to be found."""
         return self.find or len(self.breaks)
 
     @property
     def n_segments(self) -> int:
-        """One more than the breaks."""
+        """Number of segments: one more than the breaks."""
         return self.n_breaks + 1
 
     @property
     def name(self) -> str:
-        """Kind, and what is said of the breaks: 'lines, break at 2009.4'."""
+        """Kind, with the breaks: 'lines, break at 2009.4'."""
         if self.breaks:
             dates = ", ".join(f"{b:g}" for b in self.breaks)
             return f"{self.kind}, break{'s' * (len(self.breaks) > 1)} at {dates}"
@@ -119,10 +119,10 @@ class Course:
 
     @property
     def drifts(self) -> bool:
-        """Whether it has a random part that follows whatever drift there is."""
+        """True if it has a random part that can follow any drift."""
         return self.kind in ("spline", "wander")
 
     @property
     def has_slope(self) -> bool:
-        """Whether it claims a drift that goes on."""
+        """True if it claims a drift that goes on."""
         return self.kind in SLOPED

@@ -1,4 +1,4 @@
-"""The columns of a course for one series, and what their parameters mean."""
+"""Columns of a course for one series, and the meaning of their parameters."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KNOTS = {"spline": 8, "wander": 16}
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The columns of a course for one series.
+    """Columns of a course for one series.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ class Design:
     Raises
     ------
     DegenerateError
-        Where a segment or a group has too few exposures, or exposures of one date only, for what
-        the course asks of it.
+        Where a segment or a group has too few exposures, or exposures of one date only, for the
+        parameters of the course.
     """
 
     course: Course
@@ -96,7 +96,7 @@ class Design:
 
     @cached_property
     def reference(self) -> Float:
-        """Reference date of each segment, shape (S,)."""
+        """Reference date (S,) of each segment."""
         course, epoch = self.course, self.series.epoch
         if course.reference:
             return np.broadcast_to(np.array(course.reference, float), (course.n_segments,)).copy()
@@ -112,7 +112,7 @@ class Design:
 
     @cached_property
     def drift(self) -> Drift | None:
-        """The random part of the course, where it has one."""
+        """Random part of the course, or None."""
         if self.course.kind not in KNOTS:
             return None
         knots = KNOTS[self.course.kind]
@@ -120,35 +120,35 @@ class Design:
 
     @property
     def n_groups(self) -> int:
-        """Groups of the series; one where it has none."""
+        """Number of groups of the series; one without groups."""
         return max(len(self.series.group_names), 1)
 
     @property
     def n_course(self) -> int:
-        """Columns of the course itself."""
+        """Number of columns of the course itself."""
         s = self.course.n_segments
         sizes = {"constant": 1, "line": 2, "spline": 2, "wander": 1, "step": s}
         return {**sizes, "line+step": s + 1, "piecewise": s + 1, "lines": 2 * s}[self.course.kind]
 
     @property
     def n_fixed(self) -> int:
-        """Columns whose parameters have a vague prior: the course, then the groups."""
+        """Number of columns whose parameters have a vague prior: the course, then the groups."""
         each = 2 if self.course.groups == "slopes" else 1
         return self.n_course + each * (self.n_groups - 1)
 
     @property
     def n_columns(self) -> int:
-        """All columns: the fixed ones, then those of the random part."""
+        """Number of all columns: the fixed ones, then those of the random part."""
         return self.n_fixed + (self.drift.n_columns if self.drift else 0)
 
     # -- columns ----------------------------------------------------------------------------------
 
     def given_breaks(self) -> Float:
-        """The given breaks as one row, shape (1, B)."""
+        """Given breaks as one row (1, B)."""
         return np.array(self.course.breaks, float)[None]
 
     def segment(self, epoch: Float, breaks: Float | None = None) -> Int:
-        """Segment of each epoch (E,) for breaks (..., B): shape (..., E)."""
+        """Segment (..., E) of each epoch (E,) for breaks (..., B)."""
         rows = self.given_breaks() if breaks is None else breaks
         return (epoch >= rows[..., :, None]).sum(axis=-2)
 
@@ -161,7 +161,7 @@ class Design:
         group : ndarray, shape (E,)
             Codes of the groups.
         breaks : ndarray, shape (..., B), optional
-            Dates of the breaks, fewer than the course has if need be; the given ones by default.
+            Dates of the breaks, possibly fewer than the course has; the given ones by default.
 
         Returns
         -------

@@ -1,9 +1,9 @@
-"""Drift that follows no line: a Wiener process, plain or integrated once, seen at knots.
+"""Irregular or smooth drift: a Wiener process, plain or integrated once, seen at knots.
 
-With a free level (and, integrated, a free slope) beside it the date at which such a process starts
-does not matter; here it is the middle of the series.  Given its values at the knots the process is
-known exactly there, and its conditional mean runs between them: linear or cubic.  The integrated
-process is the smoothing spline of Wahba (1978).
+With a free level (and, integrated, a free slope) in addition, the date at which such a process
+starts does not matter; here it is the middle of the series.  Given its values at the knots the
+process is known exactly there, and its conditional mean runs between them: linear or cubic.  The
+integrated process is the smoothing spline of Wahba (1978).
 """
 
 from __future__ import annotations
@@ -20,26 +20,16 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """A process of unit amplitude: about one at the ends of the series.
+    """A process of unit amplitude: about one at the ends of the series."""
 
-    Parameters
-    ----------
-    origin, years : float
-        Middle of the series and half its span.
-    knots : ndarray, shape (Q,)
-        In units of half the span from the middle, none of them zero.
-    smooth : bool
-        Integrated once.
-    """
-
-    origin: float
-    years: float
-    knots: Float
-    smooth: bool
+    origin: float  # middle of the series
+    years: float  # half its span
+    knots: Float  # (Q,) in units of half the span from the middle, none of them zero
+    smooth: bool  # integrated once
 
     @classmethod
     def over(cls, epoch: Float, n_knots: int, *, smooth: bool) -> Drift:
-        """A process over a series.
+        """Process over a series.
 
         A smooth one has its knots at even distances, an irregular one where the exposures are.
         """
@@ -58,7 +48,7 @@ class Drift:
         return len(self.knots)
 
     def kernel(self, a: Float, b: Float) -> Float:
-        """Covariance (..., n, m) of the process at places (n,) and (m,)."""
+        """Covariance (..., n, m) of the process at dates (n,) and (m,), in half spans."""
         same = np.sign(a)[:, None] == np.sign(b)
         x, y = np.abs(a)[:, None], np.abs(b)
         low, high = np.minimum(x, y), np.maximum(x, y)

@@ -1,4 +1,4 @@
-"""Is the drift the same in every filter?  (ACS ISR 2015-06, section 4.4.4.)
+"""Comparison of the drift between filters (ACS ISR 2015-06, section 4.4.4).
 
 Common slopes with an offset for each filter, against slopes of their own: each further filter's
 slope differs from that of the first by one amount in all segments.
@@ -22,16 +22,16 @@ __all__ = ["FilterDependence", "filter_dependence"]
 
 @dataclass(frozen=True, eq=False)
 class FilterDependence:
-    """Whether the drift depends on the filter.
+    """Comparison of common slopes with a slope for each filter.
 
     Parameters
     ----------
     names : tuple of str
-        Filters; the first has most exposures and is what the others are compared with.
+        Filters; the first has most exposures, and the others are compared with it.
     offset : dict of str to Change
-        What each further filter adds to the coefficients, with common slopes.
+        Offset of each further filter's coefficients, with common slopes.
     slope : dict of str to Change
-        What it adds to their slopes, per year, where it has its own.
+        Difference of its slopes, per year, where it has its own.
     all_slopes : Change
         All of these in one vector, filter by filter, with their covariance.
     common, separate : SeriesPosterior
@@ -49,12 +49,12 @@ class FilterDependence:
 
     @property
     def gain(self) -> tuple[float, float]:
-        """By how much own slopes predict held-out exposures better, with standard error."""
+        """Gain of own slopes in predicting held-out exposures, with standard error."""
         return self.comparison.difference(*self._places)
 
     @property
     def depends(self) -> bool:
-        """Whether own slopes predict better beyond doubt."""
+        """True if own slopes predict significantly better."""
         return self.comparison.beats(*self._places)
 
     @property
@@ -64,7 +64,7 @@ class FilterDependence:
 
 
 def filter_dependence(series: Series, course: Course, *, seed: int = 1) -> FilterDependence:
-    """Compare common slopes with slopes of each filter's own.
+    """Compare common slopes with a slope for each filter.
 
     Parameters
     ----------

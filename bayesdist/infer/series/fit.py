@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.sampler.convergence import Limits
+from bayesdist.infer.convergence import Limits
 from bayesdist.infer.series.chains import run
 from bayesdist.infer.series.course import Course
 from bayesdist.infer.series.design import Design
@@ -32,7 +32,7 @@ def fit_series(
     target_rhat: float = 1.01,
     max_sweeps: int = 1600,
 ) -> SeriesPosterior:
-    """Posterior of a course with time, of the scatter of the exposures, and of what lies off.
+    """Posterior of a course with time, of the scatter of the exposures, and of outliers.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def fit_series(
     scatter : array_like, shape (k, k), optional
         Intrinsic covariance where it is known; it is a parameter by default.
     outliers : bool
-        Whether exposures may lie off the course.
+        True if exposures may lie off the course.
     target_ess, target_rhat : float
         Limits of convergence, for every parameter.
     max_sweeps : int
@@ -51,7 +51,7 @@ def fit_series(
     Returns
     -------
     SeriesPosterior
-        `convergence` says whether the limits were reached.
+        `convergence` shows if the limits were reached.
 
     Raises
     ------

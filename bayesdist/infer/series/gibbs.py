@@ -5,16 +5,16 @@
 with S_e the formal covariance, Sigma the intrinsic one.  An exposure is an outlier (w_e = kappa^2)
 with probability f.  Everything is in units of the series' spread.  Priors, all proper:
 
-    b        Gaussian of standard deviation `WIDE`: flat, as far as any data can tell
+    b        Gaussian of standard deviation `WIDE`: flat compared with any data
     Sigma    half-Student-t standard deviations, uniform correlations: see scatter.py
-    f        Beta(1, 9), cut off at 0.25: what lies off is the exception
+    f        Beta(1, 9), cut off at 0.25: outliers are the exception
     kappa    at least 3; inverse gamma on kappa^2, shape 1, most probable log kappa at log 5
     drift    half-Student-t standard deviation of each coefficient, two degrees of freedom
     breaks   uniform in time: see breaks.py
 
 A sweep draws the breaks with b and the deviations integrated out, b with the deviations integrated
-out, the drift's amplitude, then memberships, f, kappa and Sigma.  Many chains run side by side;
-some exposures may be held out of some of them, which gives exact refits without one.
+out, the drift's amplitude, then memberships, f, kappa and Sigma.  Many chains run in parallel; some
+exposures may be held out of some of them, which gives exact refits without one.
 """
 
 from __future__ import annotations
@@ -56,25 +56,11 @@ def sweep(
     moves: BreakMoves | None = None,
     scan: bool = False,
 ) -> State:
-    """One draw of everything.
+    """State after one draw of everything.
 
-    Parameters
-    ----------
-    problem : Problem
-    state : State
-    rng : numpy.random.Generator
-    kept : ndarray, shape (C, E), optional
-        0 for exposures that a chain must not see, else 1.
-    walk : RandomWalk, optional
-        Further moves of the scatter and of the mixture.
-    moves : BreakMoves, optional
-        Of breaks that are to be found.
-    scan : bool
-        Let the breaks be drawn among all gaps; for warming up only.
-
-    Returns
-    -------
-    State
+    `kept` (C, E) is 0 for exposures that a chain must not see, else 1; `walk` makes further moves
+    of the scatter and of the mixture, `moves` those of breaks that are to be found.  With `scan`
+    the breaks are drawn among all gaps, for warming up only.
     """
     k, n_exposures = problem.y.shape
     n_chains = len(state.fraction)
@@ -135,7 +121,7 @@ def _draw_memberships(
     fraction = np.clip(fraction, 1e-12, FRACTION_MOST)
     shape = KAPPA_SHAPE + k * count / 2
     rate = KAPPA_RATE + (off * kept * distance).sum(axis=1) / 2
-    # 1 / kappa^2 is gamma, cut off where kappa would be less than its least value
+    # 1 / kappa^2 is gamma, cut off where kappa would be less than its smallest value
     share = np.maximum(gammainc(shape, rate / KAPPA_LEAST**2), 1e-290)
     inverse = gammaincinv(shape, share * rng.uniform(1e-12, 1.0, len(share))) / rate
     kappa2_new = np.maximum(1 / np.maximum(inverse, 1e-300), KAPPA_LEAST**2)
@@ -151,7 +137,7 @@ def _draw_sigma(
     rng: np.random.Generator,
 ) -> Float:
     """Intrinsic covariance given deviations, which are drawn from the residuals (k, C, E)."""
-    # Matheron: a draw from the prior, corrected by what it misses of the residual
+    # Matheron: a draw from the prior, corrected for its part of the residual
     free = np.einsum("ijc,jce->ice", cholesky(sigma), rng.standard_normal(residual.shape))
     formal = np.einsum("ije,jce->ice", problem.root, rng.standard_normal(residual.shape))
     missed = np.einsum("ijce,jce->ice", precision, residual - free - formal)
@@ -166,7 +152,7 @@ def _move_drift_alone(
 ) -> tuple[Float, Float]:
     """Amplitudes of the drift of some coefficients, with its parameters integrated out.
 
-    Given its parameters an amplitude that the data hardly know creeps; here it leaps.
+    Given its parameters an amplitude that the data hardly determine moves slowly; here it leaps.
     """
     n_chains, k = drift.shape
     n, p = problem.design.n_fixed, matrix.shape[1] // k
@@ -207,7 +193,7 @@ def _move_drift(
     scale = scale / (DRIFT_NU / state.drift**2 + DRIFT_SCALE**-2)
     rate = DRIFT_NU * scale + 0.5 * (random**2).sum(axis=2)
     drift = np.sqrt(rate / rng.gamma((DRIFT_NU + random.shape[2]) / 2, size=shape))
-    # the second move: the likelihood decides, where the first one would creep near zero
+    # the second move: the likelihood decides, where the first one would move slowly near zero
     b = state.b.copy()
     moving = np.moveaxis(random @ np.swapaxes(columns[..., n:], -1, -2), 1, 0)
     fixed = np.moveaxis(b[..., :n] @ np.swapaxes(columns[..., :n], -1, -2), 1, 0)

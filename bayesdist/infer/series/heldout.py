@@ -1,8 +1,8 @@
-"""How well a course predicts exposures that it has not seen.
+"""Predictive densities of held-out exposures.
 
 The exposures are cut into folds, and each is predicted from the rest: by the draws of the whole
-series with importance weights where these can carry it, else by exact refits.  The chains of all
-refits run side by side from where those of the whole series ended.
+series with importance weights where these are reliable, else by exact refits.  The chains of all
+refits run in parallel from the last state of the whole series' chains.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
-from bayesdist.infer.sampler.convergence import smoothed_weights
+from bayesdist.infer.convergence import smoothed_weights
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
 from bayesdist.infer.series.small import cholesky, solve_factor
@@ -34,16 +34,16 @@ LOTS = 30
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What a course says of each exposure from the others.
+    """Predictive density of each exposure from the others.
 
     Parameters
     ----------
     log_density : ndarray, shape (E,)
         Log predictive density of all k coefficients together, in units of the spread.
     rank : ndarray, shape (E, k)
-        Predictive probability of less than what was measured; uniform if the course is right.
+        Predictive probability below the measured value; uniform if the course is right.
     fold : ndarray, shape (E,)
-        Which exposures were held out together.
+        Code of the exposures that were held out together.
     mc_error : float
         Monte-Carlo standard error of the sum of `log_density`.
     """
@@ -59,13 +59,13 @@ class HeldOut:
         return float(self.log_density.sum())
 
     def covered(self, probability: float) -> Float:
-        """Share of measurements (k,) inside the central predictive interval of a probability."""
+        """Fraction of measurements (k,) inside the central predictive interval of a probability."""
         tail = (1 - probability) / 2
         return ((self.rank > tail) & (self.rank < 1 - tail)).mean(axis=0)
 
 
 def exposure_folds(epoch: Float, lots: int = LOTS) -> Int:
-    """Exposures dealt out in the order of their dates to so many lots, or one to each."""
+    """Folds (E,) of exposures dealt out by date to so many groups, or one to each."""
     out = np.empty(len(epoch), np.int64)
     out[np.argsort(epoch, kind="stable")] = np.arange(len(epoch)) % min(len(epoch), lots)
     return out
@@ -78,7 +78,7 @@ def block_folds(epoch: Float, breaks: tuple[float, ...], length: int) -> Int:
     ----------
     epoch : ndarray, shape (E,)
     breaks : tuple of float
-        Given breaks; blocks end there, and no segment is one block only where it has two exposures.
+        Given breaks; blocks end there, and a segment of two or more exposures has several blocks.
     length : int
         Least number of exposures in a block, where the segments allow it.
 
@@ -107,9 +107,10 @@ def block_folds(epoch: Float, breaks: tuple[float, ...], length: int) -> Int:
 def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut:
     """Predict each fold from the rest.
 
-    The draws of the whole series serve, weighted by 1 / (density of the fold) with the tail of the
-    weights smoothed (Vehtari, Gelman & Gabry 2017).  Where the weights have no such tail (Pareto
-    k above 0.7), and a fold matters too much for that, the posterior is drawn anew without it.
+    The draws of the whole series are used, weighted by 1 / (density of the fold) with the tail of
+    the weights smoothed (Vehtari, Gelman & Gabry 2017).  Where the weights have no such tail
+    (Pareto k above 0.7), and a fold matters too much for that, the posterior is drawn anew without
+    it.
 
     Parameters
     ----------
@@ -156,7 +157,7 @@ def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut
 
 
 def _of_all_draws(posterior: SeriesPosterior) -> tuple[Float, Float]:
-    """Log density (n, E) of each exposure at the draws, and probability of less (n, E, k)."""
+    """Log density (n, E) of exposures at draws, and probability (n, E, k) below their values."""
     n_draws = posterior.raw.fraction.size
     pieces = [
         predictive(posterior, posterior.raw.state(slice(first, first + DRAWS_AT_ONCE)))
@@ -168,9 +169,9 @@ def _of_all_draws(posterior: SeriesPosterior) -> tuple[Float, Float]:
 def _without(
     posterior: SeriesPosterior, fold: Int, codes: Int, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Drawn anew without some folds, mean over the draws of each chain.
+    """Log density (C, E) and probability below (C, E, k), drawn anew without some folds.
 
-    Log density (C, E) and probability of less (C, E, k), `CHAINS` chains for each fold.
+    Mean over the draws of each chain, `CHAINS` chains for each fold.
     """
     engine, last = posterior.engine, posterior.last
     own = np.repeat(codes, CHAINS)
@@ -189,7 +190,7 @@ def _without(
 
 
 def predictive(posterior: SeriesPosterior, state: State) -> tuple[Float, Float]:
-    """Log density (C, E) of each exposure at a draw, and probability of less (C, E, k)."""
+    """Log density (C, E) of exposures at a draw, and probability (C, E, k) below their values."""
     problem = posterior.engine.problem
     columns = problem.columns(state.breaks)
     fitted = np.moveaxis(state.b @ np.swapaxes(columns, -1, -2), 1, 0)

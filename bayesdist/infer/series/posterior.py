@@ -1,4 +1,4 @@
-"""What is known of a series: draws of its course and scatter, predictions, changes at breaks."""
+"""Posterior of a series: draws of its course and scatter, predictions, changes at breaks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.sampler.convergence import Convergence
+from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.series.chains import Draws, Engine
 from bayesdist.infer.series.correlated import Correlated, Shared
 from bayesdist.infer.series.course import Course
@@ -37,7 +37,7 @@ class SeriesPosterior:
     convergence : Convergence
     engine : Engine
     last : State
-        Where the chains ended.
+        Last state of the chains.
     """
 
     series: Series
@@ -57,14 +57,14 @@ class SeriesPosterior:
 
     @cached_property
     def _breaks(self) -> Float:
-        """Breaks, shape (n, B); one row where they are given."""
+        """Breaks (n, B); one row where they are given."""
         if not self.course.find:
             return self.design.given_breaks()
         return self.raw.breaks.reshape(self.raw.fraction.size, self.course.find)
 
     @property
     def reference(self) -> Float:
-        """Reference date of each segment, shape (S,)."""
+        """Reference date (S,) of each segment."""
         return self.design.reference
 
     @property
@@ -96,7 +96,7 @@ class SeriesPosterior:
 
     @property
     def outlier_probability(self) -> Float:
-        """Of each exposure, shape (E,)."""
+        """Outlier probability (E,) of each exposure."""
         return self.raw.outlier_probability
 
     @property
@@ -106,12 +106,12 @@ class SeriesPosterior:
 
     @cached_property
     def group_offset(self) -> Float:
-        """Draws (n, G - 1, k) of what each further group adds."""
+        """Draws (n, G - 1, k) of each further group's offset."""
         return self._group_columns(self.design.n_course) * self.series.spread
 
     @cached_property
     def group_slope(self) -> Float:
-        """Draws (n, G - 1, k) of what each further group adds to the slope, per year.
+        """Draws (n, G - 1, k) of each further group's difference in slope, per year.
 
         Raises
         ------
@@ -132,7 +132,7 @@ class SeriesPosterior:
         return np.swapaxes(b[..., first : first + self.design.n_groups - 1], 1, 2)
 
     def change(self, number: int = 0) -> tuple[Change, Change]:
-        """What changes at a break: the coefficients at its date, and their slopes.
+        """Changes at a break: of the coefficients at its date, and of their slopes.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class SeriesPosterior:
     def predict(
         self, epoch: ArrayLike, *, group: str | None = None, extrapolate: bool = False
     ) -> Prediction:
-        """The coefficients at any epoch.
+        """Coefficients at any epoch.
 
         Parameters
         ----------
@@ -168,8 +168,8 @@ class SeriesPosterior:
         group : str, optional
             The group with most exposures by default.
         extrapolate : bool
-            Allow epochs before the first and after the last exposure.  Deviations that successive
-            exposures share are part of what is said of these: see `Correlated`.
+            Allow epochs before the first and after the last exposure.  Correlated
+            deviations of successive exposures are part of these predictions: see `Correlated`.
 
         Returns
         -------
@@ -204,27 +204,27 @@ class SeriesPosterior:
         return Prediction(t, mean, cov, cov_new)
 
     def _beyond(self, t: Float) -> NDArray[np.bool_]:
-        """Epochs (M,) at which shared deviations count, and the course has none of its own."""
+        """Boolean mask (M,) of epochs outside the series, for a course without a random part."""
         first, last = self.series.span
         return ((t < first) | (t > last)) & (self.design.drift is None)
 
     @property
     def _common(self) -> Float:
-        """Correlation (k, k) of the coefficients, as their scatter has it."""
+        """Correlation (k, k) of the coefficients in their scatter."""
         scatter = self.scatter.mean(axis=0)
         sigma = np.sqrt(np.diag(scatter))
         return np.asarray(scatter / (sigma[:, None] * sigma))
 
     def _shared(self, t: Float, group: str | None) -> list[Shared]:
-        """Each coefficient at epochs (M,) with shared deviations, in units of the spread."""
+        """Coefficients at epochs (M,) with correlated deviations, in units of the spread."""
         series, design = self.series, self.design
         breaks = np.median(self._breaks, axis=0, keepdims=True)
         code = np.full(len(t), series.group_names.index(group) if group is not None else 0)
         here = design.matrix(series.epoch, series.group_code, breaks)[0]
         there = design.matrix(t, code, breaks)[0]
         y = (series.values - series.centre) / series.spread
-        # an exposure that lies off alone says nothing: its error is as much wider as that is
-        # probable.  Where its neighbours do so too, the deviation is one that they share
+        # a single exposure that lies off gives no information: its error is as much wider as that
+        # is probable.  Where its neighbours do so too, the deviation is common to them
         order = np.argsort(series.epoch, kind="stable")
         p = np.concatenate([[0.0], self.outlier_probability[order], [0.0]])
         off = np.empty(len(series))
@@ -245,7 +245,7 @@ class SeriesPosterior:
         group: str | None = None,
         extrapolate: bool = False,
     ) -> Float:
-        """Draws (n, M, k) of what new exposures would show, those that lie off included.
+        """Draws (n, M, k) of the coefficients of new exposures, outliers included.
 
         Parameters
         ----------

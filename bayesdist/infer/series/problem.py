@@ -1,4 +1,4 @@
-"""A series in units of its spread, where chains are in it, and its normal equations."""
+"""A series in units of its spread, the state of its chains, and its normal equations."""
 
 from __future__ import annotations
 
@@ -22,43 +22,21 @@ CANDIDATES_AT_ONCE = 8
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A series in units of its spread, and what is asked of it.
-
-    Parameters
-    ----------
-    series : Series
-    design : Design
-    y : ndarray, shape (k, E)
-    formal, root : ndarray, shape (k, k, E)
-        Formal covariance and a square root of it.
-    sigma : ndarray, shape (k, k), optional
-        The intrinsic covariance where it is known.
-    outliers : bool
-        Whether exposures may lie off the course.
-    """
+    """A series in units of its spread, with its course and noise model."""
 
     series: Series
     design: Design
-    y: Float
-    formal: Float
-    root: Float
-    sigma: Float | None = None
-    outliers: bool = True
+    y: Float  # (k, E)
+    formal: Float  # formal covariance (k, k, E)
+    root: Float  # a square root of it (k, k, E)
+    sigma: Float | None = None  # intrinsic covariance (k, k) where it is known
+    outliers: bool = True  # True if exposures may lie off the course
 
     @classmethod
     def of(
         cls, series: Series, design: Design, scatter: Float | None = None, *, outliers: bool = True
     ) -> Problem:
-        """In units of the spread.
-
-        Parameters
-        ----------
-        series : Series
-        design : Design
-        scatter : ndarray, shape (k, k), optional
-            Known intrinsic covariance, in the unit of the values.
-        outliers : bool
-        """
+        """Problem in units of the spread; `scatter` (k, k) is a known intrinsic covariance."""
         unit = series.spread
         square = unit[:, None] * unit
         formal = series.cov / square
@@ -83,34 +61,19 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where C chains are.
+    """State of C chains."""
 
-    Parameters
-    ----------
-    b : ndarray, shape (C, k, p)
-    sigma : ndarray, shape (k, k, C)
-    off : ndarray of bool, shape (C, E)
-        Outliers.
-    probability : ndarray, shape (C, E)
-        Of being one, given everything else.
-    fraction, kappa2 : ndarray, shape (C,)
-    breaks : ndarray, shape (C, B)
-        Of those to be found.
-    drift : ndarray, shape (C, k)
-        Amplitude of the random part.
-    """
-
-    b: Float
-    sigma: Float
-    off: Bool
-    probability: Float
-    fraction: Float
-    kappa2: Float
-    breaks: Float
-    drift: Float
+    b: Float  # (C, k, p)
+    sigma: Float  # (k, k, C)
+    off: Bool  # outliers (C, E)
+    probability: Float  # of an outlier (C, E), given everything else
+    fraction: Float  # (C,)
+    kappa2: Float  # (C,)
+    breaks: Float  # (C, B) those to be found
+    drift: Float  # amplitude (C, k) of the random part
 
     def take(self, chains: NDArray[np.int64]) -> State:
-        """Some of the chains, or some of them several times."""
+        """State of some of the chains, possibly several times."""
         return State(
             self.b[chains],
             self.sigma[..., chains],
@@ -134,12 +97,8 @@ def prior_precision(problem: Problem, drift: Float) -> Float:
 def normal_equations(precision: Float, y: Float, columns: Float) -> tuple[Float, Float]:
     """Normal matrices (..., k p, k p) and right-hand sides (..., k p).
 
-    Parameters
-    ----------
-    precision : ndarray, shape (k, k, C, E)
-        Inverse covariance of each exposure.
-    y : ndarray, shape (k, E)
-    columns : ndarray, shape (C or 1, E, p) or (C, M, E, p)
+    `precision` (k, k, C, E) is the inverse covariance of each exposure, `y` (k, E), `columns` (C or
+    1, E, p) or (C, M, E, p).
     """
     k = len(y)
     *_, n, p = columns.shape
@@ -165,13 +124,8 @@ def course_equations(
 ) -> tuple[Float, Float]:
     """Precision (C, k p, k p) of the parameters b given everything else, and that times their mean.
 
-    Parameters
-    ----------
-    problem : Problem
-    precision : ndarray, shape (k, k, C, E)
-        Inverse covariance of each exposure.
-    columns : ndarray, shape (C or 1, E, p)
-    drift : ndarray, shape (C, k)
+    `precision` (k, k, C, E) is the inverse covariance of each exposure, `columns` (C or 1, E, p),
+    `drift` (C, k).
     """
     matrix, right = normal_equations(precision, problem.y, columns)
     prior = prior_precision(problem, drift).reshape(len(drift), -1)
@@ -190,7 +144,7 @@ def break_likelihood(problem: Problem, precision: Float) -> Likelihood:
         return 0.5 * (right * half).sum(axis=-1) - 0.5 * log_det
 
     def of(breaks: Float) -> Float:
-        # a few candidates at a time: their columns would not fit into the cache, or into memory
+        # a few candidates at a time: all their columns would not fit into the cache, or into memory
         places = range(0, breaks.shape[1], CANDIDATES_AT_ONCE)
         return np.concatenate([some(breaks[:, i : i + CANDIDATES_AT_ONCE]) for i in places], axis=1)
 

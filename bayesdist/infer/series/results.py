@@ -1,4 +1,4 @@
-"""What is read off a posterior: differences with their covariance, and predictions."""
+"""Results from a posterior: differences with their covariance, and predictions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """How a set of coefficients differs, with covariance.
+    """Difference of a set of coefficients, with covariance.
 
     Parameters
     ----------
@@ -28,27 +28,27 @@ class Change:
 
     @classmethod
     def of(cls, draws: Float) -> Change:
-        """From draws (n, k) of a difference."""
+        """Change from draws (n, k) of a difference."""
         return cls(draws.mean(axis=0), np.atleast_2d(np.cov(draws, rowvar=False)))
 
     @property
     def sigma(self) -> Float:
-        """Standard deviations, shape (k,)."""
+        """Standard deviations (k,)."""
         return np.sqrt(np.diag(self.cov))
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """Which of them (k,) can differ: the slope of a step cannot."""
+        """Boolean mask (k,) of those that can differ: the slope of a step cannot."""
         return self.sigma > 0
 
     @property
     def significance(self) -> Float:
-        """Value over sigma of each, shape (k,); 0 for what cannot differ."""
+        """Value over sigma (k,) of each; 0 for those that cannot differ."""
         return np.where(self.free, self.value / np.where(self.free, self.sigma, 1.0), 0.0)
 
     @property
     def chi2(self) -> float:
-        """Of all that can differ together, against no difference."""
+        """Chi-square of all that can differ together, against no difference."""
         some = np.flatnonzero(self.free)
         unit = self.sigma[some]
         scaled = self.cov[np.ix_(some, some)] / np.outer(unit, unit)
@@ -56,7 +56,7 @@ class Change:
 
     @property
     def p_value(self) -> float:
-        """Probability of so large a chi-square where nothing differs.
+        """Probability of a larger chi-square where nothing differs.
 
         Of a Gaussian: with few exposures the posterior has heavier tails, and this is too small.
         """
@@ -85,10 +85,10 @@ class Prediction:
 
     @property
     def sigma(self) -> Float:
-        """Of the course, shape (M, k)."""
+        """Standard deviations (M, k) of the course."""
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
 
     @property
     def sigma_new(self) -> Float:
-        """Of a new exposure, shape (M, k)."""
+        """Standard deviations (M, k) of a new exposure."""
         return np.sqrt(np.diagonal(self.cov_new, axis1=1, axis2=2))

@@ -1,11 +1,11 @@
-"""The intrinsic covariance of the exposures: its prior, and draws given what it explains.
+"""Intrinsic covariance of the exposures: its prior, and draws given their deviations.
 
 The prior is the hierarchical inverse Wishart of Huang and Wand (2013, Bayesian Analysis 8, 439)
 with nu = 2: the standard deviation of each coefficient is half-Student-t with two degrees of
 freedom and scale `PRIOR_SCALE` in units of the series' spread, and each correlation is uniform.
 
-Given each exposure's deviation the draws are exact.  They creep where the intrinsic scatter is lost
-in the formal errors; there the steps of walk.py help.
+Given each exposure's deviation the draws are exact.  They mix slowly where the intrinsic scatter is
+small against the formal errors; there the steps of walk.py help.
 """
 
 from __future__ import annotations
@@ -35,21 +35,10 @@ def log_prior(sigma: Float) -> Float:
 
 
 def draw_scatter(sigma: Float, scatter: Float, count: Float, rng: np.random.Generator) -> Float:
-    """New covariances given the exposures' deviations.
+    """New covariances (k, k, C) given the exposures' deviations.
 
-    Parameters
-    ----------
-    sigma : ndarray, shape (k, k, C)
-        Present covariances; only the scales of the prior are drawn from them.
-    scatter : ndarray, shape (C, k, k)
-        Sum of the outer products of the deviations.
-    count : ndarray, shape (C,)
-        Number of deviations.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    ndarray, shape (k, k, C)
+    `scatter` (C, k, k) is the sum of the outer products of `count` (C,) deviations; the present
+    covariances `sigma` (k, k, C) are used only to draw the scales of the prior.
     """
     k, _, n_chains = sigma.shape
     precision = precision_of(cholesky(sigma))

@@ -1,4 +1,4 @@
-"""Coefficients of many exposures against time, as they come from fits of single exposures."""
+"""Coefficients of many exposures against time, from fits of single exposures."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Series:
     names : tuple of str, optional
         Names of the exposures; '1', '2', ... by default.
     group : tuple of str, optional
-        What each exposure belongs to, such as its filter.
+        Group of each exposure, such as its filter.
     source : str
-        Where the series comes from, for messages.
+        Origin of the series, for messages.
 
     Raises
     ------
@@ -141,7 +141,7 @@ class Series:
         group: Sequence[str] = (),
         source: str = "series",
     ) -> Series:
-        """A series with uncorrelated formal errors.
+        """Series with uncorrelated formal errors.
 
         Parameters
         ----------
@@ -185,12 +185,12 @@ class Series:
 
     @property
     def n_coefficients(self) -> int:
-        """k."""
+        """Number k of coefficients."""
         return len(self.coefficients)
 
     @property
     def sigma(self) -> Float:
-        """Formal errors, shape (E, k)."""
+        """Formal errors (E, k)."""
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
 
     @property
@@ -200,12 +200,12 @@ class Series:
 
     @cached_property
     def centre(self) -> Float:
-        """Median of each coefficient, shape (k,): what is taken off before anything is computed."""
+        """Median (k,) of each coefficient, which is subtracted before anything is computed."""
         return np.median(self.values, axis=0)
 
     @cached_property
     def spread(self) -> Float:
-        """Robust spread of each coefficient, shape (k,): the unit in which priors are scaled.
+        """Robust spread (k,) of each coefficient, the unit in which priors are scaled.
 
         The median absolute deviation from the median as a standard deviation, or the median formal
         error, whichever is larger; the plain standard deviation where both vanish.
@@ -222,14 +222,14 @@ class Series:
 
     @property
     def group_code(self) -> NDArray[np.int64]:
-        """Place of each exposure's group in `group_names`, shape (E,); zeros without groups."""
+        """Index (E,) of each exposure's group in `group_names`; zeros without groups."""
         if not self.group:
             return np.zeros(len(self), np.int64)
         place = {name: i for i, name in enumerate(self.group_names)}
         return np.array([place[name] for name in self.group], np.int64)
 
     def take(self, rows: ArrayLike) -> Series:
-        """The exposures of a mask (E,) or of row numbers."""
+        """Series of the exposures of a mask (E,) or of row numbers."""
         which = np.arange(len(self))[np.asarray(rows)]
         return Series(
             self.epoch[which],
@@ -242,7 +242,7 @@ class Series:
         )
 
     def only(self, *coefficients: str) -> Series:
-        """Some of the coefficients, in the order asked for."""
+        """Series of some of the coefficients, in the order of the arguments."""
         for name in coefficients:
             if name not in self.coefficients:
                 raise InputError(

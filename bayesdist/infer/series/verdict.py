@@ -1,4 +1,4 @@
-"""A series in words: a line, no line, a break; never more than the comparison carries."""
+"""A series in words: a line, no line, a break; never more than the comparison supports."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ SIGNIFICANT = 3.0  # sigma from which a coefficient's own slope or step is named
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What a series shows.
+    """Verdict on the course of a series.
 
     Parameters
     ----------
     claim : str
-        'no line', 'line', or 'break at 2009.41', with what the segments hold.
+        'no line', 'line', or 'break at 2009.41', with the form of the segments.
     text : str
-        The claim in full sentences, with what carries it.
+        The claim in full sentences, with its evidence.
     comparison : Comparison
     posterior : SeriesPosterior
-        Of the course that is carried.
+        Of the selected course.
     breaks : ndarray, shape (B, 3)
         Median and central 68 % interval of each break of that course.
     rivals : tuple of str
-        Names of drifts that predict as well: a spline or a wandering can follow a line, so that
-        one of these beside a claimed slope says that the slope need not go on.
+        Names of drifts that predict as well: a spline or a random walk can follow a line, so that
+        one of these in addition to a claimed slope means that the slope need not go on.
     """
 
     claim: str
@@ -48,7 +48,7 @@ class Verdict:
 
     @property
     def is_line(self) -> bool:
-        """Whether a drift is claimed that goes on."""
+        """True if a drift is claimed that goes on."""
         return self.posterior.course.has_slope and self.posterior.course.kind != "spline"
 
 
@@ -72,7 +72,7 @@ def describe(
     breaks: tuple[float, ...] = (),
     seed: int = 1,
 ) -> Verdict:
-    """Say what a series shows.
+    """Describe the course of a series in words.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _text(
 
 
 def _named_slopes(posterior: SeriesPosterior) -> list[str]:
-    """Which coefficients drift, of a course that claims a drift."""
+    """Names of the coefficients that drift, for a course that claims a drift."""
     course = posterior.course
     if not course.has_slope or course.kind == "spline":
         return []

@@ -1,8 +1,8 @@
 """Random-walk steps of the scatter and of the outlier mixture, all memberships summed out.
 
-They serve where the exact draws given memberships and deviations creep: where it is not clear which
-exposures lie off, so that a narrow scatter with many outliers and a wide one with few both fit, and
-where the intrinsic scatter is lost in the formal errors.
+They are needed where the exact draws given memberships and deviations mix slowly: where it is not
+clear which exposures lie off, so that a narrow scatter with many outliers and a wide one with few
+both fit, and where the intrinsic scatter is small against the formal errors.
 """
 
 from __future__ import annotations
@@ -40,14 +40,8 @@ SHRINK = 0.3  # every other step is this much shorter
 def log_mixture(distance: Float, log_det: Float, k: int, fraction: Float, kappa2: Float) -> Float:
     """Log density (C, E) of exposures of which some lie off.
 
-    Parameters
-    ----------
-    distance : ndarray, shape (C, E)
-        Squared, in the metric of the covariance of an exposure that does not lie off.
-    log_det : ndarray, shape (C, E)
-        Of that covariance.
-    k : int
-    fraction, kappa2 : ndarray, shape (C,)
+    `distance` (C, E) is squared, in the metric of the covariance of an exposure that does not lie
+    off, `log_det` (C, E) is of that covariance; `fraction` and `kappa2` are (C,).
     """
     base = -0.5 * (k * np.log(2 * np.pi) + log_det)
     f, inflation = fraction[:, None], kappa2[:, None]
@@ -63,20 +57,14 @@ class RandomWalk:
 
     The coordinates are those of the scatter, then logit f and log kappa^2 where exposures may lie
     off.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (d, d)
-        Cholesky factor of the covariance of a step.
-    outliers : bool
     """
 
-    factor: Float
+    factor: Float  # Cholesky factor (d, d) of the covariance of a step
     outliers: bool
 
     @classmethod
     def learn(cls, sigma: Float, fraction: Float, kappa2: Float, *, outliers: bool) -> RandomWalk:
-        """From where chains have been: (k, k, n), (n,) and (n,)."""
+        """Random walk with the covariance of past states: (k, k, n), (n,) and (n,)."""
         x = _coordinates(sigma, fraction, kappa2, outliers)
         d = x.shape[1]
         cov = np.atleast_2d(np.cov(x, rowvar=False)) + 1e-8 * np.eye(d)
@@ -94,15 +82,8 @@ class RandomWalk:
     ) -> tuple[Float, Float, Float]:
         """Scatter (k, k, C), fraction and inflation (C,) after some steps.
 
-        Parameters
-        ----------
-        sigma : ndarray, shape (k, k, C)
-        fraction, kappa2 : ndarray, shape (C,)
-        residual : ndarray, shape (k, C, E)
-        formal : ndarray, shape (k, k, E)
-        kept : ndarray, shape (C, E)
-            0 for exposures that are held out, else 1.
-        rng : numpy.random.Generator
+        `residual` is (k, C, E), `formal` (k, k, E); `kept` (C, E) is 0 for exposures that are held
+        out, else 1.
         """
         x = _coordinates(sigma, fraction, kappa2, self.outliers)
         value = self._log_density(x, residual, formal, kept)
@@ -121,7 +102,7 @@ class RandomWalk:
 
     def _log_density(self, x: Float, residual: Float, formal: Float, kept: Float) -> Float:
         n = x.shape[1] - 2 * self.outliers
-        # a wild step makes a matrix that is singular in these numbers; it is refused as NaN
+        # a large step makes a numerically singular matrix, which is rejected as NaN
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             sigma, out = from_coordinates(x[:, :n])
             out = out + log_prior(sigma)

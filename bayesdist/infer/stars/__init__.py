@@ -1,1 +1,1 @@
-"""Matched stars as columns of a model: in memory, on disk, in a cluster; and how each counts."""
+"""Matched stars as columns of a model: in memory, on disk, in a cluster; and their likelihood."""

@@ -1,13 +1,13 @@
 """The Dask engine: shards stay on the workers that read them, and only sums travel.
 
-Each piece of the data becomes one task whose result, a shard, is kept by the worker that made it.
-A pass is one map-reduce: a task for each shard, run where the shard is, whose results come back and
-are added in the order of the shards, as threads add them, however many workers there are and
-whatever happens to them: a worker that is lost takes its shards along, and Dask makes them again
-elsewhere from the pieces.  What a kernel gives for one shard is the same up to rounding: code that
-was compiled for another processor may differ in the last bits.
+Each piece of the data becomes one task whose result, a shard, stays on the worker that made it.  A
+pass is one map-reduce: a task for each shard, run on its worker, whose results come back and are
+added in the order of the shards, as threads add them, however many workers there are and whatever
+happens to them: a worker that is lost takes its shards along, and Dask makes them again elsewhere
+from the pieces.  The result of a kernel for one shard is reproducible up to rounding: code that was
+compiled for another processor may differ in the last bits.
 
-The only module that knows dask and distributed; it is imported when the engine is asked for.
+The only module that uses dask and distributed; it is imported when the engine is requested.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any
 
-from bayesdist import __version__
 from bayesdist.data.partitioned import PartPiece
 from bayesdist.data.pieces import Piece
 from bayesdist.errors import InputError
@@ -32,6 +31,7 @@ from bayesdist.infer.stars.shards import Compute, Matches, Shards, Task, shard_o
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel
+from bayesdist.version import __version__
 
 try:
     import dask
@@ -50,7 +50,7 @@ __all__ = ["ClusterShards"]
 
 CONNECT = 10.0  # seconds to find the scheduler
 PATIENCE = 60.0  # seconds without any worker after which none is expected any more
-POLL = 1.0  # seconds between two looks at whether there are workers
+POLL = 1.0  # seconds between two checks for workers
 ALLOWED_FAILURES = 10  # workers that a shard may lose before it counts as their killer
 LARGE = 50_000  # bytes of arguments from which one worker passes them on to the others
 TOGETHER = 256  # results that are fetched at a time
@@ -61,23 +61,14 @@ _one_pass = threading.Lock()  # a pass uses all threads of its process
 class ClusterShards(Shards):
     """Shards on the workers of a Dask cluster.
 
-    Parameters
-    ----------
-    model : DistortionModel
-    matches : MatchTable or PartitionedMatches
-        Pieces of a table in memory are sent; those of a partitioned one are read by the workers,
-        which have to see the files under the same absolute paths.
-    compute : Compute
-        With a `scheduler`, the cluster is that one; the version of bayesdist must be the same on
-        its workers.  Otherwise `workers` processes are started here and ended by `close`, or when
-        this object or the program goes; a script that does so needs the usual
-        ``if __name__ == "__main__":``.
+    Pieces of a table in memory are sent; those of a partitioned one are read by the workers, which
+    have to see the files under the same absolute paths.  With a `scheduler` in `compute`, the
+    cluster is that one; the version of bayesdist must be the same on its workers.  Otherwise
+    `workers` processes are started here and ended by `close`, or when this object or the program
+    goes; a script that does so needs the usual ``if __name__ == "__main__":``.
 
-    Raises
-    ------
-    InputError
-        When the cluster cannot be reached or started, has no workers, or has workers with another
-        version of bayesdist; and as `prepare` and `Piece.read`.
+    InputError when the cluster cannot be reached or started, has no workers, or has workers with
+    another version of bayesdist; and as `prepare` and `Piece.read`.
     """
 
     def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
@@ -91,7 +82,7 @@ class ClusterShards(Shards):
             places = _places(self._client)
             self._loading = set(places)
             _require_version(self._client)
-            # the scheduler keeps the pieces, so that a lost shard can be made again
+            # the scheduler stores the pieces, so that a lost shard can be made again
             with _large_graphs():
                 for k, piece in enumerate(matches.pieces()):
                     self._shards.append(
@@ -114,12 +105,8 @@ class ClusterShards(Shards):
     def sum(self, task: Task, *args: Any) -> Any:
         """Sum over the shards of ``task(stars, *args)``, in their order.
 
-        Raises
-        ------
-        InputError
-            When there are no workers any more, or when they die of the task.
-        Exception
-            Whatever the task raises on the first shard, in their order, that it fails on.
+        InputError when there are no workers any more, or when they die of the task; else any
+        exception that the task raises on the first shard, in their order, that it fails on.
         """
         work: _Work | Future = _Work(task, args, self._threads)
         with _large_graphs():
@@ -129,13 +116,13 @@ class ClusterShards(Shards):
             return total(self._results(self._on_each(_pass, work=work)))
 
     def close(self) -> None:
-        """Let go of the data, and of the cluster where it was started for them."""
+        """Release the data, and the cluster where it was started for them."""
         self._shards = []
         self._end()
 
     def _on_each(self, function: Task, **options: Any) -> list[Future]:
         # Tied to some workers, loosely.  Tasks that are not, and few, count as roots of a graph:
-        # Dask then spreads them without regard to where the shards are, which would travel.
+        # Dask then spreads them without regard to the positions of the shards, which would travel.
         workers = sorted(self._workers()) or None
         return self._client.map(
             function,
@@ -164,7 +151,7 @@ class ClusterShards(Shards):
                 do="start it and the run again",
             ) from error
         finally:
-            # after an error the rest of the pass would go on as long as its traceback is kept
+            # after an error the rest of the pass would go on as long as its traceback exists
             unfinished = [future for future in futures if not future.done()]
             if unfinished and self._client.status == "running":
                 self._client.cancel(unfinished, force=True)
@@ -206,7 +193,7 @@ class ClusterShards(Shards):
             return set()
 
     def _settle(self) -> None:
-        """Untie the shards from the workers that they were spread over.
+        """Untie the shards from the workers over which they were spread.
 
         Dask takes no other worker for a tied task when, for a moment, there was none at all: it
         would wait for the lost one for ever.
@@ -218,7 +205,7 @@ class ClusterShards(Shards):
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """A task and its arguments, which Dask is not to look into."""
+    """A task and its arguments, hidden from Dask."""
 
     task: Task
     args: tuple[Any, ...]
@@ -226,12 +213,12 @@ class _Work:
 
 
 def _shard(model: DistortionModel, piece: Piece, n_total: int) -> tuple[Stars, Survey]:
-    """On a worker: read one piece; from here, so that Dask knows how large a shard is."""
+    """On a worker: read one piece, in this function, so that Dask knows the size of a shard."""
     return shard_of(model, piece, n_total)
 
 
 def _survey(shard: tuple[Stars, Survey]) -> Survey:
-    """On a worker: what is to be known of a shard."""
+    """On a worker: survey of a shard."""
     return shard[1]
 
 
@@ -241,7 +228,7 @@ def _same(work: _Work) -> _Work:
 
 
 def _pass(shard: tuple[Stars, Survey], work: _Work) -> Any:
-    """On a worker: a task on one shard."""
+    """On a worker: result of a task on one shard."""
     with _one_pass:
         # of this thread, which may be another one each time
         kernel.set_threads(work.threads or get_worker().state.nthreads)
@@ -250,7 +237,7 @@ def _pass(shard: tuple[Stars, Survey], work: _Work) -> Any:
 
 @sizeof.register(Stars)
 def _bytes_of(stars: Stars) -> int:
-    """What a shard occupies, without which the scheduler would move it as if it were nothing."""
+    """Size of a shard, without which the scheduler would move it as if it were nothing."""
     return stars.nbytes
 
 
@@ -330,11 +317,11 @@ def _places(client: Any) -> list[str]:
 
 
 def _require_version(client: Any) -> None:
-    """Refuse workers whose bayesdist is another one than ours."""
+    """Raise InputError for workers with another version of bayesdist."""
 
     def version() -> str:  # a local function travels whole, and needs no bayesdist over there
         try:
-            from bayesdist import __version__
+            from bayesdist.version import __version__
         except ImportError:
             return "none"
         return __version__
@@ -349,7 +336,7 @@ def _require_version(client: Any) -> None:
 
 
 def _large_graphs() -> Any:
-    """No warning of data inside graphs, where they have to be so that they can be made again."""
+    """Context without the warning of data inside graphs, where they must be to be made again."""
     return dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 PB"})
 
 

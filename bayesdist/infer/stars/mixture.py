@@ -1,24 +1,24 @@
-"""The outlier mixture: which stars are false matches, and how wrong the quoted errors are.
+"""Outlier mixture: probabilities of false matches, and the error of the quoted errors.
 
     p(r) = (1 - f) N(r_u; 0, s_u^2 + j^2) N(r_v; 0, s_v^2 + j^2) + f p_out(r)
 
 One membership for each star, shared by both axes.  p_out is a round Gaussian of scale s_out, or
 uniform on the match circle.  The Gaussian is never narrower than the core: with s the median quoted
-error, s_out^2 = s^2 + j^2 + w^2, and w is what is sampled.  Otherwise quoted errors that are far
-too small let the components change places, and most stars be "outliers" of the narrow one.
+error, s_out^2 = s^2 + j^2 + w^2, and w is sampled.  Otherwise quoted errors that are far too small
+let the components change places, and most stars be "outliers" of the narrow one.
 
 Where stars were matched within a circle about nominal positions that are known, both parts are
-normalised on it, and f is the fraction of false matches in it.  Sampled are log j, logit f and
-log w; the priors are proper:
+normalised on it, and f is the fraction of false matches in it.  Sampled are log j, logit f and log
+w; the priors are proper:
 
     f      Beta(a, b)
     j      half-Student-t, four degrees of freedom, scale: the median quoted error by default
     w      inverse gamma on w^2, shape 1; log w is most probable at five times the core's
-           sqrt(s^2 + j^2) by default: a second component that says nothing stays apart from it
+           sqrt(s^2 + j^2) by default: an undetermined second component stays apart from it
 
 All three leave tails in the sampled coordinates that fall at least exponentially, so that the
-posterior stays proper where the data say nothing: j when the quoted errors are right, w when there
-are no outliers.
+posterior stays proper where the data are uninformative: on j when the quoted errors are right, on w
+when there are no outliers.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ T_DOF = 4.0
 OUTLIER_SHAPE = 1.0
 OUTLIER_MODE = 5.0
 LEAST_EXCESS = 1e-9  # of w^2 over the core's variance: files round
-# of a in Beta(a, b): at 1/3 and below the posterior of f^(1/3) may have no mode
+# smallest a of Beta(a, b): at 1/3 and below the posterior of f^(1/3) may have no mode
 LEAST_SHAPE = 0.5
-# where the data say nothing of log j or log w: the end, and the slope of the log prior there
+# limit for uninformative data on log j or log w, and the slope of the log prior there
 TAILS = {"j": ("left", 1.0), "s_out": ("right", -2.0 * OUTLIER_SHAPE)}
 
 
@@ -75,7 +75,7 @@ class OutlierMixture:
     ------
     InputError
         For an unknown model, a missing radius, a negative jitter, an improper prior, or the prior
-        of what is not sampled.
+        of a parameter that is not sampled.
     """
 
     model: str = "gaussian"
@@ -133,7 +133,7 @@ class OutlierMixture:
 
     @property
     def hyper(self) -> tuple[str, ...]:
-        """The sampled ones of 'j', 'f', 's_out', in this order."""
+        """Sampled ones of 'j', 'f', 's_out', in this order."""
         out: tuple[str, ...] = () if self.jitter is not None else ("j",)
         if self.model != "none":
             out += ("f",)
@@ -142,7 +142,7 @@ class OutlierMixture:
         return out
 
     def bind(self, scale: float) -> Hyper:
-        """The mixture with its priors scaled to the data.
+        """Mixture with its priors scaled to the data.
 
         Parameters
         ----------
@@ -156,17 +156,11 @@ class OutlierMixture:
 class Hyper:
     """An `OutlierMixture` with the scale of the data: likelihood terms and priors.
 
-    A point is a dict-free vector h in the order of `mixture.hyper`: log j, logit f, log w.
-
-    Parameters
-    ----------
-    mixture : OutlierMixture
-    scale : float
-        Median quoted error: the scale of the priors, where the mixture gives none.
+    A point is a vector h in the order of `mixture.hyper`: log j, logit f, log w.
     """
 
     mixture: OutlierMixture
-    scale: float
+    scale: float  # median quoted error, of the priors where the mixture gives none
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -203,21 +197,10 @@ class Hyper:
         return np.full(h.shape[:-1], self.scale**2 + self.mixture.jitter**2)
 
     def chained(self, h: Float, gradient: Float, curvature: Float) -> tuple[Float, Float, Float]:
-        """Derivatives of a log-likelihood by log j, logit f and log s_out, brought to a point's.
+        """Gradient (n_hyper,) and minus Hessian by h, from those by log j, logit f and log s_out.
 
-        Parameters
-        ----------
-        h : ndarray, shape (n_hyper,)
-        gradient : ndarray, shape (n_hyper,)
-        curvature : ndarray, shape (n_hyper, n_hyper)
-            Minus the Hessian.
-
-        Returns
-        -------
-        gradient, curvature
-            By h.
-        by : ndarray, shape (n_hyper, n_hyper)
-            Derivatives of log j, logit f and log s_out (rows) by h.
+        The third result (n_hyper, n_hyper) are the derivatives of log j, logit f and log s_out
+        (rows) by h.
         """
         names = self.mixture.hyper
         by = np.eye(len(h))
@@ -236,7 +219,7 @@ class Hyper:
         return by.T @ gradient, by.T @ curvature @ by - gradient[s] * bend, by
 
     def constants(self, h: Float) -> Constants:
-        """What the likelihood needs of points (n, n_hyper)."""
+        """Constants of the likelihood at points (n, n_hyper)."""
         n = len(h)
         fixed = self.mixture.jitter
         j2 = np.full(n, 0.0 if fixed is None else fixed**2)
@@ -304,25 +287,10 @@ class Hyper:
                 gradient[k] += -2 * OUTLIER_SHAPE + 2 * e
                 curvature[k, k] += 4 * e
                 if "j" in self.mixture.hyper and not self.mixture.outlier_scale:
-                    # the rate goes with the core, and this with j: log rate by log j
+                    # the rate is proportional to the core, which depends on j: log rate by log j
                     j = self.mixture.hyper.index("j")
                     by_j = 2 * np.exp(2 * h[j]) / float(self.core(h))
                     gradient[j] += by_j * (OUTLIER_SHAPE - e)
                     curvature[j, j] += by_j**2 * e - by_j * (2 - by_j) * (OUTLIER_SHAPE - e)
                     curvature[[j, k], [k, j]] -= 2 * e * by_j
         return gradient, curvature
-
-    def draw_prior(self, n: int, rng: np.random.Generator) -> Float:
-        """Points (n, n_hyper) from the prior, for simulation-based calibration."""
-        columns = []
-        for name in self.mixture.hyper:
-            if name == "f":
-                f = rng.beta(*self.mixture.fraction_prior, size=n)
-                columns.append(logit(np.clip(f, 1e-300, 1 - 1e-16)))
-            elif name == "j":
-                columns.append(np.log(self._jitter_scale * np.abs(rng.standard_t(T_DOF, size=n))))
-            else:
-                unit = rng.gamma(OUTLIER_SHAPE, size=n)  # w^2 is the rate over this
-                so_far = np.column_stack(columns)
-                columns.append(0.5 * np.log(self._outlier_rate(so_far) / unit))
-        return np.column_stack(columns) if columns else np.zeros((n, 0))

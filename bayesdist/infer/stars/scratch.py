@@ -1,4 +1,4 @@
-"""Where shards are kept: in memory as far as the budget reaches, in a scratch file beyond it."""
+"""Storage of shards: in memory as far as the budget allows, in a scratch file beyond it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,7 @@ COLUMNS, OFFSETS = ("X", "Y", "u", "v", "var_u", "var_v"), ("off_u", "off_v")
 
 
 class Store:
-    """Shards in the order in which they were added.
-
-    Parameters
-    ----------
-    budget : float
-        Bytes of columns that may stay in memory.
-    """
+    """Shards in the order in which they were added; at most `budget` bytes of columns in memory."""
 
     def __init__(self, budget: float) -> None:
         self._left = budget
@@ -37,13 +31,7 @@ class Store:
         return len(self._kept)
 
     def add(self, stars: Stars) -> None:
-        """Keep a shard.
-
-        Raises
-        ------
-        InputError
-            When the disk is full.
-        """
+        """Store a shard; InputError when the disk is full."""
         if stars.nbytes <= self._left:
             self._left -= stars.nbytes
             self._kept.append((stars, None))
@@ -51,7 +39,7 @@ class Store:
         stars.blocks, stars.pieces  # noqa: B018  worked out once, kept with the frame of the shard
         try:
             if self._file is None:
-                # without a name: it is gone when the process is, however that ends
+                # without a name: it disappears with the process, however that ends
                 self._file = tempfile.TemporaryFile(prefix="bayesdist-", buffering=0)
                 self._closed = weakref.finalize(self, self._file.close)
             place = self._file.seek(0, 2)
@@ -69,7 +57,7 @@ class Store:
         self._kept.append((frame, place))
 
     def close(self) -> None:
-        """Forget the shards and give the disk back."""
+        """Drop the shards and free the disk."""
         self._kept = []
         if self._file is not None:
             self._closed()
@@ -104,7 +92,7 @@ def _write(file: IO[bytes], view: memoryview) -> None:
 
 
 def _folder() -> str:
-    """The scratch folder, as far as there is one."""
+    """Path of the scratch folder; without one the variable that should name it."""
     try:
         return tempfile.gettempdir()
     except OSError:

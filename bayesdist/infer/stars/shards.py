@@ -1,7 +1,7 @@
-"""The data as shards, and the one thing that is done with them: a task on each, and the sum.
+"""The data as shards, and the one operation on them: a task on each, and the sum.
 
-Everything that is inferred passes through `Shards.sum`.  Results add up in the order of the shards,
-which is that of the data, so that they depend neither on the threads nor on the engine.
+All inference passes through `Shards.sum`.  Results add up in the order of the shards, which is that
+of the data, so that they depend neither on the threads nor on the engine.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from bayesdist.data import MatchTable, PartitionedMatches
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.partitioned import PartitionedMatches
 from bayesdist.data.pieces import Piece
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.scratch import Store
@@ -25,19 +26,19 @@ __all__ = ["Compute", "LocalShards", "Matches", "Shards", "load", "opened", "sha
 Matches = MatchTable | PartitionedMatches
 Task = Callable[..., Any]
 
-SAMPLE = 1_000_000  # stars whose errors tell the median error
+SAMPLE = 1_000_000  # stars from whose errors the median error is computed
 
 
 @dataclass(frozen=True)
 class Compute:
-    """Where the work is done.
+    """Engine and resources of the passes over the data.
 
     Parameters
     ----------
     engine : str
         'threads', or 'dask'.
     memory_mb : float
-        Columns of stars that are kept in memory; what goes beyond is kept in a scratch file.
+        Columns of stars in memory; the rest is in a scratch file.
     scheduler : str, optional
         Address of a Dask scheduler; without one a cluster of this machine's processes is started.
     workers : int, optional
@@ -65,7 +66,7 @@ class Compute:
 
 
 class Shards(ABC):
-    """The stars of a model, wherever they are.
+    """Stars of a model, in memory, on disk or on a cluster.
 
     Parameters
     ----------
@@ -97,18 +98,11 @@ class Shards(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of the data."""
+        """Release the data."""
 
 
 class LocalShards(Shards):
-    """Shards in this process.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    matches : MatchTable or PartitionedMatches
-    memory_mb : float
-    """
+    """Shards in this process, with at most `memory_mb` of columns in memory."""
 
     def __init__(self, model: DistortionModel, matches: Matches, memory_mb: float) -> None:
         super().__init__(model)
@@ -125,12 +119,12 @@ class LocalShards(Shards):
         return total(task(stars, *args) for stars in self._store)
 
     def close(self) -> None:
-        """Let go of the data."""
+        """Release the data."""
         self._store.close()
 
 
 def shard_of(model: DistortionModel, piece: Piece, n_total: int) -> tuple[Stars, Survey]:
-    """One shard, and what is to be known of it."""
+    """One shard, and its survey."""
     table = piece.read()
     stars, _ = prepare(model, table)
     return stars, survey(stars, table, max(1, n_total // SAMPLE))
@@ -148,7 +142,7 @@ def total(parts: Any) -> Any:
 def opened(
     model: DistortionModel, matches: Matches | Shards, compute: Compute | None = None
 ) -> Iterator[Shards]:
-    """The data as shards, as `load`; those that were not given are closed at the end."""
+    """Context with the data as shards, as of `load`; shards loaded here are closed at the end."""
     shards = load(model, matches, compute)
     try:
         yield shards
@@ -160,13 +154,13 @@ def opened(
 def load(
     model: DistortionModel, matches: Matches | Shards, compute: Compute | None = None
 ) -> Shards:
-    """The data as shards of a model.
+    """Load the data as shards of a model.
 
     Parameters
     ----------
     model : DistortionModel
     matches : MatchTable, PartitionedMatches or Shards
-        Shards are given back as they are.
+        Shards are returned unchanged.
     compute : Compute, optional
 
     Returns
@@ -176,7 +170,7 @@ def load(
     Raises
     ------
     InputError
-        As `prepare`; for a full scratch folder; when no cluster is there.
+        As `prepare`; for a full scratch folder; when there is no cluster.
     """
     if isinstance(matches, Shards):
         if matches.model != model:
@@ -192,6 +186,6 @@ def load(
     compute = compute or Compute()
     if compute.engine == "threads":
         return LocalShards(model, matches, compute.memory_mb)
-    from bayesdist.infer.stars.cluster import ClusterShards  # only where it is asked for
+    from bayesdist.infer.stars.cluster import ClusterShards  # only where it is requested
 
     return ClusterShards(model, matches, compute)

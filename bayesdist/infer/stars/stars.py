@@ -1,4 +1,4 @@
-"""Some of the data as the passes want them: sorted by group, scaled to [-1, 1], in columns."""
+"""Matched stars as columns for the passes: sorted by group, scaled to [-1, 1]."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 from bayesdist.model import DistortionModel, Groups
 
-__all__ = ["Stars", "errors_of", "groups_of", "in_table_order", "prepare"]
+__all__ = ["Stars", "cell_of", "errors_of", "groups_of", "in_table_order", "prepare"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -25,35 +25,19 @@ NOBODY = np.zeros(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Stars:
-    """Matched stars in the order of their groups.
-
-    Parameters
-    ----------
-    model : DistortionModel
-    groups : Groups
-        Those that have stars here; without members, which `starts` tells.
-    starts : ndarray of int, shape (G + 1,)
-        Where each group begins.
-    X, Y : ndarray, shape (N,)
-        Scaled detector position.
-    u, v : ndarray, shape (N,)
-        Reference position.
-    var_u, var_v : ndarray, shape (N,)
-        Squared errors; one array where they are equal.
-    off_u, off_v : ndarray, shape (N,), or None
-        Nominal position, about which the star was matched, minus reference position; None where
-        it is not known.
-    """
+    """Matched stars in the order of their groups."""
 
     model: DistortionModel
-    groups: Groups
-    starts: Int
-    X: Float
+    groups: Groups  # those that have stars here, without members, which follow from `starts`
+    starts: Int  # first star (G + 1,) of each group
+    X: Float  # scaled detector position (N,)
     Y: Float
-    u: Float
+    u: Float  # reference position (N,)
     v: Float
-    var_u: Float
+    var_u: Float  # squared errors (N,); one array where they are equal
     var_v: Float
+    # nominal position, about which the star was matched, minus reference position (N,); None where
+    # it is not known
     off_u: Float | None = None
     off_v: Float | None = None
 
@@ -71,7 +55,7 @@ class Stars:
         return () if self.off_u is None or self.off_v is None else (self.off_u, self.off_v)
 
     def circle(self, constants: Constants) -> tuple[Float, ...]:
-        """Offsets of the circles in which stars were matched; empty where that plays no part."""
+        """Offsets of the circles in which stars were matched; empty where they are not needed."""
         return self.offsets if constants.radius else ()
 
     @property
@@ -82,12 +66,12 @@ class Stars:
 
     @cached_property
     def blocks(self) -> Int:
-        """Pieces (n, 3) that stay in the cache."""
+        """Pieces (n, 3) that fit into the cache."""
         return kernel.pieces_of(self.starts, kernel.BLOCK)
 
     @cached_property
     def pieces(self) -> Int:
-        """Pieces (n, 3) whose sums are kept apart."""
+        """Pieces (n, 3) with separate sums."""
         return kernel.pieces_of(self.starts, kernel.PIECE)
 
     def powers(self, theta: Float | None) -> Float:
@@ -114,24 +98,10 @@ class Stars:
 
 
 def prepare(model: DistortionModel, matches: MatchTable) -> tuple[Stars, Int]:
-    """Sort a table of matches for the passes.
+    """Stars of a table of matches, sorted for the passes, and the table row (N,) of each.
 
-    Parameters
-    ----------
-    model : DistortionModel
-        Its exposures are the table's `exposure_names`, its chips contain the table's.
-    matches : MatchTable
-
-    Returns
-    -------
-    stars : Stars
-    order : ndarray of int, shape (N,)
-        Table row of each star.
-
-    Raises
-    ------
-    InputError
-        When the table has no errors, another unit, or lacks an epoch that the model needs.
+    The model's exposures are the table's `exposure_names`, its chips contain the table's.
+    InputError when the table has no errors, another unit, or lacks an epoch that the model needs.
     """
     sigma_u, sigma_v = errors_of(matches)
     groups = groups_of(model, matches)
@@ -164,14 +134,14 @@ def prepare(model: DistortionModel, matches: MatchTable) -> tuple[Stars, Int]:
     return stars, np.arange(len(x))[order]
 
 
-def errors_of(matches: MatchTable) -> tuple[Float, Float]:
-    """Errors on u and v (N,) of matches that must have them.
+def cell_of(X: Float, Y: Float, side: int) -> Int:
+    """Cell `iy * side + ix` (N,) of scaled positions, among `side` by `side` over a chip."""
+    ix, iy = (np.clip(((z + 1) * (0.5 * side)).astype(np.int64), 0, side - 1) for z in (X, Y))
+    return np.asarray(iy * side + ix)
 
-    Raises
-    ------
-    InputError
-        When the table has none.
-    """
+
+def errors_of(matches: MatchTable) -> tuple[Float, Float]:
+    """Errors (N,) on u and v of matches; InputError when the table has none."""
     if matches.sigma_u is None or matches.sigma_v is None:
         raise InputError(
             "the matches carry no errors",
@@ -183,11 +153,8 @@ def errors_of(matches: MatchTable) -> tuple[Float, Float]:
 def groups_of(model: DistortionModel, matches: MatchTable) -> Groups:
     """Groups of matches with equal effective coefficients.
 
-    Raises
-    ------
-    InputError
-        When the table has another unit than the model, a chip or an exposure that the model does
-        not know, or lacks an epoch that it needs.
+    InputError when the table has another unit than the model, a chip or an exposure that is not in
+    the model, or lacks an epoch that it needs.
     """
     if matches.unit != model.unit:
         raise InputError(f"the matches are in {matches.unit} and the model is in {model.unit}")
@@ -197,7 +164,7 @@ def groups_of(model: DistortionModel, matches: MatchTable) -> Groups:
 
 
 def in_table_order(values: NDArray[Any], order: Int) -> NDArray[Any]:
-    """Values of each star, brought back to the order of the table along the first axis."""
+    """Values of each star, reordered to the table along the first axis."""
     out = np.empty_like(values)
     out[order] = values
     return out

@@ -1,4 +1,4 @@
-"""What must be known of all stars before anything is fitted, as sums over pieces of the data."""
+"""Statistics of all stars that are needed before any fit, as sums over chunks of the data."""
 
 from __future__ import annotations
 
@@ -19,28 +19,19 @@ __all__ = ["ChipSurvey", "Survey", "survey"]
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-ROUNDING = 1e-6  # by how much, relative, a star at the edge of its circle may seem to lie outside
+# relative distance by which a star at the edge of its circle may seem to lie outside
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class ChipSurvey:
-    """Where the stars of one chip lie.
-
-    Parameters
-    ----------
-    n : int
-    corners : ndarray, shape (m, 2)
-        Vertices of the convex hull, FITS 1-based pixels; all points where they span no area.
-    sums : ndarray, shape (5,)
-        Of x, y, x^2, xy, y^2 in units of the chip's size.
-    outside : str
-        The first star that lies on no pixel, as a sentence; empty where there is none.
-    """
+    """Positions of the stars of one chip."""
 
     n: int
+    # vertices (m, 2) of the convex hull, FITS 1-based pixels; all points where they span no area
     corners: Float
-    sums: Float
-    outside: str
+    sums: Float  # (5,) of x, y, x^2, xy, y^2 in units of the chip's size
+    outside: str  # sentence on the first star that lies on no pixel; empty where there is none
 
     def __add__(self, other: ChipSurvey) -> ChipSurvey:
         return ChipSurvey(
@@ -53,31 +44,16 @@ class ChipSurvey:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Counts and extents of some of the data; surveys of pieces add.
-
-    Parameters
-    ----------
-    n : int
-    groups : Groups
-        Without members.
-    exposures : ndarray of int, shape (E,)
-        Stars of each exposure of the model.
-    chips : tuple of ChipSurvey
-        In the order of the model's.
-    variance : tuple of ndarray
-        Evenly spread samples of the squared errors of both axes.
-    sources : tuple of str
-    farthest : tuple of float and str
-        Largest distance of a star from its nominal position, and which star that is; less than 0
-        where there are no nominal positions.
-    """
+    """Counts and extents of some of the data; surveys of pieces add."""
 
     n: int
-    groups: Groups
-    exposures: Int
-    chips: tuple[ChipSurvey, ...]
-    variance: tuple[Float, ...]
+    groups: Groups  # without members
+    exposures: Int  # number (E,) of stars of each exposure of the model
+    chips: tuple[ChipSurvey, ...]  # in the order of the model's
+    variance: tuple[Float, ...]  # evenly spread samples of the squared errors of both axes
     sources: tuple[str, ...]
+    # largest distance of a star from its nominal position, and its name; less than 0 without
+    # nominal positions
     farthest: tuple[float, str] = (-1.0, "")
 
     def __add__(self, other: Survey) -> Survey:
@@ -97,17 +73,10 @@ class Survey:
         return float(np.sqrt(np.median(np.concatenate(self.variance))))
 
     def check_circle(self, radius: float | None) -> None:
-        """Refuse stars outside the circle in which they are said to have been matched.
+        """Raise InputError for a star outside the circle in which stars were matched.
 
-        Parameters
-        ----------
-        radius : float or None
-            In the unit of u, v; None where stars are not said to be matched in a circle.
-
-        Raises
-        ------
-        InputError
-            Naming the star that is farthest from its nominal position.
+        `radius` is in the unit of u, v; None without such a circle.  The error names the star that
+        is farthest from its nominal position.
         """
         distance, where = self.farthest
         if radius is not None and distance > radius * (1 + ROUNDING):
@@ -126,16 +95,7 @@ class Survey:
 
 
 def survey(stars: Stars, matches: MatchTable, every: int) -> Survey:
-    """Survey one piece.
-
-    Parameters
-    ----------
-    stars : Stars
-        Of these matches.
-    matches : MatchTable
-    every : int
-        Every so manieth star gives its errors to the sample.
-    """
+    """Survey of one piece; every n-th star gives its errors to the sample."""
     model = stars.model
     numbers = matches.chip_number
     chips = []
@@ -157,7 +117,7 @@ def survey(stars: Stars, matches: MatchTable, every: int) -> Survey:
     return Survey(
         n=len(stars),
         groups=stars.groups,
-        # without frames a model need not know the exposures; the length is that of the model
+        # without frames a model need not have the exposures; the length is that of the model
         exposures=np.bincount(matches.exposure, minlength=len(model.exposures))[
             : len(model.exposures)
         ],
@@ -182,7 +142,7 @@ def _hull(points: Float) -> Float:
     if len(points) < 4:
         return points
     try:
-        if len(points) > 1000:  # what lies inside the octagon of the extremes is no vertex
+        if len(points) > 1000:  # points inside the octagon of the extremes are no vertices
             x, y = points.T
             seen = (x, y, x + y, x - y)
             extreme = points[sorted(set(chain(*((p.argmin(), p.argmax()) for p in seen))))]
@@ -192,5 +152,5 @@ def _hull(points: Float) -> Float:
                 beyond |= a * x + b * y + c > -1e-9
             points = points[beyond]
         return points[ConvexHull(points).vertices]
-    except QhullError:  # nearly collinear: no area to speak of
+    except QhullError:  # nearly collinear: no area
         return points

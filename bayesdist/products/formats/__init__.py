@@ -1,1 +1,1 @@
-"""The formats of calibration files, one module or folder each."""
+"""Formats of calibration files, one module or folder each."""

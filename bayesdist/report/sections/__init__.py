@@ -1,5 +1,11 @@
-"""What the report of a run shows, section by section: importing this registers all of it."""
+"""Sections of the report of a run; importing this registers all of them.
 
+Modules that missions name add theirs, after the rest.
+"""
+
+from importlib import import_module
+
+from bayesdist.mission import missions
 from bayesdist.report.contents import REPORT
 from bayesdist.report.sections import explorer
 from bayesdist.report.sections.campaign import lines, lookup, matching, release, selfcal, series
@@ -40,3 +46,7 @@ __all__ = [
     "series",
     "status",
 ]
+
+for _mission in missions().values():
+    if _mission.report:
+        import_module(_mission.report)

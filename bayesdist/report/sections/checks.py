@@ -16,25 +16,13 @@ __all__ = [
 
 
 def check_cells(check: Check) -> tuple[str, str, Level]:
-    """What was found, the limit and the outcome, as cells of a table."""
+    """Value, limit and outcome, as cells of a table."""
     found = check.value if isinstance(check.value, str) else number(check.value)
     return found, check.limit or MISSING, Level(check.level)
 
 
 def structure_check(misfits: Sequence[Misfit], *, fit: str) -> Check:
-    """Whether a fit leaves structure in the residuals: what the banner warns of.
-
-    Parameters
-    ----------
-    misfits : sequence of Misfit
-        One for each chip.
-    fit : str
-        Which fit, in words.
-
-    Returns
-    -------
-    Check
-    """
+    """Check for structure that a fit leaves in the residuals of chips, as the banner warns of."""
     worst = worst_misfit(misfits)
     chip = "" if worst.chip is None else f" of {worst.chip.name}"
     size = size_of(worst.structure, worst.unit, 2)

@@ -1,4 +1,4 @@
-"""Numbers that a page carries so that it can compute the budget, and show maps, by itself."""
+"""Numbers of a page from which it computes the budget, and shows maps, by itself."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from bayesdist.assess.budget.surface import BudgetSurface, SurfaceProduct
-from bayesdist.assess.drawn import CENTROID
-from bayesdist.assess.terms.fields import MODEL
-from bayesdist.assess.terms.given import LOCAL, MEASURED
-from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.assess.budget.surface import JOINT, BudgetSurface, GridRow
+from bayesdist.assess.terms.forms import MEASURED, Row
+from bayesdist.assess.terms.given import CENTROID
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.numbers import ladder
@@ -26,27 +24,23 @@ Float = NDArray[np.float64]
 
 MOMENT_DIGITS = 7  # quadratic forms of them cancel in part
 MAP_DIGITS = 5
-MOST_POINTS = 65  # of a map on the longer side: no pointer tells more of them apart
+MOST_POINTS = 65  # of a map on the longer side: a pointer cannot separate more of them
 _COLORS = 12
 
 
 @REPORT.data(needs=("surface",))
 def budget_data(r: ReportInput) -> dict[str, Any]:
-    """The budget as a function of position, epoch and magnitude."""
+    """Budget as a function of position, epoch and magnitude."""
     s = r.surface
     assert s is not None
     nodes = s.spans[0].nodes
-    parts = [
-        {"name": name, "kind": "systematic", "source": s.sources.get(name, MEASURED)}
-        for name in s.parts
-    ]
     return _common(r) | {
         "terms": list(s.model.basis(s.model.chips[0].number).terms),
         "grid": list(s.grid),
         "epoch": s.epoch,
         "years": [nodes[0], s.spans[-1].nodes[-1]] if nodes else None,
-        "parts": parts,
-        "joint": MODEL,
+        "parts": [_row(row) for row in s.parts],
+        "joint": JOINT,
         "spans": [
             {
                 "nodes": list(span.nodes),
@@ -58,21 +52,16 @@ def budget_data(r: ReportInput) -> dict[str, Any]:
             for span in s.spans
         ],
         "local": [
-            {
-                "name": t.name,
-                "kind": LOCAL,
-                "source": t.source,
+            _row(t.row)
+            | {
                 "sigma": {
-                    str(chip): [_short(v[..., axis], MAP_DIGITS) for axis in (0, 1)]
-                    for chip, v in t.sigma.items()
+                    str(chip): [_short(v[0, :, axis], MAP_DIGITS) for axis in (0, 1)]
+                    for chip, v in t.values[0].items()
                 },
             }
             for t in s.local
         ],
-        "given": [
-            {"name": t.name, "kind": t.kind, "source": t.source, "sigma": list(sigma)}
-            for t, sigma in zip(s.terms, s.sigmas, strict=True)
-        ],
+        "given": [_row(row) | {"sigma": sigma.tolist()} for row, sigma in s.constant],
         "centroid": _centroid(s),
         "products": [_product(term) for term in s.products],
         "cycle": list(CYCLE),
@@ -81,7 +70,7 @@ def budget_data(r: ReportInput) -> dict[str, Any]:
 
 @REPORT.data()
 def map_data(r: ReportInput) -> dict[str, Any]:
-    """The maps that a pointer reads: radial uncertainty and pixel area."""
+    """Maps that a pointer reads: radial uncertainty and pixel area."""
     chips = r.chips
     layers = []
     for k, first in enumerate(chips[0].maps):
@@ -121,29 +110,33 @@ def _layer(name: str, unit: str, maps: list[Float], digits: int = MAP_DIGITS) ->
 
 
 def _step(n: int) -> int:
-    """Every how many points are kept, so that the outermost ones are among them."""
+    """Step between the points that stay, so that the outermost ones are among them."""
     steps = [k for k in range(1, n) if (n - 1) % k == 0 and (n - 1) // k < MOST_POINTS]
     return steps[0] if steps else 1
 
 
 def _triangles(moments: Float) -> list[list[list[float | None]]]:
-    """By node and axis, the upper triangle row by row; what stands twice is added up."""
+    """Upper triangles row by row, by node and axis; symmetric pairs are added up."""
     K = moments.shape[-1]
     i, j = np.triu_indices(K)
     values = moments[..., i, j] * np.where(i == j, 1.0, 2.0)
     return [[_short(v, MOMENT_DIGITS) for v in node] for node in values]
 
 
-def _product(term: SurfaceProduct) -> dict[str, Any]:
+def _row(row: Row) -> dict[str, Any]:
+    return {"name": row.name, "kind": row.kind, "source": row.source}
+
+
+def _product(term: GridRow) -> dict[str, Any]:
     """Displacements on the grid, by span, chip, node and axis."""
     spans = [
         {
             str(chip): [[_short(one[:, axis], MAP_DIGITS) for axis in (0, 1)] for one in nodes]
             for chip, nodes in shifts.items()
         }
-        for shifts in term.shifts
+        for shifts in term.values
     ]
-    return {"name": term.name, "kind": PRODUCT, "source": term.source, "spans": spans}
+    return _row(term.row) | {"spans": spans}
 
 
 def _short(values: Float, digits: int) -> list[float | None]:

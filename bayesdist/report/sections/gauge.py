@@ -1,7 +1,7 @@
-"""In which system coefficients and errors are given, in plain words.
+"""The gauge of coefficients and errors, in plain words.
 
-What all frames have in common is a change of the polynomials: shift and rotation of a solution mean
-nothing before it is said where they are zero.
+A change common to all frames is a change of the polynomials: shift and rotation of a solution mean
+nothing before their zero is defined.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ __all__ = ["gauge_mark", "gauge_note", "gauge_of_maps", "gauge_of_new_exposure"]
 
 
 def gauge_mark(r: ReportInput) -> str:
-    """What a caption says of the gauge; empty for a single system, where there is no choice."""
+    """Words of a caption on the gauge; empty for a single system, where there is no choice."""
     return ", in the fit's own gauge" if r.fit.model.n_frame else ""
 
 
 def gauge_note(r: ReportInput) -> str:
-    """What the fit's own gauge is, as sentences; empty where there is no choice."""
+    """Sentences on the fit's own gauge; empty where there is no choice."""
     model = r.fit.model
     if not model.n_frame:
         return ""
@@ -33,7 +33,7 @@ def gauge_note(r: ReportInput) -> str:
 
 
 def gauge_of_maps(r: ReportInput) -> str:
-    """Whether shift and rotation count in the maps of the uncertainty; empty without frames."""
+    """Sentence on shift and rotation in the maps of the uncertainty; empty without frames."""
     if not r.fit.model.n_frame:
         return ""
     if r.selfcal is not None:
@@ -49,7 +49,7 @@ def gauge_of_maps(r: ReportInput) -> str:
 
 
 def gauge_of_new_exposure(r: ReportInput) -> str:
-    """For whom budget and margins of a campaign are; empty for other runs."""
+    """Sentence on the exposures that a campaign's budget and margins are for; empty for others."""
     if r.campaign is None:
         return ""
     return (

@@ -13,7 +13,7 @@ from scipy import stats
 
 from bayesdist.app.selfcal.stars import star_table
 from bayesdist.app.session import write_table
-from bayesdist.data.parallax import parallax_factors
+from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.infer import load_fit
 from bayesdist.infer.selfcal import star_catalogue
 from bayesdist.infer.selfcal.moves import functionals

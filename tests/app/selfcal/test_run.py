@@ -198,9 +198,9 @@ def test_other_commands(three_rolls, tmp_path):
     run = three_rolls.path
     assert "total" in good("budget", run, "--at", 512, 512).out
     for arguments, word in (
-        (("order", three_rolls.config), "[selfcal]"),
+        (("select-order", three_rolls.config), "[selfcal]"),
         (("monitor", run, run), "self-calibration"),
-        (("bands", run, "-o", tmp_path / "bands"), "self-calibration"),
+        (("wise", "bands", run, "-o", tmp_path / "bands"), "self-calibration"),
         (("plan", run), "self-calibration"),
         (("release", run, "-o", tmp_path / "release"), "campaign"),
     ):
@@ -214,6 +214,6 @@ def test_requirements_are_judged(three_rolls, tmp_path):
     shutil.copytree(three_rolls.path, tmp_path / "run")
     text = '[[requirement]]\nname = "a"\nstatistic = "p95"\nlimit = 0.05\nprobability = 0.9\n'
     (tmp_path / "req.toml").write_text(text)
-    good("validate", tmp_path / "run", "--requirements", tmp_path / "req.toml")
+    good("requirements", tmp_path / "run", "--requirements", tmp_path / "req.toml")
     [margin] = summary_of(tmp_path / "run")["margins"]
     assert margin["verdict"] == "met"

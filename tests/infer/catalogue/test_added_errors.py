@@ -15,6 +15,8 @@ from bayesdist.infer import build_model, fit_linear
 from bayesdist.infer.catalogue.added_errors import DECISIVE, grouped_errors
 from bayesdist.model import Chip
 
+from ..support import UNCLIPPED
+
 SIZE = (1000.0, 800.0)
 QUOTED = 0.02
 
@@ -54,7 +56,7 @@ def found_in(table, *, by="", outliers=True, order=3):
     chips = tuple(Chip(number, f"c{number}", SIZE, (500.5, 400.5)) for number in table.chip_numbers)
     several = {"chips": chips} if len(chips) > 1 else {"size": SIZE}
     model = build_model(table, order=order, **several)
-    options = {} if outliers else {"clip_chi2": np.inf, "clip_abs": None}
+    options = {} if outliers else UNCLIPPED
     return grouped_errors(table, fit_linear(table, model, **options), by=by, outliers=outliers)
 
 

@@ -8,7 +8,7 @@ from numpy.polynomial import legendre
 
 from bayesdist.data import MatchTable, read_matches
 from bayesdist.errors import InputError
-from bayesdist.infer import build_model, fit_by_magnitude, fit_linear, residuals
+from bayesdist.infer import Rejection, build_model, fit_by_magnitude, fit_linear, residuals
 from bayesdist.infer.catalogue import by_magnitude
 
 from ..support import simulated
@@ -50,8 +50,8 @@ def test_the_fit_is_that_of_the_table_it_returns(lists):
 
 def test_options_are_passed_on(lists):
     model, matches, _ = lists
-    strict, *_ = fit_by_magnitude(matches, model, clip_chi2=9.0)
-    loose, *_ = fit_by_magnitude(matches, model, clip_chi2=100.0)
+    strict, *_ = fit_by_magnitude(matches, model, rejection=Rejection(clip_chi2=9.0))
+    loose, *_ = fit_by_magnitude(matches, model, rejection=Rejection(clip_chi2=100.0))
     assert strict.n_used < loose.n_used
 
 

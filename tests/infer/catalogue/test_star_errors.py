@@ -11,14 +11,14 @@ from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.infer.catalogue import star_errors as module
-from bayesdist.infer.catalogue.star_errors import star_covariance, with_star_errors
+from bayesdist.infer import GaussianPriors, Rejection, fit_linear
+from bayesdist.infer.catalogue import star_sums as module
+from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from bayesdist.infer.transforms import linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
 
-from ..small_campaign import campaign, shared_stars
+from ..small_campaign import campaign, shared_stars, with_star_errors
 from ..support import CHIP, SIZE, UNCLIPPED, columns_of, legendre_design, simulated
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -52,7 +52,9 @@ def some(seed=1, n_stars=70):
         for e in model.exposures
         for kind in ("scale", "shear_plus", "shear_cross")
     }
-    fit = fit_linear(matches, model, priors=GaussianPriors.of(model, named), clip_chi2=4.0)
+    fit = fit_linear(
+        matches, model, priors=GaussianPriors.of(model, named), rejection=Rejection(clip_chi2=4.0)
+    )
     return model, matches, fit, code, catalogue
 
 

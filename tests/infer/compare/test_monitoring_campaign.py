@@ -9,14 +9,13 @@ import pytest
 from scipy.stats import binom, kstest
 
 from bayesdist.infer import OutlierMixture
-from bayesdist.infer.catalogue.star_errors import star_covariance, with_star_errors
+from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.compare.change_date import period_scores, scan_dates
-from bayesdist.infer.compare.monitoring import change_of, fit_new
-from bayesdist.infer.compare.monitoring_stars import with_star_errors_of
+from bayesdist.infer.compare.monitoring import change_of, fit_new, with_star_errors_of
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from bayesdist.simulate import simulate_matches
 from tests.diagnose.held_campaign import field
-from tests.infer.small_campaign import campaign, campaign_truth
+from tests.infer.small_campaign import campaign, campaign_truth, with_star_errors
 from tests.infer.support import UNCLIPPED
 
 EXACT = OutlierMixture("none", jitter=0.0)

@@ -11,12 +11,13 @@ from scipy import stats
 
 from bayesdist.data import open_matches, write_partitioned
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer import fit_linear
+from bayesdist.infer import Rejection, fit_linear
 from bayesdist.infer.compare.order import select_order
 from bayesdist.infer.compare.order_sums import bin_sums, departures, held_out_gain, share_sums
 from bayesdist.infer.stars.stars import prepare
+from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.simulate import simulate_matches, wise_solution
+from bayesdist.simulate import simulate_matches
 
 from ..support import CHIP, SIZE, TWO_CHIPS, UNCLIPPED, legendre_design, simulated, truth_of
 
@@ -94,8 +95,7 @@ def test_surfaces_are_fits_to_the_means_of_bins(small):
         orders=ORDERS,
         bins=BINS,
         regions=3,
-        clip_chi2=np.inf,
-        clip_abs=None,
+        rejection=Rejection(np.inf, None),
     )
     code = codes(matches)
     A = legendre_design(5, matches.x, matches.y)
@@ -143,8 +143,7 @@ def nulls(n, seed0, **options):
             bins=9,
             regions=5,
             shares=20,
-            clip_chi2=np.inf,
-            clip_abs=None,
+            rejection=Rejection(np.inf, None),
         )
 
 

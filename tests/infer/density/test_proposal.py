@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from bayesdist.infer import GaussianPriors, OutlierMixture
+from bayesdist.infer import GaussianPriors, OutlierMixture, Rejection
 from bayesdist.infer.density.coordinates import Split, inside
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.importance import quality_of
@@ -390,7 +390,7 @@ def test_the_search_never_begins_outside_the_support(along):
 def test_a_search_whose_tangent_leads_out_of_the_support():
     """Found by calibration: most of 300 matches false, at a scale not far above the core's."""
     model, matches, _ = simulated(44, 300, fraction=0.6, jitter=0.02, outlier_scale=0.25)
-    target, fit = target_of(model, matches, OutlierMixture(), clip_abs=None)
+    target, fit = target_of(model, matches, OutlierMixture(), rejection=Rejection(clip_abs=None))
     proposal = build_proposal(target, fit)
     assert np.isfinite(log_weights_of(target, proposal, 500)[1]).mean() > 0.5
 

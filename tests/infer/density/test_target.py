@@ -14,8 +14,8 @@ from scipy import stats
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, OutlierMixture, load
 from bayesdist.infer.density import target
-from bayesdist.infer.density.memberships import star_log_likelihood
 from bayesdist.infer.density.target import Target
+from bayesdist.infer.posterior.memberships import star_log_likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import FRAME_KINDS, DistortionModel
 

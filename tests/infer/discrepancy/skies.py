@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bayesdist.data import MatchTable
-from bayesdist.infer import LinearFit, build_model, fit_linear
+from bayesdist.infer import LinearFit, Rejection, build_model, fit_linear
 
 SIZE, SIGMA = 2048.0, 0.02
 
@@ -58,4 +58,4 @@ def matched(
     quoted = np.full(n, SIGMA)
     table = MatchTable(x=x, y=y, u=u, v=v, sigma_u=quoted, sigma_v=quoted)
     model = build_model(table, order=order, size=(SIZE, SIZE))
-    return fit_linear(table, model, clip_chi2=1e9, clip_abs=1e9), table, true
+    return fit_linear(table, model, rejection=Rejection(1e9, 1e9)), table, true

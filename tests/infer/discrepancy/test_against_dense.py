@@ -10,7 +10,7 @@ from bayesdist.infer.discrepancy.cells import cell_sums
 from bayesdist.infer.discrepancy.functions import StructureFunctions
 from bayesdist.infer.discrepancy.information import Information
 from bayesdist.infer.discrepancy.structure import chip_structure
-from bayesdist.infer.stars.likelihood import scores_of
+from bayesdist.infer.posterior.likelihood import scores_of
 from bayesdist.infer.stars.stars import prepare
 from tests.infer.discrepancy.skies import SIGMA, matched
 

@@ -7,7 +7,8 @@ import os
 import numpy as np
 import pytest
 
-from bayesdist.assess.terms.correlated import structure_term
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.errors import InputError
 from bayesdist.infer.discrepancy import DiscrepancyPriors, estimate_discrepancy
 from bayesdist.model.grid import grid_pixels, mesh
@@ -28,7 +29,7 @@ def within(n, make, seed):
     K = fit.model.n_terms
     parts = [found.covariance[a * K : (a + 1) * K, a * K : (a + 1) * K] for a in (0, 1)]
     of_fit = np.stack([np.einsum("nk,kl,nl->n", phi, part, phi) for part in parts], axis=1)
-    local = structure_term(found, GRID, None).sigma[1].reshape(-1, 2)
+    local = StructureErrors(found).sigma(EvaluationDomain.of_chips(fit.model, GRID))
     sigma = np.sqrt(of_fit + local**2)
     error = true(x, y) - fit.model.predict(fit.mean, x, y)
     inside = [np.mean(np.abs(error) < k * sigma) for k in (1.0, 1.96)]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.infer import build_model, fit_linear
+from bayesdist.infer import Rejection, build_model, fit_linear
 from bayesdist.infer.discrepancy import estimate_discrepancy
 from tests.infer.discrepancy.skies import SIZE, matched
 
@@ -30,7 +30,7 @@ def breathing(frames: str, scatter: float = SCATTER, seed: int = 2):
         exposure_names=names,
     )
     model = build_model(table, order=3, size=(SIZE, SIZE), frames=frames)
-    fit = fit_linear(table, model, clip_chi2=1e9, clip_abs=1e9)
+    fit = fit_linear(table, model, rejection=Rejection(1e9, 1e9))
     return estimate_discrepancy(table, fit, rng=rng, stars=table)
 
 

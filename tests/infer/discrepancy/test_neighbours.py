@@ -10,7 +10,7 @@ import pytest
 from bayesdist.infer import fit_linear
 from bayesdist.infer.discrepancy import estimate_discrepancy
 from bayesdist.infer.discrepancy.neighbours import EDGES, shared_variances
-from bayesdist.infer.stars.likelihood import scores_of
+from bayesdist.infer.posterior.likelihood import scores_of
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 

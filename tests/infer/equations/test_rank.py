@@ -14,7 +14,7 @@ from scipy import stats
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import DegenerateError
-from bayesdist.infer import fit_linear, load, residuals
+from bayesdist.infer import Rejection, fit_linear, load, residuals
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.equations.rank import check_coverage, null_space
 from bayesdist.model import DistortionModel, TimeDependence
@@ -152,7 +152,7 @@ def test_frames_that_absorb_the_drift(frames, order):
     simpler = named_frames(message)
     assert simpler == {"shift_rotation_scale": "shift_rotation", "affine": "shift_rotation_scale",
                        "shift": "none"}[frames]  # fmt: skip
-    fit_linear(exact, replace(model, frames=simpler), clip_abs=None)
+    fit_linear(exact, replace(model, frames=simpler), rejection=Rejection(clip_abs=None))
 
 
 @pytest.mark.parametrize("frames", ABSORBED)
@@ -261,7 +261,7 @@ def test_a_star_outside_the_detector():
         assert "outside the 1000 x 800 detector" in message
     x = matches.x.copy()
     x[41] = 1000.5  # the edge of the last pixel
-    fit_linear(table(x, matches.y, matches.u, matches.v), model, clip_abs=None)
+    fit_linear(table(x, matches.y, matches.u, matches.v), model, rejection=Rejection(clip_abs=None))
 
 
 def test_a_chip_without_stars_is_named():

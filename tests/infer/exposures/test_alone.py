@@ -9,11 +9,11 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer import GaussianPriors, fit_linear
+from bayesdist.infer import GaussianPriors, Rejection, fit_linear
 from bayesdist.infer.exposures.alone import fit_exposures
-from bayesdist.infer.transforms import LINEAR_TERMS, in_exposure, linear_terms, reference_gauge
+from bayesdist.infer.transforms import LINEAR_TERMS, linear_terms, reference_gauge
 
-from ..small_campaign import Truth, campaign
+from ..small_campaign import Truth, campaign, seen_by
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -25,7 +25,7 @@ FREE = (
 
 def truth_of(model, theta, exposure, epoch, *labels):
     """Linear terms of one exposure, from its true parameters."""
-    view = reference_gauge(in_exposure(Truth(model, theta), exposure, epoch=epoch))
+    view = reference_gauge(seen_by(exposure, epoch, model, theta))
     return linear_terms(view).select(*labels).values
 
 
@@ -132,7 +132,9 @@ def test_held_is_a_line_fit_to_what_the_high_orders_leave(sparse):
     """By lstsq, with the high orders turned to the roll that the fit itself found."""
     model, matches, theta = sparse
     one = matches.select(matches.exposure == 5)
-    found = fit_exposures(one, model, high_order=Truth(model, theta), clip_chi2=1e9, clip_abs=None)
+    found = fit_exposures(
+        one, model, high_order=Truth(model, theta), rejection=Rejection(1e9, None)
+    )
     known = reference_gauge(Truth(model, theta)).mean.copy()
     bare = found.views[0].model
     known[[p.i + p.j <= 1 for p in bare.parameters]] = 0.0

@@ -9,17 +9,17 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, sample
+from bayesdist.infer import GaussianPriors, OutlierMixture, Rejection, fit_linear, sample
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.exposures import scatter as scatter_module
 from bayesdist.infer.exposures.alone import fit_exposures
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical, held_in_reference
 from bayesdist.infer.exposures.scatter import Scatter
-from bayesdist.infer.transforms import in_exposure, lines, reference_gauge
+from bayesdist.infer.transforms import lines, reference_gauge
 from bayesdist.model import FRAME_KINDS
 from bayesdist.model.frames import CHIP_DEVIATIONS
 
-from ..small_campaign import LINEAR, Truth, campaign, campaign_model, true_lines
+from ..small_campaign import LINEAR, campaign, campaign_model, seen_by, true_lines
 from ..support import UNCLIPPED, columns_of, residual_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -239,8 +239,7 @@ def test_jointly_is_alone_and_then_the_line():
             h = np.zeros(model.n_params)
             h[model.names.index(f"{name}.{kind}")] = 1e-4
             up, down = (
-                reference_gauge(in_exposure(Truth(model, joint.mean + s * h), name, epoch=t)).mean
-                for s in (1, -1)
+                reference_gauge(seen_by(name, t, model, joint.mean + s * h)).mean for s in (1, -1)
             )
             columns.append(T @ (up - down) / 2e-4)
         G = np.array(columns).T
@@ -443,7 +442,7 @@ def test_deviations_of_single_exposures_are_those_of_the_truth(some):
 def test_its_priors_are_what_sample_wants():
     """With exact errors and no outliers the posterior is the linear fit at that tau."""
     model, matches, _ = campaign(8, 4, 60, order=2, time=False)
-    found = fit_hierarchical(matches, model, clip_chi2=1e9, clip_abs=None)
+    found = fit_hierarchical(matches, model, rejection=Rejection(1e9, None))
     for kind, tau in zip(found.scatter.kinds, found.tau_draws.T, strict=True):
         k = model.names.index(f"j003.{kind}")
         assert found.priors.precision[k] == pytest.approx(1 / np.mean(tau**2))

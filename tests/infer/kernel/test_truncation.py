@@ -16,10 +16,10 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load, sample
 from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import conditional_mode, starting_point
-from bayesdist.infer.density.memberships import memberships, star_log_likelihood
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.kernel import circle_terms
-from bayesdist.infer.stars.likelihood import Scores
+from bayesdist.infer.kernel import circle
+from bayesdist.infer.posterior.likelihood import Scores
+from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
 from tests.seeds import over
 
 from ..selected import SIGMA, selected
@@ -45,6 +45,15 @@ HYPER = {
 
 
 NODES = leggauss(2000)
+
+
+def circle_terms(du, dv, A, B, radius):
+    """Log of the probability that Gaussians fall in circles and its derivatives, shape (N, 10)."""
+    four = np.stack(np.broadcast_arrays(*np.atleast_1d(du, dv, A, B)), axis=1)
+    out, q, work = np.empty((len(four), 10)), np.empty(circle.MOST), np.empty(circle.MOST)
+    for at, row in zip(four, out, strict=True):
+        circle.slopes(*at, float(radius), circle.NODES, q, work, row)
+    return out
 
 
 def log_z(du, dv, A, B, radius):

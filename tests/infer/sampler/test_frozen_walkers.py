@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.infer.sampler.convergence import Limits, diagnose
+from bayesdist.infer.convergence import Limits, diagnose
 
 
 @pytest.mark.parametrize("coupled", [False, True])

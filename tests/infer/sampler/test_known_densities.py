@@ -17,10 +17,10 @@ from emcee.moves import DEMove, MHMove
 from scipy import special, stats
 
 from bayesdist.infer import Limits, OutlierMixture
+from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.sampler import ensembles as sampler
-from bayesdist.infer.sampler.convergence import diagnose
 
 from ..fakes import FakeTarget, advanced, ensembles_of, gaussian_proposal
 from ..oracle import JitterOracle

@@ -15,8 +15,8 @@ from bayesdist.infer.density.importance import (
     warmup_steps,
 )
 from bayesdist.infer.sampler import lookahead
-from bayesdist.infer.sampler.blocks import Walkers
 from bayesdist.infer.sampler.chains import Settings, run_chains
+from bayesdist.infer.sampler.checkpoints import Walkers
 from bayesdist.infer.sampler.ensembles import replay
 from bayesdist.infer.sampler.lookahead import Page, draw_page
 from bayesdist.infer.sampler.move_schedule import expected_passes

@@ -13,7 +13,7 @@ from bayesdist.infer import (
     GaussianPriors,
     OutlierMixture,
     fit_linear,
-    outlier_probability,
+    memberships,
     sample,
 )
 from bayesdist.model import TimeDependence
@@ -121,7 +121,7 @@ def test_the_truth_lies_within_the_posterior(campaign, posterior):
 
 def test_false_matches_are_found(campaign, posterior):
     _, matches, truth = campaign
-    p = outlier_probability(posterior, matches)
+    p = memberships(posterior, matches).outlier_probability
     assert p.shape == (len(matches),) and (p >= 0).all() and (p <= 1).all()
     # calibrated: the expected number of false matches is theirs within its own scatter
     assert abs(p.sum() - truth.false.sum()) < 4 * np.sqrt((p * (1 - p)).sum())

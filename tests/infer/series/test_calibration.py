@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from bayesdist.infer.series import fit_series, straight_lines
+from bayesdist.infer.series import fit_series
 from tests.infer.calibration import over_seeds
 
 from .campaign import ALPHA, BETA, FORMAL, LINES, SCATTER, SIGMA_ALPHA, SIGMA_BETA, campaign
+from .straight import straight_lines
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.errors import DegenerateError
 from bayesdist.infer.series import (
     Course,
     Design,
@@ -14,10 +13,11 @@ from bayesdist.infer.series import (
     exposure_folds,
     fit_series,
     held_out,
-    straight_lines,
 )
 from bayesdist.infer.series.problem import WIDE, Problem, course_equations
 from bayesdist.infer.series.small import cholesky, precision_of
+
+from .straight import straight_lines
 
 SCATTER = np.array([[1.0, 0.6], [0.6, 2.0]])
 
@@ -98,18 +98,6 @@ def test_textbook_line(rng):
     assert free.sigma_alpha[0, 0] == pytest.approx(book.intercept_stderr, rel=1e-9)
     posterior = fit_series(series, Course("line"), scatter=[[0.0]], outliers=False)
     assert posterior.beta.std() == pytest.approx(s / np.sqrt(n) / epoch.std(), rel=0.04)
-
-
-def test_straight_lines_refuse_other_courses(rng):
-    series = some_series(rng)
-    with pytest.raises(DegenerateError, match="no set of lines"):
-        straight_lines(series, Course("spline"))
-    with pytest.raises(DegenerateError, match="no formal errors"):
-        straight_lines(
-            Series.of(series.epoch, series.values, coefficients=("a", "b")),
-            Course("line"),
-            weighted=True,
-        )
 
 
 @pytest.mark.parametrize("formal", [0.0, 0.3, 3.0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from bayesdist.infer.sampler.convergence import Limits
+from bayesdist.infer.convergence import Limits
 from bayesdist.infer.series import Course, Design, Series
 from bayesdist.infer.series.chains import run
 from bayesdist.infer.series.problem import WIDE, Problem

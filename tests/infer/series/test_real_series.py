@@ -16,8 +16,9 @@ from bayesdist.infer.series import (
     fit_series,
     held_out,
     serial_correlation,
-    straight_lines,
 )
+
+from .straight import straight_lines
 
 QUANTITIES = ("mag", "e1", "e2", "rot")
 LAST_MEASURED = 91  # TESS sectors: the later ones are predicted

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from bayesdist.data import matches as tables
 from bayesdist.data import open_matches, partitioned, write_partitioned
 from bayesdist.errors import InputError
-from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load
+from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, Rejection, fit_linear, load
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.normal import least_squares, mixture
 from bayesdist.infer.stars.shards import total
@@ -150,9 +150,9 @@ def _small():
 
 def test_the_fit_does_not_depend_on_the_pieces(campaign, parquet, monkeypatch):
     model, matches, _ = campaign
-    whole = fit_linear(matches, model, radial_weight=2.0)
+    whole = fit_linear(matches, model, rejection=Rejection(radial_weight=2.0))
     monkeypatch.setattr(tables, "PIECE", 100)
-    cut = fit_linear(matches, model, radial_weight=2.0)
+    cut = fit_linear(matches, model, rejection=Rejection(radial_weight=2.0))
     np.testing.assert_allclose(
         cut.mean / whole.sigma, whole.mean / whole.sigma, rtol=1e-11, atol=1e-5
     )
@@ -234,7 +234,7 @@ def test_a_shard_holds_the_stars_of_the_table(campaign):
 def test_preparing_changes_no_input(chips):
     model, matches, _ = simulated(114, 100, chips=chips)
     before = {k: getattr(matches, k).copy() for k in ("x", "y", "u", "v", "sigma_u", "sigma_v")}
-    fit_linear(matches, model, clip_abs=None)
+    fit_linear(matches, model, rejection=Rejection(clip_abs=None))
     for name, values in before.items():
         np.testing.assert_array_equal(getattr(matches, name), values)
 

@@ -1,1 +1,1 @@
-"""What all formats share: the content of a file, documents and findings, cards, coefficients."""
+"""Parts that all formats use: content of a file, documents and findings, cards, coefficients."""

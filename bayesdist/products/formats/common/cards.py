@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from textwrap import wrap
 
 from astropy.io import fits
 
-__all__ = ["card_images", "header_of", "keyword_of", "number_card", "text_card"]
+__all__ = ["card_images", "header_of", "holds_wcs", "keyword_of", "number_card", "text_card"]
+
+# Without one of these nothing ties pixels to a world.
+_NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
 
 
 def number_card(keyword: str, value: float | int, comment: str = "") -> str:
@@ -28,7 +32,7 @@ def text_card(keyword: str, value: str, comment: str = "") -> str:
 
 
 def convergence_cards(solution: object) -> list[str]:
-    """Whether the posterior behind a product may be relied on; nothing for a linear fit."""
+    """Cards that tell if the posterior behind a product has converged; none for a linear fit."""
     convergence = getattr(solution, "convergence", None)
     if convergence is None:
         return []
@@ -49,7 +53,7 @@ def keyword_of(card: str) -> str:
 
 
 def header_of(cards: Iterable[str]) -> fits.Header:
-    """The header that the cards make."""
+    """Header of these cards."""
     return fits.Header.fromstring("".join(cards))
 
 
@@ -57,3 +61,8 @@ def card_images(header: fits.Header) -> tuple[str, ...]:
     """Cards of a header, verbatim; a long string takes several."""
     text = header.tostring(sep="", endcard=False, padding=False)
     return tuple(text[k : k + 80] for k in range(0, len(text), 80))
+
+
+def holds_wcs(header: fits.Header) -> bool:
+    """True where a header ties its pixels to a world."""
+    return any(_NEEDED.match(keyword) for keyword in header)

@@ -1,9 +1,9 @@
-"""The content of a file: its bytes, the HDUs of a FITS file with their cards, its text.
+"""Content of a file: its bytes, the HDUs of a FITS file with their cards, its text.
 
-Every reader comes through here, so that a file is opened once whatever it turns out to be.  Headers
-are often kept without their data, one after the other or alone: HDUs are found by what their
-headers say of them, and whether data are whole is stated.  The bytes are kept beside what they
-mean, which is what makes reading and writing lossless.
+Every reader uses this module, so that a file is opened once whatever its format.  Headers are often
+stored without their data, one after the other or alone: HDUs are found by their headers, and
+whether data are whole is stated.  The bytes are stored with their meaning, which makes reading and
+writing lossless.
 """
 
 from __future__ import annotations
@@ -24,42 +24,30 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import BayesdistError, FormatError, InputError
+from bayesdist.files import atomic_path
 from bayesdist.products.formats.common.cards import card_images, header_of
 
 __all__ = ["Content", "Hdu", "hdus_of", "read_content", "read_hdus", "readable", "write_hdus"]
 
 RECORD = 2880  # bytes
-LARGEST = 2**32  # bytes: what a compressed file may grow to
+LARGEST = 2**32  # bytes: a compressed file may not grow beyond
 _STARTS = (b"SIMPLE  =", b"XTENSION=")
 _CARD = re.compile(r"[A-Z0-9_-]{1,8} *=|(COMMENT|HISTORY| {8})")
 
 
 @dataclass(frozen=True, eq=False)
 class Hdu:
-    """One HDU, or the cards of one.
+    """One HDU, or the cards of one."""
 
-    Parameters
-    ----------
-    cards : tuple of str
-        Header cards without END, 80 characters each.
-    data : bytes
-        As in the file, whether padded to whole records or not.
-    number : int
-        Place in the file, the first one 0.
-    state : str
-        'whole', 'none' where there are no data though the header says some, or 'cut'.
-    """
-
-    cards: tuple[str, ...]
-    data: bytes = b""
-    number: int = 0
-    state: str = "whole"
+    cards: tuple[str, ...]  # header cards without END, 80 characters each
+    data: bytes = b""  # as in the file, padded to whole records or not
+    number: int = 0  # index in the file, from 0
+    state: str = "whole"  # 'whole', 'none' where announced data are missing, or 'cut'
 
     @property
     def header(self) -> fits.Header:
-        """The header; a new one at each call."""
+        """Header; a new one at each call."""
         return header_of(self.cards)
 
     @cached_property
@@ -85,10 +73,7 @@ class Hdu:
     def rows(self) -> NDArray[np.void]:
         """Rows of a binary table: native numbers, and text without trailing blanks.
 
-        Raises
-        ------
-        FormatError
-            When this is no binary table.
+        FormatError when this is no binary table.
         """
         if self.header.get("XTENSION", "").strip() != "BINTABLE":
             raise FormatError(f"HDU {self.name!r} is no binary table")
@@ -112,52 +97,39 @@ class Hdu:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What a file holds, decompressed.
-
-    Parameters
-    ----------
-    name : str
-        Of the file, for messages.
-    raw : bytes
-    """
+    """Decompressed bytes of a file, and its name for messages."""
 
     name: str
     raw: bytes
 
     @property
     def is_fits(self) -> bool:
-        """Whether it begins as a FITS file, or as an HDU of one."""
+        """True where it begins as a FITS file, or as an HDU of one."""
         return self.raw[:9] in _STARTS and b"\n" not in self.raw[:81]
 
     @cached_property
     def text(self) -> str:
-        """All as text, one line below the other; empty for a FITS file."""
+        """Text, one line below the other; empty for a FITS file."""
         if self.is_fits or b"\0" in self.raw[:RECORD]:
             return ""
         return self.raw.decode("latin-1").replace("\r\n", "\n")
 
     @cached_property
     def hdus(self) -> tuple[Hdu, ...]:
-        """HDUs as far as they can be found, or the one that the cards of a text file are."""
+        """HDUs as far as they can be found, or one HDU of the cards of a text file."""
         if self.is_fits:
             return tuple(_walked(self.raw))
         if not _CARD.match(self.text):
             return ()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of cards that are not ours to judge
+            warnings.simplefilter("ignore")  # of other programs' cards
             sep = "\n" if "\n" in self.text.strip() else ""
             header = fits.Header.fromstring(self.text, sep=sep)
             state = "whole" if "NAXIS" not in header else "none"
             return (Hdu(card_images(header), state=state),)
 
     def whole(self) -> tuple[Hdu, ...]:
-        """All HDUs of a FITS file that is whole.
-
-        Raises
-        ------
-        FormatError
-            When it is no FITS file, or is truncated or damaged.
-        """
+        """HDUs of a FITS file that is whole; FormatError when it is none, truncated or damaged."""
         hdus = self.hdus if self.is_fits else ()
         if not hdus or self.raw[:9] != _STARTS[0]:
             raise FormatError("is no FITS file", where=self.name, do="check the file")
@@ -179,7 +151,7 @@ class Content:
 
     @cached_property
     def damage(self) -> FormatError | None:
-        """Why a file that begins as a FITS file is none that is whole."""
+        """Error of a file that begins as a FITS file and is not whole; None for any other."""
         try:
             self.whole()
         except FormatError as error:
@@ -188,7 +160,7 @@ class Content:
 
     @cached_property
     def opened(self) -> fits.HDUList | None:
-        """The file by astropy, whose extensions hold tables of a distortion; None if not whole."""
+        """File by astropy, whose extensions hold tables of a distortion; None if not whole."""
         if not self.is_fits or any(hdu.state != "whole" for hdu in self.hdus):
             return None
         with warnings.catch_warnings():
@@ -201,10 +173,10 @@ class Content:
 
 @contextmanager
 def readable(where: str) -> Iterator[None]:
-    """What a library raises of a damaged file inside becomes a FormatError that names it."""
+    """Turn any exception of a library on a damaged file into a FormatError that names the file."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of cards that are not ours to judge
+            warnings.simplefilter("ignore")  # of other programs' cards
             yield
     except BayesdistError:
         raise
@@ -217,20 +189,8 @@ def readable(where: str) -> Iterator[None]:
 def read_content(path: str | os.PathLike[str]) -> Content:
     """Content of a file, decompressed where gzip has compressed it.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    Content
-
-    Raises
-    ------
-    InputError
-        When the file cannot be read.
-    FormatError
-        When it is a broken gzip file, or one that grows beyond 4 GiB.
+    InputError when the file cannot be read, FormatError when it is a broken gzip file, or one that
+    grows beyond 4 GiB.
     """
     where = str(path)
     try:
@@ -255,7 +215,7 @@ def read_content(path: str | os.PathLike[str]) -> Content:
 
 
 def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:
-    """All HDUs of a FITS file that is whole; raises as `read_content` and `Content.whole`."""
+    """HDUs of a FITS file that is whole; errors as for `read_content` and `Content.whole`."""
     return read_content(path).whole()
 
 

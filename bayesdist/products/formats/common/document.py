@@ -1,8 +1,8 @@
-"""What a format is, a document of one, and what is found wrong in it.
+"""Formats, documents and findings.
 
-A format is its functions, each in a module of its own where it is long.  A file that its checks
-call broken has no calibration, and bit-by-bit losslessness is a property of bytes: so reading,
-checks and words are of a document, whose meaning is a calibration.
+A format is its functions, each in a module of its own where it is long.  A file with errors has no
+calibration, and lossless reading is a property of bytes: so parsing, checks and descriptions are of
+a document, and a calibration is made from it.
 """
 
 from __future__ import annotations
@@ -60,14 +60,6 @@ def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
 
     Two fitted numbers never agree to the last digit: one of them has been copied over the other, as
     in tables that went through text extraction.
-
-    Parameters
-    ----------
-    coefficients : mapping of str to float
-
-    Returns
-    -------
-    list of tuple of str
     """
     groups: dict[float, list[str]] = {}
     for name, value in coefficients.items():
@@ -77,16 +69,7 @@ def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
 
 
 def finding_lines(findings: Sequence[Finding]) -> list[str]:
-    """Lines of text, the weightiest finding first.
-
-    Parameters
-    ----------
-    findings : sequence of Finding
-
-    Returns
-    -------
-    list of str
-    """
+    """Lines of text, the most severe finding first."""
     if not findings:
         return ["Findings: none"]
     ordered = sorted(findings, key=lambda f: LEVELS.index(f.level))
@@ -95,7 +78,7 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
 
 @dataclass(frozen=True)
 class Choice:
-    """Which of the calibrations of a file is wanted, and what a file may not say itself.
+    """Choice among the calibrations of a file, and values that the file may lack.
 
     Parameters
     ----------
@@ -103,7 +86,7 @@ class Choice:
         Of an IDCTAB, where names of both wheels may be joined by a comma; the band of WISE
         meta-data, as in "W2".
     size : tuple of float, optional
-        Columns and rows, for a header that does not say.
+        Columns and rows, for a header that lacks them.
     """
 
     filter: str | None = None
@@ -111,7 +94,7 @@ class Choice:
 
 
 class FormatSettings(BaseModel):
-    """What the configuration says of a file to be built; keys that are not known are errors."""
+    """Configuration of a file to be built; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -121,59 +104,32 @@ class FormatSettings(BaseModel):
         size: tuple[float, float] | None,
         reference_pixel: tuple[float, float] | None,
     ) -> None:
-        """Refuse a detector that the file is not for.
-
-        Raises
-        ------
-        ValueError
-        """
+        """Refuse (ValueError) a detector that the format is not for."""
 
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """What files are built with, whatever their format.
+    """Options of building files of any format."""
 
-    Parameters
-    ----------
-    epoch : float, optional
-        Decimal years, for files that hold for one date.
-    scale_arcsec : float, optional
-        Arcseconds in a pixel, where the configuration says it.
-    """
-
-    epoch: float | None = None
-    scale_arcsec: float | None = None
+    epoch: float | None = None  # decimal years, for files that are valid at one date
+    scale_arcsec: float | None = None  # arcseconds per pixel, where configured
 
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """A file that was built and not yet written.
-
-    Parameters
-    ----------
-    file_name : str
-    kind : str
-        As in summary.json.
-    content : bytes
-    made : object
-        What the content was made from, in the terms of its format.
-    chip : int, optional
-        Of a file of one chip.
-    summary : mapping
-        What summary.json says of it besides.
-    """
+    """File that was built and not yet written."""
 
     file_name: str
-    kind: str
+    kind: str  # as in summary.json
     content: bytes
-    made: Any
-    chip: int | None = None
-    summary: Mapping[str, Any] = field(default_factory=dict)
+    made: Any  # source of the content, in the terms of its format
+    chip: int | None = None  # of a file of one chip
+    summary: Mapping[str, Any] = field(default_factory=dict)  # further entries of summary.json
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of files, as its functions.
+    """Format of files, as its functions.
 
     Parameters
     ----------
@@ -184,13 +140,13 @@ class Format:
     rank : int
         Formats are tried in this order: the most special first.
     parse : callable
-        From a `Content` to what the file holds; None for a file of another kind.
+        From a `Content` to the parsed file; None for a file of another kind.
     describe : callable
-        From what `parse` gave to lines of text, findings excluded.
+        From the parsed file to lines of text, its `finding_lines` at the end.
     lint : callable, optional
-        From what `parse` gave to findings; of a format without checks there are none.
+        From the parsed file to findings; of a format without checks there are none.
     calibration : callable, optional
-        From what `parse` gave, the file's name and a `Choice` to a `Calibration`.
+        From the parsed file, its name and a `Choice` to a `Calibration`.
     settings : type of FormatSettings, optional
         Of a format that can be built.
     build : callable, optional
@@ -210,14 +166,14 @@ class Format:
 
 @dataclass(frozen=True, eq=False)
 class Document:
-    """A file that was recognized.
+    """File whose format was recognized.
 
     Parameters
     ----------
     name : str
     format : Format
     holds : object
-        What the format's `parse` gave.
+        Parsed file, by the format's `parse`.
     """
 
     name: str
@@ -225,17 +181,17 @@ class Document:
     holds: Any
 
     def lint(self) -> tuple[Finding, ...]:
-        """What is wrong, or looks wrong, in the file."""
+        """Findings in the file."""
         with readable(self.name):
             return () if self.format.lint is None else tuple(self.format.lint(self.holds))
 
     def describe(self) -> str:
-        """Text of what the file holds, its findings at the end."""
+        """Text on the content of the file, its findings at the end."""
         with readable(self.name):
             return "\n".join(self.format.describe(self.holds))
 
     def calibration(self, choice: Choice = Choice()) -> Calibration:
-        """The calibration that the file holds.
+        """Calibration of the file.
 
         Raises
         ------

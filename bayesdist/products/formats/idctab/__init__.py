@@ -1,1 +1,1 @@
-"""The IDCTAB: the distortion table of HST instruments."""
+"""IDCTAB: the distortion table of HST instruments."""

@@ -1,4 +1,4 @@
-"""An IDCTAB from solutions, with the sigmas and the covariance of all it holds."""
+"""An IDCTAB from solutions, with the sigmas and the covariance of all its numbers."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def idctab_from_solution(
 ) -> IdcTab:
     """IDCTAB of all chips of a solution, or of several filters with a solution each.
 
-    Frames of exposures are left out: in gauge 'first' the file holds what the first exposure saw.
+    Frames of exposures are left out: in gauge 'first' the polynomials are the first exposure's.
     Everything is divided by `vafactor`, since stwcs multiplies the sky by that of each exposure.
     The constant of each chip goes to its V2REF and V3REF (and is noted in BDU0_c, BDV0_c), since
     stwcs never uses CX00 and CY00.  A file for ACS/WFC always has TDD_DATE and TDD_CTB1, TDD_CTB2,
@@ -91,16 +91,17 @@ def idctab_from_solution(
     chips : sequence of int, optional
         Chip numbers; all by default.
     inverse : bool
-        Whether to add INVERSE rows; their closure is stated as BDCLOS_c.
+        True to add INVERSE rows; their closure is stated as BDCLOS_c.
     history : sequence of str
         Lines for HISTORY.
 
     Returns
     -------
     IdcTab
-        In doubles, with HDUs SIGMA and COVAR (see `bayesdist.products.idctab`).  COVAR names the
-        filters where there are several solutions.  Solutions turned by the same orientation
-        (`bayesdist.calibration.orientation`) share its error, which stands between their blocks.
+        In doubles, with HDUs SIGMA and COVAR (see `bayesdist.products.formats.idctab.table`).
+        COVAR names the filters where there are several solutions.  Solutions turned by the same
+        orientation (`bayesdist.calibration.orientation`) have its error in common, as covariance
+        between their blocks.
 
     Raises
     ------
@@ -160,7 +161,7 @@ def build_idctab(
     inverse: bool = False,
     history: Sequence[str] = (),
 ) -> IdcTab:
-    """As `idctab_from_solution`, of a calibration or of one for each filter."""
+    """IDCTAB of a calibration, or of one for each filter; arguments of `idctab_from_solution`."""
     entries = _entries(calibration, filters, instrument)
     first = entries[0][0]
     model = first.model
@@ -217,7 +218,7 @@ def _entries(
     filters: Sequence[str] | Sequence[Sequence[str]] | None,
     instrument: str,
 ) -> list[tuple[Calibration, tuple[tuple[str, ...], ...]]]:
-    """Each calibration with the filter combinations of its rows; () for rows of all filters."""
+    """Calibrations, each with the filter combinations of its rows; () for rows of all filters."""
     where = "products.idctab.filters"
     named: list[tuple[tuple[str, ...], Calibration]]
     if isinstance(calibration, Mapping):
@@ -289,7 +290,7 @@ def _mean_scale(fitted: Sequence[ChipNumbers]) -> float:
 def _check_alike(
     calibration: Calibration, first: Calibration, combination: tuple[str, ...]
 ) -> None:
-    """A file has one order, one set of chips and one drift."""
+    """Refuse calibrations of different orders, chips or drifts: a file has one of each."""
     where = f"filters {' '.join(combination)}"
     a, b = calibration.model, first.model
     if a.order != b.order or a.chips != b.chips:

@@ -1,4 +1,4 @@
-"""An IDCTAB as a calibration: all chips in one plane, with drift, covariance and INVERSE rows.
+"""Calibration of an IDCTAB: all chips in one plane, with drift, covariance and INVERSE rows.
 
 The plane is that of Xc and Yc of the reference chip,
 
@@ -35,23 +35,11 @@ Filters = Sequence[str] | None
 
 
 def idctab_calibration(tab: IdcTab, filter: str | None = None) -> Calibration:
-    """The calibration of one filter that an IDCTAB holds.
+    """Calibration of one filter of an IDCTAB in arcseconds, the reference chip first.
 
-    Parameters
-    ----------
-    tab : IdcTab
-    filter : str, optional
-        Names of both wheels may be joined by a comma; needed where the rows differ.
-
-    Returns
-    -------
-    Calibration
-        In arcseconds, the reference chip first; with its covariance where the file has it.
-
-    Raises
-    ------
-    InputError
-        As `IdcTab.row`; for several chips of an unknown detector.
+    It has a covariance where the file has it.  Names of both wheels may be joined by a comma; a
+    filter is needed where the rows differ.  InputError as for `IdcTab.row`, and for several chips
+    of an unknown detector.
     """
     names = None if filter is None else [part.strip() for part in filter.split(",")]
     numbers = tab.chips
@@ -93,7 +81,7 @@ def idctab_calibration(tab: IdcTab, filter: str | None = None) -> Calibration:
 
 
 def _map(tab: IdcTab, number: int, names: Filters, shift: tuple[float, float]) -> ChipMap:
-    """The polynomial of a chip at the reference date."""
+    """Polynomial of a chip at the reference date."""
     record = tab.rows[tab.row(number, names)]
 
     def positions(x: Float, y: Float) -> tuple[Float, Float]:
@@ -119,7 +107,7 @@ def _v2v3(record: np.void) -> tuple[float, float] | None:
 
 
 def _undated(tab: IdcTab, *, drifts: bool) -> str:
-    """What to say of positions without a date."""
+    """Note on positions without a date."""
     if drifts:
         return f"at the reference date {tab.tdd['TDD_DATE']:g} of its drift"
     if tab.tdd_scheme in ("2014", "order", "default"):
@@ -128,7 +116,7 @@ def _undated(tab: IdcTab, *, drifts: bool) -> str:
 
 
 def _inverse(tab: IdcTab, number: int, names: Filters) -> ExplicitInverse | None:
-    """The INVERSE row of a chip, where there is one."""
+    """INVERSE row of a chip, where there is one."""
     if "DIRECTION" not in tab.columns:
         return None
     found = tab.matching_rows(number, names, "INVERSE")
@@ -138,7 +126,7 @@ def _inverse(tab: IdcTab, number: int, names: Filters) -> ExplicitInverse | None
     terms = []
     for axis, values in enumerate(tab.coefficients_of_row(int(found[0]))):
         own = dict(zip(tab.terms[1:], values[1:].tolist(), strict=True))
-        own[1 - axis, axis] -= 1.0  # what is added to the position itself
+        own[1 - axis, axis] -= 1.0  # correction that is added to the position itself
         terms.append(own)
     return ExplicitInverse((float(record["XREF"]), float(record["YREF"])), terms[0], terms[1])
 
@@ -149,12 +137,12 @@ def _inverse(tab: IdcTab, number: int, names: Filters) -> ExplicitInverse | None
 def _with_covariance(
     calibration: Calibration, tab: IdcTab, names: Filters, parity: tuple[int, int]
 ) -> Calibration:
-    """The calibration with the covariance of HDU COVAR, where it has that of every chip."""
+    """Calibration with the covariance of HDU COVAR, where it has that of every chip."""
     entries, model = tab.covariance, calibration.model
     if entries is None:
         return calibration
     K, reference = model.n_terms, calibration.numbers[0]
-    jacobian = np.zeros((model.n_params, len(entries)))  # of the parameters by what is in COVAR
+    jacobian = np.zeros((model.n_params, len(entries)))  # of the parameters by the numbers in COVAR
     zero = _numbers_of_row(tab, tab.row(reference, names), reference)
     for number in calibration.numbers:
         place = _numbers_of_row(tab, tab.row(number, names), number)
@@ -166,7 +154,7 @@ def _with_covariance(
         if not by.any():
             return calibration
         if number != reference:
-            # the constant is the place of the chip's zero point from that of the reference chip
+            # the constant is the position of the chip's zero point from that of the reference chip
             for axis, name in enumerate(("V2REF", "V3REF")):
                 for found, sign in ((place, 1.0), (zero, -1.0)):
                     if name in found:
@@ -186,14 +174,14 @@ def _with_covariance(
 
 
 def _numbers_of_row(tab: IdcTab, row: int, chip: int) -> dict[str, int]:
-    """Where the numbers of a row stand in COVAR, by name; empty where they do not."""
+    """Indices in COVAR of the numbers of a row, by name; empty where they are missing."""
     entries = tab.covariance
     assert entries is not None
     listed = [str(name).strip() for name in entries["PARAM"]]
     mine = np.flatnonzero(entries["DETCHIP"].astype(int) == chip)
     own = [c for c in FILTER_COLUMNS if c in (entries.dtype.names or ())]
     if own:
-        # numbers stand once for all filters that share them: found again by their values
+        # numbers stand once for all filters with them: identified by their values
         sets = {tuple(str(entries[c][k]).strip() for c in own) for k in mine}
         of_set = [
             [int(k) for k in mine if tuple(str(entries[c][k]).strip() for c in own) == one]
@@ -202,7 +190,7 @@ def _numbers_of_row(tab: IdcTab, row: int, chip: int) -> dict[str, int]:
         same = [s for s in of_set if _is_of_row(tab, row, listed, s)]
         if not same:
             return {}
-        # all filters share the drift, which stands with the first one
+        # the drift is common to all filters, and stands with the first one
         rates = [k for k in mine if listed[k].startswith("TDD")]
         mine = np.array([*rates, *same[0]])
     return {listed[k]: int(k) for k in mine}

@@ -1,4 +1,4 @@
-"""The primary header of an IDCTAB of ours: its drift, and where its numbers come from.
+"""Primary header of an IDCTAB of ours: its drift, and the origin of its numbers.
 
 ==================  ==========================================================================
 BDVAFAC, BDUNIT     velocity aberration that was divided out; unit of u and v in the fit
@@ -43,7 +43,7 @@ def tdd_cards(fitted: Sequence[ChipNumbers], epoch: float | None, acs_wfc: bool)
 def provenance_cards(
     fitted: Sequence[ChipNumbers], vafactor: float, calibration: Calibration
 ) -> list[str]:
-    """Where the numbers come from: the fit's unit and constants, and the orientation."""
+    """Cards on the origin of the numbers: unit and constants of the fit, and the orientation."""
     orientation = calibration.plane.orientation
     unit = calibration.unit if orientation is None else orientation.base.model.unit
     cards = [
@@ -80,7 +80,7 @@ def _orientation_cards(orientation: Orientation, vafactor: float) -> list[str]:
 
 
 def closure_cards(pieces: Sequence[Piece]) -> list[str]:
-    """How well INVERSE rows undo FORWARD ones, the worst of all filters for each chip."""
+    """Cards on the closure of INVERSE with FORWARD rows, the worst of all filters for each chip."""
     worst: dict[int, float] = {}
     for piece in pieces:
         for f, back in zip(piece.fitted, piece.inverse, strict=False):

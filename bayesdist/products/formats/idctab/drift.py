@@ -1,12 +1,12 @@
-"""The time-dependent terms of ACS/WFC in an IDCTAB, and what of a drift it can hold.
+"""Time-dependent terms of ACS/WFC in an IDCTAB, and the part of a drift that it can hold.
 
     CX11 += CXB dt,  CY11 += CTB dt,  CY10 += CYB dt
 
 with dt in years from TDD_DATE (scheme of 2015), in the primary header, as stwcs reads them.
 
 A calibration that was turned into V2 and V3 drifts in terms that a file has no keyword for: a
-change of the y scale turns into one of CX10, by the sine of 2.2 degrees for ACS/WFC.  Such terms
-are left out only where what they do over the years of the file is bounded, and the bound is kept.
+change of the y scale turns into one of CX10, by the sine of 2.2 degrees for ACS/WFC. Such terms are
+left out only where their effect over the years of the file is bounded, and the bound is reported.
 """
 
 from __future__ import annotations
@@ -29,25 +29,17 @@ __all__ = ["RATES", "Loss", "drift", "scheme_of", "storable"]
 Float = NDArray[np.float64]
 Term = tuple[str, int, int]
 
-NEGLIGIBLE = 1e-3  # mas: what is held at zero by a prior, or by the gauge, is not worth a word
+NEGLIGIBLE = 1e-3  # mas: a drift held at zero by a prior, or by the gauge, is not reported
 
 # (axis, power of x, power of y) of a coefficient: the keyword of its rate, less the chip number.
 RATES = {("u", 1, 0): "TDD_CXB", ("v", 1, 0): "TDD_CTB", ("v", 0, 1): "TDD_CYB"}
 
 
 def scheme_of(keywords: Mapping[str, float]) -> str:
-    """What stwcs makes of the keywords of an ACS/WFC table, in its order of trial.
+    """Scheme that stwcs finds in the keywords TDD... of an ACS/WFC table, in its order of trial.
 
-    Parameters
-    ----------
-    keywords : mapping
-        All keywords that begin with TDD.
-
-    Returns
-    -------
-    str
-        '2015' (TDD_CTB1 ...), '2014' (TDD_CYB1 ...), 'order' (TDDORDER with TDD_A, TDD_B), or
-        'default': terms of 2004.5 that are written in its code.
+    '2015' (TDD_CTB1 ...), '2014' (TDD_CYB1 ...), 'order' (TDDORDER with TDD_A, TDD_B), or
+    'default': terms of 2004.5 that are written in its code.
     """
     for keyword, scheme in (("TDD_CTB1", "2015"), ("TDD_CYB1", "2014"), ("TDDORDER", "order")):
         if keyword in keywords:
@@ -62,28 +54,10 @@ def drift(
     epoch: float,
     where: str,
 ) -> NDArray[np.float64]:
-    """What the terms add to the coefficients of a chip.
+    """Change (2, n_terms) of the coefficients of a chip at an epoch (decimal years).
 
-    Parameters
-    ----------
-    keywords : mapping
-        All keywords that begin with TDD.
-    terms : tuple of (int, int)
-        Powers of the coefficients.
-    chip : int
-    epoch : float
-        Decimal years.
-    where : str
-        Name of the file, for the error.
-
-    Returns
-    -------
-    ndarray, shape (2, n_terms)
-
-    Raises
-    ------
-    InputError
-        For keywords of another scheme than that of 2015.
+    `keywords` are all that begin with TDD, `terms` the powers of the coefficients; `where` names
+    the file.  InputError for keywords of another scheme than that of 2015.
     """
     scheme = scheme_of(keywords)
     if scheme != "2015" or "TDD_DATE" not in keywords:
@@ -99,31 +73,18 @@ def drift(
     return out
 
 
-# -- what a file can hold --------------------------------------------------------------------------
+# -- drifts that a file can hold -------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Loss:
-    """A drift that a file does not hold.
-
-    Parameters
-    ----------
-    chip : str
-        Name of the chip.
-    term : tuple of (str, int, int)
-        Axis, power of x, power of y.
-    mas, sigma : float
-        Largest displacement that is left out, over the chip and the years of the file, and its
-        standard deviation; mas.
-    years : tuple of float
-        First and last date.
-    """
+    """Drift that a file does not hold."""
 
     chip: str
-    term: Term
-    mas: float
-    sigma: float
-    years: tuple[float, float]
+    term: Term  # axis, power of x, power of y
+    mas: float  # largest displacement left out, over the chip and the years
+    sigma: float  # its standard deviation, mas
+    years: tuple[float, float]  # first and last date
 
     def __str__(self) -> str:
         axis, i, j = self.term
@@ -142,35 +103,17 @@ def storable(
     limit_mas: float = 0.1,
     like: Calibration | None = None,
 ) -> tuple[Calibration, tuple[Loss, ...]]:
-    """One segment of a calibration, with the drift that an IDCTAB can store.
+    """Segment of a calibration with the drift that an IDCTAB can store, and the drifts left out.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        In an angular unit, along the axes of the IDCTAB (see `calibration.orientation`).
-    years : tuple of float
-        First and last date for which the file is meant, decimal years.
-    segment : int
-        Number of the segment, from 0.
-    limit_mas : float
-        Largest displacement that may be left out: the sum of all terms of a chip, mas.
-    like : Calibration, optional
-        The one whose drift the file will hold.  This one then gives its coefficients at the
-        reference date, and the difference of the drifts counts as left out.
+    The calibration has an angular unit and the axes of the IDCTAB (see `calibration.orientation`);
+    `years` are the first and last date for which the file is meant, `segment` counts from 0,
+    `limit_mas` bounds the sum of all terms of a chip that may be left out.  With `like`, the
+    calibration whose drift the file will hold, this one gives its coefficients at the reference
+    date, and the difference of the drifts counts as left out.
 
-    Returns
-    -------
-    calibration : Calibration
-        Without breaks, with drifting terms that have keywords.
-    lost : tuple of Loss
-        What was left out.
-
-    Raises
-    ------
-    InputError
-        When more than `limit_mas` would be left out, for a unit of pixels, years that do not rise,
-        no such segment, or a solution that does not depend on time, or from another date, where
-        `like` does.
+    InputError when more than `limit_mas` would be left out, for a unit of pixels, years that do not
+    rise, no such segment, or a solution that does not depend on time, or from another date, where
+    `like` does.
     """
     solution = calibration.solution
     if solution.model.unit not in ARCSEC:
@@ -229,7 +172,7 @@ def _check_like(solution: Solution, like: Calibration | None, segment: int) -> N
 def _lost(
     view: Solution, like: Solution | None, kept: list[Term], years: tuple[float, float]
 ) -> tuple[Loss, ...]:
-    """What each drifting term does beyond the drift that is stored."""
+    """Effect of each drifting term beyond the drift that is stored."""
     model = view.model
     if model.time is None:
         return ()

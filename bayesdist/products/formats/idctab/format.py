@@ -1,4 +1,4 @@
-"""The IDCTAB as a format."""
+"""Format entry of the IDCTAB."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["FORMAT", "Settings"]
 
 
 class Settings(FormatSettings):
-    """An IDCTAB reference file."""
+    """Configuration of an IDCTAB reference file."""
 
     instrument: str
     detector: str

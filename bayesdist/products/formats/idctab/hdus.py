@@ -1,4 +1,4 @@
-"""The tables of an IDCTAB: coefficients, their standard deviations, their covariance."""
+"""Tables of an IDCTAB: coefficients, their standard deviations, their covariance."""
 
 from __future__ import annotations
 
@@ -19,22 +19,11 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """The rows that one solution fills.
+    """Rows that one solution fills."""
 
-    Parameters
-    ----------
-    combinations : tuple of tuple of str
-        Filter names, one for each wheel; all have the same coefficients.  A single empty one where
-        rows serve every filter.
-    fitted : tuple of ChipNumbers
-        One for each chip.
-    inverse : tuple of ChipInverse
-        One for each chip; empty where no INVERSE rows are asked for.
-    """
-
-    combinations: tuple[tuple[str, ...], ...]
-    fitted: tuple[ChipNumbers, ...]
-    inverse: tuple[ChipInverse, ...] = ()
+    combinations: tuple[tuple[str, ...], ...]  # names of all wheels; () for all filters
+    fitted: tuple[ChipNumbers, ...]  # one for each chip
+    inverse: tuple[ChipInverse, ...] = ()  # one for each chip; empty without INVERSE rows
 
     @property
     def n_numbers(self) -> int:
@@ -47,7 +36,7 @@ class _Row:
     filters: tuple[str, ...]
     numbers: ChipNumbers
     inverse: ChipInverse | None
-    place: slice  # of the chip's numbers in the covariance
+    place: slice  # indices of the chip's numbers in the covariance
 
     @property
     def direction(self) -> str:
@@ -69,7 +58,7 @@ def _deviations(cov: Float) -> Float:
 
 
 def _rows(pieces: Sequence[Piece]) -> Iterator[_Row]:
-    """Filter after filter, chip after chip; FORWARD before INVERSE."""
+    """Rows filter after filter, chip after chip; FORWARD before INVERSE."""
     start = 0
     for piece in pieces:
         ends = start + np.cumsum([len(f.names) for f in piece.fitted])

@@ -1,6 +1,6 @@
-"""What HST's pipeline knows of its detectors beside their IDCTABs: parities and filter wheels.
+"""Constants of HST's detectors that IDCTABs lack: parities and filter wheels.
 
-V2 = V2REF + p0 Xc,  V3 = V3REF + p1 Yc, with the parities p0, p1 of stwcs (wcsutil/instruments.py).
+V2 = V2REF + p0 Xc, V3 = V3REF + p1 Yc, with the parities p0, p1 of stwcs (wcsutil/instruments.py).
 An IDCTAB of ACS names the filters of both wheels in each row.
 """
 
@@ -27,13 +27,7 @@ _SECOND = ("F435W", "F660N", "F814W", "POL0V", "POL60V", "POL120V")
 
 
 def parity_of(instrument: str, detector: str) -> tuple[int, int]:
-    """Parities (p0, p1) of a detector.
-
-    Raises
-    ------
-    InputError
-        For a detector that is not known.
-    """
+    """Parities (p0, p1) of a detector; an unknown one is refused."""
     try:
         return _PARITY[instrument.strip().upper(), detector.strip().upper()]
     except KeyError:
@@ -46,24 +40,10 @@ def parity_of(instrument: str, detector: str) -> tuple[int, int]:
 
 
 def combination_of(filter: str | tuple[str, ...], instrument: str) -> tuple[str, ...]:
-    """Names of all wheels for a filter, the others being clear.
+    """Filter names of all wheels, the others being clear, as ("F606W", "CLEAR2L") for ACS.
 
-    Parameters
-    ----------
-    filter : str or tuple of str
-        One name, as "F606W" or "CLEAR"; a tuple is given back as it is.
-    instrument : str
-        INSTRUME.
-
-    Returns
-    -------
-    tuple of str
-        As ("F606W", "CLEAR2L") for ACS; one name for others.
-
-    Raises
-    ------
-    InputError
-        When the wheel of an ACS filter is not known.
+    One name for other instruments; a tuple is returned as it is.  An ACS filter whose wheel is not
+    known is refused.
     """
     if not isinstance(filter, str):
         return tuple(map(str, filter))

@@ -1,4 +1,4 @@
-"""Checks of an IDCTAB against what stwcs makes of it."""
+"""Checks of an IDCTAB against the behaviour of stwcs."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _header(tab: IdcTab) -> Iterator[Finding]:
 
 
 def _time(tab: IdcTab) -> Iterator[Finding]:
-    """Time-dependent terms of ACS/WFC (stwcs: read_tdd_coeffs and TDDCorr)."""
+    """Findings on the time-dependent terms of ACS/WFC (stwcs: read_tdd_coeffs and TDDCorr)."""
     scheme = tab.tdd_scheme
     if scheme == "none":
         return
@@ -152,7 +152,7 @@ def _table(tab: IdcTab) -> Iterator[Finding]:
 
 
 def _rounding(tab: IdcTab) -> float:
-    """Largest effect of half a unit in the last place of every coefficient, in mas."""
+    """Largest effect of half a unit in the last digit of every coefficient, in mas."""
     rows = tab.rows[_forward(tab)]
     hx, hy = (np.maximum(rows[f"{a}REF"], rows[f"{a}SIZE"] - rows[f"{a}REF"]) for a in "XY")
     worst = 0.0
@@ -188,7 +188,7 @@ def _repeated_rows(tab: IdcTab) -> Iterator[Finding]:
 
 
 def _coefficients(tab: IdcTab) -> Iterator[Finding]:
-    """Scale, index order and parity from the linear terms; values that stand twice."""
+    """Findings on scale, index order and parity from the linear terms, and on repeated values."""
     x, y = tab.prefixes
     forward = _forward(tab)
     rows = tab.rows[forward]
@@ -258,7 +258,7 @@ def _repeated_values(tab: IdcTab) -> Iterator[Finding]:
 
 
 def _chips(tab: IdcTab) -> Iterator[Finding]:
-    """Where the two chips of ACS/WFC lie: chip 1 above chip 2 in y, so at lower V3."""
+    """Finding on the positions of ACS/WFC's chips: chip 1 is above chip 2 in y, so at lower V3."""
     if not tab.is_acs_wfc or "V3REF" not in tab.columns:
         return
     numbers = _chip_numbers(tab)

@@ -1,4 +1,4 @@
-"""The numbers that an IDCTAB takes from a calibration, with their derivatives and covariance.
+"""Numbers that an IDCTAB takes from a calibration, with their derivatives and covariance.
 
 Calibrations of different filters come from different stars, but may lie in one plane by one
 orientation.  Given the orientation p they are independent, so that
@@ -39,33 +39,20 @@ INVERSE_NODES = 33  # points of each axis of the fit
 
 @dataclass(frozen=True, eq=False)
 class ChipNumbers:
-    """The fitted numbers of one chip, as an IDCTAB names them.
-
-    Parameters
-    ----------
-    chip : Chip
-    names : tuple of str
-        V2REF, V3REF, CX10, CX11, ..., CY10, ...; then keywords of the rates that were fitted.
-    values : ndarray, shape (P,)
-        Arcseconds, arcsec/pix^n, arcsec/pix/yr.
-    jacobian : ndarray, shape (P, D)
-        Derivatives by the parameters of the solution.
-    constant : ndarray, shape (2,)
-        (Xc, Yc) of the reference pixel, which V2REF and V3REF contain; arcseconds.
-    """
+    """Fitted numbers of one chip, as an IDCTAB names them."""
 
     chip: Chip
-    names: tuple[str, ...]
-    values: Float
-    jacobian: Float
-    constant: Float
+    names: tuple[str, ...]  # V2REF, V3REF, CX10, CX11, ..., CY10, ...; keywords of fitted rates
+    values: Float  # (P,), arcsec, arcsec/pix^n, arcsec/pix/yr
+    jacobian: Float  # (P, D), by the parameters of the solution
+    constant: Float  # (Xc, Yc) of the reference pixel, in V2REF and V3REF; arcsec
 
     def column(self, name: str) -> float:
         """Value of a name."""
         return float(self.values[self.names.index(name)])
 
     def without_rates(self) -> ChipNumbers:
-        """The numbers without those of the drift."""
+        """Numbers without those of the drift."""
         keep = [k for k, name in enumerate(self.names) if not name.startswith("TDD")]
         names = tuple(self.names[k] for k in keep)
         return ChipNumbers(self.chip, names, self.values[keep], self.jacobian[keep], self.constant)
@@ -73,29 +60,18 @@ class ChipNumbers:
 
 @dataclass(frozen=True, eq=False)
 class ChipInverse:
-    """The INVERSE row of one chip, at the reference date of its drift.
+    """INVERSE row of one chip, at the reference date of its drift."""
 
-    Parameters
-    ----------
-    values, sigmas : dict of str to float
-        By column: pixels per arcsec^n.
-    closure : float
-        Largest distance between a pixel and the inverse of its forward position, pixels.
-    """
-
-    values: dict[str, float]
-    sigmas: dict[str, float]
-    closure: float
+    values: dict[str, float]  # by column, pixels per arcsec^n
+    sigmas: dict[str, float]  # of the values
+    closure: float  # largest distance of a pixel from its image there and back, pixels
 
 
 def check_time(model: DistortionModel, *, acs_wfc: bool) -> None:
     """Refuse time dependence that stwcs would not apply; to leave it out would be a silent error.
 
-    Raises
-    ------
-    InputError
-        For time-dependent terms other than (u, 1, 0), (v, 1, 0) and (v, 0, 1), of several segments,
-        or of a detector other than ACS/WFC.
+    Refused are time-dependent terms other than (u, 1, 0), (v, 1, 0) and (v, 0, 1), of several
+    segments, or of a detector other than ACS/WFC.
     """
     if model.time is None:
         return
@@ -129,28 +105,9 @@ def chip_numbers(
 ) -> ChipNumbers:
     """Numbers of one chip, at the reference date of its drift.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    chip : int
-        Chip number.
-    factor : float
-        Arcseconds of the IDCTAB in one unit of u, v.
-    parity : tuple of int
-        Sense of V2 and V3 against Xc and Yc.
-    zero : tuple of float
-        V2 and V3 of (u, v) = (0, 0), arcseconds.
-
-    Returns
-    -------
-    ChipNumbers
-
-    Raises
-    ------
-    InputError
-        For an unknown chip.
-    DegenerateError
-        When the linear part is singular.
+    `factor` is the arcseconds in one unit of u, v, `parity` the sense of V2 and V3 against Xc and
+    Yc, `zero` V2 and V3 of (u, v) = (0, 0) in arcseconds.  InputError for an unknown chip,
+    DegenerateError when the linear part is singular.
     """
     model = calibration.model
     coefficients, jacobian = calibration.coefficients(chip, reference_date(calibration))
@@ -186,7 +143,7 @@ def chip_numbers(
 
 
 def reference_date(calibration: Calibration) -> float | None:
-    """The date from which the drift of a single segment counts; None without drift."""
+    """Date from which the drift of a single segment counts; None without drift."""
     time = calibration.model.time
     return None if time is None else time.epoch0[0]
 
@@ -211,14 +168,9 @@ def _rates(calibration: Calibration, chip: int, factor: float) -> list[tuple[str
 def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInverse:
     """Least-squares inverse of a chip's polynomials, of their order, over the whole chip.
 
-    There is no constant term: (0, 0) is XREF, YREF in both directions.  stwcs has no use for
-    INVERSE rows (ACS handbook 4.1.5); other programs start their iterations there, so that the
-    closure matters and is stated.
-
-    Raises
-    ------
-    InputError
-        When the map folds the chip onto itself.
+    There is no constant term: (0, 0) is XREF, YREF in both directions. stwcs has no use for INVERSE
+    rows (ACS handbook 4.1.5); other programs start their iterations there, so that the closure
+    matters and is stated.  InputError when the map folds the chip onto itself.
     """
     stated = calibration.at(reference_date(calibration), origin="chip")[chip]
     one: ChipMap = stated.transformed(factor * np.eye(2))
@@ -252,14 +204,7 @@ def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInve
 def joint_covariance(
     calibrations: Sequence[Calibration], numbers: Sequence[Sequence[ChipNumbers]]
 ) -> Float:
-    """Covariance of all numbers of all calibrations, with what those of one orientation share.
-
-    Parameters
-    ----------
-    calibrations : sequence of Calibration
-    numbers : sequence of sequence of ChipNumbers
-        Of each calibration, those of all chips.
-    """
+    """Covariance of the numbers of all calibrations and chips, with a common orientation's part."""
     jacobians = [np.concatenate([chip.jacobian for chip in chips]) for chips in numbers]
     ends = np.cumsum([len(j) for j in jacobians])
     places = [slice(int(e) - len(j), int(e)) for e, j in zip(ends, jacobians, strict=True)]

@@ -46,14 +46,14 @@ _ANY_CHIP = -999  # stwcs lets such a row serve every chip
 
 @dataclass(frozen=True, eq=False)
 class IdcTab:
-    """An IDCTAB file: all its HDUs, and what they mean.
+    """IDCTAB file: all its HDUs, and their meaning.
 
     Parameters
     ----------
     hdus : tuple of Hdu
         All HDUs; the first table is HDU 1.
     name : str
-        What to call the file in errors.
+        Name of the file in errors.
 
     Raises
     ------
@@ -91,16 +91,16 @@ class IdcTab:
                     do="add it, or lower NORDER",
                 )
 
-    # -- what the file holds ---------------------------------------------------------------------
+    # -- content -----------------------------------------------------------------------------------
 
     @property
     def header(self) -> fits.Header:
-        """The primary header; a new one at each call."""
+        """Primary header; a new one at each call."""
         return self.hdus[0].header
 
     @property
     def rows(self) -> NDArray[np.void]:
-        """The coefficient table as a structured array."""
+        """Coefficient table as a structured array."""
         return self.hdus[1].rows
 
     @property
@@ -110,7 +110,7 @@ class IdcTab:
 
     @property
     def prefixes(self) -> tuple[str, str]:
-        """What coefficient columns begin with: CX, CY, or A, B in very old files."""
+        """First letters of coefficient columns: CX, CY, or A, B in very old files."""
         return ("CX", "CY") if "CX10" in self.columns else ("A", "B")
 
     @cached_property
@@ -135,7 +135,7 @@ class IdcTab:
 
     @property
     def is_acs_wfc(self) -> bool:
-        """Whether stwcs looks for time-dependent terms."""
+        """True where stwcs looks for time-dependent terms."""
         return self.instrument == "ACS" and self.detector == "WFC"
 
     @cached_property
@@ -149,7 +149,7 @@ class IdcTab:
 
     @property
     def tdd_scheme(self) -> str:
-        """As `drift.scheme_of`; 'none' for detectors other than ACS/WFC."""
+        """Scheme of the drift, see `drift.scheme_of`; 'none' for detectors other than ACS/WFC."""
         return scheme_of(self.tdd) if self.is_acs_wfc else "none"
 
     @property
@@ -388,7 +388,7 @@ def _filters(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _fits(asked: tuple[str, ...], row: tuple[str, ...]) -> bool:
-    """Whether a row's filters are those asked for; a table without filter columns serves all."""
+    """True where a row's filters are those asked for; a table without filter columns serves all."""
     if not row:
         return True
     if len(asked) == len(row):
@@ -413,7 +413,7 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
     InputError
         When the file cannot be read.
     FormatError
-        When it is no FITS file, is truncated, or lacks what an IDCTAB must have.
+        When it is no FITS file, is truncated, or lacks a part that an IDCTAB must have.
     """
     return IdcTab(read_hdus(path), str(path))
 

@@ -1,4 +1,4 @@
-"""An IDCTAB in words."""
+"""Text on an IDCTAB."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SCHEMES = {
 
 
 def describe_idctab(tab: IdcTab) -> list[str]:
-    """Lines of text of an IDCTAB, its findings at the end."""
+    """Lines of text on an IDCTAB, its findings at the end."""
     header = tab.header
     lines = [
         f"{tab.name}: IDCTAB of {tab.instrument}/{tab.detector or '(no DETECTOR)'}, "
@@ -49,7 +49,7 @@ def describe_idctab(tab: IdcTab) -> list[str]:
 
 
 def _first_rows(tab: IdcTab) -> list[int]:
-    """The first row of each chip and direction."""
+    """Indices of the first row of each chip and direction."""
     names = [c for c in ("DETCHIP", "DIRECTION") if c in tab.columns]
     seen: dict[tuple, int] = {}
     for k, row in enumerate(tab.rows):

@@ -1,8 +1,8 @@
-"""The extensions of a D2IMFILE or NPOLFILE, so that no consumer drops or misplaces a table.
+"""Extensions of a D2IMFILE or NPOLFILE, so that no consumer drops or misplaces a table.
 
-**Registration.**  CRPIX, CRVAL and CDELT are always written (see `lookup_file`).
+**Registration.** CRPIX, CRVAL and CDELT are always written (see `lookup_file`).
 
-**Padding.**  stwcs notes as the size of a correction the maximum of its table, not of the absolute
+**Padding.** stwcs notes as the size of a correction the maximum of its table, not of the absolute
 value, and astropy.wcs leaves out a table whose maximum is below zero.  Where no node is clearly
 above zero, columns are added at the right end: copies of the last one until the detector has ended,
 so that nothing changes there, then one that is positive and that no pixel reaches.
@@ -36,10 +36,7 @@ _CLEARLY = 0.01
 def one_per_chip(tables: Sequence[LookupTable], where: str) -> list[LookupTable]:
     """Tables in the order of the file: the highest chip first, so that EXTVER 1 is chip 2 of ACS.
 
-    Raises
-    ------
-    InputError
-        When there is none, or two of one chip.
+    InputError when there is none, or two of one chip.
     """
     if not tables:
         raise InputError("no look-up table is given", where=where, do="give one for each chip")
@@ -53,23 +50,11 @@ def one_per_chip(tables: Sequence[LookupTable], where: str) -> list[LookupTable]
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """What the file holds of one chip.
+    """Tables of one chip in the file; the consumer applies `turn` (2, 2) before it takes maxima."""
 
-    Parameters
-    ----------
-    table : LookupTable
-        For its chip and grid.
-    values : ndarray, shape (2, ny, nx)
-        To be stored.
-    sigma : ndarray, shape (2, ny, nx), or None
-        To be stored.
-    turn : ndarray, shape (2, 2)
-        What the consumer multiplies the values by before it takes their maxima.
-    """
-
-    table: LookupTable
-    values: Float
-    sigma: Float | None
+    table: LookupTable  # for its chip and grid
+    values: Float  # (2, ny, nx)
+    sigma: Float | None  # (2, ny, nx)
     turn: Float = field(default_factory=lambda: np.eye(2))
 
     def padding(self, columns: int) -> Float:
@@ -90,18 +75,10 @@ class Part:
 def lookup_file(
     parts: Sequence[Part], *, size: tuple[int, int], cards: Sequence[str], name: str
 ) -> LookupFile:
-    """A file of all its parts.
+    """File of all its parts, in the order of EXTVER.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        In the order of EXTVER.
-    size : tuple of int
-        Columns and rows of a chip.
-    cards : sequence of str
-        Of the primary header.
-    name : str
-        What to call the file.
+    `size` is the columns and rows of a chip, `cards` are of the primary header, `name` is for
+    errors.
     """
     primary = fits.PrimaryHDU()
     _append(primary, cards)
@@ -128,7 +105,7 @@ def _image(name: str, plane: Float, cards: Sequence[str]) -> fits.ImageHDU:
 
 
 def _place_cards(table: LookupTable, version: int, size: tuple[int, int]) -> list[str]:
-    """Where the table lies."""
+    """Cards of the registration of a table."""
     return [
         number_card("EXTVER", version),
         number_card("CCDCHIP", table.chip, "chip of the table"),
@@ -161,7 +138,7 @@ def identity_cards(instrument: str, detector: str, filetype: str, description: s
 
 
 def optional_cards(useafter: str | None, pedigree: str | None, history: Sequence[str]) -> list[str]:
-    """Cards that only the user can fill."""
+    """Cards of values that only the user knows."""
     return [
         *([text_card("USEAFTER", useafter)] if useafter else []),
         *([text_card("PEDIGREE", pedigree)] if pedigree else []),

@@ -60,7 +60,7 @@ def write_d2im(
     Returns
     -------
     LookupFile
-        What was written: single precision, as these files are.
+        Written file: single precision, as these files are.
 
     Raises
     ------
@@ -92,13 +92,13 @@ def write_d2im(
 def read_d2im(
     path: str | os.PathLike[str], *, first: Sequence[float] | None = None
 ) -> tuple[LookupTable, ...]:
-    """The detector's tables of a D2IMFILE.
+    """Detector's tables of a D2IMFILE.
 
     Parameters
     ----------
     path : path-like
     first : sequence of float, optional
-        Pixel (x, y) of the first node, against what the file says: for files without CRPIX and
+        Pixel (x, y) of the first node, in place of the file's own: for files without CRPIX and
         CRVAL, which older programs registered at pixel 1 and astropy.wcs since 6.1 at pixel 64.
 
     Returns

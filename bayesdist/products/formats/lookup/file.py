@@ -1,6 +1,6 @@
 """D2IMFILE and NPOLFILE: look-up tables of the distortion, as stwcs and astropy.wcs read them.
 
-Image extensions DX and DY for each chip, told apart by CCDCHIP.  Node k (from 1) of axis a lies at
+Image extensions DX and DY for each chip, identified by CCDCHIP.  Node k (from 1) of axis a lies at
 pixel CRVALa + (k - CRPIXa) CDELTa; a file without CRPIX and CRVAL has both 0, which puts the first
 node at pixel CDELT (astropy 6.1 and later; before, at pixel 1).
 
@@ -39,14 +39,14 @@ _FILTERS = ("FILTER1", "FILTER2", "FILTER")
 
 @dataclass(frozen=True, eq=False)
 class LookupFile:
-    """A D2IMFILE or NPOLFILE: all its HDUs, and what they mean.
+    """D2IMFILE or NPOLFILE: all its HDUs, and their meaning.
 
     Parameters
     ----------
     hdus : tuple of Hdu
         All HDUs.
     name : str
-        What to call the file in errors.
+        Name of the file in errors.
 
     Raises
     ------
@@ -67,12 +67,12 @@ class LookupFile:
 
     @cached_property
     def header(self) -> fits.Header:
-        """The primary header."""
+        """Primary header."""
         return self.hdus[0].header
 
     @property
     def kind(self) -> str:
-        """'npol' for a file that says so or names a filter, else 'd2im'."""
+        """'npol' for a file that states it or names a filter, else 'd2im'."""
         filetype = str(self.header.get("FILETYPE", "")).upper()
         if "D2I" in filetype:
             return "d2im"
@@ -95,12 +95,12 @@ class LookupFile:
 
     @cached_property
     def planes(self) -> tuple[Plane, ...]:
-        """The extensions DX and DY, in the order of the file."""
+        """Extensions DX and DY, in the order of the file."""
         return self._planes(AXES)
 
     @cached_property
     def sigma_planes(self) -> tuple[Plane, ...]:
-        """The extensions SIGMA_DX and SIGMA_DY."""
+        """Extensions SIGMA_DX and SIGMA_DY."""
         return self._planes(tuple(_SIGMA + a for a in AXES))
 
     def _planes(self, names: tuple[str, ...]) -> tuple[Plane, ...]:
@@ -118,12 +118,12 @@ class LookupFile:
         return tuple(dict.fromkeys(p.chip for p in self.planes))
 
     def pair(self, chip: int) -> tuple[Plane, Plane]:
-        """The extensions DX and DY of a chip.
+        """Extensions DX and DY of a chip.
 
         Raises
         ------
         FormatError
-            When one is missing or stands twice, or when the two are no common grid.
+            When one is missing or repeated, or when the two have no common grid.
         """
         x, y = (self._one(chip, axis) for axis in AXES)
         if x.nodes.shape != y.nodes.shape or x.first != y.first or x.step != y.step:
@@ -173,7 +173,7 @@ class LookupFile:
         filter : str
             As in `LookupTable`.
         first : sequence of float, optional
-            Pixel (x, y) of the first node, against what the file says.
+            Pixel (x, y) of the first node, in place of the file's own.
 
         Returns
         -------
@@ -182,7 +182,7 @@ class LookupFile:
         Raises
         ------
         FormatError
-            As `pair`, and for what `LookupTable` refuses.
+            As `pair`, and for values that `LookupTable` refuses.
         """
         x, _ = self.pair(chip)
         place = x.first if first is None else (float(first[0]), float(first[1]))
@@ -232,12 +232,7 @@ def write_lookup_file(file: LookupFile, path: str | os.PathLike[str]) -> None:
 
 
 def check_kind(file: LookupFile, kind: str) -> None:
-    """Refuse a file of the other kind.
-
-    Raises
-    ------
-    FormatError
-    """
+    """Refuse (FormatError) a file of the other kind."""
     if file.kind != kind:
         names = {"d2im": "a D2IMFILE", "npol": "an NPOLFILE"}
         raise FormatError(

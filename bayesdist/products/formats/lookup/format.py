@@ -1,4 +1,4 @@
-"""D2IMFILE and NPOLFILE as a format."""
+"""Format entry of D2IMFILE and NPOLFILE."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of a D2IMFILE or NPOLFILE against what stwcs and astropy.wcs make of it."""
+"""Checks of a D2IMFILE or NPOLFILE against the behaviour of stwcs and astropy.wcs."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _header(file: LookupFile) -> Iterator[Finding]:
 
 
 def _registration(file: LookupFile) -> Iterator[Finding]:
-    """Where the nodes lie; the extensions that lack the same keywords are gathered in one."""
+    """Findings on the positions of the nodes; extensions that lack the same keywords share one."""
     groups: dict[tuple[str, ...], list[Plane]] = {}
     for plane in file.planes:
         groups.setdefault(plane.missing, []).append(plane)
@@ -88,7 +88,7 @@ def _registration(file: LookupFile) -> Iterator[Finding]:
 
 
 def _cover(plane: Plane) -> Iterator[Finding]:
-    """The table should reach within a step of every edge, beyond which it is constant."""
+    """Finding on a table that ends more than a step inside an edge: it is constant beyond."""
     sizes = [plane.number(f"ONAXIS{a}", 0) for a in (1, 2)]
     for axis, (n, first, step, size) in enumerate(
         zip(plane.nodes.shape[::-1], plane.first, plane.step, sizes, strict=True)

@@ -1,12 +1,12 @@
 """NPOLFILE: shifts of the pixel before the polynomial, written as shifts after it.
 
 A filter's table F adds pixels to (x, y) before the polynomial P; an NPOLFILE holds N, in
-undistorted pixels of SCALE along Xc and Yc, that stwcs adds to what the polynomial gives:
+undistorted pixels of SCALE along Xc and Yc, that stwcs adds to the value of the polynomial:
 
     P(x + F(x)) / SCALE = P(x) / SCALE + N(x),     N = J F / SCALE,   J = dP/dx at the node
 
 Left out are the second order in F and the change of J from node to node, of which both sides make a
-straight line.  For ACS/WFC and 0.05 px that is some 5e-5 px; every file states what it is for it.
+straight line.  For ACS/WFC and 0.05 px that is some 5e-5 px; every file states its own value.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def write_npol(
     Returns
     -------
     LookupFile
-        What was written: single precision, as these files are.  Keyword BDNPLERR of its primary
+        Written file: single precision, as these files are.  Keyword BDNPLERR of its primary
         header is the largest difference in mas, over all chips, between the polynomial at the
         shifted pixel and the polynomial plus the stored table: at the nodes, halfway between them
         and at the edges of the detector.
@@ -145,7 +145,7 @@ def read_npol(
     *,
     first: Sequence[float] | None = None,
 ) -> tuple[LookupTable, ...]:
-    """The tables of an NPOLFILE, in pixels before the polynomial.
+    """Tables of an NPOLFILE, in pixels before the polynomial.
 
     Parameters
     ----------
@@ -183,10 +183,7 @@ def read_npol(
 def filter_name(file: LookupFile) -> str:
     """Filter of a file as data name it: without CLEAR; several are joined by '+'.
 
-    Raises
-    ------
-    FormatError
-        When the file names no filter at all.
+    FormatError when the file names no filter at all.
     """
     if not file.filters:
         raise FormatError(
@@ -207,7 +204,7 @@ def _chips(idctab: IdcTab) -> list[int]:
 
 
 class _Local:
-    """The polynomial of one chip and its derivatives, in units of SCALE."""
+    """Polynomial of one chip and its derivatives, in units of SCALE."""
 
     def __init__(self, idctab: IdcTab, chip: int, filters: Sequence[str]) -> None:
         self.idctab, self.chip, self.filters = idctab, chip, tuple(filters) or None
@@ -231,7 +228,7 @@ class _Local:
             )
 
     def jacobian(self, x: Float, y: Float) -> Float:
-        """d(Xc, Yc) / d(x, y) over SCALE at pixels of any shape, shape (..., 2, 2)."""
+        """Derivatives (..., 2, 2) of (Xc, Yc) by (x, y) over SCALE, at pixels of any shape."""
         dx, dy = x - self.reference[0], y - self.reference[1]
         out = np.empty((*x.shape, 2, 2))
         for a, terms in enumerate(self._terms):
@@ -245,7 +242,7 @@ class _Local:
         return self.jacobian(*np.meshgrid(*table.nodes()))
 
     def part(self, table: LookupTable) -> Part:
-        """The table after the polynomial, as it is stored."""
+        """Table after the polynomial, as it is stored."""
         jacobian = self._at_nodes(table)
         values = np.einsum("yxab,byx->ayx", jacobian, table.values)
         sigma = None
@@ -254,12 +251,12 @@ class _Local:
         return Part(table, values, sigma, np.linalg.inv(self.linear))
 
     def before(self, stored: LookupTable) -> LookupTable:
-        """The table before the polynomial, from what is stored."""
+        """Table before the polynomial, from the stored one."""
         jacobian = self._at_nodes(stored)
         values = _solve(jacobian, stored.values)
         sigma = None
         if stored.sigma is not None:
-            # a sigma of others may not come from two independent ones before the polynomial
+            # sigmas of other programs may not come from two independent ones before the polynomial
             sigma = np.sqrt(np.maximum(_solve(jacobian**2, stored.sigma**2), 0.0))
         return LookupTable(stored.chip, values, stored.filter, stored.first, stored.step, sigma)
 
@@ -284,7 +281,7 @@ class _Local:
 
 
 def _solve(matrix: Float, values: Float) -> Float:
-    """Solve (ny, nx, 2, 2) systems for values (2, ny, nx)."""
+    """Solutions (2, ny, nx) of (ny, nx, 2, 2) systems for values (2, ny, nx)."""
     right = np.moveaxis(values, 0, -1)[..., None]
     solved = np.asarray(np.linalg.solve(matrix, right)[..., 0], float)
     return np.moveaxis(solved, -1, 0)

@@ -1,4 +1,4 @@
-"""One image extension of a D2IMFILE or NPOLFILE, and where its nodes lie."""
+"""Image extension of a D2IMFILE or NPOLFILE, and the positions of its nodes."""
 
 from __future__ import annotations
 
@@ -19,20 +19,11 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """One image extension: the shifts along one axis of one chip, or their sigmas.
-
-    Parameters
-    ----------
-    hdu : Hdu
-    name : str
-        EXTNAME: DX, DY, SIGMA_DX or SIGMA_DY.
-    where : str
-        The extension in words, for errors.
-    """
+    """Image extension: the shifts along one axis of one chip, or their sigmas."""
 
     hdu: Hdu
-    name: str
-    where: str
+    name: str  # EXTNAME: DX, DY, SIGMA_DX or SIGMA_DY
+    where: str  # name of the extension in errors
 
     @cached_property
     def header(self) -> fits.Header:
@@ -40,13 +31,7 @@ class Plane:
         return self.hdu.header
 
     def number(self, keyword: str, default: float) -> float:
-        """Value of a keyword.
-
-        Raises
-        ------
-        FormatError
-            When it is no number.
-        """
+        """Value of a keyword; FormatError when it is no number."""
         value = self.header.get(keyword, default)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise FormatError(
@@ -66,12 +51,12 @@ class Plane:
 
     @property
     def values(self) -> Float:
-        """All nodes, padding included, shape (ny, nx)."""
+        """Nodes, padding included, shape (ny, nx)."""
         return self.hdu.image
 
     @property
     def nodes(self) -> Float:
-        """The nodes without padding, shape (ny, nx)."""
+        """Nodes without padding, shape (ny, nx)."""
         pad = int(self.number("BDPAD", 0))
         return self.values[..., :-pad] if pad > 0 else self.values
 

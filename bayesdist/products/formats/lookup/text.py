@@ -1,4 +1,4 @@
-"""A D2IMFILE or NPOLFILE in words."""
+"""Text on a D2IMFILE or NPOLFILE."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["describe_lookup_file"]
 
 
 def describe_lookup_file(file: LookupFile) -> list[str]:
-    """Lines of text of a D2IMFILE or NPOLFILE, its findings at the end."""
+    """Lines of text on a D2IMFILE or NPOLFILE, its findings at the end."""
     header = file.header
     kind, unit = {
         "d2im": ("D2IMFILE", "pixels, before the polynomial"),

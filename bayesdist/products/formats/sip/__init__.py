@@ -1,1 +1,1 @@
-"""The SIP header: a distortion as FITS keywords."""
+"""SIP header: a distortion as FITS keywords."""

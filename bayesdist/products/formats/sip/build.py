@@ -1,4 +1,4 @@
-"""A SIP header from a solution: forward terms with their sigmas, and an inverse that is checked."""
+"""SIP header from a solution: forward terms with their sigmas, and an inverse that is checked."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def sip_from_solution(
     crval : tuple of float, optional
         Sky position that the header states, degrees.  With `tangent_point` that of the reference
         pixel by default, and CRPIX is the pixel of any other one that is given; where the solution
-        has no such pixel, A_0_0 and B_0_0 are what they must be.  Without `tangent_point` it is
+        has no such pixel, A_0_0 and B_0_0 follow.  Without `tangent_point` it is
         written as it is, (0, 0) by default.
     tangent_point : tuple of float, optional
         Sky position of (u, v) = (0, 0), degrees: `MatchTable.tangent_point`.  The polynomial is
@@ -119,7 +119,7 @@ def build_sip(
     origin: tuple[float, float] | None = None,
     notes: Sequence[str] = (),
 ) -> SipHeader:
-    """As `sip_from_solution`, of a calibration: on the sky where its plane is."""
+    """SIP header of a calibration, on the sky where its plane is; as `sip_from_solution`."""
     if linear not in ("cd", "sip"):
         raise InputError(
             f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
@@ -163,7 +163,7 @@ def build_sip(
     kept = [k for k, (i, j) in enumerate(poly.terms) if linear == "sip" or i + j >= 2]
     if sky is not None:
         offset = sky.offset
-        if linear == "cd" and poly.constant.any():  # no pixel has CRVAL: only A and B can say so
+        if linear == "cd" and poly.constant.any():  # no pixel has CRVAL: only A and B can state it
             kept.insert(0, poly.index(0, 0))
             notes = (*notes, "No pixel of the solution has CRVAL: A_0_0 and B_0_0 hold the rest.")
     a, b = ({poly.terms[k]: float(terms[axis, k]) for k in kept} for axis in (0, 1))
@@ -270,7 +270,7 @@ def _origin(poly: Monomials, unit: str) -> tuple[float, float]:
 def _relative_to_identity(
     poly: Monomials, pixel: float, origin: tuple[float, float]
 ) -> tuple[Float, Float]:
-    """The whole model in pixels from the origin, less u = x and v = y, and its sigmas."""
+    """Model in pixels from the origin, less u = x and v = y, and its sigmas."""
     terms = poly.values / pixel
     for axis, power in enumerate(((1, 0), (0, 1))):
         terms[axis, poly.index(0, 0)] -= origin[axis] / pixel
@@ -285,7 +285,7 @@ def _cards(
     unit: str,
     scale_arcsec: float | None,
 ) -> tuple[str, ...]:
-    """What the fields of a SipHeader do not say."""
+    """Cards of values that are no fields of a SipHeader."""
     what = {
         "cd": "CD holds the linear terms; A and B begin at order 2.",
         "sip": "CD is a pure scale; A and B hold constant and linear terms.",
@@ -311,7 +311,7 @@ def _cards(
 def _sky_cards(
     tangent_point: tuple[float, float] | None, crval: tuple[float, float] | None
 ) -> tuple[str, ...]:
-    """What CRVAL rests on."""
+    """Cards on the origin of CRVAL."""
     if tangent_point is None:
         if crval is not None:
             return ()

@@ -1,4 +1,4 @@
-"""A SIP header as a calibration."""
+"""Calibration of a SIP header."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Float = NDArray[np.float64]
 
 
 class MissingSize(InputError):
-    """A header that does not say how large its image is."""
+    """Error of a header that does not state the size of its image."""
 
 
 def sip_calibration(
@@ -29,29 +29,10 @@ def sip_calibration(
     pixels: bool = False,
     notes: tuple[str, ...] = (),
 ) -> Calibration:
-    """The calibration that a SIP header holds.
+    """Calibration of a SIP header: one chip without number, with the header's sigmas if any.
 
-    Parameters
-    ----------
-    sip : SipHeader
-    name : str
-        Of the file, for messages.
-    size : tuple of float, optional
-        Columns and rows, for a header that does not say.
-    pixels : bool
-        Whether (u, v) are corrected pixels, for a file that states no CD; else arcseconds.
-    notes : tuple of str
-        What else a reader has to know.
-
-    Returns
-    -------
-    Calibration
-        Of one chip without number; with the sigmas that the header may hold.
-
-    Raises
-    ------
-    MissingSize
-        Without a size.
+    `size` is columns and rows, for a header without them (else MissingSize); with `pixels`, for a
+    file without CD, (u, v) are corrected pixels, else arcseconds; `notes` go to the reader.
     """
     found = size if sip.size is None else (float(sip.size[0]), float(sip.size[1]))
     if found is None:
@@ -89,7 +70,7 @@ def sip_calibration(
 
 
 def _variances(sip: SipHeader, linear: Float) -> Float | None:
-    """Variances of the header's sigmas, behind a linear map; None where there are none."""
+    """Variances of a linear map of the header's sigmas; None where there are none."""
     if not sip.sigma_a and not sip.sigma_b:
         return None
     order = max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1

@@ -1,4 +1,4 @@
-"""What the checks of a SIP header share: its coefficients by family, and its detector."""
+"""Functions that several checks of a SIP header use: coefficients by family, and detector."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ EDGE = 0.5
 
 
 def forward_is_used(sip: SipHeader) -> bool:
-    """Whether programs apply A and B: they ignore lower orders."""
+    """True where programs apply A and B: they ignore orders below 2."""
     return min(sip.order) >= SIP_ORDERS[0]
 
 
 def inverse_is_used(sip: SipHeader) -> bool:
-    """Whether AP and BP are there and of an order that is not ignored."""
+    """True where AP and BP are there and of an order that is not ignored."""
     return sip.inverse_order is not None and min(sip.inverse_order) >= SIP_ORDERS[0]
 
 
 def families(sip: SipHeader) -> list[tuple[str, int, dict[tuple[int, int], float]]]:
-    """Prefix, order and terms of A and B, and of AP and BP where they are."""
+    """Prefix, order and terms of A and B, and of AP and BP where they are there."""
     out = [("A", sip.order[0], dict(sip.a)), ("B", sip.order[1], dict(sip.b))]
     if sip.inverse_order is not None:
         out += [
@@ -49,7 +49,7 @@ def families(sip: SipHeader) -> list[tuple[str, int, dict[tuple[int, int], float
 
 
 def values_by_keyword(sip: SipHeader) -> dict[str, float]:
-    """All coefficients."""
+    """Coefficients of both pairs, by keyword."""
     return {sip_keyword(p, *k): c for p, _, terms in families(sip) for k, c in terms.items()}
 
 
@@ -78,7 +78,7 @@ def half_unit(sip: SipHeader) -> float:
 
 
 def with_coefficient(sip: SipHeader, keyword: str, value: float) -> SipHeader:
-    """The header with another value of one coefficient."""
+    """Header with another value of one coefficient."""
     family = keyword.split("_")[0].lower()
     change: dict[str, Any] = {family: {**getattr(sip, family), powers_of(keyword): value}}
     return replace(sip, **change)

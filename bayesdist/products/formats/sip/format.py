@@ -1,4 +1,4 @@
-"""The SIP header as a format."""
+"""Format entry of the SIP header."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
-from bayesdist.products.formats.sip.build import build_sip
 from bayesdist.products.formats.sip.calibration import sip_calibration
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
-from bayesdist.products.formats.wcs import describe_wcs
+from bayesdist.products.formats.wcs.format import describe as describe_wcs
 
 __all__ = ["FORMAT", "Settings"]
 
 
 class Settings(FormatSettings):
-    """A SIP header."""
+    """Configuration of a SIP header."""
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
@@ -49,7 +48,9 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
 def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
-    """A header for each chip."""
+    """Headers, one for each chip."""
+    from bayesdist.products.formats.sip.build import build_sip  # no file that is read needs it
+
     notes = [*calibration.notes, *([calibration.plane.note] if calibration.plane.note else [])]
     out = []
     for number in calibration.numbers:

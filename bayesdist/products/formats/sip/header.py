@@ -1,4 +1,4 @@
-"""The SIP header: a distortion as FITS keywords (Shupe et al. 2005, ASP Conf. 347, 491).
+"""SIP header: a distortion as FITS keywords (Shupe et al. 2005, ASP Conf. 347, 491).
 
 With FITS pixels (x, y):
 
@@ -30,7 +30,7 @@ SIP_ORDERS = (2, 9)
 
 @dataclass(frozen=True, eq=False)
 class SipHeader:
-    """What a header says of the distortion of one image, and every other card of it.
+    """Distortion of one image as a header states it, and every other card of the header.
 
     Mappings go from the powers (p, q) of u and v to the coefficient.
 
@@ -99,7 +99,7 @@ class SipHeader:
 
     @property
     def has_inverse(self) -> bool:
-        """Whether the header holds AP and BP."""
+        """True where the header holds AP and BP."""
         return self.inverse_order is not None
 
     def forward(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:

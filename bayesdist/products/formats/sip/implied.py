@@ -1,4 +1,4 @@
-"""What all other numbers of a SIP header imply of one of its coefficients."""
+"""Value of one coefficient of a SIP header that all other numbers of the header imply."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy import stats
-from scipy.optimize import brentq, minimize_scalar
-from scipy.special import betaln
 
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
@@ -33,7 +30,7 @@ __all__ = ["Implied", "StatedMaxima", "implied_values", "with_error"]
 Float = NDArray[np.float64]
 Frozen = Any  # a distribution of scipy.stats with its parameters
 
-# Odds of a further, independent fault, for what a suspect leaves unexplained.
+# Odds of a further, independent fault, for values that a suspect leaves unexplained.
 _SECOND_FAULT = 1e-2
 # Components of a closure are known to this; pixels.
 _ROUNDING = 1e-12
@@ -48,7 +45,7 @@ _NODES, _SAMPLED = 129, 2e-4
 
 @dataclass(frozen=True)
 class Implied:
-    """What all other numbers of a header say of one coefficient.
+    """Value of one coefficient that all other numbers of a header imply.
 
     Parameters
     ----------
@@ -56,13 +53,13 @@ class Implied:
     printed : float
         Its value in the header.
     value, sigma : float
-        Mean and standard deviation of what the others imply.
+        Mean and standard deviation of the implied value.
     interval : tuple of float
         That holds 95 % of the probability.
     probability : float
         That this coefficient is the wrong one, if exactly one is and any might be.
     sources : tuple of str
-        What the value agrees with: the other pair of polynomials, and A_DMAX or B_DMAX.
+        Sources that the value agrees with: the other pair of polynomials, and A_DMAX or B_DMAX.
     """
 
     keyword: str
@@ -80,23 +77,23 @@ class Implied:
 
 
 def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Implied, ...]:
-    """Each coefficient of A, B, AP and BP as if it alone were unknown.
+    """Values of each coefficient of A, B, AP and BP as if it alone were unknown.
 
     The closure (pixel, through A and B, back through AP and BP, minus pixel) is projected on
     orthonormal Legendre products over the detector, up to the order of the inverse; what that order
     cannot follow drops out.  A wrong coefficient moves the components along a known direction.
-    What they scatter beside it is the error of the printed inverse: normal, with one variance for
+    Their scatter about it is the error of the printed inverse: normal, with one variance for
     even and one for odd total degree.  An inverse that was fitted to pairs of stars is biased by
     their position errors towards where stars are denser, which for a centred field is an odd
     function.  With a scale-free prior of both variances, the coefficient has a Student t
-    distribution.  A_DMAX or B_DMAX cuts out of it what its printed digits allow.
+    distribution.  A_DMAX or B_DMAX restricts it to the values that its printed digits allow.
 
     Parameters
     ----------
     sip : SipHeader
         With an inverse.
     size : tuple of int, optional
-        Columns and rows of the detector; by default what the header says.
+        Columns and rows of the detector; by default those of the header.
 
     Returns
     -------
@@ -208,6 +205,9 @@ class _Closure:
         for _ in range(_STEPS):  # with one slope: a distortion is nearly linear in its coefficients
             value -= (d @ rest[mask]) / (d @ d)
             rest = components(value)
+        from scipy import stats  # here, as few files need it, and all would wait for it
+        from scipy.special import betaln
+
         dof = int(mask.sum()) - 1
         inside, outside = (float(r @ r) + r.size * _ROUNDING**2 for r in (rest[mask], rest[~mask]))
         score = betaln(0.5, dof / 2) - dof / 2 * np.log(inside)
@@ -225,7 +225,7 @@ class StatedMaxima:
 
     @classmethod
     def of(cls, sip: SipHeader, size: tuple[int, int]) -> StatedMaxima | None:
-        """None where they are not stated, or neither tells which points are meant."""
+        """Stated maxima of a header; None where none are stated, or they fit no set of points."""
         if None in sip.dmax:
             return None
         for margin in (0.0, EDGE):
@@ -237,11 +237,11 @@ class StatedMaxima:
         return None
 
     def with_value(self, keyword: str, value: float) -> StatedMaxima:
-        """The same with another coefficient."""
+        """Stated maxima with another coefficient."""
         return replace(self, sip=with_coefficient(self.sip, keyword, value))
 
     def met(self, prefix: str) -> bool:
-        """Whether the printed coefficients of an axis reach what is stated."""
+        """True where the printed coefficients of an axis reach the stated maximum."""
         low, high = self._limits(prefix)
         return bool(low <= np.abs(self._values(prefix)).max() <= high)
 
@@ -256,6 +256,8 @@ class StatedMaxima:
         def beyond(z: float, limit: float) -> float:
             changed = base + (centre + z * half - printed) * monomial
             return float(np.abs(changed).max()) - limit
+
+        from scipy.optimize import minimize_scalar
 
         # the largest |p| is a convex function of each coefficient
         lowest, highest = self._limits(prefix)
@@ -282,11 +284,13 @@ class StatedMaxima:
 def _crossing(
     beyond: Callable[[float, float], float], start: float, end: float, limit: float
 ) -> float:
-    """Where a function that rises from `start` to `end` meets a limit, or the end next to it."""
+    """Point where a function that rises from `start` to `end` meets a limit, or the nearer end."""
     if beyond(start, limit) >= 0:
         return start
     if beyond(end, limit) <= 0:
         return end
+    from scipy.optimize import brentq
+
     return float(brentq(beyond, start, end, args=(limit,)))
 
 

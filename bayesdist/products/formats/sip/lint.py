@@ -1,4 +1,4 @@
-"""Checks of a SIP header against what astropy.wcs, stwcs and gwcs make of it."""
+"""Checks of a SIP header against the behaviour of astropy.wcs, stwcs and gwcs."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
 # How much a stated value may differ from the measured one: headers print three decimals.
 _DMAX_ABSOLUTE, _DMAX_RELATIVE = 1e-3, 1e-3
 _CLOSURE_RELATIVE = 1e-2
-# No program computes with A_DMAX: a rough value does no harm, one that is wrong tells of another
+# No program computes with A_DMAX: a rough value does no harm, one that is wrong indicates another
 # header.
 _DMAX_ROUGH = 0.1
 # One wrong coefficient is to blame where its right value leaves this part of the closure at most.
 _EXPLAINED = 0.2
-# Suspects that are named beside the first one.
+# Suspects that are named after the first one.
 _WORTH_NAMING = 0.05
 # How far two numbers of one size may differ that are the same but for a slip.
 _SAME_SIZE = 0.05
@@ -49,8 +49,8 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
     ----------
     sip : SipHeader
     size : tuple of int, optional
-        Columns and rows of the detector; by default what the header says.  Without either, the
-        checks that need a detector are left out, and a note says so.
+        Columns and rows of the detector; by default those of the header.  Without either, the
+        checks that need a detector are left out, with a note.
 
     Returns
     -------
@@ -197,7 +197,7 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
 
 
 def _accused(sip: SipHeader, size: tuple[int, int], closure: float) -> Iterator[Finding]:
-    """The coefficient that is wrong, where its right value alone makes A, B and AP, BP agree."""
+    """Coefficient that is wrong, where its right value alone makes A, B and AP, BP agree."""
     suspects = implied_values(sip, size)
     first = suspects[0]
     left = worst_closure(with_coefficient(sip, first.keyword, first.value), size)

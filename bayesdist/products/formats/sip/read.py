@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 CD_KEYWORDS = ("CD1_1", "CD1_2", "CD2_1", "CD2_2")
-# What stands for a CD matrix in other headers.
+# Keywords in place of a CD matrix in other headers.
 LINEAR_KEYWORDS = (
     *("PC1_1", "PC1_2", "PC2_1", "PC2_2"),
     *("CDELT1", "CDELT2", "CROTA1", "CROTA2"),
@@ -58,14 +58,14 @@ def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> S
 
 
 def sip_of(content: Content, *, ext: int | str | None = None) -> SipHeader:
-    """As `read_sip`, of what a file holds."""
+    """SIP header of a file's content; as `read_sip`."""
     with readable(content.name):
         header = _chosen(content, ext)
     return parsed(header, content.name)
 
 
 def holds_sip(content: Content) -> bool:
-    """Whether there is a header with A_ORDER, right or wrong."""
+    """True where there is a header with A_ORDER, right or wrong."""
     return any("A_ORDER" in hdu.header for hdu in content.hdus)
 
 
@@ -73,7 +73,7 @@ def holds_sip(content: Content) -> bool:
 
 
 def _chosen(content: Content, ext: int | str | None) -> fits.Header:
-    """The header of an HDU; by default the first one with A_ORDER."""
+    """Header of an HDU; by default the first one with A_ORDER."""
     if not content.hdus:
         raise FormatError(
             "is not a header that can be read: there is no A_ORDER",
@@ -100,7 +100,7 @@ def _chosen(content: Content, ext: int | str | None) -> fits.Header:
 
 
 def parsed(header: fits.Header, where: str) -> SipHeader:
-    """The SIP header that cards hold; `where` names them in errors."""
+    """SIP header of these cards; `where` names them in errors."""
     with readable(where):
         return _parsed(header, where)
 

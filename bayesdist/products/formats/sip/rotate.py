@@ -1,4 +1,4 @@
-"""A SIP header in rotated or mirrored pixels: forward and inverse terms, CD and CRPIX together."""
+"""SIP header in rotated or mirrored pixels: forward and inverse terms, CD and CRPIX together."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SHAPE = ("NAXIS1", "NAXIS2", "IMAGEW", "IMAGEH")
 
 
 def rotated_sip(sip: SipHeader, degrees: float, *, mirror: bool = False) -> SipHeader:
-    """The header of the same image in rotated or mirrored pixels.
+    """Header of an image in rotated or mirrored pixels.
 
     The sky stays where it is: forward terms, inverse terms, CD and CRPIX change together, so that
     every star has the same position as before at its new pixel.

@@ -1,4 +1,4 @@
-"""A SIP header in words."""
+"""Text on a SIP header."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["coefficient_lines", "sip_lines"]
 
 
 def sip_lines(sip: SipHeader, name: str) -> list[str]:
-    """Lines that say what a header states, but for its coefficients."""
+    """Lines of text on a header, but for its coefficients."""
     size = "unknown" if sip.size is None else f"{sip.size[0]} x {sip.size[1]} px"
     lines = [
         f"{name}: SIP header, A_ORDER {sip.order[0]}, B_ORDER {sip.order[1]}, image size {size}",
@@ -35,7 +35,7 @@ def sip_lines(sip: SipHeader, name: str) -> list[str]:
 
 
 def _closure(sip: SipHeader) -> str:
-    """What the header states of AP and BP, and what they leave."""
+    """Line on the stated closure of AP and BP, and on the measured one."""
     stated = "not stated" if sip.closure is None else f"stated {sip.closure:.3g} px"
     if sip.size is None:
         return f"{stated}; not computed, for the image size is not known"

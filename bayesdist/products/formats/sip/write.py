@@ -1,4 +1,4 @@
-"""Writing of SIP headers: what was read stays card by card, and numbers keep all their digits."""
+"""Writing of SIP headers: cards that were read stay, and numbers keep all their digits."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.data.files import atomic_path
+from bayesdist.files import atomic_path
 from bayesdist.products.formats.common.cards import header_of, keyword_of, number_card, text_card
 from bayesdist.products.formats.common.coefficients import sip_keyword, sip_powers
 from bayesdist.products.formats.sip.header import SipHeader
@@ -22,7 +22,7 @@ _STRUCTURE = (
 )
 # Keywords that only a field of the header stands for: without the field they go.
 _OWNED = ("AP_ORDER", "BP_ORDER", "A_DMAX", "B_DMAX", "BDCLOS", "BDU0", "BDV0", "BDUNIT")
-# What readers assume for a keyword that is not there.
+# Values that readers assume for missing keywords.
 _DEFAULTS: dict[str, float | str] = {
     **dict.fromkeys(("CRVAL1", "CRVAL2", *CD_KEYWORDS), 0.0),
     **dict.fromkeys(("CTYPE1", "CTYPE2", "BDUNIT"), ""),
@@ -34,8 +34,8 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
     A path that ends in .fits gives a FITS file without data, whose structural keywords are its own
     (the image size goes to IMAGEW and IMAGEH); any other path a text file with one card a line,
-    which ``astropy.io.fits.Header.fromtextfile`` reads.  What `read_sip` read is written back card
-    by card.
+    which ``astropy.io.fits.Header.fromtextfile`` reads.  A header that was read is written back
+    card by card.
 
     Parameters
     ----------
@@ -60,12 +60,12 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
 
 def sip_text(sip: SipHeader) -> str:
-    """The header as text, one card a line."""
+    """Header as text, one card a line."""
     return "\n".join(_cards(sip)) + "\n"
 
 
 def sip_header(sip: SipHeader) -> fits.Header:
-    """The whole header, as astropy.wcs.WCS takes it.
+    """Whole header, as astropy.wcs.WCS takes it.
 
     Parameters
     ----------
@@ -74,13 +74,13 @@ def sip_header(sip: SipHeader) -> fits.Header:
     Returns
     -------
     astropy.io.fits.Header
-        The cards that were read, with what the fields say otherwise.
+        The cards that were read, except where fields differ.
     """
     return header_of(_cards(sip))
 
 
 def _cards(sip: SipHeader) -> list[str]:
-    """All cards: those that were read stay as they are unless a field says otherwise."""
+    """Cards: those that were read stay as they are unless a field differs."""
     header = header_of(sip.cards)
     stated = _keywords(sip)
     drop = {
@@ -111,7 +111,7 @@ def _cards(sip: SipHeader) -> list[str]:
 
 
 def _keywords(sip: SipHeader) -> dict[str, tuple[float | int | str, str]]:
-    """Every keyword that a field stands for, with value and comment, in the usual order."""
+    """Keywords that the fields stand for, with value and comment, in the usual order."""
     out: dict[str, tuple[float | int | str, str]] = {}
     for axis in (1, 2):
         out[f"CTYPE{axis}"] = sip.ctype[axis - 1], "tangent plane with SIP"

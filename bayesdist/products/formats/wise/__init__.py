@@ -1,1 +1,1 @@
-"""The distortion entries of WISE meta-data."""
+"""Distortion entries of WISE meta-data."""

@@ -1,7 +1,7 @@
 """Writing of the distortion entries of WISE meta-data: WSDC D-T033, Appendix B.
 
-The layout has no place for uncertainties.  They stand in comment lines, which begin with a
-backslash: readers of the layout pass over them, and `read_wise_meta` takes them back.
+The layout cannot hold uncertainties.  They stand in comment lines, which begin with a backslash:
+readers of the layout skip them, and `read_wise_meta` reads them.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.data.files import atomic_path
 from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.coefficients import largest_magnitude, sip_keyword
 from bayesdist.products.formats.sip.families import EDGE, families, offset_ranges
@@ -46,7 +46,7 @@ def write_wise_meta(
     path : path-like
     bands : mapping of int to SipHeader
         By the number of the band.  CD is a pure scale and the reference pixel the middle of the
-        array, as ``sip_from_solution(..., linear="sip")`` has it: the file says nothing of either.
+        array, as ``sip_from_solution(..., linear="sip")`` has it: the file states neither.
     skew : mapping of int to float, optional
         SKEW of each band, radians; zero by default.
 
@@ -62,7 +62,7 @@ def write_wise_meta(
 
 
 def wise_text(bands: Mapping[int, SipHeader], skew: Mapping[int, float] | None = None) -> str:
-    """As `write_wise_meta`, the text of the file."""
+    """Text of the file that `write_wise_meta` writes."""
     if not bands:
         raise InputError("there is no band to write", do="give a header for each band")
     skew = {} if skew is None else skew
@@ -73,7 +73,7 @@ def wise_text(bands: Mapping[int, SipHeader], skew: Mapping[int, float] | None =
 
 
 def _lines(band: int, sip: SipHeader, skew: float) -> list[str]:
-    """All lines of one band."""
+    """Lines of one band."""
     _check(band, sip, skew)
     written = _as_written(sip)
     size = written.size or (0, 0)
@@ -115,7 +115,7 @@ def _lines(band: int, sip: SipHeader, skew: float) -> list[str]:
 
 
 def _as_written(sip: SipHeader) -> SipHeader:
-    """The header with the digits of the file, every term of its orders there."""
+    """Header with the digits of the file, every term of its orders there."""
     terms: dict[str, Any] = {
         prefix.lower(): {k: float(f"{values.get(k, 0.0):.6E}") for k in _powers(order)}
         for prefix, order, values in families(sip)

@@ -1,4 +1,4 @@
-"""WISE meta-data as a format."""
+"""Format entry of WISE meta-data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
-from bayesdist.products.formats.sip.build import build_sip
 from bayesdist.products.formats.sip.header import SIP_ORDERS
 from bayesdist.products.formats.wise.build import wise_text
 from bayesdist.products.formats.wise.lint import lint_wise_band
@@ -35,7 +34,7 @@ Bands = tuple[WiseBand, ...]
 
 
 class Settings(FormatSettings):
-    """The entries of the band that the detector is named after."""
+    """Configuration of the entries of the band that the detector is named after."""
 
     def check(
         self,
@@ -43,7 +42,7 @@ class Settings(FormatSettings):
         size: tuple[float, float] | None,
         reference_pixel: tuple[float, float] | None,
     ) -> None:
-        """Refuse what is not the whole array of a band, its middle the reference pixel."""
+        """Refuse a chip that is not the whole array of a band, its middle the reference pixel."""
         band = _band(detector)
         if band is None:
             raise ValueError(
@@ -81,7 +80,9 @@ def _calibration(named: tuple[str, Bands], name: str, choice: Choice) -> Calibra
 
 
 def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
-    """As WISE has it: all linear terms in A and B, and an inverse of the same order."""
+    """WISE's form: all linear terms in A and B, and an inverse of equal order."""
+    from bayesdist.products.formats.sip.build import build_sip  # no file that is read needs it
+
     band = _band(calibration.detector)
     if band is None:
         raise InputError(
@@ -90,7 +91,7 @@ def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tupl
             do="name the band as detector.name, or leave wise_meta out",
         )
     sip = build_sip(
-        replace(calibration, plane=Plane("free")),  # the entries have no place for the sky
+        replace(calibration, plane=Plane("free")),  # the entries cannot state a sky position
         epoch=options.epoch,
         inverse_order=max(calibration.model.order, SIP_ORDERS[0]),
         linear="sip",

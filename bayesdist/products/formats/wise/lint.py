@@ -29,7 +29,7 @@ __all__ = ["lint_wise_band"]
 
 _NUMBER = re.compile(r"([+-]?)([0-9]+)\.([0-9]+)([EeDd][+-]?[0-9]+)")
 _MONOMIAL = re.compile(r"coefficient of (\S+)")
-# Farther from what is implied a number is taken as excluded.
+# Farther from the implied value a number counts as excluded.
 _ALLOWED_SIGMAS = 4.0
 
 
@@ -43,10 +43,10 @@ def lint_wise_band(band: WiseBand) -> tuple[Finding, ...]:
     Returns
     -------
     tuple of Finding
-        Those of `lint_sip`, and of the text itself: coefficients that are missing, numbers with
+        Findings of `lint_sip`, and on the text itself: coefficients that are missing, numbers with
         another count of digits than the rest, comments that name another monomial than the keyword.
     """
-    # what would be said of its parity is about the nominal CD, which is not in the file
+    # a finding on parity would be on the nominal CD, which is not in the file
     findings = [f for f in lint_sip(band.sip) if f.where != "CD"]
     return (*findings, *_absent(band.sip), *_digits(band), *_comments(band), *_skew(band))
 
@@ -59,7 +59,7 @@ def _absent(sip: SipHeader) -> Iterator[Finding]:
 
 
 def _digits(band: WiseBand) -> Iterator[Finding]:
-    """A number with a digit too many or too few, and which digit that may be."""
+    """Finding on a number with a digit too many or too few, and which digit that may be."""
     numbers = {
         k: m for k, v in band.printed.items() if sip_powers(k) and (m := _NUMBER.fullmatch(v))
     }

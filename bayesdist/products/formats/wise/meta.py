@@ -29,7 +29,7 @@ __all__ = [
 _ENTRY = re.compile(r"\S*distort_(?:skew|(?:a|b|ap|bp)_)\S*")
 _ENTRY_LINE = re.compile(r"\S*distort_(\S+)\s+(\d+)\s+(\S+)\s+([ir])\s+(\S+)\s*(.*)")
 _KEYWORD = re.compile(r"SKEW|[AB]P?_(?:ORDER|\d_\d)|[AB]_DMAX")
-# What `write_wise_meta` says in comment lines, which other readers pass over.
+# Entries of `write_wise_meta` in comment lines, which other readers skip.
 _ASIDE = re.compile(r"\\\s+(\d+)\s+([AB]E_\d_\d|BDCLOS)\s+r\s+(\S+).*")
 # Columns and rows of the arrays, and arcseconds in a pixel: those of W4 are twice as wide.
 ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
@@ -37,13 +37,13 @@ ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
 
 @dataclass(frozen=True, eq=False)
 class WiseBand:
-    """The distortion entries of one band in a WISE meta-data file.
+    """Distortion entries of one band in a WISE meta-data file.
 
     Parameters
     ----------
     band : int
     sip : SipHeader
-        The reference pixel is the middle of the array.  The file says nothing of the sky: CRVAL is
+        The reference pixel is the middle of the array.  The file has no sky position: CRVAL is
         zero, and CD has the nominal scale.
     skew : float
         Of the CD matrix, radians.
@@ -87,7 +87,7 @@ def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
 
 
 def bands_of(content: Content) -> tuple[WiseBand, ...]:
-    """As `read_wise_meta`, of what a file holds."""
+    """Bands of a file's content; as `read_wise_meta`."""
     where, lines = content.name, content.text.splitlines()
     entries: dict[int, dict[str, tuple[str, str]]] = {}
     asides: dict[int, dict[str, str]] = {}
@@ -113,7 +113,7 @@ def bands_of(content: Content) -> tuple[WiseBand, ...]:
 
 
 def holds_wise_meta(content: Content) -> bool:
-    """Whether there are distortion entries of WISE meta-data, right or wrong."""
+    """True where there are distortion entries of WISE meta-data, right or wrong."""
     return any(_ENTRY.match(line) for line in content.text.splitlines())
 
 
@@ -137,7 +137,7 @@ def _entry(line: str, where: str) -> tuple[int, str, str, str]:
 
 
 def monomial(p: int, q: int) -> str:
-    """Of u^p v^q, as the comments have it: u2.v, u.v, v3, and v0 for the constant."""
+    """Name of u^p v^q, as the comments have it: u2.v, u.v, v3, and v0 for the constant."""
     if p == 0:
         return f"v{q}"
     if q == 0:
@@ -176,24 +176,10 @@ def _wise_band(
 
 
 def wise_calibration(bands: Sequence[WiseBand], name: str, band: str | None = None) -> Calibration:
-    """The calibration of one band: (u, v) in corrected pixels about the middle of the array.
+    """Calibration of one band, as "W2": (u, v) in corrected pixels about the middle of the array.
 
-    Parameters
-    ----------
-    bands : sequence of WiseBand
-    name : str
-        Of the file, for messages.
-    band : str, optional
-        As "W2"; needed where the file has several.
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    InputError
-        For a band that the file does not have, or that has to be named.
+    `name` is the file, for messages.  InputError for a band that the file lacks, or that has to be
+    named.
     """
     known = {f"W{one.band}": one for one in bands}
     chosen = (band or "").upper()

@@ -1,4 +1,4 @@
-"""WISE meta-data in words."""
+"""Text on WISE meta-data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["describe_wise_meta"]
 
 
 def describe_wise_meta(bands: Iterable[WiseBand], name: str) -> list[str]:
-    """Lines of text of its bands, each with what contradicts what."""
+    """Lines of text on its bands, each with its contradictions."""
     bands = tuple(bands)
     lines = [f"{name}: WISE meta-data, {', '.join(f'W{one.band}' for one in bands)}"]
     for one in bands:

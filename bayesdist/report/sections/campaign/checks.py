@@ -1,4 +1,4 @@
-"""What the status on top of the report says of a campaign."""
+"""Status rows of a campaign."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ __all__ = [
     "campaign_checks",
 ]
 
-_COMPLETE = 0.8  # below it stars are missed for a reason that selects among them
-_FALSE = 0.01  # the outlier model takes care of more, but so many say that matching went wrong
+_COMPLETE = 0.8  # below it stars are missed for a reason, and are a selection
+_FALSE = 0.01  # the outlier model can take more, but so many mean that matching went wrong
 
 
 def _level(good: bool) -> str:
@@ -20,16 +20,7 @@ def _level(good: bool) -> str:
 
 
 def campaign_checks(r: CampaignResults) -> tuple[Check, ...]:
-    """Criteria of matching, tables, series, residuals and doubts.
-
-    Parameters
-    ----------
-    r : CampaignResults
-
-    Returns
-    -------
-    tuple of Check
-    """
+    """Criteria of matching, tables, series, residuals and warnings."""
     m, tables, time = (r.section(k) for k in ("matching", "tables", "time_dependence"))
     least = float(m["completeness"]["least"])
     false = float(m["false_share"])

@@ -10,12 +10,7 @@ from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
 from bayesdist.report.numbers import MISSING, count, display_scale, interval, number, rounded
-from bayesdist.report.sections.campaign.published import (
-    SOURCE,
-    WHERE,
-    PublishedLine,
-    published_lines,
-)
+from bayesdist.report.sections.campaign.published import Published, PublishedLine, published_terms
 from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
 from bayesdist.report.texttable import TextTable, listing
 
@@ -25,17 +20,18 @@ __all__ = [
 
 Row = tuple[str, ...]
 
+TERMS = ("A_2", "B_3", "B_2", "B_1", "A_3")  # in the order of their tables
 _SIGNIFICANT = 3.0  # sigmas
-FIXED = 5e-3  # 10^-6, or 10^-3 of a length: errors below it say that a term is held
+FIXED = 5e-3  # 10^-6, or 10^-3 of a length: a term with errors below it is held
 
 
 @REPORT.table("campaign-time", needs=("campaign",))
 def time_tables(r: ReportInput) -> Iterator[TextTable]:
-    """Gauge, lines of each term, changes at the breaks, scatter and claims."""
+    """Tables of the gauge, lines of each term, changes at the breaks, scatter and claims."""
     c = campaign_of(r)
     found, joint = c.section("time_dependence"), c.summary.get("lines") or []
     names = {chip.number: chip.name for chip in c.chips}
-    published = published_lines(c.config, c.filter, tuple(names.values()))
+    published = published_terms(c.config, c.filter, tuple(names.values()))
     if c.section("gauge"):
         yield _gauge(c)
     terms = dict.fromkeys(row["term"] for row in joint)
@@ -45,13 +41,13 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
         if row["alpha"] is not None
     }
     note = _why_errors_differ(c) if alone else ""
-    for term in [t for t in (*WHERE, "A_3") if t in terms]:
+    for term in [t for t in TERMS if t in terms]:
         rows = [row for row in joint if row["term"] == term and _is_free(row, c.unit)]
         rows.sort(key=lambda row: (row["segment"], names[row["chip"]]))
         if rows:
-            table = _line_table(term, rows, names, alone, published.get(term, ()), c)
+            table = _line_table(term, rows, names, alone, published.get(term), c)
             yield replace(table, note=" ".join(text for text in (table.note, note) if text))
-            note = ""  # said once, under the first of them
+            note = ""  # shown once, under the first of them
     if found.get("breaks"):
         yield _changes(found["breaks"], c.unit)
     if c.section("scatter"):
@@ -96,10 +92,10 @@ def _line_table(
     joint: list[Mapping[str, Any]],
     names: Mapping[int, str],
     alone: Mapping[tuple[str, int], Mapping[str, Any]],
-    published: tuple[PublishedLine, ...],
+    published: Published | None,
     c: CampaignResults,
 ) -> TextTable:
-    """alpha and beta of a term: joint, exposure by exposure, and published."""
+    """Table of alpha and beta of a term: joint, exposure by exposure, and published."""
     factor, unit = _scale(term, c.unit)
     own = [row for row in (*joint, *alone.values()) if _is_of(row, term)]
     # as many digits for all of this run's, so that they can be compared; others as printed
@@ -107,6 +103,11 @@ def _line_table(
         key: min((row[key] for row in own if row[key] * factor > FIXED), default=0.0)
         for key in ("sigma_alpha", "sigma_beta")
     }
+    lines: tuple[PublishedLine, ...] = ()
+    source = cited = ""
+    if published is not None:
+        lines, source = published.lines, published.source
+        cited = f"; published: {source}, {published.where}"
     rows: list[Row] = []
     for row in joint:
         chip = names[row["chip"]]
@@ -116,15 +117,14 @@ def _line_table(
         if (label, row["segment"]) in alone:
             numbers = _numbers(alone[label, row["segment"]], factor, digits)
             rows.append((*head, "exposures, then line", *numbers))
-        for one in published:
+        for one in lines:
             if one.chip == chip and abs(one.rdate - row["epoch0"]) < 1e-6:
-                rows.append((*head, SOURCE, *_numbers(vars(one), factor, vars(one))))
-    source = f"; published: {SOURCE}, {WHERE[term]}" if published else ""
+                rows.append((*head, source, *_numbers(vars(one), factor, vars(one))))
     system = ""
     if c.section("gauge"):
         system = f", in the system of {c.chip_name(c.section('gauge')['chip'])}"
     return TextTable(
-        f"{name_of_term(term)}: α + β (TIME − RDATE){system}{source}",
+        f"{name_of_term(term)}: α + β (TIME − RDATE){system}{cited}",
         ("Chip", "RDATE", "From", "α", f"σ α [{unit}]", f"β [{unit}/yr]", f"σ β [{unit}/yr]"),
         tuple(rows),
         words=(0, 2),
@@ -134,7 +134,7 @@ def _line_table(
 
 
 def _why_errors_differ(c: CampaignResults) -> str:
-    """Why two fits of the same stars give two errors, for those who see them side by side."""
+    """Note on why two fits of the same stars give two errors."""
     n = count(len(c.matching) if c.series is None else len(c.series.exposures))
     return (
         "The two σ of this run may differ, here and in the tables below. An exposure that is fitted"
@@ -151,7 +151,7 @@ def _scale(term: str, unit: str) -> tuple[float, str]:
 
 
 def _is_free(row: Mapping[str, Any], unit: str) -> bool:
-    """Whether the data have a say: the gauge fixes terms of the reference chip."""
+    """True where the data constrain the term: the gauge fixes terms of the reference chip."""
     return bool(row["sigma_alpha"] * _scale(row["term"], unit)[0] > FIXED)
 
 

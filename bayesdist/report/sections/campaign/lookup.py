@@ -1,4 +1,4 @@
-"""Look-up tables: what they take out of the residuals, and how well their nodes are known."""
+"""Look-up tables: the residuals without and with them, and the errors of their nodes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _REACH = 4.5  # times the robust width of the residuals without tables: where ax
 
 @REPORT.table("campaign-tables", needs=("campaign",))
 def lookup_table(r: ReportInput) -> TextTable:
-    """The look-up tables of each chip."""
+    """Table of the look-up tables of each chip."""
     c = campaign_of(r)
     t = c.section("tables")
     if not t.get("chips"):
@@ -152,7 +152,7 @@ def _cloud(ax: Axes, residual: Float, reach: float, color: str) -> None:
 
 
 def _base(c: CampaignResults) -> str:
-    """What the residuals of a run are compared with: what its own tables were fitted over."""
+    """Words on the fit that residuals with tables are compared with."""
     return "with the detector's tables alone" if any(c.table_filters) else "without"
 
 
@@ -197,7 +197,7 @@ def residual_map(r: ReportInput, which: str) -> Plot:
 def _common_scale(chips: Sequence[ChipResiduals]) -> tuple[float, float]:
     """Magnification at which the vectors without tables are seen well, and length of the key.
 
-    Both maps are drawn so.
+    Both maps use it.
     """
     length = np.concatenate([_lengths(c.binned_without) for c in chips])
     typical = float(np.quantile(length, 0.95)) if length.size else 1.0
@@ -223,7 +223,7 @@ def largest_cell(*binned: BinnedResiduals) -> float:
 
 
 def rms_of_cells(*binned: BinnedResiduals) -> tuple[float, float]:
-    """Rms of the cells' means on an axis, and what the scatter in the cells alone would give."""
+    """Rms of the cells' means on an axis, and that of the scatter in the cells alone."""
     mean, noise = [], []
     for b in binned:
         full = np.isfinite(b.mean_u) & np.isfinite(b.sem_u) & np.isfinite(b.sem_v)
@@ -241,7 +241,7 @@ def _figures_by_filter(r: ReportInput, name: str, *, known: bool) -> Mapping[str
 
 
 def _by_chip(c: CampaignResults, filter: str) -> list[LookupTable | None]:
-    """The table of each chip, None where there is none."""
+    """Table of each chip, None where there is none."""
     of = {table.chip: table for table in c.tables if table.filter == filter}
     return [of.get(chip.number) for chip in c.chips]
 
@@ -252,7 +252,7 @@ def _by_chip(c: CampaignResults, filter: str) -> list[LookupTable | None]:
     each=lambda r: _figures_by_filter(r, "table_nodes", known=False),
 )
 def table_nodes(r: ReportInput, filter: str) -> Plot:
-    """What the tables of a filter add to the pixels, an arrow at each node."""
+    """Shifts of the pixels by the tables of a filter, an arrow at each node."""
     c = campaign_of(r)
     chips = _by_chip(c, filter)
     tables = [t for t in c.tables if t.filter == filter]

@@ -1,4 +1,4 @@
-"""Catalogue and matching: errors against magnitude, cuts, and where the exposures lie."""
+"""Catalogue and matching: errors against magnitude, cuts, and footprints of the exposures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _LEFT_OUT = PALETTE["vermilion"]
 
 @REPORT.table("campaign-matching", needs=("campaign",))
 def matching_table(r: ReportInput) -> TextTable:
-    """What was matched, and what was left out."""
+    """Table of detections that were matched, and that were left out."""
     c = campaign_of(r)
     m = c.section("matching")
     left_out = {
@@ -248,7 +248,7 @@ def footprints(r: ReportInput) -> Plot:
         fig = new_figure(0.85 * WIDTH, 0.78 * WIDTH, layout="compressed")
         ax = fig.subplots()
         ax.plot(field.u, field.v, ".", ms=1.3, color="#9AA7B4", mec="none", zorder=1)
-        # so many outlines hide each other: three of them show what one looks like
+        # so many outlines hide each other: three of them are drawn boldly
         dates = np.unique(field.epoch)
         strong = np.isin(field.epoch, dates[[0, len(dates) // 2, -1]])
         for some, style in (

@@ -1,4 +1,4 @@
-"""Released files, and two exposures laid on each other through the old files and the new ones."""
+"""Released files, and two exposures aligned through the old files and the new ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = [
     "released_files",
 ]
 
-MIN_STARS_PER_CELL = 5  # to be drawn, and to count
+MIN_STARS_PER_CELL = 5  # for a cell that is drawn and counted
 
 _KINDS = {
     "IDCTAB": "IDCTAB: polynomial and its drift",
@@ -30,7 +30,7 @@ _KINDS = {
 
 @REPORT.table("campaign-release", needs=("campaign",))
 def released_files(r: ReportInput) -> TextTable | None:
-    """Files for pipelines, with their dates; None where none were written."""
+    """Table of files for pipelines, with their dates; None where none were written."""
     c = campaign_of(r)
     files = [p for p in c.summary.get("products") or () if p["kind"] in _KINDS]
     if not files:
@@ -55,7 +55,7 @@ def released_files(r: ReportInput) -> TextTable | None:
 
 @REPORT.figure("campaign-release", needs=("campaign.overlap",))
 def overlap(r: ReportInput) -> Plot:
-    """What shift, rotation and scale leave between two exposures: old files and new.
+    """Residuals between two exposures after shift, rotation and scale: old files and new.
 
     Figures 27 and 28 of ACS ISR 2015-06.
     """
@@ -118,7 +118,7 @@ def overlap(r: ReportInput) -> Plot:
 
 
 def _panels(t: OverlapTest) -> Panels:
-    """Two panels of the area that both exposures see."""
+    """Panels of the area that both exposures see."""
     size = np.ptp(t.new.position, axis=0)
     middle, half = np.array(t.corner) + size / 2, 0.56 * size
     aspect = float(np.clip(size[1] / size[0], 0.5, 1.6))

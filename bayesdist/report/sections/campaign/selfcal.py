@@ -1,4 +1,4 @@
-"""A self-calibration: its gauge, how exposures and stars came about, the stars."""
+"""Self-calibration: its gauge, the matching of exposures and stars, the stars."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_STARS_DRAWN = 20_000  # more only hide each other
 
 @REPORT.table("selfcal", needs=("selfcal",))
 def selfcal_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Gauge, detections, exposures and stars."""
+    """Tables of gauge, detections, exposures and stars."""
     found = r.selfcal
     assert found is not None
     return (_gauge(found), _detections(found), _exposures(found, r), _stars(found, r))

@@ -38,7 +38,7 @@ FALLS = 1.2  # scatter before VAFACTOR over that after it, above which the aberr
 
 
 def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
-    """Names of figures, each with its term and which chips it is of."""
+    """Names of figures, each with its term and chips."""
     series = campaign_of(r).series
     assert series is not None
     return {
@@ -200,7 +200,7 @@ def _segment_name(breaks: tuple[float, ...], s: int) -> str:
 
 
 def _share_limits(*rows: Sequence[Axes]) -> None:
-    """The same range for the panels before and after VAFACTOR: their scatter is to be compared."""
+    """Give the panels before and after VAFACTOR one range: their scatter is to be compared."""
     limits = [row[0].get_ylim() for row in rows]
     low, high = min(a for a, _ in limits), max(b for _, b in limits)
     for row in rows:
@@ -211,7 +211,7 @@ def _share_limits(*rows: Sequence[Axes]) -> None:
 def _draw_lines(
     ax: Axes, series: LinearSeries, course: TermCourse, ref: float, factor: float
 ) -> None:
-    """Lines of the segments, their 68 % bands, and those of a new exposure."""
+    """Draw lines of the segments, their 68 % bands, and those of a new exposure."""
     first, last = float(series.epoch.min()), float(series.epoch.max())
     edges = [first, *series.breaks, last]
     for s, (a, b) in enumerate(pairwise(edges)):

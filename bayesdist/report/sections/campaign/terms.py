@@ -1,4 +1,4 @@
-"""Linear terms of the exposures and their lines in time, and what they are called."""
+"""Linear terms of the exposures and their lines in time, and their names."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = [
 
 Float = NDArray[np.float64]
 
-TERM_ORDER = ("A_2", "B_3", "B_2", "A_3", "B_1", "A_1")  # as the report treats them
+TERM_ORDER = ("A_2", "B_3", "B_2", "A_3", "B_1", "A_1")  # as in the published report
 _FEWEST = 3  # dates in a segment that fix a parabola
 
 _TERMS = {
@@ -44,12 +44,12 @@ _SCATTER = {
 
 
 def name_of_term(term: str) -> str:
-    """A linear term with its meaning, as ACS ISR 2015-06 (Section 4.2) gives it."""
+    """Name of a linear term with its meaning, as ACS ISR 2015-06 (Section 4.2) gives it."""
     return _TERMS.get(term, term)
 
 
 def name_of_scatter(kind: str) -> str:
-    """In what the exposures scatter; a chip that does so by itself comes first."""
+    """Name of a term in which the exposures scatter; a single chip's name comes first."""
     chip, _, bare = kind.rpartition(".")
     text = _SCATTER.get(bare, bare.replace("_", " "))
     return f"{chip} against the others: {text}" if chip else f"all chips together: {text}"
@@ -57,36 +57,18 @@ def name_of_scatter(kind: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class TermCourse:
-    """One term of one chip: what the exposures show, and the lines through it.
+    """Term of one chip: its values in the exposures, and the lines through them."""
 
-    Parameters
-    ----------
-    label : str
-        With the chip's name, 'WFC1.A_2'.
-    value, sigma : ndarray, shape (E,)
-        Free of aberration, and its formal error.
-    raw : ndarray, shape (E,)
-        As measured: times VAFACTOR.
-    line : ndarray, shape (E,)
-        The line of the exposure's segment at its date.
-    drift : ndarray, shape (E,)
-        What of it is rate times time since the reference date.
-    alpha : ndarray, shape (S,)
-    beta, epoch0 : ndarray, shape (S,)
-    good : ndarray of bool, shape (E,)
-        Exposures that do not lie off.
-    """
-
-    label: str
-    value: Float
-    sigma: Float
-    raw: Float
-    line: Float
-    drift: Float
-    alpha: Float
-    beta: Float
-    epoch0: Float
-    good: NDArray[np.bool_]
+    label: str  # with the chip's name, 'WFC1.A_2'
+    value: Float  # (E,), free of aberration
+    sigma: Float  # (E,), formal
+    raw: Float  # (E,), as measured: times VAFACTOR
+    line: Float  # (E,), of the exposure's segment at its date
+    drift: Float  # (E,), rate times time since the reference date
+    alpha: Float  # (S,)
+    beta: Float  # (S,)
+    epoch0: Float  # (S,)
+    good: NDArray[np.bool_]  # (E,), exposures that are not off
 
     @property
     def chip(self) -> str:
@@ -95,13 +77,13 @@ class TermCourse:
 
     @property
     def reference(self) -> float:
-        """A round value near all of them."""
+        """Round value near all of them."""
         digits = 3 if self.is_constant else 5
         return round(float(self.alpha[0]), digits)
 
     @property
     def is_constant(self) -> bool:
-        """Whether it is a constant term, in the unit of u and v."""
+        """True for a constant term, in the unit of u and v."""
         return self.label.endswith("_1")
 
     @property
@@ -125,19 +107,7 @@ def terms_of(series: LinearSeries) -> dict[str, tuple[str, ...]]:
 
 
 def course_of(series: LinearSeries, lines: Sequence[Mapping[str, Any]], label: str) -> TermCourse:
-    """A term of the exposures with its lines.
-
-    Parameters
-    ----------
-    series : LinearSeries
-    lines : sequence of mapping
-        `time_dependence.lines` of summary.json.
-    label : str
-
-    Returns
-    -------
-    TermCourse
-    """
+    """Term of the exposures with its lines, which are `time_dependence.lines` of summary.json."""
     rows = sorted((r for r in lines if r["term"] == label), key=lambda r: int(r["segment"]))
     alpha, beta, epoch0 = (
         np.array([np.nan if r[k] is None else r[k] for r in rows], float)
@@ -161,22 +131,10 @@ def course_of(series: LinearSeries, lines: Sequence[Mapping[str, Any]], label: s
 
 
 def line_error(series: LinearSeries, column: str, s: int, t: Float) -> Float | None:
-    """Error of a line, or of a new exposure about it, at any date: its square is a parabola.
+    """Error of a line, or of a new exposure about it, at dates of segment `s`, or None.
 
-    Parameters
-    ----------
-    series : LinearSeries
-    column : str
-        Of drift.ecsv, which has it at some dates.
-    s : int
-        Segment, from 0.
-    t : ndarray
-        Dates in the segment.
-
-    Returns
-    -------
-    ndarray, same shape, or None
-        None where too few dates lie in the segment.
+    Its square is a parabola through the values of a column of drift.ecsv, which has them at some
+    dates; None where too few of these are in the segment.
     """
     epoch = np.asarray(series.drift["epoch"], float)
     here = np.searchsorted(np.asarray(series.breaks, float), epoch, side="right") == s

@@ -1,4 +1,4 @@
-"""The error budget: how much each term gives, and where which one is largest."""
+"""Error budget: the size of each term, and a map of the largest one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from bayesdist.assess.terms.product_terms import PRODUCT
+from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.fields import Grid, scalar_map
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 AS_ABOVE = "as above"  # of the rows of single chips
-_MOST_PANELS = 3  # chips whose bars stand beside those of the detector
+_MOST_PANELS = 3  # chips whose bars are shown with those of the detector
 _KIND_COLORS = {
     "random": PALETTE["sky"],
     "systematic": PALETTE["blue"],
@@ -51,13 +51,13 @@ _MARKER_STYLE = {"ms": 5.5, "color": PALETTE["yellow"], "mec": INK, "mew": 0.7, 
 
 
 def is_total(row: Mapping[str, str | float]) -> bool:
-    """Whether a row of `ErrorBudget.rows` is the sum of the others."""
+    """True where a row of `ErrorBudget.rows` is the sum of the others."""
     return row["kind"] == "total"
 
 
 @REPORT.table("budget", needs=("budget",))
 def budget_table(r: ReportInput) -> TextTable:
-    """The error budget, the total last."""
+    """Table of the error budget, the total last."""
     assert r.budget is not None
     unit, mas = r.budget.unit, r.scale_mas
     names = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
@@ -82,7 +82,7 @@ def budget_table(r: ReportInput) -> TextTable:
         heads,
         tuple(out),
         words=tuple(range(len(heads) - 4)),
-        leading=len(r.budget.rows()),  # those of all chips together
+        leading=len(r.budget.rows()),  # rows of all chips together
         stacked=(heads.index("Radial"),),
         note="The parts of the model are correlated and enter the total jointly, by draws;"
         " independent terms are added in quadrature. The total therefore need not be the root of"
@@ -91,7 +91,7 @@ def budget_table(r: ReportInput) -> TextTable:
 
 
 def _known_to(row: Mapping[str, Any]) -> str:
-    """How well a term is known itself."""
+    """Words on how well a term is known itself."""
     error, size = row["radial_error"], float(row["radial"])
     if error is None or not size > 0:
         return MISSING
@@ -111,7 +111,7 @@ def _of_products(rows: Sequence[Mapping[str, Any]]) -> str:
 def budget_terms(r: ReportInput) -> Plot:
     """Bars of each term's radial rms over the detector, with its two axes marked.
 
-    Each of up to three chips has a panel beside that of the whole detector.
+    Each of up to three chips has a panel next to that of the whole detector.
     """
     budget = r.budget
     assert budget is not None
@@ -177,7 +177,10 @@ def budget_dominating(r: ReportInput) -> Plot:
     panels.frame()
     scalar_map(
         panels,
-        [Grid(b.x, b.y, np.searchsorted(present, b.dominant).astype(float)) for b in budget.chips],
+        [
+            Grid(*b.axes, np.searchsorted(present, b.on_grid(b.dominant)).astype(float))
+            for b in budget.chips
+        ],
         r.mosaic.names,
         norm=BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present)),
         cmap=ListedColormap(colors),

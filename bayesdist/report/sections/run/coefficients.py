@@ -1,4 +1,4 @@
-"""The parameters: Legendre, time dependence and frames, monomial."""
+"""Parameters: Legendre, time dependence and frames, monomial."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SMALL = 1e-3  # below it a number without a unit is shown in 10^-6
 
 @REPORT.table("coefficients")
 def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Legendre coefficients, then time dependence and frames, then monomial coefficients."""
+    """Tables of Legendre coefficients, of time dependence and frames, of monomial coefficients."""
     kinds = {p.name: p.kind for p in r.fit.model.parameters}
     rows = list(r.coefficients)
     mark, held = gauge_mark(r), r.held
@@ -58,7 +58,7 @@ def _notes(*sentences: str) -> str:
 
 
 def _held_note(r: ReportInput, names: list[str]) -> str:
-    """Parameters that are no measurements, those of one term together."""
+    """Note on parameters that are no measurements, those of one term together."""
     if not names:
         return ""
     terms: dict[str, list[str]] = {}
@@ -135,13 +135,13 @@ def _parameter_table(
         "ESS",
     )
     columns = (*heads, *(("Unit",) if with_unit else ()))
-    # where an interval is that of the sd and convergence was judged as a whole, paper does without
+    # where an interval is that of the sd and convergence was tested as a whole, paper omits them
     on_paper = tuple(k for k, name in enumerate(columns) if name not in _ON_SCREEN)
     return TextTable(caption, columns, tuple(out), words=(0, len(heads)), on_paper=on_paper)
 
 
 def _monomial_table(r: ReportInput, chip: int) -> TextTable:
-    """Coefficients of (x - xref)^i (y - yref)^j with the errors that carry over."""
+    """Table of coefficients of (x - xref)^i (y - yref)^j with propagated errors."""
     model = r.fit.model
     basis = model.basis(chip)
     gauge = gauge_note(r) if chip == model.chips[0].number else ""

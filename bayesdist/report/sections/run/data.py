@@ -1,4 +1,4 @@
-"""What came in, with errors by magnitude."""
+"""Input data, with errors by magnitude."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Float = NDArray[np.float64]
 
 @REPORT.table("data")
 def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """What was read, what was rejected, errors by magnitude, exposures."""
+    """Tables of what was read and rejected, errors by magnitude, exposures."""
     m, fit, words = r.stars.table, r.fit, r.words
     partial = ", of the sample" if r.stars.partial else ""
     pairs = {
@@ -148,7 +148,7 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
 
 
 def _magnitudes(r: ReportInput) -> NDArray[np.bool_]:
-    """Stars (N,) whose magnitude is known."""
+    """Boolean mask (N,) of the stars whose magnitude is known."""
     mag = r.stars.table.mag
     return np.zeros(len(r.stars.table), bool) if mag is None else np.isfinite(mag)
 
@@ -156,7 +156,7 @@ def _magnitudes(r: ReportInput) -> NDArray[np.bool_]:
 def _density(
     mag: Float, residual: Float, *, unit: str, errors: MagnitudeErrors | None, shown: str
 ) -> Figure:
-    """Hexagons that count residuals, an axis of these in each panel."""
+    """Figure with hexagons that count residuals, an axis of these in each panel."""
     reach = _magnitude_reach(residual, errors)
     scale = display_scale(unit, reach)
     low, high = np.quantile(mag, [0.002, 0.998])  # a few very bright stars must not fill the plot

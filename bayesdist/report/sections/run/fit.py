@@ -1,4 +1,4 @@
-"""The least-squares fit in numbers, statistics and tests of its residuals."""
+"""Least-squares fit in numbers, statistics and tests of its residuals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = [
 
 @REPORT.table("fit")
 def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """The linear fit in figures, and statistics of its residuals."""
+    """Tables of the linear fit in numbers, and statistics of its residuals."""
     fit, model, stars = r.fit, r.fit.model, r.stars
     mas, words = r.scale_mas, r.words
     pairs = {
@@ -71,7 +71,7 @@ def _residual_note(r: ReportInput) -> str:
 
 
 def _skew_table(r: ReportInput) -> TextTable:
-    """The skew that the linear terms of each chip hold."""
+    """Table of the skew in the linear terms of each chip."""
     rows = []
     for c in r.chips:
         for name, solution in (("least squares", r.fit), ("posterior", r.posterior)):
@@ -104,7 +104,7 @@ def _skew_table(r: ReportInput) -> TextTable:
 
 
 def _drifting(r: ReportInput) -> str:
-    """Terms whose drift was asked for, and which constants may step beside them."""
+    """Words on terms whose drift was fitted, and on constants that may step."""
     model = r.fit.model
     time = model.time
     if time is None:
@@ -128,7 +128,7 @@ def _drifting(r: ReportInput) -> str:
 
 
 def _chips_of_stars(r: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
-    """Stars (N,) used of all chips and, where there are several, of each; what rows begin with."""
+    """Row names and masks (N,) of the stars used: of all chips and, where several, of each."""
     table, used = r.stars.table, r.stars.used
     if not r.several:
         return [("", used)]
@@ -139,7 +139,7 @@ def _chips_of_stars(r: ReportInput) -> list[tuple[str, NDArray[np.bool_]]]:
 
 @REPORT.table("fit", needs=("score_tests",))
 def score_test_table(r: ReportInput) -> TextTable:
-    """What the residuals were asked, and what they say."""
+    """Table of the tests of the residuals, and of their results."""
     seen = [t.smallest for t in r.score_tests if np.isfinite(t.smallest)]
     scale = display_scale(r.unit, seen or [1.0])
     rows = tuple(

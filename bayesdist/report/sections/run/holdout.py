@@ -38,16 +38,7 @@ _KEY = 3.0  # length of the arrow in the key, in sigma
 
 
 def holdout_checks(found: HeldOutTruth | None) -> tuple[Check, ...]:
-    """The verdict of the held-out stars as rows of the status; none where there are none.
-
-    Parameters
-    ----------
-    found : HeldOutTruth or None
-
-    Returns
-    -------
-    tuple of Check
-    """
+    """Status rows of the verdict of the held-out stars; none where there are none."""
     if found is None:
         return ()
     return (
@@ -66,7 +57,7 @@ def _with_coverage(r: ReportInput) -> bool:
 
 @REPORT.table("holdout", needs=("held_out",), when=_with_coverage)
 def holdout_coverage(r: ReportInput) -> TextTable:
-    """Coverage of the held-out stars along each axis."""
+    """Table of the coverage of the held-out stars along each axis."""
     found = r.held_out
     assert found is not None
     rows = tuple(
@@ -87,7 +78,7 @@ def holdout_coverage(r: ReportInput) -> TextTable:
 
 @REPORT.table("holdout", needs=("held_out",))
 def holdout_table(r: ReportInput) -> TextTable:
-    """The tests that tell most."""
+    """Table of the most informative tests."""
     found = r.held_out
     assert found is not None
     shown = found.tests[:_MOST_TESTS]
@@ -188,7 +179,7 @@ def _limit(found: HeldOutTruth) -> float:
 def _regions(
     ax: Axes, found: HeldOutTruth, k: int, size: tuple[float, float], norm: TwoSlopeNorm
 ) -> PatchCollection:
-    """Regions of one chip: their colour is the factor, their arrow the offset in sigma."""
+    """Draw regions of one chip: their colour is the factor, their arrow the offset in sigma."""
     chips = list(dict.fromkeys(bin_.chip for bin_ in found.regions))
     mine = [
         b

@@ -1,4 +1,4 @@
-"""The distortion over the detector, and how well it is known there."""
+"""Distortion over the detector, and its uncertainty there."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ __all__ = [
 
 @REPORT.table("maps")
 def map_table(r: ReportInput) -> TextTable:
-    """Extremes of the uncertainty maps."""
+    """Table of the extremes of the uncertainty maps."""
     rows = []
     for c in r.chips:
         for m in c.maps:
@@ -128,7 +128,7 @@ def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
 
 
 def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
-    """The vectors of the chip where the longest one is, and its place in words."""
+    """Vectors of the chip where the longest one is, and its position in words."""
     worst = max(r.chips, key=lambda c: getattr(c, which).length_max)
     vectors: VectorMap = getattr(worst, which)
     x, y = vectors.position_of_max

@@ -1,4 +1,4 @@
-"""Requirements: how they are met, where each statistic lies against its limit, and how long."""
+"""Requirements: verdicts, each statistic against its limit, and validity periods."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _MARKERS = {"met": "o", "undecided": "D", "missed": "X"}  # shape as well as col
 
 @REPORT.table("margins", needs=("margins",))
 def margin_table(r: ReportInput) -> TextTable:
-    """Requirements and how they are met."""
+    """Table of requirements and their verdicts."""
     out = []
     for m in r.margins:
         asked = m.requirement
@@ -84,7 +84,7 @@ def margin_table(r: ReportInput) -> TextTable:
 
 
 def _judgement(m: Margin, several: bool) -> str:
-    """Verdict, reason, where the error is largest, and what would help."""
+    """Words on verdict, reason, position of the largest error, and remedy."""
     on = f" of chip {m.worst.chip}" if several else ""
     out = [
         f"{m.verdict}: {m.reason}" if m.reason else m.verdict,
@@ -95,7 +95,7 @@ def _judgement(m: Margin, several: bool) -> str:
 
 @REPORT.table("margins", needs=("margins",))
 def rests_on_table(r: ReportInput) -> TextTable | None:
-    """What the verdicts take for granted or have measured."""
+    """Table of the assumptions and measurements behind the verdicts."""
     clauses: dict[str, list[str]] = {}
     for m in r.margins:
         for clause in m.rests_on:
@@ -163,7 +163,7 @@ def margins(r: ReportInput) -> Plot:
 
 
 def _ridge(ax: Axes, k: int, values: Float, color: str) -> None:
-    """Histogram of the draws, standing on row k."""
+    """Draw a histogram of the draws, standing on row k."""
     low, high = np.quantile(values, _SHOWN)
     counts, edges = np.histogram(values, bins=40, range=(low, high if high > low else low + 1e-9))
     top = k - 0.6 * counts / max(counts.max(), 1)

@@ -1,4 +1,4 @@
-"""Change with time: the verdict, tables of the periods, and the difference of the ends."""
+"""Change with time: verdict, tables of the periods, and the difference of first and last."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ __all__ = [
 ]
 
 GRID = 17  # vectors along the longer side
-_CLEAR = 3.0  # sigmas beyond which a coefficient is counted
+_CLEAR = 3.0  # sigmas beyond which a coefficient counts
 
 
 @REPORT.table("periods", needs=("periods",))
 def period_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Verdict, periods, coefficients of the ends, and residuals."""
+    """Tables of verdict, periods, coefficients of first and last, and residuals."""
     found = r.periods
     assert found is not None
     out = [_verdict(found), _periods(found, r), _coefficients(found)]
@@ -183,7 +183,7 @@ def _patterns(found: TimeVariation, r: ReportInput) -> TextTable:
 def period_differences(r: ReportInput) -> Plot:
     """Map of the latest model minus the earliest one.
 
-    Vectors that noise would make as long at their place in more than 5 of 100 cases are pale.
+    Vectors that noise would make as long at their position in more than 5 % of cases are pale.
     """
     found = r.periods
     assert found is not None

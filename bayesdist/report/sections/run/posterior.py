@@ -1,4 +1,4 @@
-"""The posterior: outliers, the most correlated coefficients, and the chains that it came from."""
+"""Posterior: outliers, the most correlated coefficients, and the chains."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def _with_mixture(r: ReportInput) -> bool:
 
 @REPORT.table("outliers", needs=("posterior",))
 def outlier_table(r: ReportInput) -> TextTable:
-    """The mixture's own parameters, and how many stars or detections it flags."""
+    """Table of the mixture's own parameters, and of the number of stars or detections it flags."""
     post, words = r.posterior, r.words
     assert post is not None
     named = {
@@ -112,7 +112,7 @@ def outlier_table(r: ReportInput) -> TextTable:
 
 @REPORT.table("outliers", needs=("added_errors",))
 def added_errors_table(r: ReportInput) -> TextTable:
-    """Errors beyond the quoted ones, by the groups that the evidence asks for."""
+    """Table of errors beyond the quoted ones, by the groups that the evidence asks for."""
     found = r.added_errors
     assert found is not None
     scale = display_scale(r.unit, found.sigma)
@@ -191,19 +191,9 @@ def coefficients_corner(r: ReportInput) -> Plot:
 
 
 def correlated_parameters(posterior: Posterior, n: int = 5) -> tuple[str, ...]:
-    """The coefficients that take part in the strongest correlations of the posterior.
+    """Coefficients in the n strongest correlations of the posterior, in the model's order.
 
-    Parameters
-    ----------
-    posterior : Posterior
-    n : int
-        How many.
-
-    Returns
-    -------
-    tuple of str
-        In the model's order; polynomial and time-dependent terms only, without those that are
-        held.
+    Polynomial and time-dependent terms only, without those that are held.
     """
     moves = np.ptp(posterior.flat, axis=0) > 0
     kinds = [p.kind for p in posterior.model.parameters]
@@ -275,19 +265,7 @@ def traces(r: ReportInput) -> Plot:
 def slowest_parameters(
     posterior: Posterior, n: int = 4, *, without: Collection[str] = ()
 ) -> tuple[str, ...]:
-    """The parameters of theta with the fewest effective draws: the worst that the chains offer.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    n : int
-    without : collection of str
-        Parameters that are passed over.
-
-    Returns
-    -------
-    tuple of str
-    """
+    """Parameters of theta with the n fewest effective draws, but for those in `without`."""
     names = posterior.model.names
     known = dict(zip(posterior.convergence.names, posterior.convergence.ess_bulk, strict=True))
     ess = np.array([known.get(name, np.inf) for name in names], float)
@@ -299,7 +277,7 @@ def _by_walker(values: Float, posterior: Posterior) -> Float:
     """Draws (ensembles, walkers, steps) of an array (ensembles, draws), walker after walker."""
     ensembles, draws = values.shape
     walkers = posterior.sampler.walkers
-    # a posterior that was thinned on the way has lost its order in time: show it as it is
+    # a posterior that was thinned while sampling has lost its order in time: show it as it is
     return values.reshape(ensembles, walkers if draws % walkers == 0 else 1, -1)
 
 

@@ -1,4 +1,4 @@
-"""The files that were written, and what made the result."""
+"""Files that were written, and the provenance of the result."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PRINTED = {"inputs": 4, "versions": 3}  # rows on paper
 
 @REPORT.table("products", needs=("products",))
 def product_table(r: ReportInput) -> TextTable:
-    """Files with what was checked on each as written."""
+    """Table of files with the checks of each as written."""
     rows: list[tuple[str, ...]] = []
     for product in r.products:
         head = product.path, product.what
@@ -40,7 +40,7 @@ def product_table(r: ReportInput) -> TextTable:
 
 @REPORT.table("provenance")
 def provenance_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """What made the result: single values first, then one table for each group."""
+    """Tables of the provenance: single values first, then one table for each group."""
     single = {k: _plain(v) for k, v in r.provenance.items() if not isinstance(v, Mapping)}
     if r.posterior is not None:
         s = r.posterior.sampler
@@ -80,7 +80,7 @@ def _plain(value: Any) -> str:
 
 @REPORT.table("provenance")
 def config_table(r: ReportInput) -> TextTable | None:
-    """The resolved configuration, one key a row."""
+    """Table of the resolved configuration, one key a row."""
     pairs: dict[str, str] = {}
     for section, value in r.config.items():
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Residuals against what the fitted mixture says that they should be, and over the detector."""
+"""Residuals against their distribution under the fitted mixture, and over the detector."""
 
 from __future__ import annotations
 
@@ -44,43 +44,17 @@ _SIGMA_BINS = 200
 
 @dataclass(frozen=True)
 class MixtureCurve:
-    """Distribution of one axis of the residuals under the fitted mixture.
+    """Distribution of one axis of the residuals under the fitted mixture."""
 
-    Parameters
-    ----------
-    sigma : ndarray, shape (N,)
-        Quoted error of each star on this axis.
-    fraction : float
-        Outlier fraction f.
-    jitter : float
-        j, added in quadrature to every quoted error.
-    scale : float
-        s_out of a Gaussian outlier component, or the match radius of a uniform one.
-    outliers : str
-        'gaussian', 'uniform' or 'none'.
-    taken : ndarray, shape (N,), or float
-        Share of the variance of each residual that fitted places of the stars take out of it.
-    """
-
-    sigma: Float
-    fraction: float = 0.0
-    jitter: float = 0.0
-    scale: float = 0.0
-    outliers: str = "none"
-    taken: Float | float = 0.0
+    sigma: Float  # (N,), quoted error of each star on this axis
+    fraction: float = 0.0  # of outliers, f
+    jitter: float = 0.0  # j, in quadrature with every quoted error
+    scale: float = 0.0  # s_out of Gaussian outliers, or the match radius of uniform ones
+    outliers: str = "none"  # 'gaussian', 'uniform' or 'none'
+    taken: Float | float = 0.0  # (N,), fraction of the variance taken by fitted star positions
 
     def expected(self, edges: ArrayLike) -> tuple[Float, Float]:
-        """Stars expected in each bin: of the good component, and of the outliers.
-
-        Parameters
-        ----------
-        edges : array_like, shape (B + 1,)
-            Bin edges, in the unit of `sigma`.
-
-        Returns
-        -------
-        good, outlying : ndarray, shape (B,)
-        """
+        """Stars expected in each bin (B,) between edges (B + 1,): good component, outliers."""
         edges = np.asarray(edges, float)
         sigma, weight = self._widths()
         good = weight @ np.diff(ndtr(edges / sigma[:, None]), axis=1)
@@ -90,7 +64,7 @@ class MixtureCurve:
         return (1.0 - f) * good, f * outlying
 
     def _widths(self) -> tuple[Float, Float]:
-        """Total widths that occur, and how many stars have each (binned where there are many)."""
+        """Total widths that occur, and numbers of stars with each (binned where there are many)."""
         total = np.hypot(self.sigma, self.jitter) * np.sqrt(1.0 - self.taken)
         values, counts = np.unique(total, return_counts=True)
         if values.size > _SIGMA_BINS:
@@ -113,7 +87,7 @@ class MixtureCurve:
 
 
 def _mixture_curves(r: ReportInput) -> tuple[MixtureCurve, MixtureCurve]:
-    """What the results say of the distribution of the residuals in u and in v.
+    """Distributions of the residuals in u and in v by the results.
 
     Without quoted errors the rms of the fit stands in for them.
     """
@@ -177,7 +151,7 @@ def _histograms(
     sampled: bool,
     things: str,
 ) -> Figure:
-    """Two rows of panels: the core, and everything."""
+    """Figure with two rows of panels: the core, and everything."""
     width = max(float(np.sqrt(np.median(c.sigma**2 + c.jitter**2))) for c in curves)
     widest = max(float(np.sqrt(np.max(c.sigma**2 + c.jitter**2))) for c in curves)
     core = min(6.0 * width, 4.0 * widest)
@@ -195,7 +169,7 @@ def _histograms(
             axes[0, column].set_title(f"{axis}: core")
             axes[1, column].set_title(f"{axis}: {everything}, logarithmic")
             axes[1, column].set_yscale("log")
-        # curves fall far below one star: they are not what the axis is for
+        # curves fall far below one star: the axis is not for them
         most = [np.histogram(r, np.linspace(-tail, tail, 122))[0].max() for r in residual.T]
         axes[1, 0].set_ylim(0.5, 2.0 * max(*most, 1))
         for ax in axes[:, 0]:
@@ -278,23 +252,11 @@ def residual_panels(
     magnification: float | None = None,
     key: float | None = None,
 ) -> Panels:
-    """Panels with the mean residual of each cell.
+    """Panels with the mean residual of each cell, all chips on one scale; empty cells stay empty.
 
-    Parameters
-    ----------
-    binned : sequence of BinnedResiduals
-        One for each chip; all are drawn to the same scale.  Empty cells hold NaN and stay empty.
-    mosaic : Mosaic
-    unit : str
-        Of the residuals.
-    magnification : float, optional
-        Pixels of the axes for one unit of the vectors; a round number by default.
-    key : float, optional
-        Length of the arrow that states the scale; that of a typical vector by default.
-
-    Returns
-    -------
-    Panels
+    `magnification` is in pixels of the axes for one `unit` of the vectors, a round number by
+    default; `key` is the length of the arrow that states the scale, that of a typical vector by
+    default.
     """
     chips = [Arrows.of_cells(b) for b in binned]
     length = np.concatenate([c.length for c in chips])

@@ -1,4 +1,4 @@
-"""The status on top of the report: each criterion with its number and limit, and a verdict."""
+"""Status on top of the report: each criterion with its number and limit, and a verdict."""
 
 from __future__ import annotations
 
@@ -27,21 +27,13 @@ _PARETO_K = 0.7  # above it importance weights cannot be trusted (Vehtari et al.
 _EFFICIENCY = 0.1
 _MCSE = 0.1  # of a posterior sd: adds half a percent to the error of a mean
 _MOST_CHI2 = 1.5  # per degree of freedom: quoted errors right within some twenty percent
-_LEFT_OUT = 0.2  # of the stars: rejection that takes more has shaped what it was to protect
+_LEFT_OUT = 0.2  # of the stars: rejection of more has shaped the result that it was to protect
 _CONDITION = 1e8  # leaves half the digits of a double
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the run is worth, in words.
-
-    Parameters
-    ----------
-    level : str
-        'pass', 'warn' or 'fail'.
-    headline : str
-    sentences : tuple of str
-    """
+    """Verdict on the run in words; `level` is 'pass', 'warn' or 'fail'."""
 
     level: str
     headline: str
@@ -49,17 +41,9 @@ class Verdict:
 
 
 def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
-    """All criteria, by what they concern.
+    """Criteria by subject; empty groups are left out.
 
-    Parameters
-    ----------
-    r : ReportInput
-
-    Returns
-    -------
-    dict of str to tuple of Check
-        Groups 'Held-out truth', 'Campaign', 'Sampling', 'Fit', 'Requirements', 'Products'; empty
-        ones are left out.
+    Groups are 'Held-out truth', 'Campaign', 'Sampling', 'Fit', 'Requirements', 'Products'.
     """
     groups = {
         "Held-out truth": holdout_checks(r.held_out),
@@ -79,7 +63,7 @@ def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
 
 @REPORT.table("status")
 def status_table(r: ReportInput) -> TextTable:
-    """All criteria with what was found, the limit and the outcome."""
+    """Table of all criteria with value, limit and outcome."""
     rows = tuple(
         (group, check.name, *check_cells(check))
         for group, checks in status_checks(r).items()
@@ -101,7 +85,7 @@ def _sampling_checks(r: ReportInput) -> tuple[Check, ...]:
     sd = np.sqrt(np.diag(r.posterior.cov))
     with np.errstate(divide="ignore", invalid="ignore"):
         mcse = float(np.nanmax(np.where(sd > 0, c.mcse_mean[:D] / sd, 0.0), initial=0.0))
-    # what only advises does not fail by itself: the limits of R-hat and ESS decide
+    # advice does not fail by itself: the limits of R-hat and ESS decide
     return (
         Check("Converged", "yes" if c.converged else "NO", "yes", _level(c.converged)),
         Check(
@@ -187,17 +171,10 @@ def _margin_checks(r: ReportInput) -> tuple[Check, ...]:
 
 
 def verdict(r: ReportInput) -> Verdict:
-    """The verdict on the run.
+    """Verdict on the run.
 
-    Parameters
-    ----------
-    r : ReportInput
-
-    Returns
-    -------
-    Verdict
-        'fail' when the posterior is not converged, a requirement is missed or a product fails its
-        check; 'warn' when something is undecided or nothing was sampled.
+    'fail' when the posterior is not converged, a requirement is missed or a product fails its
+    check; 'warn' when something is undecided or nothing was sampled.
     """
     sentences = [_margin_sentence(r), _accuracy_sentence(r)]
     failed = [f"{p.path} ({c.name})" for p in r.products for c in p.checks if c.level == "fail"]
@@ -273,7 +250,7 @@ def _accuracy_sentence(r: ReportInput) -> str:
 
 
 def _with_shift(r: ReportInput) -> str:
-    """What a shift and a rotation of the whole count for in the errors of positions."""
+    """Words on the part of a common shift and rotation in the errors of positions."""
     if r.selfcal is not None:
         return ", in the gauge of the solution"
     return ", shift and rotation included" if r.fit.model.n_frame else ""

@@ -1,1 +1,0 @@
-"""`bayesdist bands`: tables and diagrams of several bands beside each other."""

@@ -1,0 +1,57 @@
+"""What to observe, and which order to fit."""
+
+from __future__ import annotations
+
+import click
+
+from bayesdist.app.commands.options import CommaList, command, force
+from bayesdist.errors import InputError
+
+
+@command()
+@click.argument("run", metavar="RUN")
+@click.option("--requirement", metavar="NAME", show_default="all", help="One of them.")
+@click.option(
+    "--epochs",
+    type=CommaList(float),
+    default=(),
+    metavar="T,...",
+    help="Dates of exposures, decimal years, separated by commas.",
+)
+def plan(run: str, requirement: str | None, epochs: tuple[float, ...]) -> None:
+    """How many more exposures would meet the requirements."""
+    from bayesdist.app.plan import plan as exposures_planned
+
+    if run.endswith(".toml"):
+        raise InputError(
+            "is a file, not a run",
+            where=run,
+            do=f"compare dither patterns by 'bayesdist plan-dither {run}'",
+        )
+    click.echo(exposures_planned(run, name=requirement, epochs=epochs))
+
+
+@command(name="plan-dither")
+@click.argument("patterns", metavar="PATTERNS.toml")
+@click.option("-o", "--output", metavar="DIR", help="A new folder for table, record and figure.")
+@click.pass_obj
+def plan_dither(line: str, patterns: str, output: str | None) -> None:
+    """Which dither pattern determines a self-calibration best."""
+    from bayesdist.app.patterns.command import plan_patterns
+
+    click.echo(plan_patterns(patterns, output, line))
+
+
+@command(name="select-order")
+@click.argument("config", metavar="CONFIG.toml")
+@click.option("--orders", nargs=2, type=int, default=(3, 9), metavar="LOW HIGH")
+@click.option("-o", "--output", metavar="orders.ecsv", help="The table as a file.")
+@click.option("--figure", metavar="orders.png")
+@force
+def select_order(
+    config: str, orders: tuple[int, int], output: str | None, figure: str | None, force: bool
+) -> None:
+    """The polynomial order, selected by the data."""
+    from bayesdist.app.order import order
+
+    click.echo(order(config, orders, output=output, figure=figure, force=force))

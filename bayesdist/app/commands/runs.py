@@ -1,0 +1,103 @@
+"""A run: its configuration, what would become of it, the whole of it, and its stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import click
+
+from bayesdist.app.commands.options import column_names, command, force
+
+STAGES = ("match", "fit", "sample", "assess", "export", "report")
+
+
+@command()
+@click.argument("config", metavar="CONFIG.toml")
+@click.option("--matches", required=True, metavar="FILE", help="Table of matched stars.")
+@click.option(
+    "--columns",
+    type=column_names,
+    metavar="KEY=NAME,...",
+    help="Columns that are not found by their names; KEY= leaves one out.",
+)
+@click.option(
+    "--size",
+    nargs=2,
+    type=int,
+    metavar="NX NY",
+    show_default="guessed from the positions",
+    help="Columns and rows of each chip.",
+)
+@force
+def init(
+    config: str,
+    matches: str,
+    columns: Mapping[str, str] | None,
+    size: tuple[int, int] | None,
+    force: bool,
+) -> None:
+    """A commented configuration for matched stars."""
+    from bayesdist.app.init import init as write_configuration
+
+    n = write_configuration(config, matches, columns=columns, size=size, force=force)
+    click.echo(f"{config}: for {n} matches; read it, then 'bayesdist check' it")
+
+
+@command()
+@click.argument("config", metavar="CONFIG.toml")
+def check(config: str) -> None:
+    """Units, rank, null space and cost; samples nothing."""
+    from bayesdist.app.check import check as checked
+
+    click.echo(checked(config))
+
+
+@command()
+@click.argument("config", metavar="CONFIG.toml")
+@click.option("-o", "--output", required=True, metavar="RUN", help="Folder of the run.")
+@click.option("--resume", is_flag=True, help="Go on with the run that is there.")
+@click.option("--force", is_flag=True, help="Replace the run that is there.")
+@click.option("--strict", is_flag=True, help="Exit 3 unless converged.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), metavar="N", show_default="that of the configuration"
+)
+@click.pass_obj
+def run(
+    line: str,
+    config: str,
+    output: str,
+    resume: bool,
+    force: bool,
+    strict: bool,
+    seed: int | None,
+) -> None:
+    """The whole job: fit, sample, assess, export, report."""
+    if resume and force:
+        raise click.UsageError("--resume and --force exclude each other.")
+    from bayesdist.app.run import run as whole_job
+    from bayesdist.app.rundir import RunDirectory
+    from bayesdist.app.session import Session
+    from bayesdist.app.summary_text import results_text
+
+    path = whole_job(
+        config, output, resume=resume, force=force, strict=strict, seed=seed, command=line
+    )
+    click.echo(results_text(Session(RunDirectory(path))))  # its input was checked when it began
+
+
+@command()
+@click.argument("name", metavar=f"[{'|'.join(STAGES)}]", type=click.Choice(STAGES))
+@click.argument("run", metavar="RUN")
+@click.option("--strict", is_flag=True, help="Of sample: exit 3 unless converged.")
+def stage(name: str, run: str, strict: bool) -> None:
+    """One stage of a run.
+
+    match: star lists to matches, of a campaign or a self-calibration; fit: the linear fit; sample:
+    the posterior, from its checkpoints on; assess: maps, budget, margins; export: files for
+    pipelines; report: figures and report.html.
+    """
+    if strict and name != "sample":
+        raise click.UsageError("--strict is an option of the stage 'sample'.")
+    from bayesdist.app.run import continue_stage
+
+    continue_stage(run, name, strict=strict)

@@ -1,0 +1,48 @@
+"""Forms in which errors are drawn: all that a new error term has to choose from."""
+
+from bayesdist.assess.terms.forms.functions import FunctionField, Functions
+from bayesdist.assess.terms.forms.independent import Independent, Known, KnownField, NoiseField
+from bayesdist.assess.terms.forms.polynomials import (
+    PolynomialField,
+    Polynomials,
+    polynomial_errors,
+)
+from bayesdist.assess.terms.forms.rows import (
+    GIVEN,
+    LOCAL,
+    MEASURED,
+    PRODUCT,
+    PUBLISHED,
+    ErrorDraws,
+    ErrorField,
+    ErrorTerm,
+    Image,
+    Noise,
+    Row,
+)
+from bayesdist.assess.terms.forms.together import Together, TogetherField
+
+__all__ = [
+    "GIVEN",
+    "LOCAL",
+    "MEASURED",
+    "PRODUCT",
+    "PUBLISHED",
+    "ErrorDraws",
+    "ErrorField",
+    "ErrorTerm",
+    "FunctionField",
+    "Functions",
+    "Image",
+    "Independent",
+    "Known",
+    "KnownField",
+    "Noise",
+    "NoiseField",
+    "PolynomialField",
+    "Polynomials",
+    "Row",
+    "Together",
+    "TogetherField",
+    "polynomial_errors",
+]

@@ -1,0 +1,169 @@
+"""Errors that are sums of functions of the position, of any shape."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.terms.forms.rows import ErrorField, Image, Row, Scale
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
+
+__all__ = ["FunctionField", "Functions"]
+
+Float = NDArray[np.float64]
+
+MANY = 64  # functions from which on their values are kept, not their coefficients alone
+
+
+class OfPosition(Protocol):
+    """Functions of the position on a chip."""
+
+    def __call__(self, chip: int, x: Float, y: Float) -> NDArray[np.floating]:
+        """Values (N, m) at pixels (N,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Functions:
+    """Errors that are sums of functions of the position: draw k is row k mod n' of coefficients.
+
+    Parameters
+    ----------
+    row : Row
+    coefficients : mapping of int to ndarray, shape (n', 2, m)
+        By chip number; a chip that is not there has no such error.  Under None, those of all chips.
+    functions : callable
+        Of chip number, x and y.
+    n_draws : int
+    uniform : bool
+        Whether the error is the same at all positions.
+    covariance : mapping of int to ndarray, shape (2, m, m), optional
+        Of the coefficients, where it is stated: mean squares are exact then, and it is not known
+        how well their size is.
+    """
+
+    row: Row
+    coefficients: Mapping[int | None, NDArray[np.floating]]
+    functions: OfPosition
+    n_draws: int
+    uniform: bool = False
+    covariance: Mapping[int | None, Float] | None = None
+    _kept: dict[EvaluationDomain, FunctionField] = field(default_factory=dict, repr=False)
+
+    def on(self, domain: EvaluationDomain, image: Image) -> FunctionField:
+        """The errors at the positions of a domain; of those asked for last they are kept."""
+        key = domain.at(None)
+        if key not in self._kept:
+            self._kept.clear()
+            self._kept[key] = FunctionField(self, key)
+        return self._kept[key]
+
+    def of(self, chip: int) -> NDArray[np.floating] | None:
+        """Coefficients (n', 2, m) on a chip; None where there is no error."""
+        return self.coefficients.get(chip, self.coefficients.get(None))
+
+    def values(self, chip: int, x: Float, y: Float) -> NDArray[np.floating]:
+        """Errors (n', N, 2) of all rows at pixels of a chip."""
+        own = self.of(chip)
+        if own is None:
+            return np.zeros((1, len(x), 2))
+        phi = self.functions(chip, x, y).astype(own.dtype)
+        return np.swapaxes(own @ phi.T, 1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionField(ErrorField):
+    """Sums of functions at the positions of a domain."""
+
+    of: Functions
+    domain: EvaluationDomain
+
+    @property
+    def rows(self) -> tuple[Row, ...]:  # type: ignore[override]
+        """The row."""
+        return (self.of.row,)
+
+    @property
+    def n_draws(self) -> int:  # type: ignore[override]
+        """Number of draws."""
+        return self.of.n_draws
+
+    @property
+    def n_different(self) -> int:
+        """Rows of coefficients."""
+        return max(len(values) for values, _ in self._parts)
+
+    @property
+    def uniform(self) -> bool:  # type: ignore[override]
+        """Whether the error is the same at all positions."""
+        return self.of.uniform
+
+    @cached_property
+    def _parts(self) -> list[tuple[NDArray[np.floating], NDArray[np.floating] | None]]:
+        """Coefficients with functions (N, m) of each chip, or values where these are many."""
+        at, out = self.domain, []
+        for chip, rows in at.by_chip():
+            x, y = at.x[rows], at.y[rows]
+            own = self.of.of(chip)
+            if own is None or own.shape[2] > MANY:
+                out.append((self.of.values(chip, x, y), None))
+            else:
+                out.append((own, self.of.functions(chip, x, y)))
+        return out
+
+    def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
+        """Errors (d, N, 2) of some draws."""
+        number, parts = np.arange(draws.start, draws.stop), []
+        for values, phi in self._parts:
+            some = values[number % len(values)]
+            parts.append(some if phi is None else np.swapaxes(some @ phi.T, 1, 2))
+        out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        return np.asarray(scale.get(self.of.row.name, 1.0) * out, float)
+
+    def total(self) -> Float:
+        """Mean squares (P, 2): by the covariance, or over all rows of coefficients."""
+        if self.of.covariance is not None:
+            return self._stated(self.of.covariance)
+        return super().total()
+
+    def _stated(self, covariance: Mapping[int | None, Float]) -> Float:
+        at, functions = self.domain, self.of.functions
+        phi = {chip: functions(chip, at.x[rows], at.y[rows]) for chip, rows in at.by_chip()}
+        by_chip = {chip: covariance.get(chip, covariance.get(None)) for chip in phi}
+
+        def squares(values: Float, chip: int) -> Float:
+            return np.einsum("nk,akl,nl->na", values, by_chip[chip], values)
+
+        pairs = at.pairs()
+        if pairs is None:
+            return np.concatenate([squares(values, chip) for chip, values in phi.items()])
+        every, out = np.concatenate(list(phi.values())), np.empty((pairs.shape[1], 2))
+        first, second = at.chip[pairs]
+        for chip in phi:
+            rows = first == chip
+            same = rows & ((second == chip) | (None in covariance))
+            out[same] = squares(every[pairs[1, same]] - every[pairs[0, same]], chip)
+        apart = (first != second) & (None not in covariance)
+        for side, chips in ((0, first), (1, second)):
+            for chip in phi:
+                rows = apart & (chips == chip)
+                part = squares(every[pairs[side, rows]], chip)
+                out[rows] = part if side == 0 else out[rows] + part
+        return out
+
+    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
+        """As the rms of each draw over the chip scatters, where the size was measured."""
+        if self.of.covariance is not None:
+            return None
+        model = self.domain.model
+        size = model.chips[model.chip_code(chip)].size
+        values = self.of.values(chip, *mesh(*grid_pixels(size, DEFAULT_GRID)))
+        by_draw = np.sqrt(np.mean(np.square(values, dtype=float), axis=(1, 2)))
+        mean = float(by_draw.mean())
+        return float(by_draw.std()) / mean if mean > 0 else 0.0

@@ -1,0 +1,147 @@
+"""Errors that are independent from position to position, and displacements that are none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.terms.forms.rows import ErrorField, Image, Noise, Row, Scale
+
+__all__ = ["Independent", "Known", "KnownField", "NoiseField"]
+
+Float = NDArray[np.float64]
+
+
+class SigmaAt(Protocol):
+    """Standard deviations at the positions of a domain."""
+
+    def __call__(self, domain: EvaluationDomain) -> Float | None:
+        """Values (N, 2); None where there is no such error, as of stars of no stated magnitude."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Independent:
+    """Errors that are independent from position to position.
+
+    Parameters
+    ----------
+    row : Row
+    sigma : callable
+        Of a domain.
+    sizes : mapping of int to ndarray, shape (n, 2)
+        As of `Noise`.
+    known : mapping of int to float
+        By chip number: how well the size is known, relative to it.
+    """
+
+    row: Row
+    sigma: SigmaAt
+    sizes: Mapping[int, Float] = field(default_factory=dict)
+    known: Mapping[int, float | None] = field(default_factory=dict)
+
+    def on(self, domain: EvaluationDomain, image: Image) -> NoiseField:
+        """The errors at the positions of a domain."""
+        sigma = self.sigma(domain)
+        return NoiseField(() if sigma is None else (self.row,), domain, self, sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseField(ErrorField):
+    """Independent errors at the positions of a domain: no row where there are none."""
+
+    rows: tuple[Row, ...]
+    domain: EvaluationDomain
+    of: Independent
+    sigma: Float | None
+
+    def errors(self, draws: slice, scale: Scale) -> None:
+        """None: the noise of all terms is drawn together."""
+        return None
+
+    def squares(self) -> dict[str, Float]:
+        """Mean squares of the row, if there is one."""
+        return super().squares() if self.rows else {}
+
+    def total(self) -> Float:
+        """Variances (P, 2); of differences those of both positions."""
+        pairs = self.domain.pairs()
+        if self.sigma is None:
+            return np.zeros((self.domain.size if pairs is None else pairs.shape[1], 2))
+        square = self.sigma**2
+        return square if pairs is None else square[pairs[0]] + square[pairs[1]]
+
+    def noise(self, scale: Scale) -> Iterator[Noise]:
+        """The standard deviations themselves."""
+        if self.sigma is not None:
+            name = self.of.row.name
+            yield Noise(name, scale.get(name, 1.0) * self.sigma, self.of.sizes)
+
+    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
+        """As it was stated."""
+        return self.of.known.get(chip)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Displacements that are known, and no error.
+
+    Parameters
+    ----------
+    row : Row
+        In no total.
+    shift : callable
+        Takes pixels x, y (N,), a chip number and an epoch (or None) to (N, 2).
+    """
+
+    row: Row
+    shift: Callable[[Float, Float, int, float | None], Float]
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """The row."""
+        return (self.row,)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Known:
+        """Itself: it is the same in every draw."""
+        return self
+
+    def on(self, domain: EvaluationDomain, image: Image) -> KnownField:
+        """The displacements at the positions of a domain."""
+        parts = [
+            self.shift(domain.x[rows], domain.y[rows], chip, domain.epoch)
+            for chip, rows in domain.by_chip()
+        ]
+        return KnownField((self.row,), domain, np.concatenate(parts))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownField(ErrorField):
+    """Displacements (N, 2) at the positions of a domain."""
+
+    rows: tuple[Row, ...]
+    domain: EvaluationDomain
+    shift: Float
+
+    def errors(self, draws: slice, scale: Scale) -> None:
+        """None: no error."""
+        return None
+
+    def squares(self) -> dict[str, Float]:
+        """Squares of the displacements, or of their differences."""
+        pairs = self.domain.pairs()
+        moved = self.shift if pairs is None else self.shift[pairs[1]] - self.shift[pairs[0]]
+        return {self.rows[0].name: moved**2}
+
+    def total(self) -> Float:
+        """Nothing."""
+        return np.zeros_like(self.squares()[self.rows[0].name])
+
+    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
+        """Known exactly."""
+        return 0.0

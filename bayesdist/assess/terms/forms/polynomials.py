@@ -1,0 +1,180 @@
+"""Errors of parameters: on any chip at any epoch a polynomial of the pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.solution import place_of
+from bayesdist.assess.terms.forms.rows import ErrorField, Image, Row, Scale
+from bayesdist.assess.terms.rigid import without_rigid
+from bayesdist.calibration.chip_map import position_moments
+from bayesdist.model import DistortionModel
+
+__all__ = ["PolynomialField", "Polynomials", "polynomial_errors"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+def polynomial_errors(
+    model: DistortionModel,
+    mean: Float,
+    theta: Float,
+    *,
+    epoch: float | None,
+    chip: int,
+    exposure: Int | int | None = None,
+) -> Float:
+    """Legendre coefficients (n, 2, K) of errors of parameters, along the axes of the gauge.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    mean : ndarray, shape (D,)
+        Where there is no error.
+    theta : ndarray, shape (n, D)
+    epoch : float or None
+        Decimal years.
+    chip : int
+        Chip number.
+    exposure : int or ndarray of int, shape (n,), optional
+        Code of the exposure, of all draws or of each, whose frame is among the parameters that err;
+        None for errors of the polynomials and their drift alone.
+    """
+    if isinstance(exposure, np.ndarray):
+        out = np.empty((len(theta), 2, model.n_terms))
+        for e in np.unique(exposure):
+            rows = exposure == e
+            out[rows] = polynomial_errors(
+                model, mean, theta[rows], epoch=epoch, chip=chip, exposure=int(e)
+            )
+        return out
+    place = place_of(model, epoch=epoch, exposure=exposure, chip=chip)
+    error = place.polynomial(theta) - place.polynomial(mean)
+    if exposure is None:
+        return error
+    return np.linalg.solve(model.frame(mean, exposure)[0], error)
+
+
+class AddedPolynomials(Protocol):
+    """Coefficients that are added to those of the parameters."""
+
+    def polynomials(self, epoch: float | None, chip: int) -> Float:
+        """Legendre coefficients (n, 2, K)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Polynomials:
+    """Errors of parameters: on any chip at any epoch a polynomial.
+
+    Parameters
+    ----------
+    row : Row
+    model : DistortionModel
+    mean : ndarray, shape (D,)
+        Where there is no error.
+    theta : ndarray, shape (n, D)
+    exposure : int or None
+        Code of an exposure whose frame errs, and takes the place of any new one.
+    frames : bool
+        Whether the frame of the exposure of each draw's star errs.
+    more : tuple
+        What is added to these polynomials.
+    """
+
+    row: Row
+    model: DistortionModel
+    mean: Float
+    theta: Float
+    exposure: int | None = None
+    frames: bool = False
+    more: tuple[AddedPolynomials, ...] = ()
+
+    def on(self, domain: EvaluationDomain, image: Image) -> PolynomialField:
+        """The errors at the positions of a domain, less what an alignment takes up."""
+
+        def coefficients(chip: int) -> Float:
+            exposure = image.exposure if self.frames else self.exposure
+            out = polynomial_errors(
+                self.model, self.mean, self.theta, epoch=domain.epoch, chip=chip, exposure=exposure
+            )
+            for one in self.more:
+                out = out + one.polynomials(domain.epoch, chip)
+            return out
+
+        return PolynomialField.of((self.row,), domain, image, coefficients)
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialField(ErrorField):
+    """Errors that are polynomials of the pixel.
+
+    Parameters
+    ----------
+    rows : tuple of Row
+        One, or none for a sum of rows.
+    domain : EvaluationDomain
+    coefficients : dict of int to ndarray, shape (n, 2, K)
+        By chip number.
+    """
+
+    rows: tuple[Row, ...]
+    domain: EvaluationDomain
+    coefficients: dict[int, Float]
+
+    @classmethod
+    def of(
+        cls,
+        rows: tuple[Row, ...],
+        domain: EvaluationDomain,
+        image: Image,
+        coefficients: Callable[[int], Float],
+    ) -> PolynomialField:
+        """The field of coefficients by chip number, less what an alignment takes up."""
+        model, mean = domain.model, image.aligned_by
+        if mean is None:
+            return cls(rows, domain, {chip: coefficients(chip) for chip in domain.chips})
+        every = {chip.number: coefficients(chip.number) for chip in model.chips}
+        positions = {
+            chip: place_of(model, epoch=domain.epoch, chip=chip).polynomial(mean) for chip in every
+        }
+        return cls(rows, domain, without_rigid(every, positions, model))
+
+    @property
+    def n_draws(self) -> int:  # type: ignore[override]
+        """Number of draws."""
+        return len(next(iter(self.coefficients.values())))
+
+    def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
+        """Errors (d, N, 2) of some draws."""
+        size = scale.get(self.rows[0].name, 1.0) if self.rows else 1.0
+        parts = [
+            np.swapaxes(self.coefficients[chip][draws] @ phi.T, -1, -2)
+            for chip, phi in self.domain.basis.items()
+        ]
+        out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+        return out if size == 1.0 else size * out
+
+    def of_parameters(self, name: str) -> bool:
+        """All of it."""
+        return True
+
+    def total(self) -> Float:
+        """Mean squares (P, 2), by second moments where they are those of positions."""
+        if self.domain.relative:
+            return self.by_draws(slice(0, self.n_draws))
+        at, out = self.domain, []
+        for chip, rows in at.by_chip():
+            e = self.coefficients[chip]
+            flat = e.reshape(len(e), -1)
+            second = (flat.T @ flat / len(e)).reshape(*e.shape[1:], *e.shape[1:])
+            uu, vv, _ = position_moments(second, at.model.basis(chip), at.x[rows], at.y[rows])
+            out.append(np.stack([uu, vv], axis=1))
+        return np.concatenate(out)

@@ -1,0 +1,173 @@
+"""What an error term has to give: rows of a budget, draws, and fields of these at positions.
+
+A term draws its chance once, for all chips, epochs and questions; its draws are evaluated at the
+positions of a domain wherever they are asked for.  Terms are independent of each other: what is
+correlated is one term with several rows.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.domain import EvaluationDomain
+
+__all__ = [
+    "GIVEN",
+    "LOCAL",
+    "MEASURED",
+    "PRODUCT",
+    "PUBLISHED",
+    "ErrorDraws",
+    "ErrorField",
+    "ErrorTerm",
+    "Image",
+    "Noise",
+    "Row",
+    "Scale",
+]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Scale = Mapping[str, float]
+
+LOCAL, PRODUCT = "local", "product"
+MEASURED, GIVEN, PUBLISHED = "measured in this run", "given by the user", "published"
+
+BLOCK = 200_000  # positions times draws that are evaluated at once
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a budget.
+
+    Parameters
+    ----------
+    name : str
+    kind : str
+        'systematic' (shared by all stars of an image), 'random' (of each star), 'local' (shared by
+        the stars near a position) or 'product' (of a file: known, and no error).
+    source : str
+        Begins with 'measured in this run', 'given by the user' or 'published'.
+    in_total : bool
+        False for a row that is shown beside the others, as these hold it already.
+    """
+
+    name: str
+    kind: str = "systematic"
+    source: str = MEASURED
+    in_total: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """In which image a position is asked for.
+
+    Parameters
+    ----------
+    exposure : ndarray of int, shape (n,), or None
+        Code of the exposure in which the star of each draw lies; None for a new exposure, or one of
+        a model without frames.
+    aligned_by : ndarray, shape (D,), or None
+        Parameters of the positions to which the observer has fitted shift and rotation of the whole
+        detector; None where nobody has.
+    """
+
+    exposure: Int | None = None
+    aligned_by: Float | None = None
+
+
+class ErrorTerm(Protocol):
+    """Something that moves positions: all that a new one has to give."""
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """Rows of the budget."""
+        ...
+
+    def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
+        """Draws of the error, one chance for all chips and epochs."""
+        ...
+
+
+class ErrorDraws(Protocol):
+    """Draws of a term: one of the forms of this module."""
+
+    def on(self, domain: EvaluationDomain, image: Image) -> ErrorField:
+        """The errors at the positions of a domain."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Errors that are independent from position to position.
+
+    Parameters
+    ----------
+    name : str
+        Of the row.
+    sigma : ndarray, shape (N, 2)
+    sizes : mapping of int to ndarray, shape (n, 2)
+        By chip number, what the variances of each draw are multiplied by; 1 where it is not there.
+    """
+
+    name: str
+    sigma: Float
+    sizes: Mapping[int, Float] = field(default_factory=dict)
+
+
+class ErrorField(ABC):
+    """Errors of a term at the N positions of a domain."""
+
+    domain: EvaluationDomain
+    rows: tuple[Row, ...]
+    n_draws: int
+
+    uniform = False  # the same at all positions
+
+    @property
+    def n_different(self) -> int:
+        """Draws after which they are the first ones again."""
+        return self.n_draws
+
+    @abstractmethod
+    def errors(self, draws: slice, scale: Scale) -> Float | None:
+        """Errors (d, N, 2) of some draws, rows multiplied by factors; None where all is noise."""
+
+    def squares(self) -> dict[str, Float]:
+        """Mean squares (P, 2) of each row: at positions, or of the differences of pairs."""
+        (row,) = self.rows
+        return {row.name: self.total()}
+
+    def total(self) -> Float:
+        """Mean squares (P, 2) of all rows together."""
+        return self.by_draws(slice(0, self.n_different))
+
+    def noise(self, scale: Scale) -> Iterator[Noise]:
+        """What is independent from position to position, rows multiplied by factors."""
+        yield from ()
+
+    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
+        """How well the size of a row is known on a chip, relative to it; None where it is not."""
+        return monte_carlo
+
+    def of_parameters(self, name: str) -> bool:
+        """Whether a row is an error of parameters."""
+        return False
+
+    def by_draws(self, draws: slice) -> Float:
+        """Mean squares (P, 2) over some draws, evaluated in blocks."""
+        pairs, total, n = self.domain.pairs(), 0.0, draws.stop - draws.start
+        step = max(1, BLOCK // max(self.domain.size, 1))
+        for start in range(draws.start, draws.stop, step):
+            errors = self.errors(slice(start, min(start + step, draws.stop)), {})
+            assert errors is not None
+            if pairs is not None:
+                errors = errors[:, pairs[1]] - errors[:, pairs[0]]
+            total = total + np.einsum("dna,dna->na", errors, errors)
+        return np.asarray(total / n)

@@ -1,0 +1,146 @@
+"""Rows of one term: the same draw number in each, so that they may be correlated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.terms.forms.rows import ErrorDraws, ErrorField, Image, Row, Scale
+
+__all__ = ["Together", "TogetherField"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Rows of one term: the same draw number in each, so that they may be correlated.
+
+    The joint error is the sum of the rows that are in the total.  Rows that are not are held by it:
+    where one of them shrinks, the joint error does so at each position as the row's share in its
+    variance says.
+
+    Parameters
+    ----------
+    draws : tuple
+        One for each row.
+    remainder : bool
+        Whether the last row counts as much as the joint error has beyond the other rows.
+    """
+
+    draws: tuple[ErrorDraws, ...]
+    remainder: bool = False
+
+    def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
+        """The errors at the positions of a domain."""
+        parts = tuple(one.on(domain, image) for one in self.draws)
+        return TogetherField(domain, parts, remainder=self.remainder)
+
+
+@dataclass(frozen=True, eq=False)
+class TogetherField(ErrorField):
+    """Rows of one term at the positions of a domain.
+
+    Parameters
+    ----------
+    domain : EvaluationDomain
+    parts : tuple of ErrorField
+    whole : ErrorField or None
+        The joint error, where it is more than the sum of the rows.
+    remainder : bool
+        As of `Together`.
+    """
+
+    domain: EvaluationDomain
+    parts: tuple[ErrorField, ...]
+    whole: ErrorField | None = None
+    remainder: bool = False
+
+    @property
+    def rows(self) -> tuple[Row, ...]:  # type: ignore[override]
+        """Rows of all parts."""
+        return tuple(row for part in self.parts for row in part.rows)
+
+    @property
+    def n_draws(self) -> int:  # type: ignore[override]
+        """Number of draws."""
+        return self.parts[0].n_draws
+
+    @cached_property
+    def summed(self) -> tuple[ErrorField, ...]:
+        """Fields whose sum is the joint error."""
+        return self._added if self.whole is None else (self.whole,)
+
+    @cached_property
+    def _added(self) -> tuple[ErrorField, ...]:
+        """Parts that are in the total."""
+        return tuple(p for p in self.parts if all(row.in_total for row in p.rows))
+
+    def errors(self, draws: slice, scale: Scale = {}) -> Float:  # noqa: B006
+        """The joint error (d, N, 2), each row multiplied by its factor."""
+        if self.whole is None:
+            out = 0.0
+            for part in self._added:
+                out = out + part.errors(draws, scale)
+        else:
+            out = self.whole.errors(draws, {})
+            for part in self._added:
+                sizes = [scale[row.name] for row in part.rows if row.name in scale]
+                if sizes:
+                    out = out - (1.0 - sizes[0]) * part.errors(draws, {})
+        factor = self._factor(scale)
+        return np.asarray(out if factor is None else factor * out)
+
+    def _factor(self, scale: Scale) -> Float | None:
+        """What multiplies the joint error (N, 2) where rows shrink that it holds."""
+        held = [r.name for r in self.rows if not r.in_total and r.name in scale]
+        if not held:
+            return None
+        assert not self.domain.relative
+        whole, by_row = self.total(), self.squares()
+        left = whole - sum(
+            (1.0 - scale[name] ** 2) * np.minimum(by_row[name], whole) for name in held
+        )
+        return np.sqrt(np.maximum(left, 0.0) / np.where(whole > 0, whole, 1.0))
+
+    def squares(self) -> dict[str, Float]:
+        """Mean squares (P, 2) of each row."""
+        return self._squares
+
+    @cached_property
+    def _squares(self) -> dict[str, Float]:
+        out: dict[str, Float] = {}
+        for part in self.parts:
+            out |= part.squares()
+        if self.remainder:
+            last = self.rows[-1].name
+            others = sum(square for name, square in out.items() if name != last)
+            out[last] = np.maximum(self.total() - others, 0.0)
+        return out
+
+    @cached_property
+    def _total(self) -> Float:
+        if self.whole is not None:
+            return self.whole.total()
+        if len(self._added) == 1:
+            return self._added[0].total()
+        return self.by_draws(slice(0, min(part.n_different for part in self._added)))
+
+    def total(self) -> Float:
+        """Mean squares (P, 2) of the joint error."""
+        return self._total
+
+    def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
+        """As of the row's own form."""
+        return self._part(name).relative_error(name, chip, monte_carlo)
+
+    def of_parameters(self, name: str) -> bool:
+        """As of the row's own form."""
+        return self._part(name).of_parameters(name)
+
+    def _part(self, name: str) -> ErrorField:
+        return next(p for p in self.parts if name in [row.name for row in p.rows])

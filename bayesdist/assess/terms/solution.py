@@ -1,0 +1,147 @@
+"""Errors of the parameters of a solution, part by part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.solution import Solution, place_of
+from bayesdist.assess.terms.forms import (
+    Image,
+    PolynomialField,
+    Row,
+    TogetherField,
+    polynomial_errors,
+)
+from bayesdist.assess.terms.parameters import CatalogueErrors
+from bayesdist.model import DistortionModel
+
+__all__ = ["COEFFICIENTS", "EXPOSURE_FRAME", "TIME_DEPENDENCE", "SolutionErrors"]
+
+Float = NDArray[np.float64]
+
+COEFFICIENTS = "coefficients"
+TIME_DEPENDENCE = "time dependence"
+EXPOSURE_FRAME = "exposure frame"
+
+
+@dataclass(frozen=True, eq=False)
+class SolutionErrors:
+    """Draws of a solution less its mean: of its coefficients, its drift, and a frame.
+
+    The parts add up to the joint error (to first order) along the axes of the polynomials, however
+    the field turned between exposures.  They are correlated.
+
+    Parameters
+    ----------
+    solution : Solution
+    without : Solution, optional
+        The solution that lacks the errors of the catalogue, and shows the rows of the parts.
+    catalogue : tuple of CatalogueErrors
+        What the errors of the catalogue do, which the solution's draws hold: shown beside.
+    """
+
+    solution: Solution
+    without: Solution | None = None
+    catalogue: tuple[CatalogueErrors, ...] = ()
+
+    @property
+    def fitted_exposures(self) -> list[int]:
+        """Codes of the exposures whose frame was fitted."""
+        model = self.solution.model
+        return [e for e in range(len(model.exposures)) if model.free_frame_names(e)]
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """Coefficients, drift and frame as far as the model has them, and the catalogue's."""
+        names = [COEFFICIENTS]
+        if self.solution.model.time is not None:
+            names.append(TIME_DEPENDENCE)
+        if self.fitted_exposures:
+            names.append(EXPOSURE_FRAME)
+        return (*(Row(name) for name in names), *(r for c in self.catalogue for r in c.rows))
+
+    def draw(self, n: int, rng: np.random.Generator) -> SolutionDraws:
+        """Draws of the solution, and of what is shown beside them."""
+        theta = shown = np.asarray(self.solution.draws(n, rng), float)
+        (own,) = rng.spawn(1)  # what is shown beside changes nothing of what follows
+        if self.without is not None:
+            shown = np.asarray(self.without.draws(n, own), float)
+        return SolutionDraws(self, theta, shown, tuple(c.draw(n, own) for c in self.catalogue))
+
+
+@dataclass(frozen=True, eq=False)
+class SolutionDraws:
+    """Draws (n, D) of the parameters: of the joint error, and of that whose parts are shown."""
+
+    of: SolutionErrors
+    theta: Float
+    shown: Float
+    catalogue: tuple[Any, ...] = ()
+
+    def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
+        """The errors at the positions of a domain."""
+        exact = self.of.without is None
+        shown = self.of.solution if exact else self.of.without
+        assert shown is not None
+        parts = _parts(shown, self.shown, domain.epoch, image.exposure)
+        fields = [
+            # rows of another solution cannot be taken off the draws of this one
+            PolynomialField.of((Row(name, in_total=exact),), domain, image, of)
+            for name, of in parts.items()
+            if name
+        ]
+        model, mean = self.of.solution.model, np.asarray(self.of.solution.mean, float)
+
+        def joint(chip: int) -> Float:
+            return polynomial_errors(
+                model, mean, self.theta, epoch=domain.epoch, chip=chip, exposure=image.exposure
+            )
+
+        whole = PolynomialField.of((), domain, image, joint)
+        fields += [c.on(domain, image) for c in self.catalogue]
+        return TogetherField(domain, tuple(fields), whole)
+
+
+def _parts(
+    solution: Solution, theta: Float, epoch: float | None, exposure: NDArray[np.int64] | None
+) -> dict[str, Callable[[int], Float]]:
+    """By name of the part, its Legendre coefficients (n, 2, K) by chip number."""
+    model, mean = solution.model, np.asarray(solution.mean, float)
+
+    def static(chip: int) -> Float:
+        return _static(model, theta - mean, chip)
+
+    def drift(chip: int) -> Float:
+        gauge = place_of(model, epoch=epoch, chip=chip)
+        return gauge.polynomial(theta) - gauge.polynomial(mean) - static(chip)
+
+    def frame(chip: int) -> Float:
+        assert exposure is not None
+        out = np.zeros((len(theta), 2, model.n_terms))
+        for e in np.unique(exposure):
+            rows = np.flatnonzero(exposure == e)
+            only = np.tile(mean, (rows.size, 1))
+            block = model.frame_slice(int(e))
+            only[:, block] = theta[rows, block]
+            out[rows] = polynomial_errors(
+                model, mean, only, epoch=epoch, chip=chip, exposure=int(e)
+            )
+        return out
+
+    out: dict[str, Callable[[int], Float]] = {COEFFICIENTS: static}
+    if model.time is not None:
+        out[TIME_DEPENDENCE] = drift
+    if exposure is not None:
+        out[EXPOSURE_FRAME] = frame
+    return out
+
+
+def _static(model: DistortionModel, theta: Float, chip: int) -> Float:
+    """Legendre coefficients (n, 2, K) of a chip without drift."""
+    return np.stack([theta[..., model.coefficient_slice(chip, axis)] for axis in (0, 1)], axis=-2)

@@ -1,0 +1,297 @@
+"""Similarity between two lists of stars, found without a start value by the shapes of triangles.
+
+Triangles of bright neighbours are looked up in a k-d tree of those of the reference list.  Each two
+of equal shape vote for one rotation, scale and shift; true ones agree, chance spreads its votes
+over the whole space.  The winner is believed when it brings far more stars together than the stars
+find when they are displaced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from bayesdist.data.matching.linear_map import LinearMap
+from bayesdist.data.matching.pairs import chance_rate, hull_of
+from bayesdist.data.matching.triangles import Candidate, Level, candidates
+from bayesdist.data.matching.voting import mean_spacing
+from bayesdist.errors import InputError
+
+__all__ = [
+    "MIRRORED",
+    "PatternIndex",
+    "Similarity",
+    "find_similarity",
+    "mismatch_reason",
+    "pattern_index",
+]
+
+Float = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_MIN_STARS_TRIED = 60  # stars of the shallowest try
+_STARS_OF_FIRST_LEVEL = 400  # each further one has three times as many
+_LEVEL_FACTOR = 3
+_TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: remainder of a distortion
+_DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of the number by the mean density
+_STARS_CHECKED = 1000  # stars that a candidate is checked with
+_CHANCE_SIGMAS = 8.0  # by which its coincidences must beat chance
+_MIN_AGREEING = 6  # stars that agree
+
+# ratios of arcsec, mas, degrees and pixels of 0.05 arcsec
+_RATIOS = (20.0, 50.0, 1000.0, 3600.0, 72_000.0, 3.6e6)
+_RATIO_TOLERANCE = 1.1  # of such a ratio; pixels have other sizes, too
+_WIDE_SCALE = 1.4  # a scale that is only badly known
+_SCALE_TOLERANCE = 0.03  # that the matching allows
+_STARS_FOR_EACH_AGREEING = 5.0  # stars that have a neighbour, for each whose triangles agree
+_CLEAR_SIGMAS = 16.0  # standard deviations of chance: of many tries one may well reach half of it
+MIRRORED = "its mirror image"
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """Rotation, scale and shift from one list to another.
+
+    w = scale exp(i rotation) (z or its mirror image - origin) + target,    z = x + i y
+    """
+
+    rotation: float  # degrees anticlockwise, in [0, 360)
+    scale: float
+    mirrored: bool  # True where the y axis is reversed first
+    origin: Float  # (2,), a point in the middle of the list
+    target: Float  # (2,), its position on the other list
+    coincidences: int  # stars whose triangles agree
+    found: int  # bright stars with a neighbour after the transformation
+    expected: float  # as many by chance
+
+    @property
+    def map(self) -> LinearMap:
+        """Linear map that is equal to this."""
+        a = np.radians(self.rotation)
+        matrix = self.scale * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+        if self.mirrored:
+            matrix = matrix @ np.diag([1.0, -1.0])
+        return LinearMap(matrix, self.target - self.origin, self.origin)
+
+    def __call__(self, points: Float) -> Float:
+        """Transformed points, shape (N, 2)."""
+        return self.map(points)
+
+
+@dataclass(frozen=True, eq=False)
+class PatternIndex:
+    """Reference list (M, 2), ready to be searched any number of times; made by `pattern_index`."""
+
+    positions: Float
+    levels: tuple[Level, ...]  # the brightest stars in growing number, with triangles
+    area: float  # of the hull of all
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """k-d tree of the positions."""
+        return cKDTree(self.positions)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Mean distance between neighbours."""
+        return mean_spacing(self.positions)
+
+
+def pattern_index(positions: ArrayLike, mag: ArrayLike | None = None) -> PatternIndex:
+    """Reference list prepared for `find_similarity`.
+
+    Parameters
+    ----------
+    positions : array_like, shape (M, 2)
+    mag : array_like, shape (M,), optional
+        Magnitudes; without them all stars take part at once.
+
+    Returns
+    -------
+    PatternIndex
+
+    Raises
+    ------
+    InputError
+        For fewer than three stars, or positions that are not finite.
+    """
+    points = np.ascontiguousarray(positions, np.float64)
+    if len(points) < 3 or not np.isfinite(points).all():
+        raise InputError(
+            "positions are fewer than three, or not all finite",
+            where="reference list",
+            do="give more stars",
+        )
+    stars = points[:, 0] + 1j * points[:, 1]
+    sizes = [len(points)]
+    if mag is not None:
+        stars = stars[np.argsort(np.asarray(mag, float), kind="stable")]
+        sizes = []
+        size = _STARS_OF_FIRST_LEVEL
+        while size < len(points):
+            sizes.append(size)
+            size *= _LEVEL_FACTOR
+        sizes.append(len(points))
+    return PatternIndex(points, tuple(Level(stars[:n]) for n in sizes), hull_of(points)[1])
+
+
+def find_similarity(
+    points: ArrayLike,
+    reference: PatternIndex,
+    *,
+    mag: ArrayLike | None = None,
+    scale: tuple[float, float] = (0.97, 1.03),
+    mirrored: bool = False,
+    source: str = "detections",
+    reference_name: str = "reference list",
+) -> Similarity:
+    """Similarity that brings a list of stars onto a reference list.
+
+    Parameters
+    ----------
+    points : array_like, shape (N, 2)
+        Positions; the remainder of a distortion may displace them by several pixels, as long as it
+        changes local scales by less than about a per cent.
+    reference : PatternIndex
+    mag : array_like, shape (N,), optional
+        Magnitudes, any zero point; with them the bright stars are tried first.
+    scale : tuple of float, optional
+        Smallest and largest scale.
+    mirrored : bool, optional
+        True to search for the mirror image.
+    source, reference_name : str, optional
+        For the error.
+
+    Returns
+    -------
+    Similarity
+
+    Raises
+    ------
+    InputError
+        When no similarity brings together more stars than chance does, with the best number of
+        coincidences.
+    """
+    xy = np.ascontiguousarray(points, np.float64)
+    if len(xy) < 3 or not np.isfinite(xy).all():
+        raise InputError(
+            "positions are fewer than three, or not all finite", where=source, do="give more stars"
+        )
+    if not 0.0 < scale[0] < scale[1]:
+        raise InputError(
+            f"scales from {scale[0]} to {scale[1]} are none", where=source, do="give a range"
+        )
+    order = np.arange(len(xy))
+    if mag is not None:
+        order = np.argsort(np.asarray(mag, float), kind="stable")
+    origin = 0.5 * (xy.min(axis=0) + xy.max(axis=0))
+    ranked = (xy - origin)[order]
+    stars = ranked[:, 0] + 1j * ranked[:, 1]
+    if mirrored:
+        stars = np.conj(stars)
+    area = hull_of(xy)[1] * scale[0] * scale[1]
+    best = (0, 0.0)  # coincidences of the best candidate, and those by chance
+    for tolerance, level, size in _tries(len(stars), mag is not None, reference, area):
+        bright = stars[:size]
+        for candidate in candidates(bright, level, tolerance, scale):
+            found, expected = _support(candidate, bright, reference)
+            best = max(best, (found, expected))
+            if (
+                candidate.agreeing >= _MIN_AGREEING
+                and found - expected > _CHANCE_SIGMAS * np.sqrt(expected)
+                and found > 2.0 * expected
+                and found >= _MIN_AGREEING
+            ):
+                return Similarity(
+                    rotation=float(np.degrees(np.angle(candidate.turn)) % 360.0),
+                    scale=float(abs(candidate.turn)),
+                    mirrored=mirrored,
+                    origin=origin,
+                    target=np.array([candidate.target.real, candidate.target.imag]),
+                    coincidences=candidate.agreeing,
+                    found=found,
+                    expected=expected,
+                )
+    raise InputError(
+        f"does not match {reference_name}: the best rotation and shift bring together {best[0]} "
+        f"stars, where chance gives {best[1]:.1f}",
+        where=source,
+        do="check the field, the scale, the parity and the distortion that is taken as known",
+    )
+
+
+def _tries(
+    n: int, ranked: bool, reference: PatternIndex, area: float
+) -> Iterator[tuple[float, Level, int]]:
+    """Tolerance, reference stars and number of stars of the list, the most promising first."""
+    for tolerance in _TOLERANCES:
+        for level in reference.levels:
+            even = len(level.stars) * area / reference.area
+            last = level is reference.levels[-1]
+            if even < _MIN_STARS_TRIED and not last:
+                continue
+            if not ranked:
+                if last:
+                    yield tolerance, level, n
+                continue
+            sizes = [int(np.clip(even * depth, min(_MIN_STARS_TRIED, n), n)) for depth in _DEPTHS]
+            for size in dict.fromkeys(sizes):
+                yield tolerance, level, size
+
+
+def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> tuple[int, float]:
+    """Numbers of stars that have a reference star near them, and that have one by chance."""
+    sample = stars[:: -(-len(stars) // _STARS_CHECKED)]
+    moved = candidate.turn * sample + candidate.target
+    points = np.stack([moved.real, moved.imag], axis=-1)
+    reach = float(np.clip(3.0 * candidate.slack, 0.02 * reference.spacing, 0.2 * reference.spacing))
+    distance, _ = reference.tree.query(points, distance_upper_bound=reach, workers=-1)
+    expected = len(sample) * chance_rate(points, reference.tree, reach, 4.0 * reach)
+    return int(np.isfinite(distance).sum()), max(expected, 0.5)
+
+
+def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) -> str:
+    """Clause on the scale or mirror image by which a list (N, 2) would match; else empty."""
+    ratios = [factor for one in _RATIOS for factor in (one, 1.0 / one)]
+    tries = [
+        (1.0, _WIDE_SCALE, False),
+        *((one, _RATIO_TOLERANCE, False) for one in ratios),
+        (1.0, _WIDE_SCALE, True),
+    ]
+    best, reason = 0.0, ""
+    # a wrong unit is found or dismissed in no time, a mirror image is not: it comes last
+    for ratio, within, mirrored in tries:
+        try:
+            found = find_similarity(
+                ratio * plane,
+                reference,
+                mag=mag,
+                scale=(1.0 / within, within),
+                mirrored=mirrored,
+            )
+        except InputError:
+            continue
+        # shrunk onto a crowded region any list finds neighbours; but few of its triangles agree
+        if _STARS_FOR_EACH_AGREEING * found.coincidences < found.found:
+            continue
+        scale = ratio * found.scale
+        as_it_is = abs(scale - 1.0) < _SCALE_TOLERANCE
+        if as_it_is and not mirrored:  # then neither scale nor image is wrong
+            continue
+        sigmas = (found.found - found.expected) / np.sqrt(found.expected)
+        if sigmas <= best:
+            continue
+        image = MIRRORED if mirrored else "it"
+        at = "" if as_it_is else f" at {scale:.4g} times the scale"
+        best = sigmas
+        reason = (
+            f"{image} does match{at}: {found.found} stars, where chance gives {found.expected:.1f}"
+        )
+        if best > _CLEAR_SIGMAS:
+            break
+    return reason

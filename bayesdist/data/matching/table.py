@@ -1,0 +1,233 @@
+"""Matches of detections that agree with a catalogue up to a shift, a small rotation and a scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
+from bayesdist.data.matching.pairs import beats_chance, mutual_pairs, overlap
+from bayesdist.data.matching.voting import mean_spacing, vote_offset
+from bayesdist.errors import InputError
+
+__all__ = ["Matching", "match_table", "match_to_catalog"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+_LOG10_CHANCE = -4.0  # a vote that chance wins more often than this is no match
+_FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows
+_CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
+
+
+@dataclass(frozen=True, eq=False)
+class Matching:
+    """Pairs of detections and reference stars, and how they were found.
+
+    Parameters
+    ----------
+    index, catalog_index : ndarray of int, shape (n_pairs,)
+        Rows of the detections and of the catalogue; no row is repeated.
+    transformation : LinearMap
+        From the given positions to the catalogue's.
+    radius : float
+        Largest distance of a pair, in the catalogue's unit.
+    coincidences : int
+        Pairs that agreed in the vote on the offset.
+    false_rate : float
+        Probability that a detection without counterpart is paired by chance: 1 - exp(-density pi
+        radius^2), with the mean density over the detections of reference stars that are still free.
+    """
+
+    index: Int
+    catalog_index: Int
+    transformation: LinearMap
+    radius: float
+    coincidences: int
+    false_rate: float
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def match_to_catalog(
+    x: ArrayLike,
+    y: ArrayLike,
+    catalog: ReferenceCatalog,
+    *,
+    mag: ArrayLike | None = None,
+    start: LinearMap | None = None,
+    radius: float | None = None,
+    max_offset: float | None = None,
+    source: str = "detections",
+) -> Matching:
+    """Matches of detections with reference stars, one to one.
+
+    The offset is voted for by the differences of bright pairs; a linear transformation is then
+    iterated while the radius shrinks; the pairs are mutual nearest neighbours inside the final
+    radius.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (N,)
+        Approximate *corrected* positions, in the catalogue's unit and orientation.
+    catalog : ReferenceCatalog
+        At the epoch of the detections.
+    mag : array_like, shape (N,), optional
+        Magnitudes of the detections, any zero point: with those of the catalogue they let the
+        bright stars vote.
+    start : LinearMap, optional
+        Transformation that is applied before the vote; by default none.
+    radius : float, optional
+        Final radius; by default the one in which a detection without counterpart finds a neighbour
+        by chance with probability 0.02.
+    max_offset : float, optional
+        Largest offset on either axis; by default any.
+    source : str, optional
+        File, for errors.
+
+    Returns
+    -------
+    Matching
+
+    Raises
+    ------
+    InputError
+        When no offset brings together more stars than chance does (another field, another
+        orientation), with the best number of coincidences.
+    """
+    points = np.column_stack([np.asarray(x, float), np.asarray(y, float)])
+    reference = np.column_stack([catalog.u, catalog.v])
+    if not len(points) or not np.isfinite(points).all():
+        raise InputError(
+            "positions to match are none, or not all finite", where=source, do="correct the list"
+        )
+    if radius is not None and not radius > 0:
+        raise InputError(f"match radius is {radius}", where=source, do="give a positive radius")
+    origin = np.median(points, axis=0)
+    if start is None:
+        start = LinearMap(np.eye(2), np.zeros(2), origin)
+    moved = start(points)
+    magnitudes = None if mag is None else np.asarray(mag, float)
+    vote = vote_offset(moved, reference, magnitudes, catalog.mag, max_offset)
+    failure = InputError(
+        f"does not match {catalog.source}: the best offset brings together {vote.count} pairs, "
+        f"where chance gives {vote.expected:.1f}",
+        where=source,
+        do="check the field, the orientation, the scale and the largest offset",
+    )
+    if vote.log10_chance > _LOG10_CHANCE or vote.count < MIN_PAIRS:
+        raise failure
+
+    tree = cKDTree(reference)
+    middle = np.median(vote.voters, axis=0)
+    first = LinearMap(np.eye(2), vote.offset, middle)
+    # until a nearest neighbour is the right one, only those that voted are used
+    reach = 0.25 * mean_spacing(reference)
+    rough = iterated_map(vote.voters, vote.voted, cKDTree(vote.voted), first, vote.width, reach)
+    if rough is None:
+        raise failure
+    n_over, area = overlap(rough(moved), reference)
+    if radius is None:
+        radius = float(np.sqrt(-np.log1p(-_FALSE_RATE) * area / (np.pi * n_over)))
+    fine = iterated_map(moved, reference, tree, rough, max(reach, radius), radius)
+    if fine is None:
+        raise failure
+    transformation = LinearMap(
+        fine.matrix @ start.matrix, fine(start(origin[None]))[0] - origin, origin
+    )
+    found = transformation(points)
+    index, catalog_index, distance = mutual_pairs(found, reference, radius, tree=tree)
+    few = len(index) < MIN_PAIRS or len(index) < min(
+        _CONVINCING_PAIRS, 0.5 * min(len(points), n_over)
+    )
+    if few or not beats_chance(found, reference, tree, distance):
+        raise failure
+    return Matching(
+        index=index,
+        catalog_index=catalog_index,
+        transformation=transformation,
+        radius=radius,
+        coincidences=vote.count,
+        false_rate=float(-np.expm1(-max(n_over - len(index), 0) / area * np.pi * radius**2)),
+    )
+
+
+def match_table(
+    table: MatchTable,
+    catalog: ReferenceCatalog,
+    *,
+    radius: float | None = None,
+    max_offset: float | None = None,
+) -> MatchTable:
+    """Matches with a catalogue's positions in place of approximate ones, exposure by exposure.
+
+    Parameters
+    ----------
+    table : MatchTable
+        u, v are approximate corrected positions in the catalogue's unit, as hst1pass gives them.
+    catalog : ReferenceCatalog
+        Brought to the mean epoch of each exposure, where it has proper motions.
+    radius, max_offset
+        As `match_to_catalog`.
+
+    Returns
+    -------
+    MatchTable
+        The matched stars, with u, v and star codes of the catalogue; the others are counted as
+        rejected.  Errors stay as they are: those of a catalogue are only a part of the error of a
+        match.
+
+    Raises
+    ------
+    InputError
+        When the units differ, an exposure does not match, or proper motions meet a table without
+        epoch.
+    """
+    where = ", ".join(table.sources)
+    if table.unit != catalog.unit:
+        raise InputError(
+            f"positions are in {table.unit}, those of {catalog.source} in {catalog.unit}",
+            where=where,
+            do="bring both to one unit",
+        )
+    if catalog.pm_u is not None and table.epoch is None:
+        raise InputError(
+            f"has no epoch, and {catalog.source} has proper motions",
+            where=where,
+            do="give the epoch of the exposures",
+        )
+    u, v = table.u.copy(), table.v.copy()
+    star = np.zeros(len(table), np.int64)
+    matched = np.zeros(len(table), bool)
+    for code in np.unique(table.exposure):
+        rows = np.flatnonzero(table.exposure == code)
+        then = catalog
+        if catalog.pm_u is not None and table.epoch is not None:
+            then = catalog.at(float(table.epoch[rows].mean()))
+        found = match_to_catalog(
+            table.u[rows],
+            table.v[rows],
+            then,
+            mag=None if table.mag is None else table.mag[rows],
+            radius=radius,
+            max_offset=max_offset,
+            source=f"{table.sources[table.source[rows[0]]]}, exposure {table.exposure_names[code]}",
+        )
+        pairs = rows[found.index]
+        u[pairs], v[pairs] = then.u[found.catalog_index], then.v[found.catalog_index]
+        star[pairs] = then.star[found.catalog_index]
+        matched[pairs] = True
+    kept = table.select(matched, reason="no counterpart in the catalogue")
+    return replace(
+        kept,
+        u=u[matched],
+        v=v[matched],
+        star=star[matched],
+        tangent_point=catalog.tangent_point,
+    )

@@ -1,0 +1,187 @@
+"""Triangles of neighbouring stars, and their votes for a rotation, a scale and a shift."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bayesdist.data.matching.linear_map import robust_fit
+
+__all__ = ["Candidate", "Level", "Triangles", "candidates", "triangles_of"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Complex = NDArray[np.complex128]
+
+_MIN_SIDE_RATIO = 0.15  # shortest to longest side: below, a small error turns the shape around
+_MAX_SIDE_RATIO = 0.985  # sides nearer to each other than this may change places
+_MAX_ANCHORS = 500  # stars of the list that triangles are made around
+_NEIGHBOURS = (5, 6)  # of each, in the list and in the reference
+_MAX_CANDIDATES = 3  # peaks of a vote that are looked at
+_MAX_VOTES = 400_000  # at most
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """Triangles, their corners in the order of the opposite sides, longest first."""
+
+    corners: Int  # (T, 3), indices of stars
+    shape: Float  # (T, 2), logarithms of middle and shortest side over the longest
+    log_size: Float  # (T,), of the longest side
+    left: NDArray[np.bool_]  # (T,), anticlockwise; a mirror changes it
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+
+def triangles_of(stars: Complex, anchors: Int, neighbours: int) -> Triangles:
+    """Triangles of each anchor with two of its nearest `neighbours`, of stars x + i y (N,).
+
+    Each stands once; nearly flat and nearly isosceles ones are left out.
+    """
+    points = np.stack([stars.real, stars.imag], axis=-1)
+    neighbours = min(neighbours, len(stars) - 1)
+    if neighbours < 2 or not len(anchors):
+        return _described(stars, np.zeros((0, 3), np.int64))
+    _, near = cKDTree(points).query(points[anchors], k=neighbours + 1, workers=-1)
+    pairs = np.array(list(combinations(range(1, neighbours + 1), 2)))
+    first = np.broadcast_to(near[:, :1, None], (len(anchors), len(pairs), 1))
+    corners = np.concatenate([first, near[:, pairs]], axis=2).reshape(-1, 3)
+    corners = np.sort(corners.astype(np.int64), axis=1)
+    n = len(stars)
+    _, once = np.unique((corners[:, 0] * n + corners[:, 1]) * n + corners[:, 2], return_index=True)
+    return _described(stars, corners[once])
+
+
+def _described(stars: Complex, corners: Int) -> Triangles:
+    z = stars[corners]
+    sides = np.abs(z[:, [1, 2, 0]] - z[:, [2, 0, 1]])  # opposite to each corner
+    order = np.argsort(-sides, axis=1)
+    corners = np.take_along_axis(corners, order, axis=1)
+    sides = np.take_along_axis(sides, order, axis=1)
+    good = (sides[:, 2] > _MIN_SIDE_RATIO * sides[:, 0]) & (
+        sides[:, 1] < _MAX_SIDE_RATIO * sides[:, 0]
+    )
+    good &= sides[:, 2] < _MAX_SIDE_RATIO * sides[:, 1]
+    corners, sides = corners[good], sides[good]
+    a, b, c = stars[corners].T
+    return Triangles(
+        corners=corners,
+        shape=np.log(sides[:, 1:] / sides[:, :1]),
+        log_size=np.log(sides[:, 0]),
+        left=((b - a) * np.conj(c - a)).imag < 0,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """The brightest reference stars x + i y (M,) and their triangles."""
+
+    stars: Complex
+
+    @cached_property
+    def triangles(self) -> Triangles:
+        """Triangles of each star with two of its nearest neighbours."""
+        return triangles_of(self.stars, np.arange(len(self.stars)), _NEIGHBOURS[1])
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Similarity w = turn z + target that triangles have voted for."""
+
+    turn: complex
+    target: complex
+    agreeing: int  # stars of these triangles that it brings together
+    slack: float  # median of their distances: how far the map may be off
+
+
+def candidates(
+    stars: Complex, level: Level, tolerance: float, scale: tuple[float, float]
+) -> Iterator[Candidate]:
+    """Peaks of the vote of all pairs of triangles of equal shape, the best supported first.
+
+    `stars` (N,) are positions x + i y from the middle of the list, brightest first where magnitudes
+    are known; `tolerance` is that of the logarithms of side ratios.
+    """
+    # evenly over the ranks, so that a clump of false bright detections is not all
+    anchors = np.unique(np.linspace(0, len(stars) - 1, min(_MAX_ANCHORS, len(stars))).astype(int))
+    own = triangles_of(stars, anchors, _NEIGHBOURS[0])
+    i, j = _alike(own, level.triangles, tolerance, scale)
+    if not len(i):
+        return
+    z, w = stars[own.corners[i]], level.stars[level.triangles.corners[j]]
+    middle_z, middle_w = z.mean(axis=1, keepdims=True), w.mean(axis=1, keepdims=True)
+    dz, dw = z - middle_z, w - middle_w
+    turn = (np.conj(dz) * dw).sum(axis=1) / (np.abs(dz) ** 2).sum(axis=1)
+    kept = (np.abs(turn) > scale[0]) & (np.abs(turn) < scale[1])
+    i, j, turn = i[kept], j[kept], turn[kept]
+    if not len(i):
+        return
+    target = middle_w[kept, 0] - turn * middle_z[kept, 0]
+    lever = float(np.sqrt(np.mean(np.abs(stars) ** 2)))
+    votes = np.stack([target.real, target.imag, lever * turn.real, lever * turn.imag], axis=-1)
+    reach = 3.0 * tolerance * lever
+    near = cKDTree(votes)
+    support = near.query_ball_point(votes, reach, return_length=True, workers=-1)
+    for _ in range(_MAX_CANDIDATES):
+        peak = int(np.argmax(support))
+        if support[peak] < 2:
+            return
+        members = np.array(near.query_ball_point(votes[peak], 2.0 * reach))
+        support[members] = 0
+        pairs = np.stack(
+            [own.corners[i[members]].ravel(), level.triangles.corners[j[members]].ravel()], axis=-1
+        )
+        fitted = _fitted(stars, level.stars, np.unique(pairs, axis=0), reach)
+        if fitted is not None:
+            yield fitted
+
+
+def _alike(
+    own: Triangles, theirs: Triangles, tolerance: float, scale: tuple[float, float]
+) -> tuple[Int, Int]:
+    """Pairs of triangles of one shape, handedness and, within the range of scales, size."""
+    low, high = np.log(scale[0]), np.log(scale[1])
+    # the size counts in units that make its range as wide as the tolerance
+    unit = tolerance / (0.5 * (high - low) + tolerance)
+    found: list[tuple[Int, Int]] = []
+    for hand in (False, True):
+        a, b = np.flatnonzero(own.left == hand), np.flatnonzero(theirs.left == hand)
+        if not (len(a) and len(b)):
+            continue
+        first = np.column_stack([own.shape[a], unit * (own.log_size[a] + 0.5 * (low + high))])
+        second = np.column_stack([theirs.shape[b], unit * theirs.log_size[b]])
+        pairs = cKDTree(first).sparse_distance_matrix(
+            cKDTree(second), tolerance * np.sqrt(2.0), output_type="ndarray"
+        )
+        found.append((a[pairs["i"]], b[pairs["j"]]))
+    if not found:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    i, j = (np.concatenate(one) for one in zip(*found, strict=True))
+    every = -(-len(i) // _MAX_VOTES) or 1
+    return i[::every], j[::every]
+
+
+def _fitted(stars: Complex, others: Complex, pairs: Int, reach: float) -> Candidate | None:
+    """Least-squares similarity of pairs of stars that belong together."""
+    z, w = stars[pairs[:, 0]], others[pairs[:, 1]]
+
+    def fit(use: NDArray[np.bool_]) -> tuple[tuple[complex, complex], NDArray[np.float64]]:
+        middle_z, middle_w = z[use].mean(), w[use].mean()
+        dz, dw = z[use] - middle_z, w[use] - middle_w
+        turn = complex((np.conj(dz) * dw).sum() / (np.abs(dz) ** 2).sum())
+        target = complex(middle_w - turn * middle_z)
+        return (turn, target), np.abs(w - turn * z - target)
+
+    slack = 1e-9 * float(np.abs(w).max(initial=0.0))
+    found = robust_fit(fit, len(z), least=3, slack=slack, reach=reach)
+    if found is None or found.use.sum() < 3:
+        return None
+    agreeing = min(len(np.unique(pairs[found.use, axis])) for axis in (0, 1))
+    return Candidate(*found.solution, agreeing, float(np.median(found.away[found.use])))

@@ -1,0 +1,272 @@
+"""Columns of a table to the arrays of a MatchTable."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.reading.chips import numbered_chips
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
+from bayesdist.data.sky.tangent import onto_plane
+from bayesdist.data.tables.checks import refuse_half
+from bayesdist.data.tables.column import SourceColumn, year_of
+from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.data.tables.units import check_unit, conversion
+from bayesdist.errors import InputError
+
+__all__ = [
+    "columns_read",
+    "is_on_sky",
+    "match_columns",
+    "needed_columns",
+    "nominal_columns",
+    "plane_unit",
+    "position_unit",
+]
+
+Float = NDArray[np.float64]
+
+
+def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
+    """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or else the option.
+
+    Refused where both are missing, where they contradict each other, or where the columns do.
+    """
+    if unit is not None:
+        check_unit(unit, where="unit")
+    stated: list[str | None] = []
+    for column in pair:
+        own = column.unit
+        stated.append(None if own is None else check_unit(str(own), where=column.where))
+    first, second = stated
+    if first is not None and second is not None and first != second:
+        raise InputError(
+            f"unit is {second}, but {first} in column {pair[0].name!r}",
+            where=pair[1].where,
+            do="give both columns one unit",
+        )
+    own_unit = first or second
+    if own_unit is None and unit is None:
+        raise InputError(
+            "has no unit",
+            where=pair[0].where,
+            do="set the unit option to pix, arcsec, mas or deg, or write the unit into the file",
+        )
+    if own_unit is not None and unit is not None and own_unit != unit:
+        raise InputError(
+            f"unit is {own_unit} in the file, but {unit} in the options",
+            where=pair[0].where,
+            do="correct one of the two",
+        )
+    return own_unit or unit or ""
+
+
+def is_on_sky(
+    names: Iterable[str],
+    found: Mapping[str, str],
+    columns: Mapping[str, str] | None,
+    source: str,
+) -> bool:
+    """True where ra, dec are the reference positions, not u, v; refused when the user names both.
+
+    `found` is the column of each quantity, `columns` those that the user names.
+    """
+    named = {key for key, column in (columns or {}).items() if column}
+    plane, sky = named & {"u", "v"}, named & {"ra", "dec"}
+    if plane and sky:
+        raise InputError(
+            "columns names both u, v and ra, dec", where=source, do="name one of the two pairs"
+        )
+    on_sky, on_plane = {"ra", "dec"} <= set(found), {"u", "v"} <= set(found)
+    if plane or not on_sky:
+        return False
+    # with a magnitude B, the U and V of a table are magnitudes, too
+    return bool(sky) or not on_plane or "b" in {name.lower() for name in names}
+
+
+def needed_columns(
+    names: Iterable[str],
+    columns: Mapping[str, str] | None,
+    *,
+    source: str,
+    read_sigma: bool = True,
+) -> dict[str, str]:
+    """Column of each quantity that is read: x, y, either u, v or ra, dec, and others there are."""
+    names = list(names)
+    found = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
+    on_sky = is_on_sky(names, found, columns, source)
+    for key in ("x", "y") if on_sky else ("x", "y", "u", "v"):
+        if key not in found:
+            raise InputError(
+                f"no column for {key!r} among {', '.join(names) or 'none'}",
+                where=source,
+                do=f"name it in the option 'columns' (bayesdist init --columns {key}=NAME)",
+            )
+    unread = {"u", "v"} if on_sky else {"ra", "dec", *SKY_QUANTITIES}
+    if not read_sigma:
+        unread |= {"sigma_u", "sigma_v"}
+    if not read_sigma or "sigma_u" in found:  # the errors of the match hold those of the catalogue
+        unread |= {"sigma_ra", "sigma_dec"}
+    if "mag" in found:
+        unread.add("flux")
+    return {key: name for key, name in found.items() if key not in unread}
+
+
+def columns_read(
+    names: Sequence[str], header: Mapping[str, Any], options: ReadOptions, *, source: str
+) -> tuple[dict[str, str], ReadOptions, tuple[str, ...]]:
+    """Column of each quantity, the options with the origin of the pixels, and notes about it."""
+    found = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
+    if options.pixel_origin is not None:
+        return found, options, ()
+    origin, why = origin_of(found["x"], names, header)
+    notes = (f"the first pixel is taken as {origin}: {why}",) if why else ()
+    return found, replace(options, pixel_origin=origin), notes
+
+
+def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:
+    """Arguments of `MatchTable` from rows of a table, with columns as `needed_columns`."""
+    found, column = quantities.found, quantities.__getitem__
+    out: dict[str, Any] = {}
+    out["x"], out["y"] = (_pixels(column(key), options.pixel_origin) for key in ("x", "y"))
+    if "epoch" in found:
+        if options.epoch is not None:
+            raise InputError(
+                "an epoch of the exposures is given, and the table has a column of it",
+                where=column("epoch").where,
+                do='leave one of them out (columns = {epoch = ""})',
+            )
+        out["epoch"] = column("epoch").years()
+    elif options.epoch is not None:
+        year = year_of(options.epoch, where="data.epoch")
+        out["epoch"] = np.full(len(quantities), year)
+    if "ra" in found:
+        out |= _projected(quantities, options, out.get("epoch"))
+    else:
+        if options.tangent_point is not None:
+            raise InputError(
+                "a tangent point is given, but the reference positions are u, v",
+                where=quantities.source,
+                do="name the columns ra and dec, or leave the tangent point out",
+            )
+        out["u"], out["v"] = (column(key).numbers() for key in ("u", "v"))
+        out["unit"] = position_unit((column("u"), column("v")), options.unit)
+    for key in ("sigma_u", "sigma_v"):
+        if key in found:
+            out[key] = _sigma(column(key), out["unit"])
+    at = options.tangent_point
+    for key in nominal_columns(found, source=quantities.source, tangent_point=at):
+        out[key] = _in_unit(column(key), out["unit"])
+    if "mag" in found:
+        out["mag"] = column("mag").numbers()
+    elif "flux" in found:
+        with contextlib.suppress(InputError):  # magnitudes are rarely needed: then no star has one
+            flux = column("flux").numbers()
+            if (flux > 0).all():
+                out["mag"] = -2.5 * np.log10(flux)
+    if "colour" in found:
+        # colours serve a test alone: where stars have none, the table is read without
+        with contextlib.suppress(InputError):
+            out["colour"] = column("colour").numbers()
+    if "exposure" in found:
+        out["exposure"], out["exposure_names"] = column("exposure").labels()
+    if "filter" in found:
+        out["filter"], out["filter_names"] = column("filter").labels()
+    if "star" in found:
+        out["star"] = column("star").integers()
+    if "chip" in found:
+        out["chip"], out["chip_numbers"], out["chip_names"] = numbered_chips(
+            column("chip"), options.chips
+        )
+    return out
+
+
+def _pixels(column: SourceColumn, pixel_origin: int | None) -> Float:
+    """FITS 1-based pixels."""
+    pixel_origin = 1 if pixel_origin is None else pixel_origin
+    if pixel_origin not in (0, 1):
+        raise InputError(
+            f"pixel_origin is {pixel_origin}", where=column.source, do="set it to 0 or 1"
+        )
+    if column.unit is not None and str(column.unit) != "pix":
+        raise InputError(
+            f"unit is {column.unit}, and detector positions are in pix",
+            where=column.where,
+            do="name the columns of raw pixels",
+        )
+    return column.numbers() + (1 - pixel_origin)
+
+
+def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None) -> dict[str, Any]:
+    """Positions on the tangent plane, their errors and motions."""
+    where = quantities.source
+    unit = plane_unit(options.unit, source=where)
+    sky = reference_sky(quantities, epoch=epoch, catalogue_epoch=options.catalogue_epoch)
+    if sky.sigma is not None and not (sky.sigma > 0).all():
+        bad = int(np.argmin((sky.sigma > 0).all(axis=0)))
+        raise quantities["sigma_ra"].fail(bad, "the error of the position is not positive")
+    return {"unit": unit, "notes": sky.notes} | onto_plane(
+        sky.ra,
+        sky.dec,
+        options.tangent_point,
+        sigma=sky.sigma,
+        motion=sky.motion,
+        sigma_motion=sky.sigma_motion,
+        where=where,
+        place=quantities.place,
+    )
+
+
+def plane_unit(unit: str | None, *, source: str) -> str:
+    """Unit of u and v that come from the sky; another one by option is refused."""
+    if unit not in (None, "arcsec"):
+        raise InputError(
+            f"unit is {unit}, but sky positions come to the tangent plane in arcsec",
+            where=source,
+            do="set the unit to arcsec or leave it out",
+        )
+    return "arcsec"
+
+
+def nominal_columns(
+    found: Mapping[str, str], *, source: str, tangent_point: tuple[float, float] | None
+) -> tuple[str, ...]:
+    """'u_nominal' and 'v_nominal' where a table has them, else nothing.
+
+    Refused is one without the other; and both with sky positions where no tangent point is given:
+    the plane on which they lie is not to depend on which stars were matched.
+    """
+    pair = ("u_nominal", "v_nominal")
+    refuse_half(pair, found, where=source, what="nominal positions")
+    keys = tuple(key for key in pair if key in found)
+    if keys and "ra" in found and tangent_point is None:
+        raise InputError(
+            "nominal positions stand beside ra and dec, and the tangent point of their plane is "
+            "not given",
+            where=source,
+            do="set data.tangent_point to that of the nominal positions",
+        )
+    return keys
+
+
+def _in_unit(column: SourceColumn, unit: str) -> Float:
+    """Numbers in the unit of u, v."""
+    own = column.unit
+    return column.numbers() * (1.0 if own is None else conversion(own, unit, where=column.where))
+
+
+def _sigma(column: SourceColumn, unit: str) -> Float:
+    """Standard errors in the unit of u, v."""
+    sigma = _in_unit(column, unit)
+    good = sigma > 0
+    if not good.all():
+        bad = int(np.argmin(good))
+        raise column.fail(bad, f"sigma is {sigma[bad]:g}, and must be positive")
+    return sigma

@@ -1,0 +1,110 @@
+"""Files that a path names, their formats, and the exposures they stand for."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from bayesdist.data.astrometrynet import is_astrometrynet
+from bayesdist.data.hst1pass import is_hst1pass, is_matchup
+from bayesdist.data.reading.mission_formats import mission_formats
+from bayesdist.data.tables.files import TABLE_SUFFIXES, is_binary, is_fits, read_lines, read_table
+from bayesdist.data.tables.text import is_text_table
+from bayesdist.errors import FormatError, InputError
+
+__all__ = ["FORMATS", "exposure_names", "input_files", "kind_of"]
+
+PathLike = str | os.PathLike[str]
+
+FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")
+
+
+def input_files(path: PathLike | Sequence[PathLike]) -> list[Path]:
+    """Files that a path, pattern, folder or list of them names.
+
+    Parameters
+    ----------
+    path : path-like or sequence of path-like
+        A pattern (``*``, ``?``, ``[``) stands for the files that fit it, a folder for the Parquet
+        files in it and below, both in the order of their names.
+
+    Returns
+    -------
+    list of pathlib.Path
+
+    Raises
+    ------
+    InputError
+        When there are none, or a file is repeated.
+    """
+    given = [path] if isinstance(path, str | os.PathLike) else list(path)
+    if not given:
+        raise InputError("no file is named", where="data.matches", do="name at least one")
+    files = [file for one in given for file in _expanded(Path(one))]
+    for file in files:
+        if files.count(file) > 1:
+            raise InputError("is named twice", where=str(file), do="name each file once")
+    return files
+
+
+def _expanded(path: Path) -> list[Path]:
+    if path.is_dir():
+        found = sorted(
+            file for file in path.rglob("*.parquet") if not file.name.startswith((".", "_"))
+        )
+        if not found:
+            raise InputError(
+                "is a folder without Parquet files", where=str(path), do="name the files"
+            )
+        return found
+    if path.exists() or not glob.has_magic(str(path)):
+        return [path]
+    found = sorted(Path(file) for file in glob.glob(str(path), recursive=True))
+    if not found:
+        raise InputError("no file fits the pattern", where=str(path), do="check the pattern")
+    return found
+
+
+def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
+    """Format of a file: one that a mission adds, else by its name and then by its content."""
+    if columns is None and file.is_file():
+        for own, one in mission_formats().items():
+            if one.recognizes(file):
+                return own
+    name = file.name.lower().removesuffix(".gz")
+    if name.endswith(tuple(TABLE_SUFFIXES)):
+        if columns is None and name.endswith((".fits", ".fit")):
+            return "astrometry.net" if is_astrometrynet(read_table(file).colnames) else "table"
+        return "table"
+    lines = [] if is_binary(file) else read_lines(file)
+    if is_hst1pass(lines):
+        return "hst1pass"
+    if is_matchup(lines):
+        return "matchup"
+    if name.endswith("uvwxympq"):
+        return "hst1pass"  # its reader finds what is wrong
+    if is_text_table(lines) or is_fits(file):
+        return "table"
+    raise FormatError(
+        "is of no known kind",
+        where=str(file),
+        do=f"give a file that ends in {', '.join(TABLE_SUFFIXES)}, or set the format",
+    )
+
+
+def exposure_names(files: Sequence[Path]) -> list[str]:
+    """Names of files as exposures: the stem, with as many folders before it as tell all apart."""
+    stems = [file.name.split(".")[0] or file.name for file in files]
+    parents = [file.parent for file in files]
+    while len(set(stems)) < len(stems):
+        again = {stem for stem in stems if stems.count(stem) > 1}
+        named = [
+            f"{parent.name}/{stem}" if stem in again and parent.name else stem
+            for stem, parent in zip(stems, parents, strict=True)
+        ]
+        if named == stems:  # only the extensions differ
+            return [str(file) for file in files]
+        stems, parents = named, [parent.parent for parent in parents]
+    return stems

@@ -1,0 +1,84 @@
+"""Interpretation of the columns of a table, to be shown and written down before it is read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesdist.data.reading.columns import needed_columns
+from bayesdist.data.reading.formats import input_files, kind_of
+from bayesdist.data.reading.table import own_epoch, with_sky_columns
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import origin_of
+from bayesdist.data.tables.parquet import describe_part
+from bayesdist.data.tables.quantities import Columns
+
+__all__ = ["TableLayout", "table_layout"]
+
+PathLike = str | os.PathLike[str]
+
+MAX_ROWS_READ = 200_000  # rows of a large table that are read to interpret its columns
+MAX_CHIPS = 200
+MIN_ROWS_ON_CHIP = 20  # rows: flags and qualities have values that are rare
+
+
+@dataclass(frozen=True)
+class TableLayout:
+    """Columns of a table, and their interpretation."""
+
+    names: tuple[str, ...]  # all columns
+    taken: dict[str, str]  # column of each quantity that is read
+    origin: int  # of the pixels, by names and header
+    why: str  # reason for the origin; empty where there is none
+    like_chips: dict[str, int]  # number of values of unused columns that may be chips
+    dated: bool  # True where the header has the date of the exposure
+
+
+def table_layout(
+    path: PathLike | Sequence[PathLike],
+    columns: Mapping[str, str] | None = None,
+    *,
+    read_sigma: bool = True,
+) -> TableLayout | None:
+    """Layout of a file of matches, or of the first of several; None of files with fixed columns.
+
+    Arguments and errors are as for `read_matches`; `read_sigma` is True where columns of errors are
+    read.
+    """
+    file = input_files(path)[0]
+    if kind_of(file, columns) != "table":
+        return None
+    if file.suffix.lower() == ".parquet":
+        part = describe_part(file)
+        table: Columns = next(part.blocks(part.colnames, size=MAX_ROWS_READ))
+        header: Mapping[str, Any] = {}
+    else:
+        table = with_sky_columns(read_table(file))
+        header = table.meta
+    names = tuple(table.colnames)
+    taken = needed_columns(names, columns, source=str(file), read_sigma=read_sigma)
+    origin, why = origin_of(taken["x"], names, header)
+    found = {name: _values_like_chips(table[name]) for name in names}
+    return TableLayout(
+        names,
+        taken,
+        origin,
+        why,
+        {k: n for k, n in found.items() if n and k not in taken.values()},
+        own_epoch(header) is not None,
+    )
+
+
+def _values_like_chips(column: Any) -> int:
+    """Number of chips if these values are chips; 0 where they cannot be."""
+    values = np.asarray(getattr(column, "unmasked", column))
+    if values.ndim != 1 or values.dtype.kind not in "iuSU" or getattr(column, "unit", None):
+        return 0
+    unique, counts = np.unique(values, return_counts=True)
+    if not 2 <= len(unique) <= MAX_CHIPS or counts.min() < MIN_ROWS_ON_CHIP:
+        return 0
+    return len(unique)

@@ -1,0 +1,209 @@
+"""`read_matches`: files of any known kind to one MatchTable."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.data.astrometrynet import COLUMNS as CORR_COLUMNS
+from bayesdist.data.astrometrynet import matches_from_corr
+from bayesdist.data.hst1pass import is_matchup, read_hst1pass, read_matchup
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.matching.table import match_table
+from bayesdist.data.reading.chips import numbered, text_labels
+from bayesdist.data.reading.formats import FORMATS, exposure_names, input_files, kind_of
+from bayesdist.data.reading.mission_formats import mission_formats
+from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
+from bayesdist.data.reading.table import matches_from_table, sky_positions
+from bayesdist.data.sky.tangent import mean_direction
+from bayesdist.data.tables.checks import absent
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import read_lines, read_table
+from bayesdist.data.tables.names import ALIASES, find_columns
+from bayesdist.errors import InputError
+
+__all__ = ["read_matches"]
+
+
+PathLike = str | os.PathLike[str]
+IN_MEMORY = "table"  # name of a table that is no file, in errors
+
+
+def read_matches(
+    path: PathLike | Sequence[PathLike] | Any,
+    *,
+    format: str = "auto",
+    columns: Mapping[str, str] | None = None,
+    unit: str | None = None,
+    sigma: str | float = "columns",
+    pixel_origin: int | None = None,
+    tangent_point: tuple[float, float] | None = None,
+    epoch: float | str | None = None,
+    catalogue_epoch: float | None = None,
+    chips: Mapping[str, int] | None = None,
+    not_finite: str = "refuse",
+) -> MatchTable:
+    """Read matched star positions.
+
+    Parameters
+    ----------
+    path : path-like, sequence of path-like, or table
+        A file, a list of files, a pattern, or a folder of Parquet files (parts of one table).  Of
+        several files each is one exposure, named for the file, where it has no column of exposures.
+        Also an astropy Table or QTable, a pandas DataFrame, or a mapping of arrays.
+    format : str, optional
+        'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
+        'hst1pass' (lists with raw and corrected positions),
+        'matchup' (such lists with the MATCHUP master that they are then matched with),
+        'astrometry.net' (corr.fits), or 'auto': by name and content.
+    columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
+        As `ReadOptions`.
+
+    Returns
+    -------
+    MatchTable
+
+    Raises
+    ------
+    InputError
+        For all that is wrong with a file or an option, in one sentence.
+    """
+    if format not in FORMATS:
+        raise InputError(
+            f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(FORMATS)}"
+        )
+    options = ReadOptions(
+        columns,
+        unit,
+        sigma,
+        pixel_origin,
+        tangent_point,
+        epoch,
+        catalogue_epoch,
+        chips,
+        not_finite,
+    )
+    if isinstance(path, Table | Mapping) or hasattr(path, "to_parquet"):  # a DataFrame
+        if format not in ("auto", "table"):
+            raise InputError(
+                f"format is {format!r}, but a table is given, no file",
+                where="format",
+                do="leave it out",
+            )
+        return _with_errors(matches_from_table(path, options, source=IN_MEMORY), sigma)
+    files = input_files(path)
+    kinds = [kind_of(file, columns) if format == "auto" else format for file in files]
+    masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
+    if masters:
+        table = _read_with_master(files, kinds, options)
+    else:
+        in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
+        table = _read_plain(files, kinds, options, in_parts=in_parts)
+    return _with_errors(table, sigma)
+
+
+def _with_errors(table: MatchTable, sigma: str | float) -> MatchTable:
+    refuse_missing_errors(sigma, table.has_sigma, table.has_mag, where=", ".join(table.sources))
+    if isinstance(sigma, str):
+        return table
+    return table.with_sigma(float(sigma), float(sigma))
+
+
+def _read_plain(
+    files: Sequence[Path], kinds: Sequence[str], options: ReadOptions, *, in_parts: bool
+) -> MatchTable:
+    """Matches from files that hold them."""
+    own = mission_formats()
+    names: Sequence[str | None] = exposure_names(files)
+    if in_parts or (len(files) == 1 and kinds[0] in ("table", *own)):
+        names = [None] * len(files)
+    tables = {
+        file: own[kind].read(file) if kind in own else read_table(file)
+        for file, kind in zip(files, kinds, strict=True)
+        if kind in ("table", "astrometry.net", *own)
+    }
+    options = _with_common_chips(tables, _with_common_point(tables, kinds, options))
+    readers: dict[str, Callable[[Path, str | None], MatchTable]] = {
+        "hst1pass": lambda file, name: _read_list(file, name, options),
+        "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
+        "table": lambda file, name: matches_from_table(
+            tables[file], options, source=str(file), exposure_name=name
+        ),
+    }
+    readers |= dict.fromkeys(own, readers["table"])
+    return MatchTable.concatenate(
+        [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
+    )
+
+
+def _with_common_point(
+    tables: Mapping[Path, Table], kinds: Iterable[str], options: ReadOptions
+) -> ReadOptions:
+    """Options with one tangent point for all files: each by itself would choose its own."""
+    if options.tangent_point is not None or len(tables) < 2:
+        return options
+    corr = "astrometry.net" in set(kinds)
+    columns = CORR_COLUMNS if corr else options.columns
+    sky = [sky_positions(table, columns, source=str(file)) for file, table in tables.items()]
+    on_sky = [one for one in sky if one is not None and len(one[0])]
+    if not on_sky:
+        return options
+    ra, dec = (np.concatenate(axis) for axis in zip(*on_sky, strict=True))
+    return replace(options, tangent_point=mean_direction(ra, dec))
+
+
+def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> ReadOptions:
+    """Options with one numbering of the chips of all files, where these give names."""
+    if options.chips is not None or len(tables) < 2:
+        return options
+    names: set[str] = set()
+    for file, table in tables.items():
+        found = find_columns(table.colnames, options.columns, ALIASES, source=str(file))
+        if "chip" in found:
+            column = table[found["chip"]]
+            present = column[~absent(column, not_finite=False)]
+            names.update(text_labels(SourceColumn(present, str(file), found["chip"])))
+    return replace(options, chips=numbered(names)) if names else options
+
+
+def _read_list(file: Path, name: str | None, options: ReadOptions) -> MatchTable:
+    options.refuse(str(file), "hst1pass", "columns", "pixel_origin", "tangent_point", "epoch")
+    if options.unit not in (None, "pix"):
+        options.refuse(str(file), "hst1pass", "unit")
+    return read_hst1pass(file).matches(name=name)
+
+
+def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> MatchTable:
+    options.refuse(str(file), "astrometry.net", "columns", "pixel_origin")
+    if options.unit not in (None, "arcsec"):
+        options.refuse(str(file), "astrometry.net", "unit")
+    return matches_from_corr(table, options, source=str(file), exposure_name=name)
+
+
+def _read_with_master(
+    files: Sequence[Path], kinds: Sequence[str], options: ReadOptions
+) -> MatchTable:
+    """Matches of hst1pass lists with the MATCHUP master among the files."""
+    masters: list[Path] = []
+    lists: list[Path] = []
+    for file, kind in zip(files, kinds, strict=True):
+        is_master = kind == "matchup" and is_matchup(read_lines(file))
+        (masters if is_master else lists).append(file)
+    if len(masters) != 1 or not lists:
+        raise InputError(
+            f"{len(masters)} MATCHUP masters and {len(lists)} lists are named: a master alone has "
+            "no detector positions",
+            where=", ".join(str(file) for file in files),
+            do="name one master together with the hst1pass lists to match with it",
+        )
+    names = exposure_names(lists)
+    detections = MatchTable.concatenate(
+        [_read_list(file, name, options) for file, name in zip(lists, names, strict=True)]
+    )
+    return match_table(detections, read_matchup(masters[0]))

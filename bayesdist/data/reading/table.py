@@ -1,0 +1,143 @@
+"""MatchTable from any object with columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import Table
+from astropy.time import Time
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
+from bayesdist.data.tables.checks import absent, without_missing
+from bayesdist.data.tables.column import row_number
+from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
+from bayesdist.data.tables.quantities import Quantities
+from bayesdist.errors import InputError
+
+__all__ = ["as_table", "matches_from_table", "own_epoch", "sky_positions", "with_sky_columns"]
+
+Float = NDArray[np.float64]
+
+_SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them
+
+
+def as_table(data: Any, source: str) -> Table:
+    """Astropy Table from any object with columns."""
+    if isinstance(data, Table):
+        return data
+    try:
+        if hasattr(data, "to_parquet"):  # a DataFrame, whose NaN are missing values
+            return Table.from_pandas(data)
+        return Table(dict(data))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"columns do not make a table ({error})", where=source, do="give columns of one length"
+        ) from error
+
+
+def sky_positions(
+    data: Any, columns: Mapping[str, str] | None = None, *, source: str = "table"
+) -> tuple[Float, Float] | None:
+    """Degrees (N,) of ra and of dec where the reference positions are on the sky, else None."""
+    table = with_sky_columns(as_table(data, source))
+    found = find_columns(table.colnames, columns, ALIASES, source=source, pairs=PAIRS)
+    if not is_on_sky(table.colnames, found, columns, source):
+        return None
+    stay = ~(
+        absent(table[found["ra"]], not_finite=True) | absent(table[found["dec"]], not_finite=True)
+    )
+    table = table if stay.all() else table[stay]
+    return sky_columns(Quantities(table, found, source))
+
+
+def with_sky_columns(table: Table) -> Table:
+    """Table whose SkyCoord columns are columns of ra and dec, in degrees.
+
+    `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS); without such it is the table itself.
+    """
+    coordinates = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
+    if not coordinates:
+        return table
+    out = table.copy(copy_data=False)
+    for name in coordinates:
+        sky = table[name].icrs
+        out[f"{name}.ra"], out[f"{name}.dec"] = sky.ra.deg, sky.dec.deg
+        out.remove_column(name)
+    return out
+
+
+def matches_from_table(
+    data: Any,
+    options: ReadOptions | None = None,
+    *,
+    source: str = "table",
+    exposure_name: str | None = None,
+) -> MatchTable:
+    """MatchTable from a table's columns.
+
+    Parameters
+    ----------
+    data : astropy Table or QTable, pandas DataFrame, or mapping of arrays
+    options : ReadOptions, optional
+    source : str, optional
+        File, for errors.
+    exposure_name : str, optional
+        Name of the one exposure, where the table has no column of them.
+
+    Returns
+    -------
+    MatchTable
+        Without errors where these do not come from columns.
+
+    Raises
+    ------
+    InputError
+        For a missing column, text among numbers, values that are not finite, units that are missing
+        or contradict each other, no rows, and all that `MatchTable` refuses.
+    """
+    options = options or ReadOptions()
+    table = with_sky_columns(as_table(data, source))
+    found, options, notes = columns_read(table.colnames, table.meta, options, source=source)
+    if len(table) == 0:
+        raise InputError("holds no rows", where=source, do="give a table with matched stars")
+    if options.epoch is None and "pm_ra" in found and "epoch" not in found:
+        options = replace(options, epoch=own_epoch(table.meta))
+    dated = "catalogue_epoch" in found or options.catalogue_epoch is not None
+    moves = "pm_ra" in found and dated and ("epoch" in found or options.epoch is not None)
+    stay, rejected = without_missing(
+        table,
+        found,
+        source=source,
+        reject=options.not_finite == "reject",
+        spared=_SPARED | (frozenset() if moves else frozenset(MOTIONS)),
+        motions=frozenset(MOTIONS),
+    )
+    n, rows, place = len(table), np.flatnonzero(stay), row_number
+    if rejected:
+        table = table[stay]
+
+        def place(index: int) -> str:
+            return row_number(int(rows[index]))
+
+    out = match_columns(Quantities(table, found, source, place), options)
+    if exposure_name is not None:
+        out.setdefault("exposure_names", (exposure_name,))
+    out["notes"] = (*notes, *out.get("notes", ()))
+    return MatchTable(**out, sources=(source,), row=rows, n_rows=n, rejected=rejected)
+
+
+def own_epoch(header: Mapping[str, Any]) -> float | str | None:
+    """Date of the exposure by its header: MJD-OBS as a decimal year, DATE-OBS as it stands."""
+    upper = {str(key).upper(): value for key, value in header.items()}
+    if isinstance(upper.get("MJD-OBS"), float):
+        return float(Time(upper["MJD-OBS"], format="mjd", scale="tt").decimalyear)
+    date = upper.get("DATE-OBS")
+    return date if isinstance(date, str) and date.strip() else None

@@ -1,0 +1,199 @@
+"""The tangent plane: gnomonic projection of the sky, in seconds of arc.
+
+    D   = sin d sin d0 + cos d cos d0 cos(a - a0)
+    xi  = cos d sin(a - a0) / D                                  east
+    eta = (cos d0 sin d - sin d0 cos d cos(a - a0)) / D          north
+
+Calabretta & Greisen 2002, A&A 395, 1077, Section 5.1.3, written as standard coordinates.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.data.tables.column import Place, row_number
+from bayesdist.errors import InputError
+
+__all__ = [
+    "ARCSEC",
+    "direction_of",
+    "direction_sum",
+    "mean_direction",
+    "onto_plane",
+    "plane_axes",
+    "sky_of_plane",
+    "tangent_jacobian",
+    "tangent_plane",
+]
+
+Float = NDArray[np.float64]
+
+ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
+
+
+def mean_direction(ra: ArrayLike, dec: ArrayLike) -> tuple[float, float]:
+    """Direction of the sum of unit vectors.
+
+    Parameters
+    ----------
+    ra, dec : array_like, shape (N,)
+        Degrees.
+
+    Returns
+    -------
+    ra0, dec0 : float
+        Degrees, ra0 in [0, 360).
+    """
+    return direction_of(direction_sum(ra, dec))
+
+
+def direction_sum(ra: ArrayLike, dec: ArrayLike) -> tuple[int, int, int]:
+    """Sum of unit vectors in units of 2^-62, from ra and dec (N,) in degrees.
+
+    It is exact to the last digit: sums of parts add up to that of the whole.
+    """
+    a, d = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
+    x, y, z = (_exact_sum(c) for c in (np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)))
+    return x, y, z
+
+
+def _exact_sum(values: Float) -> int:
+    """Sum of numbers within [-1, 1] in units of 2^-62: two halves of 31 bits cannot overflow."""
+    upper = np.rint(values * 2.0**31)
+    lower = np.rint((values * 2.0**31 - upper) * 2.0**31)
+    return (int(upper.astype(np.int64).sum()) << 31) + int(lower.astype(np.int64).sum())
+
+
+def direction_of(vector: tuple[int, int, int]) -> tuple[float, float]:
+    """Direction of a vector of any length, as `mean_direction` gives it."""
+    x, y, z = (float(component) for component in vector)
+    ra0 = float(np.degrees(np.arctan2(y, x)) % 360.0)
+    return ra0, float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+
+def _angles(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], where: str, place: Place
+) -> tuple[Float, Float, float, Float]:
+    """Hour angle from the point, declination, the point's declination, and D; radians."""
+    delta = np.radians(np.asarray(ra, float) - point[0])
+    d = np.radians(np.asarray(dec, float))
+    d0 = float(np.radians(point[1]))
+    D = np.sin(d) * np.sin(d0) + np.cos(d) * np.cos(d0) * np.cos(delta)
+    if np.any(D <= 0):
+        row = place(int(np.argmax(D <= 0)))
+        raise InputError(
+            f"the position lies 90 degrees or more from the tangent point {point}",
+            where=f"{where}, {row}" if where else row,
+            do="give a tangent point inside the field",
+        )
+    return delta, d, d0, D
+
+
+def tangent_plane(
+    ra: ArrayLike,
+    dec: ArrayLike,
+    point: tuple[float, float],
+    *,
+    where: str = "",
+    place: Place = row_number,
+) -> tuple[Float, Float]:
+    """Positions of the sky on the plane that touches it at a point.
+
+    Parameters
+    ----------
+    ra, dec : array_like, shape (N,)
+        Degrees.
+    point : tuple of float
+        Tangent point (ra0, dec0), degrees.
+    where : str, optional
+        File, for the error.
+    place : callable, optional
+        Name of a row in it, by its index in the arrays.
+
+    Returns
+    -------
+    xi, eta : ndarray, shape (N,)
+        Seconds of arc; xi grows to the east, eta to the north.
+
+    Raises
+    ------
+    InputError
+        When a position is 90 degrees or more from the point.
+    """
+    delta, d, d0, D = _angles(ra, dec, point, where, place)
+    xi = np.cos(d) * np.sin(delta) / D
+    eta = (np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * np.cos(delta)) / D
+    return ARCSEC * xi, ARCSEC * eta
+
+
+def tangent_jacobian(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], *, where: str = ""
+) -> Float:
+    """Derivatives (N, 2, 2) of (xi, eta) by small steps to the east and to the north.
+
+    ``J[:, 0, 1]`` is d xi / d dec; a step to the east counts as d ra cos(dec).
+    """
+    delta, d, d0, D = _angles(ra, dec, point, where, row_number)
+    out = np.empty((*np.shape(D), 2, 2))
+    out[..., 0, 0] = (np.sin(d) * np.sin(d0) * np.cos(delta) + np.cos(d) * np.cos(d0)) / D**2
+    out[..., 0, 1] = -np.sin(d0) * np.sin(delta) / D**2
+    out[..., 1, 0] = np.sin(d) * np.sin(delta) / D**2
+    out[..., 1, 1] = np.cos(delta) / D**2
+    return out
+
+
+def onto_plane(
+    ra: Float,
+    dec: Float,
+    point: tuple[float, float] | None,
+    *,
+    sigma: Float | None = None,
+    motion: Float | None = None,
+    sigma_motion: Float | None = None,
+    where: str = "",
+    place: Place = row_number,
+) -> dict[str, Any]:
+    """Columns u, v, tangent_point of stars in arcsec; sigma_u, pm_u, sigma_pm_u where given.
+
+    `ra`, `dec` (N,) and `point` are in degrees, None being the mean direction; errors, motions and
+    their errors (2, N) are to the east (with the factor cos(dec)) and to the north, in arcsec (per
+    year).
+    """
+    point = mean_direction(ra, dec) if point is None else point
+    u, v = tangent_plane(ra, dec, point, where=where, place=place)
+    out: dict[str, Any] = {"u": u, "v": v, "tangent_point": (float(point[0]), float(point[1]))}
+    if sigma is None and motion is None:
+        return out
+    J = tangent_jacobian(ra, dec, point, where=where)
+    if motion is not None:
+        out["pm_u"], out["pm_v"] = np.einsum("nij,jn->in", J, motion)
+    for name, errors in (("sigma", sigma), ("sigma_pm", sigma_motion)):
+        if errors is not None:
+            variance = np.einsum("nij,jn->in", J**2, errors**2)
+            out[f"{name}_u"], out[f"{name}_v"] = np.sqrt(variance)
+    return out
+
+
+def plane_axes(point: tuple[float, float]) -> Float:
+    """Unit vectors to east, north and tangent point (degrees), as the rows (3, 3) of a matrix.
+
+    A position of the plane lies in the direction (xi, eta, 1) @ rows, xi and eta in radians.
+    """
+    a, d = np.radians(point)
+    return np.array(
+        [
+            [-np.sin(a), np.cos(a), 0.0],
+            [-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)],
+            [np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)],
+        ]
+    )
+
+
+def sky_of_plane(xi: ArrayLike, eta: ArrayLike, point: tuple[float, float]) -> tuple[Float, Float]:
+    """Right ascension in [0, 360) and declination, degrees, of points (arcsec) of a plane."""
+    xi, eta = np.asarray(xi, float) / ARCSEC, np.asarray(eta, float) / ARCSEC
+    x, y, z = np.moveaxis(np.stack([xi, eta, np.ones_like(xi)], axis=-1) @ plane_axes(point), -1, 0)
+    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))

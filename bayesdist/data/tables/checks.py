@@ -1,0 +1,153 @@
+"""Columns of one length with finite values; rows that lack one are counted by reason or refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+
+__all__ = [
+    "NOT_FINITE",
+    "absent",
+    "check_not_finite",
+    "check_values",
+    "counted",
+    "one_length",
+    "refuse_half",
+    "without_missing",
+]
+
+Bool = NDArray[np.bool_]
+
+NOT_FINITE = ("refuse", "reject")
+
+
+def one_length(
+    columns: Mapping[str, Any], *, integers: Collection[str] = (), where: str
+) -> dict[str, NDArray[Any]]:
+    """Contiguous float64 arrays, those of `integers` int64, as long as the first of them.
+
+    They are in the machine's byte order, which columns of FITS tables are not.
+    """
+    arrays = {
+        name: np.ascontiguousarray(values, np.int64 if name in integers else np.float64)
+        for name, values in columns.items()
+    }
+    first = next(iter(arrays))
+    for name, values in arrays.items():
+        if values.shape != (arrays[first].size,):
+            raise InputError(
+                f"column {name!r} has shape {values.shape}, but {first!r} has "
+                f"{arrays[first].size} rows",
+                where=where,
+                do="give columns of one length",
+            )
+    return arrays
+
+
+def check_values(
+    columns: Mapping[str, NDArray[Any]],
+    *,
+    place: Callable[[int], str],
+    positive: Collection[str] = (),
+    not_negative: Collection[str] = (),
+) -> None:
+    """Refuse columns with values that are not finite, or not positive where they must be.
+
+    The row is named by its `place`.
+    """
+    for name, values in columns.items():
+        good, must = np.isfinite(values), "finite"
+        if name in positive:
+            good, must = good & (values > 0), "finite and positive"
+        elif name in not_negative:
+            good, must = good & (values >= 0), "finite and not negative"
+        if not good.all():
+            bad = int(np.argmin(good))
+            raise InputError(
+                f"value is {values[bad]:g}, and must be {must}",
+                where=f"{place(bad)}, column {name!r}",
+                do="correct the row or drop it",
+            )
+
+
+def refuse_half(pair: tuple[str, str], present: Container[str], *, where: str, what: str) -> None:
+    """Refuse one column of a pair without the other."""
+    for name, partner in (pair, pair[::-1]):
+        if partner in present and name not in present:
+            raise InputError(
+                f"column {name!r} is missing beside its partner",
+                where=where,
+                do=f"give {what} in both axes or in none",
+            )
+
+
+def check_not_finite(value: str) -> None:
+    """Refuse an invalid option `not_finite`."""
+    if value not in NOT_FINITE:
+        raise InputError(
+            f"not_finite is {value!r}",
+            where="data.not_finite",
+            do="set it to 'refuse' or 'reject'",
+        )
+
+
+def absent(column: Any, *, not_finite: bool) -> Bool:
+    """Boolean mask (N,) of the rows without a value: masked or, if asked for, not finite."""
+    mask = np.array(np.broadcast_to(getattr(column, "mask", False), np.shape(column)), bool)
+    if mask.ndim > 1:  # a column of arrays, which is refused elsewhere
+        return np.zeros(len(mask), bool)
+    if not_finite:
+        plain = getattr(column, "unmasked", column)
+        values = np.asarray(getattr(plain, "value", plain))
+        if values.dtype.kind == "f":
+            mask |= ~np.isfinite(values)
+    return mask
+
+
+def counted(reasons: Sequence[tuple[str, Bool]], n: int) -> tuple[Bool, dict[str, int]]:
+    """Boolean mask of the n rows that stay, and how many others go, by their first reason."""
+    stay, counts = np.ones(n, bool), dict[str, int]()
+    for reason, gone in reasons:
+        new = int((stay & gone).sum())
+        if new:
+            counts[reason] = counts.get(reason, 0) + new
+            stay &= ~gone
+    return stay, counts
+
+
+def without_missing(
+    table: Any,
+    found: Mapping[str, str],
+    *,
+    source: str,
+    reject: bool,
+    spared: frozenset[str],
+    motions: frozenset[str],
+) -> tuple[Bool, dict[str, int]]:
+    """Boolean mask (N,) of the rows with a value in every column that is read.
+
+    The others are counted by reason.  `reject` leaves out what is not finite, too; missing values
+    of `spared` quantities do no harm; in `motions` NaN means that a star has none, as catalogues
+    write it.  No row left is an error.
+    """
+    reasons = []
+    for key, name in found.items():
+        if key in spared:
+            continue
+        reason = "no proper motion" if key in motions else f"no value in column {name!r}"
+        gone = absent(table[name], not_finite=reject or key in motions)
+        reasons.append((reason, gone))
+    stay, counts = counted(reasons, len(table))
+    if not stay.any():
+        text = ", ".join(f"{reason} ({n} rows)" for reason, n in counts.items())
+        raise InputError(
+            f"no row has a value in every column that is read: {text}",
+            where=source,
+            do="leave such a column out by an empty name in the option 'columns'",
+        )
+    return stay, counts

@@ -1,0 +1,224 @@
+"""Quantities of columns: by the user, or by the names, units and origins that programs give."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from bayesdist.errors import InputError
+
+__all__ = ["ALIASES", "BASIC", "PAIRS", "find_columns", "known_unit", "origin_of"]
+
+# lower case; the first that the file has is taken, and of a pair the first of which it has both
+BASIC: dict[str, tuple[str, ...]] = {
+    "x": ("x", "x_pix", "xpix", "x_raw", "xraw", "xwin_image", "xpsf_image", "x_image"),
+    "y": ("y", "y_pix", "ypix", "y_raw", "yraw", "ywin_image", "ypsf_image", "y_image"),
+    "u": ("u",),
+    "v": ("v",),
+    "sigma_u": ("sigma_u", "su", "sig_u", "u_error", "u_err", "u_sigma", "e_u", "err_u", "sigma"),
+    "sigma_v": ("sigma_v", "sv", "sig_v", "v_error", "v_err", "v_sigma", "e_v", "err_v", "sigma"),
+    "epoch": ("epoch", "year"),
+    "exposure": ("exposure", "exp", "frame", "exposure_name"),
+    "chip": ("chip", "ccdchip", "ccd_chip"),
+    "mag": ("mag", "magnitude"),
+    "star": ("star",),
+}
+
+ALIASES: dict[str, tuple[str, ...]] = {
+    "x": (
+        *BASIC["x"],
+        *("xcentroid", "x_centroid", "x_fit", "xcenter", "slot_centroid_x"),
+        *("base_sdsscentroid_x", "w1x", "w2x", "w3x", "w4x"),
+    ),
+    "y": (
+        *BASIC["y"],
+        *("ycentroid", "y_centroid", "y_fit", "ycenter", "slot_centroid_y"),
+        *("base_sdsscentroid_y", "w1y", "w2y", "w3y", "w4y"),
+    ),
+    "u": ("u", "xi"),
+    "v": ("v", "eta"),
+    "ra": (
+        *("ra", "ra_deg", "radeg", "ra_icrs", "raj2000", "_raj2000", "ra_j2000", "alpha_j2000"),
+        *("alphawin_j2000", "alphapsf_j2000", "coord_ra", "right_ascension", "alpha"),
+        *("skycoord.ra", "sky_centroid.ra", "coord.ra", "sky.ra"),
+    ),
+    "dec": (
+        *("dec", "dec_deg", "decdeg", "de_icrs", "dej2000", "_dej2000", "dec_j2000"),
+        *("delta_j2000", "deltawin_j2000", "deltapsf_j2000", "coord_dec", "declination", "delta"),
+        *("skycoord.dec", "sky_centroid.dec", "coord.dec", "sky.dec"),
+    ),
+    "sigma_u": (*BASIC["sigma_u"], "xi_error", "xi_err", "sigma_xi", "e_xi"),
+    "sigma_v": (*BASIC["sigma_v"], "eta_error", "eta_err", "sigma_eta", "e_eta"),
+    "sigma_ra": ("ra_error", "e_ra_icrs", "sigra"),
+    "sigma_dec": ("dec_error", "e_de_icrs", "sigdec"),
+    "pm_ra": ("pmra", "pmra"),
+    "pm_dec": ("pmdec", "pmde"),
+    "sigma_pm_ra": ("pmra_error", "e_pmra"),
+    "sigma_pm_dec": ("pmdec_error", "e_pmde"),
+    "corr_ra": ("ra_pmra_corr",),
+    "corr_dec": ("dec_pmdec_corr",),
+    "parallax": ("parallax", "plx"),
+    "sigma_parallax": ("parallax_error", "e_plx"),
+    "catalogue_epoch": ("ref_epoch",),
+    "epoch": (*BASIC["epoch"], "mjd", "mjd_obs", "mjd-obs", "obs_mjd", "date_obs", "date-obs"),
+    "exposure": (*BASIC["exposure"], "expname", "rootname", "expnum", "visit"),
+    "chip": (
+        *(*BASIC["chip"], "ccd", "ccdnum", "chip_id", "ccd_id", "detector", "sca", "detpos"),
+        "ext_number",
+    ),
+    "filter": ("filter", "filt", "filter_name", "band"),
+    "mag": (
+        *(*BASIC["mag"], "mag_psf", "mag_auto", "mag_iso", "mag_best", "mag_fit"),
+        *("phot_g_mean_mag", "gmag", "w1mpro"),
+    ),
+    "flux": (
+        *("flux", "flux_psf", "flux_auto", "flux_fit", "kron_flux", "segment_flux"),
+        *("psfflux", "instflux", "slot_psfflux_instflux", "base_psfflux_instflux"),
+        "aperture_sum",
+    ),
+    "colour": ("colour", "color", "bp_rp"),
+    "star": BASIC["star"],
+    "u_nominal": ("u_nominal",),
+    "v_nominal": ("v_nominal",),
+}
+
+PAIRS = (
+    *(("x", "y"), ("u", "v"), ("ra", "dec"), ("sigma_u", "sigma_v"), ("sigma_ra", "sigma_dec")),
+    *(("pm_ra", "pm_dec"), ("sigma_pm_ra", "sigma_pm_dec")),
+)
+
+_MAS, _MOTION = "mas", "mas / yr"
+# of columns that a catalogue documents; two of its other names with them show that it is this one
+_CATALOGUES: tuple[tuple[dict[str, str], frozenset[str]], ...] = (
+    (  # Gaia archive
+        {
+            **dict.fromkeys(("ra_error", "dec_error", "parallax", "parallax_error"), _MAS),
+            **dict.fromkeys(("pmra", "pmdec", "pmra_error", "pmdec_error"), _MOTION),
+        },
+        frozenset(
+            ("source_id", "solution_id", "ref_epoch", "phot_g_mean_mag", "parallax", "pmra",
+             "pmra_error", "parallax_error", "ruwe", "bp_rp", "phot_bp_mean_mag")
+        ),
+    ),
+    (  # Gaia as VizieR and the X-match service of CDS have it
+        {
+            **dict.fromkeys(("e_ra_icrs", "e_de_icrs", "plx", "e_plx"), _MAS),
+            **dict.fromkeys(("pmra", "pmde", "e_pmra", "e_pmde"), _MOTION),
+        },
+        frozenset(
+            ("ra_icrs", "e_ra_icrs", "plx", "e_plx", "pmra", "pmde", "gmag", "source", "ruwe")
+        ),
+    ),
+    (  # AllWISE and other source tables of IRSA
+        {"sigra": "arcsec", "sigdec": "arcsec"},
+        frozenset(("designation", "w1mpro", "w2mpro", "sigradec", "w1x", "source_id")),
+    ),
+)  # fmt: skip
+_COMPANY = 2
+_DAYS = frozenset(("mjd", "mjd_obs", "mjd-obs", "obs_mjd"))
+
+# names that only programs which count from 0 give
+_FROM_ZERO = {
+    **dict.fromkeys(("xcentroid", "x_centroid", "x_fit"), "photutils"),
+    **dict.fromkeys(("slot_centroid_x", "base_sdsscentroid_x"), "the LSST pipelines"),
+}
+# program, and columns that it writes with its x, y
+_COUNTS_FROM_ZERO: tuple[tuple[str, frozenset[str]], ...] = (
+    ("sep", frozenset(("tnpix", "xcpeak"))),
+    ("photutils", frozenset(("aperture_sum",))),
+    ("the LSST pipelines", frozenset(("coord_ra", "detect_isprimary"))),
+    ("the LSST pipelines", frozenset(("coord_ra", "parentsourceid"))),
+)
+_ORIGIN_KEYS = ("pixel_origin", "pixorig", "pix_orig")
+
+
+def find_columns(
+    names: Iterable[str],
+    mapping: Mapping[str, str] | None,
+    aliases: Mapping[str, tuple[str, ...]],
+    *,
+    source: str,
+    pairs: Iterable[tuple[str, str]] = (),
+) -> dict[str, str]:
+    """Column of each quantity that a file has.
+
+    `mapping` gives what the user names (an empty name leaves a quantity out), `aliases` the usual
+    names, in lower case, for the rest; of `pairs` the names go together: those of which the file
+    has both come first.  An unknown quantity, or a column that is not in the file, is refused with
+    the nearest name.
+    """
+    names = list(names)
+    found: dict[str, str] = {}
+    for key, column in (mapping or {}).items():
+        if key not in aliases:
+            raise InputError(
+                f"columns has the key {key!r}, which is no quantity",
+                where=source,
+                do=f"use {_nearest(key, aliases)}",
+            )
+        if column and column not in names:
+            raise InputError(
+                f"column {column!r} is missing", where=source, do=f"name {_nearest(column, names)}"
+            )
+        found[key] = column
+    lower: dict[str, str] = {}
+    for name in names:
+        # where only case tells two columns apart, the lower-case one is the usual one
+        if name.lower() not in lower or name == name.lower():
+            lower[name.lower()] = name
+    for one, other in pairs:
+        if one not in found and other not in found:
+            both = zip(aliases[one], aliases[other], strict=True)
+            first = next((two for two in both if lower.keys() >= set(two)), None)
+            if first is not None:
+                found[one], found[other] = lower[first[0]], lower[first[1]]
+    for key, usual in aliases.items():
+        if key not in found:
+            found[key] = next((lower[a] for a in usual if a in lower), "")
+    return {key: column for key, column in found.items() if column}
+
+
+def _nearest(name: str, choices: Iterable[str]) -> str:
+    """The nearest choice, or all of them where none is near."""
+    choices = list(choices)
+    lower = {c.lower(): c for c in choices}
+    near = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.5)
+    if near:
+        return f"{lower[near[0]]!r} if that is meant"
+    return "one of " + ", ".join(repr(c) for c in choices)
+
+
+def known_unit(name: str, names: Iterable[str]) -> str | None:
+    """Unit that a column has by its name, where its file gives none, or None.
+
+    A catalogue is recognised by two of its `names` apart from this one.
+    """
+    name, others = name.lower(), {other.lower() for other in names}
+    if name in _DAYS:
+        return "d"
+    for units, company in _CATALOGUES:
+        if name in units and len((company & others) - {name}) >= _COMPANY:
+            return units[name]
+    return None
+
+
+def origin_of(column: str, names: Iterable[str], header: Mapping[str, Any]) -> tuple[int, str]:
+    """Coordinate (0 or 1) of the centre of the first pixel, and the reason.
+
+    `column` is that of x; where the reason is empty nothing is known, and 1 is FITS's own.
+    """
+    for key, value in header.items():
+        if str(key).lower() in _ORIGIN_KEYS and str(value).strip() in ("0", "1"):
+            return int(str(value).strip()), f"{key} in the header"
+    programs = str(header.get("version", "")) + " ".join(map(str, header))
+    if "photutils" in programs.lower():
+        return 0, "photutils in the header, which counts from 0"
+    lower = {name.lower() for name in names}
+    if column.lower() in _FROM_ZERO:
+        return 0, f"{column} is a name of {_FROM_ZERO[column.lower()]}, which counts from 0"
+    if column in ("x", "xcenter"):
+        for program, beside in _COUNTS_FROM_ZERO:
+            if beside <= lower:
+                return 0, f"{', '.join(sorted(beside))} are of {program}, which counts from 0"
+    return 1, ""

@@ -1,0 +1,264 @@
+"""Parquet files, block by block: memory is that of a block, however large file and row groups are.
+
+Damage is named with its row group.  Checksums of pages are verified where a file has them; without
+them a flipped bit among numbers is just another number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.tables.column import EncodedColumn, Place
+from bayesdist.data.tables.files import naming_faults, parquet_column, parquet_units
+from bayesdist.errors import InputError
+
+if TYPE_CHECKING:
+    import pyarrow
+    import pyarrow.parquet
+
+__all__ = ["ParquetPart", "RowBlock", "describe_part"]
+
+_BATCH = 65_536  # rows decoded at a time
+_BUFFER = 2**18  # bytes: without a buffer, Arrow loads the columns of a whole row group
+
+
+@dataclass(frozen=True, eq=False)
+class RowBlock:
+    """Consecutive rows of a file, with the columns that an astropy Table would have."""
+
+    first: int  # row in the file of the first one, from 0
+    columns: Mapping[str, pyarrow.ChunkedArray]
+    units: Mapping[str, str]
+    encoded: Collection[str]  # columns to be given as `EncodedColumn`
+
+    @property
+    def colnames(self) -> list[str]:
+        """Names of the columns."""
+        return list(self.columns)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def __getitem__(self, name: str) -> Any:
+        column = self.columns[name]
+        if name in self.encoded:
+            encoded = _encoded(column, self.units.get(name))
+            if encoded is not None:
+                return encoded
+        return parquet_column(column, self.units.get(name))
+
+
+@dataclass(frozen=True, eq=False)
+class ParquetPart:
+    """Description of a Parquet file without its rows."""
+
+    path: Path
+    group_rows: tuple[int, ...]  # rows of each row group
+    colnames: tuple[str, ...]
+    units: Mapping[str, str]
+    texts: frozenset[str]  # columns of strings, or of dictionaries
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the file."""
+        return int(self._edges[-1])
+
+    @cached_property
+    def _edges(self) -> NDArray[np.int64]:
+        return np.cumsum([0, *self.group_rows])
+
+    def _group_of(self, row: int) -> int:
+        """Row group of a row, both from 0."""
+        return int(np.searchsorted(self._edges, row, side="right")) - 1
+
+    def _group_name(self, group: int) -> str:
+        return f"row group {group + 1} of {len(self.group_rows)}"
+
+    def place(self, first: int) -> Place:
+        """Names of rows, by their distance from the row `first`: row group and row, both from 1."""
+
+        def name(index: int) -> str:
+            row = first + index
+            return f"{self._group_name(self._group_of(row))}, row {row + 1}"
+
+        return name
+
+    def blocks(
+        self,
+        columns: Sequence[str],
+        *,
+        encoded: Collection[str] = (),
+        start: int = 0,
+        stop: int | None = None,
+        size: int,
+    ) -> Iterator[RowBlock]:
+        """Blocks of rows `start` to `stop` (from 0), of at most `size` rows each.
+
+        Columns of `encoded` are given as `EncodedColumn`.  InputError when the file is damaged,
+        gone, or not what it was when it was described.
+        """
+        import pyarrow
+
+        stop = self.n_rows if stop is None else stop
+        batches: list[pyarrow.RecordBatch] = []
+        held = 0
+        for batch in self._batches(columns, encoded, start, stop):
+            while len(batch):
+                head = batch.slice(0, size - held)
+                batch = batch.slice(len(head))
+                batches.append(head)
+                held += len(head)
+                start += len(head)
+                if held == size or start == stop:
+                    table = pyarrow.Table.from_batches(batches)
+                    arrays = dict(zip(table.column_names, table.columns, strict=True))
+                    batches = []
+                    yield RowBlock(start - held, arrays, self.units, encoded)
+                    held = 0
+        if start != stop:
+            raise self._changed()
+
+    def _batches(
+        self, columns: Sequence[str], encoded: Collection[str], start: int, stop: int
+    ) -> Iterator[pyarrow.RecordBatch]:
+        """Rows as they are decoded."""
+        import pyarrow
+
+        if start >= stop:
+            return
+        groups = list(range(self._group_of(start), self._group_of(stop - 1) + 1))
+        at = int(self._edges[groups[0]])
+        with _opened(self.path, self.texts & set(encoded)) as stored:
+            if _group_rows(stored) != self.group_rows or _names(stored) != self.colnames:
+                raise self._changed()
+            # only next() is guarded: exceptions of the consumer are not the file's fault
+            decoded = stored.iter_batches(_BATCH, row_groups=groups, columns=list(columns))
+            while True:
+                try:
+                    batch = next(decoded, None)
+                except Exception as error:
+                    raise self._damage(stored, columns, at, groups, error) from error
+                if batch is None:
+                    break
+                end = at + len(batch)
+                if end > start:
+                    yield batch.slice(max(0, start - at), min(end, stop) - max(start, at))
+                at = end
+                if at >= stop:
+                    break
+            del decoded, batch
+        pyarrow.default_memory_pool().release_unused()
+
+    def _damage(
+        self,
+        stored: pyarrow.parquet.ParquetFile,
+        columns: Sequence[str],
+        reached: int,
+        groups: Sequence[int],
+        error: Exception,
+    ) -> InputError:
+        """Error about the first row group that cannot be read."""
+        where = str(self.path)
+        for group in groups:
+            if self._edges[group + 1] <= reached:
+                continue
+            try:
+                for _ in stored.iter_batches(_BATCH, row_groups=[group], columns=list(columns)):
+                    pass
+            except Exception as found:
+                error = found
+                first, last = self._edges[group] + 1, self._edges[group + 1]
+                where = f"{self.path}, {self._group_name(group)} (rows {first} to {last})"
+                break
+        return _as_input_error(self.path, where, error)
+
+    def _changed(self) -> InputError:
+        return InputError("has changed since it was opened", where=str(self.path), do="start again")
+
+
+def describe_part(path: Path) -> ParquetPart:
+    """Description of a Parquet file from its footer; one that is missing or damaged is refused."""
+    import pyarrow
+
+    with _opened(path) as stored, naming_faults(path):
+        schema = stored.schema_arrow
+        is_text = (
+            pyarrow.types.is_string,
+            pyarrow.types.is_large_string,
+            pyarrow.types.is_binary,
+            pyarrow.types.is_large_binary,
+            pyarrow.types.is_dictionary,
+        )
+        return ParquetPart(
+            path,
+            _group_rows(stored),
+            _names(stored),
+            parquet_units(schema),
+            frozenset(one.name for one in schema if any(kind(one.type) for kind in is_text)),
+        )
+
+
+@contextmanager
+def _opened(path: Path, as_codes: Collection[str] = ()) -> Iterator[pyarrow.parquet.ParquetFile]:
+    """Open file of which only the part being decoded is held in memory."""
+    import pyarrow.parquet
+
+    with naming_faults(path):
+        stored = pyarrow.parquet.ParquetFile(
+            path,
+            read_dictionary=sorted(as_codes) or None,
+            pre_buffer=False,
+            buffer_size=_BUFFER,
+            page_checksum_verification=True,
+        )
+    with stored:
+        yield stored
+
+
+def _group_rows(stored: pyarrow.parquet.ParquetFile) -> tuple[int, ...]:
+    metadata = stored.metadata
+    return tuple(metadata.row_group(k).num_rows for k in range(metadata.num_row_groups))
+
+
+def _names(stored: pyarrow.parquet.ParquetFile) -> tuple[str, ...]:
+    return tuple(stored.schema_arrow.names)
+
+
+def _as_input_error(path: Path, where: str, error: Exception) -> InputError:
+    try:
+        with naming_faults(path, where):
+            raise error
+    except InputError as named:
+        return named
+
+
+def _encoded(values: pyarrow.ChunkedArray, unit: str | None) -> EncodedColumn | None:
+    """Codes and labels of a column, or None where it has nulls or a type that has no equals."""
+    import pyarrow
+
+    try:
+        array = values.combine_chunks()
+        if not pyarrow.types.is_dictionary(array.type):
+            array = array.dictionary_encode()
+    except pyarrow.ArrowException:
+        return None
+    if array.null_count or array.dictionary.null_count:
+        return None
+    labels = array.dictionary.to_numpy(zero_copy_only=False)
+    codes = array.indices.to_numpy().astype(np.int64)
+    # the dictionary of a file may have another order, and labels that no row has
+    n = len(codes)
+    first = np.full(len(labels), n)
+    first[codes[::-1]] = np.arange(n - 1, -1, -1)
+    order = np.argsort(first)[: int((first < n).sum())]
+    rank = np.zeros(len(labels), np.int64)
+    rank[order] = np.arange(len(order))
+    return EncodedColumn(rank[codes], labels[order], unit)

@@ -1,0 +1,149 @@
+"""Repeated rows of a table that is held in memory or streamed.
+
+Rows are hashed to one integer each, so that ten million of them need one sort, not one for each
+key; only rows whose hashes meet are compared in full.  Of a table that streams by, the hashes are
+sorted into buckets of about `HELD` in a scratch file, and then looked at bucket by bucket: the cost
+grows linearly with the rows and the memory not at all.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+
+__all__ = ["HELD", "buckets_for", "first_duplicate", "first_repetition"]
+
+UInt = NDArray[np.uint64]
+Keys = Sequence[NDArray[Any]]
+Batches = Callable[[], Iterable[Keys]]
+
+HELD = 8_000_000  # hashes in memory at a time
+_COMPARED = 100_000  # hashes that rows are compared in full for at a time
+_BLOCK = 16_384  # rows hashed together: their keys stay in the cache
+_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
+_SHIFT = np.uint64(29)
+
+
+def first_duplicate(keys: Keys) -> tuple[int, int] | None:
+    """Indices of a row and of its first repetition in all keys (N,); None where no row repeats."""
+    return first_repetition(lambda: (keys,), 1)
+
+
+def buckets_for(n_rows: int) -> int:
+    """Number of buckets into which the hashes of `n_rows` rows are to be sorted."""
+    return max(1, -(-n_rows // HELD))
+
+
+def first_repetition(batches: Batches, buckets: int) -> tuple[int, int] | None:
+    """Row numbers of a row and of its first repetition in all keys; None where no row repeats.
+
+    `batches` gives the table anew at each call: an iterable of batches of rows, each a sequence of
+    keys as `first_duplicate` takes them; 1 / `buckets` of the hashes are held at a time.  The pair
+    is the earliest one, unless more than 100 000 different rows repeat: then it is the earliest of
+    the first of them that are found.  InputError when the scratch folder is full.
+    """
+    waiting: list[UInt] = []
+    for k, hashes in enumerate(_bucketed(batches, buckets)):
+        waiting.append(_repeated(hashes))
+        if k < buckets - 1 and sum(len(w) for w in waiting) <= _COMPARED:
+            continue
+        repeated, waiting = np.concatenate(waiting), []
+        for a in range(0, len(repeated), _COMPARED):
+            pair = _first_of(batches, np.sort(repeated[a : a + _COMPARED]))
+            if pair is not None:
+                return pair
+    return None
+
+
+def _bits(keys: Keys) -> list[UInt]:
+    """Keys as integers that are equal where the keys are."""
+    out = []
+    for key in keys:
+        key = key + 0.0 if key.dtype.kind == "f" else key  # -0.0 equals 0.0
+        out.append(np.ascontiguousarray(key).view(np.uint64))
+    return out
+
+
+def _hashed(keys: Keys) -> UInt:
+    """One integer for each row."""
+    n = len(keys[0])
+    out = np.zeros(n, np.uint64)
+    for a in range(0, n, _BLOCK):
+        h = out[a : a + _BLOCK]
+        for b in _bits([key[a : a + _BLOCK] for key in keys]):
+            h ^= b
+            h *= _MULTIPLIER
+            h ^= h >> _SHIFT
+    return out
+
+
+def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
+    """Hashes of each bucket; the table is read once."""
+    if buckets == 1:
+        found = [_hashed(keys) for keys in batches()]
+        yield np.concatenate(found) if found else np.zeros(0, np.uint64)
+        return
+    edges: list[NDArray[np.int64]] = []  # of the buckets of each batch, in the file
+    with tempfile.TemporaryFile(prefix="bayesdist-") as file:
+        try:
+            for hashed in _joined(_hashed(keys) for keys in batches()):
+                # by the upper half: the lower bits of a product see those of its factors only
+                bucket = (hashed >> np.uint64(32)) % np.uint64(buckets)
+                counts = np.bincount(bucket.astype(np.int64), minlength=buckets)
+                edges.append(file.tell() + 8 * np.concatenate([[0], np.cumsum(counts)]))
+                file.write(hashed[np.argsort(bucket, kind="stable")].data)
+            file.flush()
+        except OSError as error:
+            raise InputError(
+                f"the search for repeated rows does not fit into the scratch folder "
+                f"({error.strerror})",
+                where=tempfile.gettempdir(),
+                do="set TMPDIR to a folder with 8 bytes of room for each row",
+            ) from error
+        for k in range(buckets):
+            parts = []
+            for begin, end in ((e[k], e[k + 1]) for e in edges):
+                file.seek(int(begin))
+                parts.append(np.frombuffer(file.read(int(end - begin)), np.uint64))
+            yield np.concatenate(parts)
+
+
+def _joined(pieces: Iterable[UInt]) -> Iterator[UInt]:
+    """Hashes in larger pieces, so that the list of their positions in the file stays short."""
+    waiting: list[UInt] = []
+    for piece in pieces:
+        waiting.append(piece)
+        if sum(len(w) for w in waiting) >= HELD // 4:
+            yield np.concatenate(waiting)
+            waiting = []
+    if waiting:
+        yield np.concatenate(waiting)
+
+
+def _repeated(hashed: UInt) -> UInt:
+    """Hashes that occur more than once; the array is sorted in place."""
+    hashed.sort()
+    twice = hashed[1:][hashed[1:] == hashed[:-1]]
+    return np.unique(twice)
+
+
+def _first_of(batches: Batches, repeated: UInt) -> tuple[int, int] | None:
+    """Earliest pair of equal rows among those with certain hashes, in rising order."""
+    seen: dict[bytes, int] = {}
+    start = 0
+    for keys in batches():
+        hashed = _hashed(keys)
+        slot = np.minimum(np.searchsorted(repeated, hashed), len(repeated) - 1)
+        for index in np.flatnonzero(repeated[slot] == hashed).tolist():
+            row = b"".join(b.tobytes() for b in _bits([k[index : index + 1] for k in keys]))
+            if row in seen:
+                return seen[row], start + index
+            seen[row] = start + index
+        start += len(hashed)
+    return None

@@ -1,0 +1,83 @@
+"""Units are resolved on reading: every unit in a file becomes one of four words, or an error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import astropy.units as apu
+import numpy as np
+
+from bayesdist.errors import InputError
+
+__all__ = ["UNITS", "check_unit", "conversion", "length_advice", "unit_of", "without_unit"]
+
+UNITS = ("pix", "arcsec", "mas", "deg")
+
+# names that other programs write where astropy expects 'pix' or 'deg'
+_SPELLINGS = {
+    "pixels": "pix",
+    "pixel": "pix",
+    "px": "pix",
+    "degrees": "deg",
+    "degree": "deg",
+    "arcseconds": "arcsec",
+    "arcsecs": "arcsec",
+    "milliarcsec": "mas",
+    "none": "",
+}
+
+
+def check_unit(unit: str, *, where: str = "unit") -> str:
+    """The unit itself, when it is one of `UNITS`; any other is refused."""
+    if unit not in UNITS:
+        do = length_advice(unit) or f"choose one of {', '.join(UNITS)}"
+        raise InputError(f"unit is {unit!r}", where=where, do=do)
+    return unit
+
+
+def length_advice(unit: str) -> str:
+    """Advice on positions in a length, as millimetres of a focal plane; empty for other units."""
+    parsed = apu.Unit(unit.strip(), parse_strict="silent")
+    if parsed.physical_type != "length":
+        return ""
+    return (
+        f"divide u, v and their errors by the size of a pixel in {unit} and call them 'pix', or "
+        "multiply them by the plate scale and call them 'arcsec'"
+    )
+
+
+def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
+    """Unit of a table's column, None where it has none; an unknown one is refused."""
+    unit = getattr(column, "unit", None)
+    if unit is None:
+        return None
+    text = _SPELLINGS.get(str(unit).strip().lower(), str(unit).strip())
+    if not text:
+        return None
+    parsed = apu.Unit(text, parse_strict="silent")
+    if isinstance(parsed, apu.UnrecognizedUnit):
+        raise InputError(
+            f"unit {text!r} is unknown", where=where, do=f"write one of {', '.join(UNITS)}"
+        )
+    return None if parsed == apu.dimensionless_unscaled else parsed
+
+
+def conversion(unit: apu.UnitBase, to: str, *, where: str) -> float:
+    """Factor from values of `unit` to those of `to`; units of different quantities are refused."""
+    try:
+        return float(unit.to(apu.Unit(to)))
+    except apu.UnitConversionError:
+        raise InputError(
+            f"unit {unit} cannot be brought to {to}",
+            where=where,
+            do=length_advice(str(unit)) or "correct the unit in the file or in the configuration",
+        ) from None
+
+
+def without_unit(column: Any) -> Any:
+    """Numbers of a column with a unit, masked where it is."""
+    if hasattr(column, "to_value"):  # a Quantity, plain or Masked
+        return column.value
+    if isinstance(column, np.ma.MaskedArray):
+        return np.ma.MaskedArray(column.data, mask=column.mask)
+    return np.asarray(column)

@@ -1,0 +1,112 @@
+"""Sums over detections that err together: those of one star, of one exposure, or in one cell.
+
+A statistic that is a sum over detections varies by the squares of its sums over such clusters, not
+by those of single detections.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+__all__ = ["add_over", "joint_clusters", "products_over", "squares_over", "sums_over"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
+    """Sums of values over clusters.
+
+    Parameters
+    ----------
+    cluster : ndarray of int, shape (N,)
+        Numbered from 0.
+    values : ndarray, shape (N, ...)
+    n : int, optional
+        Clusters that there are at least.
+
+    Returns
+    -------
+    ndarray, shape (c, ...)
+    """
+    columns = values.reshape(len(values), math.prod(values.shape[1:])).T
+    sums = [np.bincount(cluster, column, n) for column in columns]
+    return np.stack(sums, axis=1).reshape(-1, *values.shape[1:]).astype(np.float64)
+
+
+def add_over(total: Float, cluster: Int, values: Float) -> None:
+    """Add values (N, ...) to the totals (c, ...) of their clusters, which may be few of many.
+
+    Parameters
+    ----------
+    total : ndarray, shape (c, ...)
+        Changed in place.
+    cluster : ndarray of int, shape (N,)
+    values : ndarray, shape (N, ...)
+    """
+    present, of = np.unique(cluster, return_inverse=True)
+    total[present] += sums_over(of, values)
+
+
+def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
+    """Group (c,) of each part of a cluster that lies in one group, and part (N,) of each value.
+
+    Parameters
+    ----------
+    group, cluster : ndarray of int, shape (N,)
+        Not negative.
+
+    Returns
+    -------
+    owner : ndarray of int, shape (c,)
+    of : ndarray of int, shape (N,)
+    """
+    n = int(cluster.max(initial=0)) + 1
+    keys, of = np.unique(group * n + cluster, return_inverse=True)
+    return keys // n, of
+
+
+def squares_over(cluster: Int, values: Float, group: Int | None = None, n: int = 1) -> Float:
+    """Squares (n, ...) of the sums over clusters, added up in each group.
+
+    Parameters
+    ----------
+    cluster : ndarray of int, shape (N,)
+        Not negative.
+    values : ndarray, shape (N, ...)
+    group : ndarray of int, shape (N,), optional
+        One group by default.
+    n : int
+        Number of groups.
+
+    Returns
+    -------
+    ndarray, shape (n, ...)
+    """
+    owner, of = joint_clusters(np.zeros_like(cluster) if group is None else group, cluster)
+    return sums_over(owner, sums_over(of, values) ** 2, n)
+
+
+def products_over(group: Int, cluster: Int, values: Float, n: int) -> Float:
+    """Products of sums of k values over groups and clusters, added up over the clusters.
+
+    Parameters
+    ----------
+    group, cluster : ndarray of int, shape (N,)
+    values : ndarray, shape (N, k)
+    n : int
+        Number of groups.
+
+    Returns
+    -------
+    ndarray, shape (k n, k n)
+    """
+    k = values.shape[1]
+    rows = (group[:, None] * k + np.arange(k)).ravel()
+    shape = (n * k, int(cluster.max(initial=0)) + 1)
+    table = csr_matrix((values.ravel(), (rows, np.repeat(cluster, k))), shape=shape)
+    return np.asarray((table @ table.T).toarray())

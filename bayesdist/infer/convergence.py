@@ -1,0 +1,248 @@
+"""Convergence of the sampler, judged over independent ensembles, never over coupled walkers.
+
+Differential evolution couples the walkers of an ensemble.  Then two estimates of the effective
+sample size are made and the smaller counts: that of the walkers laid end to end, and that of the
+ensemble averages, which shows a drift that all walkers share (Goodman and Weare 2010, section 5).
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "Convergence",
+    "Limits",
+    "diagnose",
+    "importance_efficiency",
+    "pareto_k",
+    "smoothed_weights",
+]
+
+Float = NDArray[np.float64]
+
+LEAST_PER_WALKER = 5.0  # effective draws that each walker must have made
+
+_COLUMNS = ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Targets of a converged run.
+
+    Parameters
+    ----------
+    ess : float
+        Bulk and tail effective sample size of every parameter.
+    rhat : float
+        Rank-normalised split R-hat of every parameter.
+    """
+
+    ess: float = 400.0
+    rhat: float = 1.01
+
+
+@dataclass(frozen=True, eq=False)
+class Convergence:
+    """Diagnostics of every sampled parameter, and the verdict.
+
+    Parameters
+    ----------
+    names : tuple of str
+        theta, then the hyperparameters as sampled.
+    rhat, ess_bulk, ess_tail, mcse_mean, mcse_sd : ndarray, shape (D,)
+        NaN for fixed parameters, which are not judged.
+    pareto_k : float
+        Of the importance weights of the independence proposal (Vehtari et al. 2024).
+    importance_efficiency : float
+        Effective fraction of the proposal's draws.
+    converged : bool
+    reasons : tuple of str
+        Failed criteria, with the worst parameter; empty when converged.
+    limits : Limits
+    """
+
+    names: tuple[str, ...]
+    rhat: Float
+    ess_bulk: Float
+    ess_tail: Float
+    mcse_mean: Float
+    mcse_sd: Float
+    pareto_k: float
+    importance_efficiency: float
+    converged: bool
+    reasons: tuple[str, ...]
+    limits: Limits
+
+    @property
+    def rhat_max(self) -> float:
+        """Largest R-hat."""
+        return float(np.nanmax(self.rhat))
+
+    @property
+    def ess_bulk_min(self) -> float:
+        """Smallest bulk effective sample size."""
+        return float(np.nanmin(self.ess_bulk))
+
+    @property
+    def ess_tail_min(self) -> float:
+        """Smallest tail effective sample size."""
+        return float(np.nanmin(self.ess_tail))
+
+    def among(self, names: tuple[str, ...]) -> Convergence:
+        """Convergence with further names, of parameters that are fixed and not judged."""
+        at = [names.index(name) for name in self.names]
+
+        def spread(values: Float) -> Float:
+            out = np.full(len(names), np.nan)
+            out[at] = values
+            return out
+
+        columns: dict[str, Any] = {name: spread(getattr(self, name)) for name in _COLUMNS}
+        return replace(self, names=names, **columns)
+
+
+def diagnose(
+    chains: Float,
+    names: tuple[str, ...],
+    log_weights: Float,
+    limits: Limits,
+    *,
+    coupled: bool,
+    n_outside: int = 0,
+) -> Convergence:
+    """Diagnostics from the draws after warm-up: chains (ensembles, steps, walkers, D).
+
+    `log_weights` (n,) are log importance weights of independent proposals; `n_outside` further ones
+    fell outside the support and have weight zero.  `coupled` if the walkers of an ensemble
+    influence each other.
+    """
+    az = _arviz()
+
+    E, T, W, D = chains.shape
+    in_time = chains.reshape(E, T * W, D)
+    by_walker = np.swapaxes(chains, 1, 2).reshape(E, W * T, D)
+
+    def each(function, values: Float, **options: object) -> Float:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            out = function(az.convert_to_dataset({"x": values}), **options)
+        # a parameter that never moved has no variance: no effective draws, no agreement
+        return np.asarray(out["x"].values, float)
+
+    rhat = each(az.rhat, in_time)
+    rhat[~np.isfinite(rhat)] = np.inf
+    bulk = each(az.ess, by_walker)
+    tail = each(az.ess, by_walker, method="tail")
+    if coupled:
+        low, high = np.quantile(in_time.reshape(-1, D), [0.05, 0.95], axis=0)
+        bulk = np.minimum(bulk, _coupled_ess(chains, each))
+        for outside in (chains <= low, chains >= high):
+            tail = np.minimum(tail, _coupled_ess(outside.astype(float), each))
+    frozen = np.ptp(in_time.reshape(-1, D), axis=0) == 0
+    bulk[frozen | ~np.isfinite(bulk)] = 0.0
+    tail[frozen | ~np.isfinite(tail)] = 0.0
+    spread = in_time.reshape(-1, D).std(axis=0)
+    # delta method; arviz.mcse(method="sd") of 0.23 fails on numpy 2.4
+    squares = (by_walker - by_walker.reshape(-1, D).mean(axis=0)) ** 2
+    ess_squares = np.maximum(each(az.ess, squares, method="mean"), 1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mcse_sd = squares.reshape(-1, D).std(axis=0) / np.sqrt(ess_squares) / (2 * spread)
+    reasons = []
+    for label, values, bad, limit in (
+        ("R-hat", rhat, rhat > limits.rhat, limits.rhat),
+        ("bulk ESS", bulk, bulk < limits.ess, limits.ess),
+        ("tail ESS", tail, tail < limits.ess, limits.ess),
+    ):
+        if bad.any():
+            k = int(np.argmax(values) if label == "R-hat" else np.argmin(values))
+            reasons.append(
+                f"{label} of {names[k]} is {values[k]:.4g} and must be "
+                f"{'at most' if label == 'R-hat' else 'at least'} {limit:g}"
+                f" ({int(bad.sum())} of {D} parameters)"
+            )
+    # every walker counts at least as one draw, even if it never moved: many walkers must not
+    # compensate for walkers that do not mix
+    each_walker = float(np.minimum(bulk, tail).min()) / (E * W)
+    if each_walker < LEAST_PER_WALKER:
+        k = int(np.argmin(np.minimum(bulk, tail)))
+        reasons.append(
+            f"a walker has made {each_walker:.2g} effective draws of {names[k]} and must have made "
+            f"at least {LEAST_PER_WALKER:g}"
+        )
+    return Convergence(
+        names=names,
+        rhat=rhat,
+        ess_bulk=bulk,
+        ess_tail=tail,
+        mcse_mean=spread / np.sqrt(np.maximum(bulk, 1.0)),
+        mcse_sd=np.nan_to_num(mcse_sd),
+        pareto_k=pareto_k(log_weights),
+        importance_efficiency=importance_efficiency(log_weights, n_outside),
+        converged=not reasons,
+        reasons=tuple(reasons),
+        limits=limits,
+    )
+
+
+def _arviz() -> Any:
+    """ArviZ, without its daily notice, which does not concern users of this package."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz  # takes seconds: only where it is needed
+    return arviz
+
+
+def _coupled_ess(chains: Float, each) -> Float:
+    """Effective sample size of the mean over ensembles that may move as one."""
+    az = _arviz()
+
+    D = chains.shape[-1]
+    averages = chains.mean(axis=2)
+    share = averages.reshape(-1, D).var(axis=0)
+    total = chains.reshape(-1, D).var(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ess = each(az.ess, averages, method="mean") * total / share
+    return np.where(np.isfinite(ess), ess, 0.0)
+
+
+def importance_efficiency(log_weights: Float, n_outside: int = 0) -> float:
+    """Effective fraction of draws with these log weights, and of others with weight zero."""
+    if not len(log_weights):
+        return 0.0
+    weights = np.exp(log_weights - log_weights.max())
+    return float(weights.sum() ** 2 / (weights**2).sum() / (len(weights) + n_outside))
+
+
+def pareto_k(log_weights: Float) -> float:
+    """Shape of the Pareto tail of importance weights; above 0.7 they cannot be trusted.
+
+    0 where no weight is more than twice the mean: there is no tail then, and the shape of nearly
+    equal weights means nothing.
+    """
+    az = _arviz()
+
+    finite = log_weights[np.isfinite(log_weights)]
+    if len(finite) < 25 or np.ptp(finite) < 1e-9:
+        return float("-inf") if len(finite) >= 25 else float("inf")
+    weights = np.exp(finite - finite.max())
+    if weights.mean() > 0.5:
+        return 0.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return float(az.psislw(finite.copy())[1])
+
+
+def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, float]:
+    """Importance weights (n,) of sum 1 with a Pareto tail, and the shape k of that tail.
+
+    `independent` is the effective fraction of the draws.  With k above 0.7 the weights cannot be
+    trusted.
+    """
+    with np.errstate(over="ignore"):  # inside arviz, of draws of negligible weight
+        smoothed, k = _arviz().psislw(log_weights, reff=independent)
+    return np.exp(smoothed), float(k)

@@ -1,0 +1,142 @@
+"""Gauss-Newton over the frames of exposures, by moving normal equations instead of the data."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import DegenerateError
+from bayesdist.infer.equations.normal import NormalEquations
+from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.rank import require_full_rank
+from bayesdist.model import DistortionModel
+from bayesdist.model.frames import nearest_frame
+
+__all__ = ["gauss_newton", "refuse_absorbed_drift", "starting_point"]
+
+Float = NDArray[np.float64]
+
+RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
+STALLED = 1e-4  # formal errors: steps below this that do not shrink are rounding
+TURNS = 50  # most iterations
+
+
+def starting_point(first: NormalEquations, model: DistortionModel, priors: GaussianPriors) -> Float:
+    """Starting parameters: frames from linear maps, then polynomials for these frames."""
+    groups = first.groups
+    theta = np.zeros(model.n_params)
+    if model.n_frame:
+        _start_frames(first, theta, model)
+    held = first.moved(model.effective(theta, groups))
+    matrix, right = held.assemble(model, theta)
+    prior = priors.matrix(model)
+    n = model.n_distortion
+    theta[:n] = np.linalg.lstsq(
+        (matrix.border + prior.border)[:n, :n], (right + priors.pull(theta))[:n], rcond=1e-13
+    )[0]
+    return theta
+
+
+def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) -> None:
+    """Set the frames of `theta` from linear maps, each exposure after one with a common chip."""
+    groups, o = first.groups, np.asarray(model.origin)
+    affine = np.array([_affine(w, r) for w, r in zip(first.weight, first.right, strict=True)])
+    of_chip: dict[int, Float] = {}  # constant and linear coefficients of w, before the frame
+
+    def enter(e: int) -> None:
+        """Take the chips' linear maps from an exposure whose frame is known."""
+        M, d = model.frame(theta, e)
+        for g in np.flatnonzero(groups.exposure == e):
+            if int(groups.chip[g]) not in of_chip and np.isfinite(affine[g]).all():
+                back = np.linalg.solve(M, affine[g] - np.column_stack([o + d, np.zeros((2, 2))]))
+                back[:, 0] += o
+                of_chip[int(groups.chip[g])] = back
+
+    enter(0)
+    waiting = list(range(1, len(model.exposures)))
+    while waiting:
+        still = []
+        for e in waiting:
+            for g in np.flatnonzero(groups.exposure == e):
+                w = of_chip.get(int(groups.chip[g]))
+                if w is not None and np.isfinite(affine[g]).all():
+                    M = affine[g][:, 1:] @ np.linalg.inv(w[:, 1:])
+                    d = affine[g][:, 0] - o - M @ (w[:, 0] - o)
+                    frame = nearest_frame(model.frames, M, d)
+                    theta[model.frame_slice(e)][: len(frame)] = frame
+                    enter(e)
+                    break
+            else:
+                still.append(e)
+        if len(still) == len(waiting):
+            return
+        waiting = still
+
+
+def refuse_absorbed_drift(
+    equations: NormalEquations,
+    theta: Float,
+    model: DistortionModel,
+    priors: GaussianPriors,
+) -> None:
+    """Raise an error for frames that absorb the drift of the linear terms.
+
+    With a curved polynomial such a degeneracy is not exact, and the fit would follow its valley to
+    numbers that mean nothing.  On the linear part of the model it is exact, and shows.
+    """
+    if model.time is None or not model.n_frame:
+        return
+    flat = np.zeros_like(theta)
+    for chip in model.chips:
+        for axis in (0, 1):
+            part = model.coefficient_slice(chip.number, axis)
+            flat[part][:3] = theta[part][:3]
+    matrix, _ = equations.assemble(model, flat)
+    require_full_rank(matrix + priors.matrix(model), model, equations.groups)
+
+
+def _affine(weight: Float, right: Float) -> Float:
+    """Constant and linear coefficients (2, 3) of one group alone; NaN where undetermined."""
+    out = np.full((2, 3), np.nan)
+    for axis, pair in ((0, 0), (1, 2)):
+        W = weight[pair][:3, :3]
+        if np.linalg.matrix_rank(W, rtol=1e-10) == 3:
+            out[axis] = np.linalg.solve(W, right[axis][:3])
+    return out
+
+
+def gauss_newton(
+    equations: NormalEquations,
+    theta: Float,
+    model: DistortionModel,
+    priors: GaussianPriors,
+) -> Float:
+    """Solution of the equations, which are moved instead of passing over the data again."""
+    groups = equations.groups
+    prior = priors.matrix(model)
+    about = model.effective(theta, groups)
+    decrement = np.inf
+    for _ in range(TURNS):
+        matrix, right = equations.moved(about).assemble(model, theta)
+        matrix, pull = matrix + prior, right + priors.pull(theta)
+        try:
+            step = matrix.factor().solve(pull)
+        except np.linalg.LinAlgError:
+            require_full_rank(matrix, model, groups)
+            raise
+        theta = theta + step
+        before, about = about, model.effective(theta, groups)
+        moved = np.abs(about - before).sum(axis=2).max()
+        if moved < RELINEARISED * model.pixel_size(theta):
+            return theta
+        # outside the area of the stars rounding always moves high orders by more than that: the
+        # criterion is the step in formal errors, and without frames there is nothing but rounding
+        last, decrement = decrement, float(pull @ step)
+        if decrement >= last / 4 and (not model.n_frame or decrement < STALLED**2):
+            return theta
+    raise DegenerateError(
+        f"the exposure frames did not settle in {TURNS} iterations",
+        where="fit",
+        do="check that the exposures overlap and are not mirrored, lower model.order"
+        + ("" if model.frames == "affine" else ", or set model.frames = 'affine'"),
+    )

@@ -1,0 +1,293 @@
+"""Solutions as netCDF files, written whole or not at all, and read with one clear error.
+
+fit.nc holds a linear fit, posterior.nc a posterior, as a tree that ArviZ and xarray open: groups
+posterior, sample_stats, diagnostics; for tables in memory also observed_data, constant_data and,
+where that is not too large, log_likelihood. Values for each star of larger data are in separate
+files, in the parts of `stars/`.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import FormatError
+from bayesdist.files import atomic_path
+from bayesdist.infer.convergence import Convergence, Limits
+from bayesdist.infer.linear import Clip, LinearFit
+from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
+from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.model import DistortionModel
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["load_fit", "load_posterior", "save_fit", "save_posterior"]
+
+ENGINE: Final = "h5netcdf"
+SCHEMA = 2
+POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
+MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file
+LARGEST = 16_000_000  # bytes of log-likelihood that are stored star by star and draw by draw
+FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
+
+
+def save_posterior(
+    posterior: Posterior,
+    matches: MatchTable | None,
+    path: str | Path,
+    *,
+    provenance: Mapping[str, object] | None = None,
+) -> None:
+    """Write a posterior to a netCDF file.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    matches : MatchTable or None
+        The data it was made from; None, or more than a million stars, leaves them out.
+    path : path
+        Replaced atomically.
+    provenance : mapping, optional
+        JSON-able facts about the run, stored as an attribute.
+    """
+    import xarray as xr
+
+    c = posterior.convergence
+    n_theta = len(posterior.model.names)
+    parameter = ("parameter", list(posterior.model.names))
+    sampled = ("sampled", list(c.names))
+    groups = {
+        "posterior": xr.Dataset(
+            {
+                "theta": (("chain", "draw", "parameter"), posterior.theta),
+                **{k: (("chain", "draw"), v) for k, v in posterior.hyper.items()},
+            },
+            coords={"parameter": parameter, "unit": ("parameter", list(posterior.model.units))},
+        ),
+        "sample_stats": xr.Dataset(
+            {"lp": (("chain", "draw"), posterior.log_prob)},
+            attrs=asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
+        ),
+        "diagnostics": xr.Dataset(
+            {
+                name: ("sampled", getattr(c, name))
+                for name in ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
+            },
+            coords={"sampled": sampled},
+            attrs={
+                "pareto_k": c.pareto_k,
+                "importance_efficiency": c.importance_efficiency,
+                "converged": int(c.converged),
+                "reasons": json.dumps(c.reasons),
+                "limit_ess": c.limits.ess,
+                "limit_rhat": c.limits.rhat,
+            },
+        ),
+    }
+    if matches is not None and len(matches) <= MOST_STARS:
+        groups["observed_data"] = xr.Dataset({"u": ("star", matches.u), "v": ("star", matches.v)})
+        groups["constant_data"] = _constants(posterior, matches, xr)
+        # of one draw only where the stars' positions are unknowns too
+        few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
+        if few and not posterior.own_places:
+            values = star_log_likelihood(posterior, matches)
+            groups["log_likelihood"] = xr.Dataset({"uv": (("chain", "draw", "star"), values)})
+    tree = xr.DataTree.from_dict({f"/{name}": data for name, data in groups.items()})
+    tree.attrs = {
+        "schema": SCHEMA,
+        "creator": "bayesdist",
+        "model": json.dumps(posterior.model.to_dict()),
+        "mixture": json.dumps(asdict(posterior.mixture)),
+        "provenance": json.dumps(dict(provenance or {}), default=str),
+        "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
+        "n_parameters": n_theta,
+        "own_places": int(posterior.own_places),
+        **{name: getattr(posterior, name) for name in POSTERIOR_NUMBERS},
+    }
+    _write(tree, path)
+
+
+def _constants(posterior: Posterior, matches: MatchTable, xr):  # type: ignore[no-untyped-def]
+    columns = {
+        "x": matches.x,
+        "y": matches.y,
+        "sigma_u": matches.sigma_u,
+        "sigma_v": matches.sigma_v,
+        "exposure": np.asarray(matches.exposure),
+        "chip": matches.chip_number,
+        "outlier_probability": memberships(posterior, matches).outlier_probability,
+        "row": matches.row,
+    }
+    for name in ("epoch", "mag", "colour"):
+        if getattr(matches, name) is not None:
+            columns[name] = getattr(matches, name)
+    return xr.Dataset(
+        {name: ("star", values) for name, values in columns.items()},
+        attrs={"unit": matches.unit, "exposure_names": json.dumps(matches.exposure_names)},
+    )
+
+
+def load_posterior(path: str | Path) -> Posterior:
+    """Posterior from a file.
+
+    Parameters
+    ----------
+    path : path
+        A posterior.nc, or a run directory that holds one.
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    FormatError
+        When the file is missing or is not such a file.
+    """
+    import xarray as xr
+
+    path = Path(path)
+    if path.is_dir():
+        path = path / "posterior.nc"
+    with _reading(path, "a posterior", "sample"):
+        with xr.open_datatree(path, engine=ENGINE) as tree:
+            tree.load()
+        attrs = tree.attrs
+        draws, checks = tree["posterior"].to_dataset(), tree["diagnostics"].to_dataset()
+        stats = tree["sample_stats"].to_dataset()
+        if attrs.get("creator") != "bayesdist":
+            raise KeyError("creator")
+        mixture = json.loads(attrs["mixture"])
+        mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
+        info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
+        info["exact"] = bool(info["exact"])
+        return Posterior(
+            model=DistortionModel.from_dict(json.loads(attrs["model"])),
+            mixture=OutlierMixture(**mixture),
+            theta=draws["theta"].values,
+            hyper={k: draws[k].values for k in ("j", "f", "s_out") if k in draws},
+            log_prob=stats["lp"].values,
+            n_stars=int(attrs["n_stars"]),
+            n_flagged=int(attrs["n_flagged"]),
+            n_false=float(attrs["n_false"]),
+            reference_sigma=float(attrs["reference_sigma"]),
+            convergence=Convergence(
+                names=tuple(str(n) for n in checks["sampled"].values),
+                rhat=checks["rhat"].values,
+                ess_bulk=checks["ess_bulk"].values,
+                ess_tail=checks["ess_tail"].values,
+                mcse_mean=checks["mcse_mean"].values,
+                mcse_sd=checks["mcse_sd"].values,
+                pareto_k=float(checks.attrs["pareto_k"]),
+                importance_efficiency=float(checks.attrs["importance_efficiency"]),
+                converged=bool(checks.attrs["converged"]),
+                reasons=tuple(json.loads(checks.attrs["reasons"])),
+                limits=Limits(float(checks.attrs["limit_ess"]), float(checks.attrs["limit_rhat"])),
+            ),
+            sampler=SamplerInfo(**info),
+            certificate=_certificate(json.loads(attrs["certificate"])),
+            own_places=bool(attrs.get("own_places", False)),
+        )
+
+
+def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
+    return None if fields is None else Certificate(**fields | {"reasons": tuple(fields["reasons"])})
+
+
+def _plain(value: object) -> object:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def save_fit(fit: LinearFit, path: str | Path) -> None:
+    """Write a linear fit to a netCDF file, which is replaced atomically."""
+    import xarray as xr
+
+    names = list(fit.model.names)
+    data = xr.Dataset(
+        {
+            "mean": ("parameter", fit.mean),
+            "cov": (("parameter", "parameter_2"), fit.cov),
+            "clip": ("parameter", fit.clip.theta),
+        },
+        coords={"parameter": names, "parameter_2": names},
+        attrs={
+            "creator": "bayesdist",
+            "model": json.dumps(fit.model.to_dict()),
+            "rejected": json.dumps(fit.rejected),
+            "clip_chi2_limit": fit.clip.chi2_limit,
+            "clip_abs_limit": fit.clip.abs_limit,
+            **{name: getattr(fit, name) for name in FIT_NUMBERS},
+        },
+    )
+    _write(data, path)
+
+
+def load_fit(path: str | Path) -> LinearFit:
+    """Linear fit from a file.
+
+    Raises
+    ------
+    FormatError
+        When the file is missing or is not such a file.
+    """
+    import xarray as xr
+
+    path = Path(path)
+    with _reading(path, "a fit", "fit"):
+        with xr.open_dataset(path, engine=ENGINE) as data:
+            data.load()
+        return LinearFit(
+            model=DistortionModel.from_dict(json.loads(data.attrs["model"])),
+            mean=data["mean"].values,
+            cov=data["cov"].values,
+            clip=Clip(
+                data["clip"].values,
+                float(data.attrs["clip_chi2_limit"]),
+                float(data.attrs["clip_abs_limit"]),
+            ),
+            rejected=json.loads(data.attrs["rejected"]),
+            **{name: data.attrs[name].item() for name in FIT_NUMBERS},
+        )
+
+
+def _write(data: xr.Dataset | xr.DataTree, path: str | Path) -> None:
+    """Write a dataset or a tree, replaced atomically.
+
+    The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
+    """
+    content = data.to_netcdf(engine=ENGINE)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+@contextmanager
+def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
+    """Turn any exception while a file is read into one FormatError.
+
+    `what` names the expected content ('a posterior', 'a fit'), `stage` the stage that makes it.
+    """
+    if not path.exists():
+        raise FormatError(
+            "there is no such file", where=str(path), do=f"run 'bayesdist stage {stage} RUN' first"
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # foreign HDF5 files are reported below
+            yield
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+        raise FormatError(
+            f"this is not {what} that bayesdist wrote, or it is damaged",
+            where=str(path),
+            do=f"make it again with 'bayesdist stage {stage} RUN'",
+        ) from error

@@ -1,1 +1,0 @@
-"""Solutions as netCDF files: fit.nc and posterior.nc."""

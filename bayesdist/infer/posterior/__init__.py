@@ -1,0 +1,5 @@
+"""The posterior as a result, and what it says of each star."""
+
+from bayesdist.infer.posterior.posterior import Posterior, SamplerInfo
+
+__all__ = ["Posterior", "SamplerInfo"]

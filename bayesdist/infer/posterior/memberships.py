@@ -1,0 +1,156 @@
+"""Probabilities of stars to be false matches, averaged over posterior draws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer import kernel
+from bayesdist.infer.kernel import Constants
+from bayesdist.infer.posterior.posterior import Posterior
+from bayesdist.infer.stars.mixture import Hyper
+from bayesdist.infer.stars.shards import Shards
+from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
+
+__all__ = [
+    "Memberships",
+    "averaged_draws",
+    "count_outliers",
+    "memberships",
+    "memberships_of",
+    "sampled_points",
+    "some_draws",
+    "star_averages",
+    "star_log_likelihood",
+]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+MOST_DRAWS, LEAST_DRAWS = 64, 8
+EVALUATIONS = 200_000_000  # largest number of evaluations of a star for the average
+
+
+@dataclass(frozen=True, eq=False)
+class Memberships:
+    """Outlier probability and log-likelihood of each star.
+
+    Parameters
+    ----------
+    outlier_probability : ndarray, shape (N,)
+    log_likelihood : ndarray, shape (N,)
+        Mean over the draws.
+    log_likelihood_variance : ndarray, shape (N,)
+        Over the draws.
+    draws : int
+        Number of draws averaged.
+    """
+
+    outlier_probability: Float
+    log_likelihood: Float
+    log_likelihood_variance: Float
+    draws: int
+
+    def in_table_order(self, order: Int) -> Memberships:
+        """Values reordered from prepared stars to their table."""
+        return Memberships(
+            in_table_order(self.outlier_probability, order),
+            in_table_order(self.log_likelihood, order),
+            in_table_order(self.log_likelihood_variance, order),
+            self.draws,
+        )
+
+
+def sampled_points(posterior: Posterior) -> tuple[Float, Float]:
+    """All draws as theta (n, D) and hyperparameters (n, h) in sampled coordinates."""
+    hyper = posterior.mixture.bind(posterior.reference_sigma)
+    h = hyper.point({k: posterior.hyper[k].ravel() for k in posterior.mixture.hyper})
+    return posterior.flat, h.reshape(len(posterior.flat), len(posterior.mixture.hyper))
+
+
+def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
+    """Draws spread evenly over all: fewer for more stars, whose posterior is narrower."""
+    n = int(np.clip(EVALUATIONS // n_stars, LEAST_DRAWS, MOST_DRAWS))
+    rows = np.linspace(0, len(theta) - 1, min(n, len(theta))).astype(int)
+    return theta[rows], h[rows]
+
+
+def memberships(posterior: Posterior, matches: MatchTable) -> Memberships:
+    """Probability that each star is a false match, and its log-likelihood.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    matches : MatchTable
+        The stars that the posterior was made from, or some of them.
+
+    Returns
+    -------
+    Memberships
+        In the order of the table.
+    """
+    stars, order = prepare(posterior.model, matches)
+    return memberships_of(posterior, stars).in_table_order(order)
+
+
+def memberships_of(posterior: Posterior, stars: Stars) -> Memberships:
+    """`memberships` of stars that are prepared for the posterior's model, in their own order."""
+    theta, constants = averaged_draws(posterior)
+    p, mean, square = star_averages(stars, theta, constants)
+    return Memberships(p, mean, np.maximum(square - mean**2, 0.0), len(theta))
+
+
+def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
+    """Draws over which memberships are averaged: theta (n, D), and the mixture at each.
+
+    Only the mean where the stars' positions are unknowns: at other draws they would be different.
+    """
+    if posterior.own_places:
+        theta, h = (one.mean(axis=0, keepdims=True) for one in sampled_points(posterior))
+    else:
+        theta, h = some_draws(*sampled_points(posterior), posterior.n_stars)
+    return theta, posterior.mixture.bind(posterior.reference_sigma).constants(h)
+
+
+def star_log_likelihood(posterior: Posterior, matches: MatchTable) -> Float:
+    """Log-likelihood (chains, draws, N) of each star at every draw."""
+    stars, order = prepare(posterior.model, matches)
+    theta, h = sampled_points(posterior)
+    constants = posterior.mixture.bind(posterior.reference_sigma).constants(h)
+    out = np.empty((len(theta), len(matches)))
+    for k in range(len(theta)):
+        rows = slice(k, k + 1)
+        values = star_averages(stars, theta[rows], constants.of(rows))[1]
+        out[k] = in_table_order(values, order)
+    return out.reshape(*posterior.log_prob.shape, len(matches))
+
+
+def count_outliers(shards: Shards, hyper: Hyper, theta: Float, h: Float) -> tuple[int, float]:
+    """Number of stars that are more likely false than not, and the expected number of false ones.
+
+    `theta` (n, D) and `h` (n, n_hyper) are all draws; some of them are used.
+    """
+    theta, h = some_draws(theta, h, len(shards))
+    flagged, expected = shards.sum(_count, theta, hyper.constants(h))
+    return int(flagged), float(expected)
+
+
+def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
+    """Outlier probability, log-likelihood and its square (3, N), averaged over draws.
+
+    With a sum over the stars it makes a task for `Shards.sum`.
+    """
+    powers, order = stars.powers(theta), stars.model.order
+    if circle := stars.circle(constants):
+        return kernel.truncated_memberships(
+            stars.blocks, stars.columns, circle, powers, order, constants
+        )
+    return kernel.memberships(stars.blocks, stars.columns, powers, order, constants)
+
+
+def _count(stars: Stars, theta: Float, constants: Constants) -> Float:
+    p = star_averages(stars, theta, constants)[0]
+    return np.array([(p > 0.5).sum(), p.sum()])

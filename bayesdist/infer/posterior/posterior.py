@@ -1,0 +1,159 @@
+"""The posterior as a result: draws, their moments and convergence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.convergence import Convergence
+from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.model import DistortionModel
+
+__all__ = ["Posterior", "SamplerInfo"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SamplerInfo:
+    """Record of how the draws were made.
+
+    Parameters
+    ----------
+    method : str
+        Moves that were used.
+    ensembles, walkers, steps : int
+        Steps of each ensemble, warm-up included.
+    warmup : int
+        Steps dropped from each ensemble.
+    passes : int
+        Evaluations of the likelihood of all stars.
+    acceptance : float
+        Fraction of accepted proposals.
+    wall_s : float
+        Seconds of this session.
+    seed : int
+    exact : bool
+        False where draws are those of a surrogate.
+    """
+
+    method: str
+    ensembles: int
+    walkers: int
+    steps: int
+    warmup: int
+    passes: int
+    acceptance: float
+    wall_s: float
+    seed: int
+    exact: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Posterior draws of the distortion and of the outlier mixture.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    mixture : OutlierMixture
+    theta : ndarray, shape (chains, draws, D)
+        One chain for each independent ensemble; its draws are those of the first walker, then of
+        the second, and so on.
+    hyper : dict of str to ndarray, shape (chains, draws)
+        Sampled ones of 'f', 'j' and 's_out', in natural form.
+    log_prob : ndarray, shape (chains, draws)
+        Log posterior density, up to a constant.
+    n_stars, n_flagged : int
+        Number of all stars, and of those that are more likely false matches than not.
+    n_false : float
+        Expected number of false matches: the sum of the probabilities.
+    reference_sigma : float
+        Median quoted error, in which the priors of the mixture are scaled.
+    convergence : Convergence
+    sampler : SamplerInfo
+    certificate : Certificate, optional
+        Of the surrogate, where one was made.
+    own_places : bool
+        True if the stars' positions are unknowns of the solution, as in a self-calibration: the
+        matches then have the positions of the mean, which are those of no other draw.
+    """
+
+    model: DistortionModel
+    mixture: OutlierMixture
+    theta: Float
+    hyper: dict[str, Float]
+    log_prob: Float
+    n_stars: int
+    n_flagged: int
+    n_false: float
+    reference_sigma: float
+    convergence: Convergence
+    sampler: SamplerInfo
+    certificate: Certificate | None = None
+    own_places: bool = False
+
+    def __repr__(self) -> str:
+        c = self.convergence
+        state = "converged" if c.converged else f"NOT CONVERGED ({'; '.join(c.reasons)})"
+        return (
+            f"Posterior({self.model.summary}, {self.n_stars} stars, {self.n_flagged} of them "
+            f"flagged, {len(self.flat)} draws, {state}, R-hat {c.rhat_max:.4g}, "
+            f"ESS {c.ess_bulk_min:.4g})"
+        )
+
+    @property
+    def approximation(self) -> str:
+        """Warning for every output that the draws are not exact; empty where they are."""
+        if self.sampler.exact or self.certificate is None:
+            return ""
+        return self.certificate.statement
+
+    @cached_property
+    def flat(self) -> Float:
+        """All draws of theta, shape (chains * draws, D)."""
+        return self.theta.reshape(-1, self.theta.shape[-1])
+
+    @cached_property
+    def mean(self) -> Float:
+        """Posterior mean of theta, shape (D,)."""
+        return self.flat.mean(axis=0)
+
+    @cached_property
+    def cov(self) -> Float:
+        """Posterior covariance of theta, shape (D, D)."""
+        return np.atleast_2d(np.cov(self.flat, rowvar=False))
+
+    @property
+    def sigma(self) -> Float:
+        """Posterior standard deviation of theta, shape (D,)."""
+        return self.flat.std(axis=0, ddof=1)
+
+    @property
+    def unit(self) -> str:
+        """Unit of u and v."""
+        return self.model.unit
+
+    def interval(self, probability: float) -> Float:
+        """Central interval of every entry of theta, shape (D, 2)."""
+        tail = (1 - probability) / 2
+        return np.quantile(self.flat, [tail, 1 - tail], axis=0).T
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Random draws of theta, without replacement as long as there are enough.
+
+        Parameters
+        ----------
+        n : int
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        ndarray, shape (n, D)
+        """
+        total = len(self.flat)
+        return self.flat[rng.choice(total, size=n, replace=n > total)]

@@ -1,0 +1,14 @@
+"""ACS of HST: a simulated campaign, published lines, and what its handbook shows."""
+
+from bayesdist.mission import Mission
+
+__all__ = ["MISSION"]
+
+_COMMANDS = "bayesdist.missions.acs.commands"
+
+MISSION = Mission(
+    title="HST: what its handbooks show of a calibration.",
+    commands={"handbook": f"{_COMMANDS}:handbook", "pam": f"{_COMMANDS}:pam"},
+    simulate={"acs": f"{_COMMANDS}:simulate"},
+    report="bayesdist.missions.acs.published",
+)

@@ -1,0 +1,89 @@
+"""Commands of HST: handbook, pam, and the simulated campaign of ACS."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from bayesdist.app.commands.options import (
+    CommaList,
+    command,
+    epoch,
+    filter_name,
+    force,
+    new_folder,
+    pixel_scale,
+    seed,
+)
+
+
+@command()
+@click.argument("file", metavar="FILE")
+@filter_name
+@epoch
+@pixel_scale
+@new_folder
+@click.option(
+    "--detector",
+    metavar="WFC",
+    show_default="that of an IDCTAB of ACS",
+    help="Detector of ACS whose printed numbers stand beside.",
+)
+@click.option("--magnification", type=float, metavar="M", help="Of the vectors.")
+def handbook(file: str, output: str, **options: Any) -> None:
+    """Figures and numbers as in the ACS handbook.
+
+    FILE is an IDCTAB, a run, or whatever 'compare' takes.
+    """
+    from bayesdist.missions.acs.handbook.command import handbook as written
+
+    click.echo(written(file, output, **options))
+
+
+@command()
+@click.argument("file", metavar="FILE")
+@filter_name
+@epoch
+@pixel_scale
+@click.option("-o", "--output", required=True, metavar="OUT.fits")
+@click.option(
+    "--chip", type=int, metavar="N", show_default="all", help="The one in the primary HDU."
+)
+@click.option("--image", metavar="FLT", help="A calibrated image that the maps are to fit.")
+@force
+def pam(file: str, output: str, **options: Any) -> None:
+    """Pixel area maps, with their errors.
+
+    FILE is an IDCTAB, a run, or whatever 'compare' takes.
+    """
+    from bayesdist.missions.acs.pam import write_area_maps
+
+    click.echo(write_area_maps(file, output, **options))
+
+
+@command(name="acs")
+@new_folder
+@seed
+@force
+@click.option("--exposures", type=int, default=110, metavar="N", help="In F606W.")
+@click.option("--stars", type=int, default=53_900, metavar="N", help="Of the catalogue.")
+@click.option(
+    "--filters", type=CommaList(), default="F606W", metavar="F606W,F814W", help="One or several."
+)
+@click.option(
+    "--secondary-exposures",
+    type=int,
+    default=15,
+    metavar="N",
+    help="Exposures of each further filter.",
+)
+@click.option("--false", type=float, default=0.05, help="Fraction of detections that are none.")
+@click.option("--outlying", type=float, default=0.0, help="Fraction of outlying exposures.")
+@click.option("--cte", is_flag=True, help="Trailed charge moves the stars.")
+@click.option("--no-tables", is_flag=True, help="A distortion without look-up tables.")
+def simulate(output: str, **options: Any) -> None:
+    """Star lists, catalogue and log of the 47 Tuc campaign."""
+    from bayesdist.missions.acs.simulated_campaign import simulate_campaign
+
+    click.echo(simulate_campaign(output, **options))

@@ -1,0 +1,126 @@
+"""`bayesdist hst handbook`: what section 4.1 of the ACS handbook shows, of any calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from astropy.table import Table
+
+from bayesdist.app.calibrations import calibration_at
+from bayesdist.app.folder import whole_folder
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.screen import table_text
+from bayesdist.app.session import write_table
+from bayesdist.app.sessions import session_of
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.errors import InputError
+from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
+
+if TYPE_CHECKING:
+    from bayesdist.assess import BinnedResiduals
+
+__all__ = ["handbook"]
+
+
+def handbook(
+    path: str | Path,
+    output: str | Path,
+    *,
+    filter: str | None = None,
+    epoch: float | None = None,
+    scale: float | None = None,
+    detector: str | None = None,
+    magnification: float | None = None,
+) -> str:
+    """Write the figures and the numbers of a calibration.
+
+    Parameters
+    ----------
+    path : path
+        As of `calibration_at`.
+    output : path
+        New or empty folder.
+    filter, scale
+        As of `calibration_at`.
+    epoch : float, optional
+        Decimal years, for what depends on time.
+    detector : str, optional
+        WFC, HRC or SBC, whose printed numbers stand beside; that of an IDCTAB of ACS by default.
+    magnification : float, optional
+        Of the vectors.
+
+    Returns
+    -------
+    str
+        The numbers.
+
+    Raises
+    ------
+    InputError
+        For what cannot be read or written.
+    """
+    # figures take seconds to import
+    from bayesdist.missions.acs.handbook.figures import (
+        area_figure,
+        non_linear_figure,
+        residual_figure,
+    )
+    from bayesdist.missions.acs.handbook.published import handbook_rows
+    from bayesdist.products.detectors import acs_detector
+    from bayesdist.report.drawing import save_figures
+
+    if detector is not None:
+        detector = acs_detector(detector).name
+    if magnification is not None and not magnification > 0:
+        raise InputError(
+            f"the magnification is {magnification}",
+            where="--magnification",
+            do="give a positive number",
+        )
+    found = calibration_at(path, filter=filter, scale=scale)
+    pixel, _ = found.pixel(epoch)
+    if detector is None and found.instrument == "ACS":
+        detector = found.detector
+    whole = WholeDetector(found.in_frame(epoch), pixel)
+    title = _title(found, filter, epoch)
+    with whole_folder(Path(output)) as folder:
+        figures = {
+            "non_linear": non_linear_figure(whole, title, magnification=magnification),
+            "pixel_area": area_figure(whole, title),
+        }
+        binned, missing = _residuals(Path(path))
+        if binned:
+            figures["residuals"] = residual_figure(whole, binned, found.unit, title)
+        rows = handbook_rows(
+            detector_numbers(whole), scale=pixel, unit=found.unit, detector=detector or ""
+        )
+        save_figures(figures, folder)
+        write_table(Table(rows), folder / "numbers.ecsv")
+    shown = [row | {"published": row["published"] or "-"} for row in rows]
+    return f"{output}: {', '.join(figures)}{missing}\n{table_text(shown, 5)}"
+
+
+def _title(found: Calibration, filter: str | None, epoch: float | None) -> str:
+    parts = [Path(found.name).resolve().name, filter or "", f"at {epoch:g}" if epoch else ""]
+    whose = "/".join(p for p in (found.instrument, found.detector) if p)
+    return ", ".join(p for p in (whose, *parts) if p)
+
+
+def _residuals(path: Path) -> tuple[Mapping[int, BinnedResiduals], str]:
+    """Mean residuals in cells, by chip; or none, and what to say of that."""
+    home = path if path.is_dir() else path.parent
+    if path.is_file() and path.suffix != ".nc":  # products may be in other units
+        return {}, "; no residuals, which only runs have"
+    if not (home / "run.json").exists():
+        return {}, "; no residuals, which only runs have"
+    try:
+        with closing(session_of(RunDirectory.open(home))) as session:
+            chips = session.fit.model.chips
+            sums = zip(chips, session.shown_sums, strict=True)
+            return {chip.number: one.residuals() for chip, one in sums}, ""
+    except InputError as error:  # matches that were moved away: all else can be shown without them
+        return {}, f"; no residuals: {error}"

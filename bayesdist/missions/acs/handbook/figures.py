@@ -1,0 +1,142 @@
+"""Diagrams of a whole detector, its chips as one array: as Figures 4.1 to 4.5 of the ACS handbook.
+
+They are oriented as in pipelines, x to the right and y up; two of the handbook's are rotated by 180
+degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
+from bayesdist.report.arrows import Arrows, magnification_of, vector_map
+from bayesdist.report.fields import Grid, contour_levels, scalar_map
+from bayesdist.report.numbers import size_of
+from bayesdist.report.panels import OneArray
+from bayesdist.report.style import PALETTE, nice_below
+
+if TYPE_CHECKING:
+    from bayesdist.assess import BinnedResiduals
+
+__all__ = [
+    "area_figure",
+    "non_linear_figure",
+    "residual_figure",
+]
+
+Float = NDArray[np.float64]
+
+# vectors, and points of contours, along the longer side of a chip
+_VECTORS, _POINTS = 21, 65
+
+
+def non_linear_figure(
+    detector: WholeDetector, title: str = "", *, magnification: float | None = None
+) -> Figure:
+    """Figure of the residuals from the best linear map of the detector, as vectors in its pixels.
+
+    `magnification` is the length of the vectors over the axes' pixels, by default a round number.
+    """
+    found, sizes, chips = detector_numbers(detector), _sizes(detector), []
+    for n, size in sizes.items():
+        x, y = _grid(size, _VECTORS)
+        f = detector.non_linear(n, x, y)
+        along = f.along_x.ravel(), f.along_y.ravel()
+        gx, gy = (a.ravel() for a in np.meshgrid(x, y))
+        chips.append(Arrows(gx, gy, *along, float(x[1] - x[0])))
+    step = min(one.step for one in chips)
+    longest = max(float(one.length.max()) for one in chips)
+    M = magnification or (nice_below(2.5 * step / longest) if longest > 1e-9 * step else 1.0)
+    panels = OneArray(sizes, detector.places, margin=M * longest + 0.01 * step)
+    place = found.non_linear_at
+    at = f"({place[0]:.0f}, {place[1]:.0f})"
+    text = f"largest {found.non_linear_max:.3g}\u202foutput pix at {at}"
+    text = text.replace("-", "−")
+    vector_map(
+        panels,
+        chips,
+        [f"{title}\n{text}" if title else text],
+        magnification=M,
+        key=nice_below(longest / 1.5),
+        pad=11,
+    )
+    ring: dict[str, Any] = {
+        "ms": 6,
+        "mfc": "none",
+        "mec": PALETTE["vermilion"],
+        "mew": 1.3,
+        "zorder": 5,
+    }
+    panels.all_axes[0].plot(*place, "o", **ring)
+    return panels.figure
+
+
+def area_figure(detector: WholeDetector, title: str = "") -> Figure:
+    """Figure of the pixel area over that at the centre of the detector, as contours."""
+    sizes = _sizes(detector)
+    grids = []
+    for n, size in sizes.items():
+        x, y = _grid(size, _POINTS)
+        grids.append(Grid(x, y, detector.relative_area(n, x, y)))
+    every = np.concatenate([g.values.ravel() for g in grids])
+    panels = OneArray(sizes, detector.places, colorbar=True)
+    text = f"pixel area {every.min():.3f} to {every.max():.3f} of that at the centre"
+    scalar_map(
+        panels,
+        grids,
+        [f"{title}\n{text}" if title else text],
+        levels=contour_levels(every, 12),
+        label="pixel area / area at the centre",
+        labelled=True,
+    )
+    return panels.figure
+
+
+def residual_figure(
+    detector: WholeDetector,
+    binned: Mapping[int, BinnedResiduals],
+    unit: str,
+    title: str = "",
+) -> Figure:
+    """Figure of the mean residuals of a fit in cells of the detector, as vectors.
+
+    `binned` is by chip number, along the axes of (u, v).  Cells whose mean is within two of its
+    standard errors from zero are light.
+    """
+    chips = [Arrows.of_cells(b) for b in binned.values()]
+    length = np.concatenate([one.length for one in chips])
+    typical = float(np.quantile(length, 0.95)) if length.size else 0.0
+    step = min(float(b.x[1] - b.x[0]) for b in binned.values())
+    sizes = {n: _sizes(detector)[n] for n in binned}
+    panels = OneArray(sizes, detector.places, margin=0.6 * step)
+    lines = [
+        title,
+        "dark: beyond 2 sigma",
+        f"95 % of cells below {size_of(typical, unit)}",
+    ]
+    vector_map(
+        panels,
+        chips,
+        ["\n".join(line for line in lines if line)],
+        magnification=magnification_of(1.1 * step, typical),
+        key=nice_below(typical),
+        unit=unit,
+        pad=11,
+    )
+    return panels.figure
+
+
+def _sizes(detector: WholeDetector) -> dict[int, tuple[float, float]]:
+    return {n: c.basis.size for n, c in detector.chips.items()}
+
+
+def _grid(size: tuple[float, float], longest: int) -> tuple[Float, Float]:
+    """Columns and rows about as far apart on both axes, corners included."""
+    nx, ny = (max(3, round((longest - 1) * n / max(size)) + 1) for n in size)
+    return np.linspace(1.0, size[0], nx), np.linspace(1.0, size[1], ny)

@@ -1,0 +1,102 @@
+"""Numbers of a whole detector: scales, angle of the axes, areas, the largest displacement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
+from bayesdist.model.grid import mesh
+
+__all__ = ["DetectorNumbers", "detector_numbers"]
+
+# Points on each axis of a chip where extremes are looked for: they lie at edges and in corners.
+_GRID = 129
+
+
+@dataclass(frozen=True)
+class DetectorNumbers:
+    """What section 4.1 of the ACS handbook tells of a detector.
+
+    Parameters
+    ----------
+    non_linear_max : float
+        Largest non-linear displacement, output pixels.
+    non_linear_at : tuple of float
+        Where, pixels of the detector as one array.
+    scale_x, scale_y : float
+        Size of a pixel along the detector's axes at its centre.
+    mean_scale_x, mean_scale_y : float
+        The same, mean over all pixels.
+    scale_range : float
+        Largest size of a pixel (root of its area) over the smallest, less 1.
+    angle : float
+        Between the detector's axes at its centre, degrees.
+    elongation : float
+        Largest over smallest size of a pixel in any direction at the centre, less 1.
+    area_min, area_max : float
+        Pixel area over that at the centre.
+    size : tuple of float
+        Length of the array along its axes, gaps included: mean scales times pixels.
+    """
+
+    non_linear_max: float
+    non_linear_at: tuple[float, float]
+    scale_x: float
+    scale_y: float
+    mean_scale_x: float
+    mean_scale_y: float
+    scale_range: float
+    angle: float
+    elongation: float
+    area_min: float
+    area_max: float
+    size: tuple[float, float]
+
+
+def detector_numbers(detector: WholeDetector) -> DetectorNumbers:
+    """What section 4.1 of the ACS handbook tells, of any detector.
+
+    Parameters
+    ----------
+    detector : WholeDetector
+
+    Returns
+    -------
+    DetectorNumbers
+    """
+    best, where = -1.0, (0.0, 0.0)
+    low, high = np.inf, 0.0
+    scales, pixels = np.zeros(2), 0.0
+    for n, c in detector.chips.items():
+        x, y = (np.linspace(1.0, size, _GRID) for size in c.basis.size)
+        field = detector.non_linear(n, x, y)
+        iy, ix = np.unravel_index(int(field.length.argmax()), field.length.shape)
+        if field.length[iy, ix] > best:
+            best, where = float(field.length[iy, ix]), (float(field.x[ix]), float(field.y[iy]))
+        area = detector.relative_area(n, x, y)
+        low, high = min(low, float(area.min())), max(high, float(area.max()))
+        slopes = c.slope(*mesh(x, y))
+        weight = c.basis.size[0] * c.basis.size[1]
+        scales += weight * np.hypot(slopes[:, 0], slopes[:, 1]).mean(axis=0)
+        pixels += weight
+    L = detector.central_slope
+    axes = L[0] + 1j * L[1]
+    stretch = np.linalg.svd(L, compute_uv=False)
+    mean = scales / pixels
+    extent = detector.bounds[1] - detector.bounds[0]
+    return DetectorNumbers(
+        non_linear_max=best,
+        non_linear_at=where,
+        scale_x=float(abs(axes[0])),
+        scale_y=float(abs(axes[1])),
+        mean_scale_x=float(mean[0]),
+        mean_scale_y=float(mean[1]),
+        scale_range=float(np.sqrt(high / low) - 1.0),
+        angle=float(abs(np.degrees(np.angle(axes[1] / axes[0])))),
+        elongation=float(stretch[0] / stretch[1] - 1.0),
+        area_min=low,
+        area_max=high,
+        size=(float(mean[0] * extent[0]), float(mean[1] * extent[1])),
+    )

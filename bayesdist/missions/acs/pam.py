@@ -1,0 +1,105 @@
+"""`bayesdist hst pam`: pixel area maps of a calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.app.calibrations import calibration_at, images_of, notes_of
+from bayesdist.app.output import refuse_existing
+from bayesdist.app.screen import number
+from bayesdist.calibration.area import PixelAreaMap, pixel_area_map
+from bayesdist.calibration.subarray import FULL
+from bayesdist.errors import InputError
+from bayesdist.products.pam_file import write_pam
+
+__all__ = ["write_area_maps"]
+
+
+def write_area_maps(
+    path: str | Path,
+    output: str | Path,
+    *,
+    chip: int | None = None,
+    filter: str | None = None,
+    epoch: float | None = None,
+    scale: float | None = None,
+    image: str | Path | None = None,
+    force: bool = False,
+) -> str:
+    """Write the pixel area maps of a calibration.
+
+    Parameters
+    ----------
+    path : path
+        As of `calibration_at`.
+    output : path
+        A FITS file.
+    chip : int, optional
+        All by default.
+    filter, scale
+        As of `calibration_at`.
+    epoch : float, optional
+        Decimal years, for what depends on time.
+    image : path, optional
+        A calibrated image: maps are of its chips, in its order, and of its subarrays.
+    force : bool
+        Replace a file that is there.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For what cannot be read or written.
+    """
+    output = Path(output)
+    if output.suffix.lower() != ".fits":
+        raise InputError(
+            f"extension {output.suffix!r} is not that of a FITS file",
+            where=str(output),
+            do="choose a name that ends in .fits",
+        )
+    refuse_existing(output, force)
+    found = calibration_at(path, filter=filter, scale=scale)
+    chips, (pixel, source) = found.in_frame(epoch), found.pixel(epoch)
+    images = images_of(found, image=image)
+    numbers = list(images or chips)
+    if chip is not None:
+        if chip not in numbers:
+            raise InputError(
+                f"there is no chip {chip}",
+                where=found.name,
+                do=f"choose one of {', '.join(map(str, numbers))}",
+            )
+        numbers = [chip]
+    maps = [pixel_area_map(chips[n], pixel, image=images.get(n, FULL)) for n in numbers]
+    write_pam(
+        output,
+        maps,
+        instrument=found.instrument,
+        detector=found.detector,
+        source=found.name,
+    )
+    notes = "".join(f"; {note}" for note in notes_of(found, epoch))
+    unit = "pix of u, v" if found.unit == "pix" else found.unit
+    head = (
+        f"{output}: pixel area over that of {number(pixel, 6)} {unit} squared "
+        f"({source}), by {found.name}{notes}"
+    )
+    return "\n".join([head, *(_line(one) for one in maps)])
+
+
+def _line(one: PixelAreaMap) -> str:
+    low, high = float(one.area.min()), float(one.area.max())
+    text = (
+        f"  chip {one.chip}: {low:.5f} to {high:.5f}, "
+        f"{-2.5 * np.log10(low):+.4f} to {-2.5 * np.log10(high):+.4f} mag"
+    )
+    if one.sigma_magnitude is None:
+        return text
+    return f"{text}, known to {number(1e3 * float(one.sigma_magnitude.max()), 3)} mmag at worst"

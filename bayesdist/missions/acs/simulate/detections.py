@@ -1,0 +1,139 @@
+"""Detections of one exposure: stars with their errors, blends, and false detections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.starlists import StarList
+from bayesdist.missions.acs.simulate.stars import FAINT, centroid_error
+from bayesdist.missions.acs.simulate.truth import AcsTruth, DetectionTruth
+from bayesdist.model import Chip
+
+__all__ = ["Detector", "cte_shift", "star_list"]
+
+Float = NDArray[np.float64]
+
+BORDER = 5.0  # pixels: too close to an edge for a fit
+LIMIT, SOFT = -7.5, 0.3  # magnitude at which half of the stars are found, and width of the decline
+SATURATED = -14.0  # Figure 5
+
+LAUNCH = 2002.2
+CTE = 0.1  # pixels after 12 years and 2048 transfers at magnitude -9 (Section 3)
+REACH = 2.0  # pixels within which a neighbour is blended
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Errors of the detections of an exposure."""
+
+    centroid: float = 1.0  # factor on the centroid errors; 0 gives exact positions
+    false: float = 0.05  # fraction of a list that is no star: cosmic rays and junk
+    blended: float = 0.01  # fraction of the stars that a close neighbour displaces
+    cte: bool = False  # True where trailed charge displaces the positions
+
+
+def cte_shift(chip: int, y: Float, mag: Float, epoch: float) -> Float:
+    """Shift along y (N,), pixels, by charge that is left behind during the readout.
+
+    ACS ISR 2015-06, Section 3: about 0.1 px, growing with time, with the number of transfers and to
+    the faint end.  WFC1 is read out at its upper edge and WFC2 at its lower one; the trail points
+    away from it.
+    """
+    transfers = (2048.5 - y if chip == 1 else y - 0.5) / 2048.0
+    size = CTE * max(epoch - LAUNCH, 0.0) / 12.0 * transfers * 10 ** (0.15 * (mag + 9.0))
+    return -size if chip == 1 else size
+
+
+def star_list(
+    truth: AcsTruth, exposure: str, detector: Detector, rng: np.random.Generator
+) -> tuple[StarList, DetectionTruth]:
+    """Simulated detections of an exposure, in no order, and their truth."""
+    e = truth.frames.names.index(exposure)
+    epoch = truth.log[exposure].epoch
+    u, v = truth.stars.at(epoch)
+    parts = []
+    for chip in truth.model.chips:
+        x, y = truth.to_pixels(exposure, u, v, chip.number)
+        seen = np.flatnonzero(_inside(x, y, chip))
+        mag = truth.stars.mag[seen]
+        found = rng.uniform(size=len(seen)) < 1.0 / (1.0 + np.exp((mag - LIMIT) / SOFT))
+        stars, mag = seen[found], mag[found]
+        part = _measured(chip, x[stars], y[stars], mag, epoch, detector, rng)
+        part["star"] = stars
+        parts += [part, _junk(chip, len(stars), detector.false, rng)]
+    columns: dict[str, Any] = {
+        key: np.concatenate([part[key] for part in parts]) for key in parts[0]
+    }
+    columns["mag"] += truth.frames.zero_point[e]
+    order = rng.permutation(len(columns["x"]))
+    columns = {key: values[order] for key, values in columns.items()}
+    star, blended = columns.pop("star"), columns.pop("blended")
+    return StarList(exposure=exposure, **columns), DetectionTruth(star, blended)
+
+
+def _inside(x: Float, y: Float, chip: Chip) -> NDArray[np.bool_]:
+    nx, ny = chip.size
+    out: NDArray[np.bool_] = (
+        (x >= BORDER) & (x <= nx + 1 - BORDER) & (y >= BORDER) & (y <= ny + 1 - BORDER)
+    )
+    return out  # NaN is not inside
+
+
+def _measured(
+    chip: Chip,
+    x: Float,
+    y: Float,
+    mag: Float,
+    epoch: float,
+    detector: Detector,
+    rng: np.random.Generator,
+) -> dict[str, NDArray[Any]]:
+    """Columns of the stars of a chip, found at true pixels."""
+    n = len(x)
+    error = centroid_error(mag)
+    if detector.cte:
+        y = y + cte_shift(chip.number, y, mag, epoch)
+    moved = detector.centroid * error * rng.standard_normal((2, n))
+
+    # a neighbour draws the centroid by its fraction of the light
+    blended = rng.uniform(size=n) < detector.blended
+    distance = REACH * np.sqrt(rng.uniform(size=n))
+    angle = rng.uniform(0.0, 2.0 * np.pi, n)
+    ratio = 10 ** rng.uniform(-2.0, -0.3, n)
+    pull = np.where(blended, distance * ratio / (1.0 + ratio), 0.0)
+
+    quality = error * np.exp(0.25 * rng.standard_normal(n))
+    saturated = mag < SATURATED
+    quality = np.where(saturated, 0.3 * np.exp(0.5 * rng.standard_normal(n)), quality)
+    quality = np.where(blended, quality + 0.3 * pull, quality)
+    seen = mag + np.hypot(0.02, error) * rng.standard_normal(n)
+    seen -= np.where(blended, 2.5 * np.log10(1.0 + ratio), 0.0)
+    return {
+        "x": x + moved[0] + pull * np.cos(angle),
+        "y": y + moved[1] + pull * np.sin(angle),
+        "chip": np.full(n, chip.number, np.int64),
+        "mag": seen,
+        "q": quality,
+        "blended": blended,
+    }
+
+
+def _junk(
+    chip: Chip, stars: int, share: float, rng: np.random.Generator
+) -> dict[str, NDArray[Any]]:
+    """Columns of detections that are no stars: mostly faint, and mostly of a bad fit."""
+    n = int(rng.poisson(stars * share / (1.0 - share)))
+    nx, ny = chip.size
+    return {
+        "x": rng.uniform(BORDER, nx + 1 - BORDER, n),
+        "y": rng.uniform(BORDER, ny + 1 - BORDER, n),
+        "chip": np.full(n, chip.number, np.int64),
+        "mag": FAINT - rng.exponential(1.5, n),
+        "q": 0.25 * np.exp(0.8 * rng.standard_normal(n)),
+        "blended": np.zeros(n, bool),
+        "star": np.full(n, -1, np.int64),
+    }

@@ -1,0 +1,149 @@
+"""Field west of 47 Tucanae: its true stars, and their standard catalogue.
+
+ACS ISR 2015-06, Section 2: 53917 stars, tangent plane in ACS/WFC pixels, (5000, 5000) at the centre
+of the field 6.7' west of the cluster, epoch 2004.5. u grows to the west and v to the north.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bayesdist.data import ReferenceCatalog
+
+__all__ = [
+    "BRIGHT",
+    "CATALOG_EPOCH",
+    "CENTRE",
+    "FAINT",
+    "TrueStars",
+    "centroid_error",
+    "measured_catalogs",
+    "true_stars",
+]
+
+Float = NDArray[np.float64]
+
+HALF_SIZE = 4500.0  # pixels from the centre to each side
+CENTRE = (5000.0, 5000.0)
+CLUSTER = (CENTRE[0] - 6.7 * 60 / 0.05, CENTRE[1])  # its centre lies to the east
+SLOPE = -1.5  # of the surface density; crowding makes the list shallower than the light
+CLOSEST = 4.0  # pixels: of two stars that are closer neither is well measured
+
+BRIGHT, FAINT = -15.0, -7.0
+COUNTS = 0.15  # stars rise as 10^(0.15 m)
+
+CATALOG_EPOCH = 2004.5
+DISPERSION = 0.01  # px/yr on each axis, Section 2.2
+EARLY, LATE = 2004.7, 2011.9  # mean epochs of the two halves
+EPOCH_SPREAD = 0.3
+POOR = 0.08  # 4270 of 53917 lie above the line of Figure 3
+
+
+@dataclass(frozen=True, eq=False)
+class TrueStars:
+    """True positions, motions and magnitudes of the stars (N,)."""
+
+    u: Float  # at 2004.5, pixels of the catalogue
+    v: Float
+    pm_u: Float  # pixels per year
+    pm_v: Float
+    mag: Float  # instrumental, -2.5 log10(flux / exposure time)
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def at(self, epoch: float | Float) -> tuple[Float, Float]:
+        """Positions at an epoch in decimal years, one for all or one for each star."""
+        dt = epoch - CATALOG_EPOCH
+        return self.u + self.pm_u * dt, self.v + self.pm_v * dt
+
+
+def centroid_error(mag: Float) -> Float:
+    """Error of a measured position on each axis, pixels, at instrumental magnitudes.
+
+    0.01 px at -14 and 0.02 px at -10 (Section 2.2 and Figure 3), from there with the noise of the
+    photons and then of the sky; above saturation at -14 growing with the excess.
+    """
+    flux = 10 ** (-0.4 * (np.asarray(mag, float) + 10.0))
+    noise = 0.015**2 / flux * (1.0 + 0.3 / flux)
+    saturated = 0.1 * np.maximum(-14.0 - mag, 0.0)
+    out: Float = np.sqrt(0.01**2 + noise + saturated**2)
+    return out
+
+
+def true_stars(n: int, rng: np.random.Generator) -> TrueStars:
+    """True stars of the field, denser towards the cluster in the east."""
+    u, v = np.zeros(0), np.zeros(0)
+    nearest = CENTRE[0] - HALF_SIZE - CLUSTER[0]  # of the edge of the field to the cluster
+    while len(u) < n:
+        offsets = rng.uniform(-HALF_SIZE, HALF_SIZE, (2, 4 * n))
+        new_u, new_v = CENTRE[0] + offsets[0], CENTRE[1] + offsets[1]
+        density = (np.hypot(new_u - CLUSTER[0], new_v - CLUSTER[1]) / nearest) ** SLOPE
+        kept = rng.uniform(size=4 * n) < density
+        u, v = np.append(u, new_u[kept]), np.append(v, new_v[kept])
+        pairs = cKDTree(np.column_stack([u, v])).query_pairs(CLOSEST, output_type="ndarray")
+        single = np.ones(len(u), bool)
+        single[pairs.ravel()] = False
+        u, v = u[single], v[single]
+    p = rng.uniform(size=n)
+    low, high = 10 ** (COUNTS * BRIGHT), 10 ** (COUNTS * FAINT)
+    mag = np.log10(low + p * (high - low)) / COUNTS
+    pm_u, pm_v = DISPERSION * rng.standard_normal((2, n))
+    return TrueStars(u[:n].copy(), v[:n].copy(), pm_u, pm_v, mag)
+
+
+def measured_catalogs(
+    stars: TrueStars, rng: np.random.Generator
+) -> tuple[ReferenceCatalog, ReferenceCatalog, ReferenceCatalog]:
+    """Standard catalogue (2004.5, with motions), and mean positions before and after SM4.
+
+    Errors are normal, of the quoted size, and independent: of the stars, of the axes, of positions
+    and motions, and of the three catalogues.  Motions are as good as a difference of two mean
+    positions; of one star in twelve they are poor.  The mean positions are without motions, each
+    star at the mean epoch of its observations.
+    """
+    n = len(stars)
+    mag = stars.mag + 0.01 * rng.standard_normal(n)
+    single = centroid_error(stars.mag)
+    # poorly measured stars were seen in few exposures
+    worse = np.where(rng.uniform(size=n) < POOR, rng.uniform(4.0, 12.0, n), 1.0)
+    often = np.exp(0.15 * rng.standard_normal(n))  # the number of exposures differs a little, too
+    sigma = 0.5 * single * often
+    sigma_mean = 0.35 * single * often * worse
+
+    def mean_positions(epoch: float, name: str) -> ReferenceCatalog:
+        dates = epoch + EPOCH_SPREAD * rng.standard_normal(n)
+        u, v = stars.at(dates)
+        return ReferenceCatalog(
+            u=u + sigma_mean * rng.standard_normal(n),
+            v=v + sigma_mean * rng.standard_normal(n),
+            sigma_u=sigma_mean,
+            sigma_v=sigma_mean,
+            mag=mag,
+            epoch=dates,
+            source=name,
+        )
+
+    sigma_pm = np.sqrt(2.0) * sigma_mean / (LATE - EARLY)
+    catalog = ReferenceCatalog(
+        u=stars.u + sigma * rng.standard_normal(n),
+        v=stars.v + sigma * rng.standard_normal(n),
+        sigma_u=sigma,
+        sigma_v=sigma,
+        mag=mag,
+        pm_u=stars.pm_u + sigma_pm * rng.standard_normal(n),
+        pm_v=stars.pm_v + sigma_pm * rng.standard_normal(n),
+        sigma_pm_u=sigma_pm,
+        sigma_pm_v=sigma_pm,
+        epoch=CATALOG_EPOCH,
+        source="catalog",
+    )
+    return (
+        catalog,
+        mean_positions(EARLY, "catalog_early"),
+        mean_positions(LATE, "catalog_late"),
+    )

@@ -1,0 +1,152 @@
+"""Truth of a campaign as files, written and read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.data.exposures import ExposureLog
+from bayesdist.data.tables.files import naming_faults, read_table
+from bayesdist.data.write import write_columns
+from bayesdist.files import atomic_path
+from bayesdist.missions.acs.simulate.pointings import AcsFrames
+from bayesdist.missions.acs.simulate.stars import TrueStars
+from bayesdist.missions.acs.simulate.truth import LINEAR_TERMS, AcsTruth, DetectionTruth
+from bayesdist.model import DistortionModel
+from bayesdist.model.lookup import LookupTable
+
+__all__ = ["read_truth", "write_truth"]
+
+STAR_UNITS = {"u": "pix", "v": "pix", "pm_u": "pix / yr", "pm_v": "pix / yr"}
+MATRIX = ("uu", "uv", "vu", "vv")
+
+
+def write_truth(truth: AcsTruth, folder: Path) -> None:
+    """Write theta.ecsv, exposures.ecsv, stars, tables and detections .parquet to a folder."""
+    theta = Table({"name": list(truth.model.names), "unit": list(truth.model.units)})
+    for filter, values in truth.theta.items():
+        theta[filter] = values
+    theta.meta = {"model": truth.model.to_dict(), "settings": dict(truth.settings)}
+    for table, name in ((theta, "theta.ecsv"), (_frames_table(truth), "exposures.ecsv")):
+        with atomic_path(folder / name) as temporary:
+            table.write(temporary, format="ascii.ecsv")
+    stars = {key: getattr(truth.stars, key) for key in ("u", "v", "pm_u", "pm_v", "mag")}
+    write_columns(folder / "stars.parquet", stars, STAR_UNITS)
+    if truth.tables:
+        _write_tables(truth, folder / "tables.parquet")
+    sizes = [len(one.star) for one in truth.detections]
+    write_columns(
+        folder / "detections.parquet",
+        {
+            "exposure": (np.repeat(np.arange(len(sizes)), sizes), truth.frames.names),
+            "star": np.concatenate([one.star for one in truth.detections]),
+            "blended": np.concatenate([one.blended for one in truth.detections]),
+        },
+        {},
+    )
+
+
+def read_truth(folder: Path, log: ExposureLog) -> AcsTruth:
+    """Truth that `write_truth` wrote for the campaign of a log.
+
+    InputError for files that are missing or damaged.
+    """
+    folder = Path(folder)
+    theta = read_table(folder / "theta.ecsv")
+    frames = read_table(folder / "exposures.ecsv")
+    stars = read_table(folder / "stars.parquet")
+    found = read_table(folder / "detections.parquet")
+    with naming_faults(folder):
+        model = DistortionModel.from_dict(theta.meta["model"])
+        settings = dict(theta.meta["settings"])
+        names = tuple(str(name) for name in frames["exposure"])
+        exposure = np.asarray(found["exposure"]).astype(str)
+        rows = [exposure == name for name in names]
+        return AcsTruth(
+            model=model,
+            theta={f: np.array(theta[f]) for f in theta.colnames if f not in ("name", "unit")},
+            tables=_read_tables(folder / "tables.parquet") if settings["fine_scale"] else (),
+            stars=TrueStars(**{key: np.array(stars[key]) for key in stars.colnames}),
+            log=log,
+            frames=AcsFrames(
+                names=names,
+                centre=np.column_stack([frames["u"], frames["v"]]),
+                angle=np.radians(frames["angle"]),
+                vafactor=np.array(frames["vafactor"]),
+                shared=_matrices(frames, "shared"),
+                own=_matrices(frames, "own"),
+                outlying=np.array(frames["outlying"], bool),
+                zero_point=np.array(frames["zero_point"]),
+            ),
+            detections=tuple(
+                DetectionTruth(np.array(found["star"][r]), np.array(found["blended"][r], bool))
+                for r in rows
+            ),
+            settings=settings,
+        )
+
+
+def _frames_table(truth: AcsTruth) -> Table:
+    """Table of the exposures: frame, deviations, and the linear terms that follow from them."""
+    frames = truth.frames
+    out = Table({"exposure": list(frames.names)})
+    out["epoch"] = truth.log.values("epoch")
+    out["u"], out["v"] = frames.centre.T
+    out["angle"] = np.degrees(frames.angle)
+    out["vafactor"] = frames.vafactor
+    out["zero_point"] = frames.zero_point
+    out["outlying"] = frames.outlying
+    for name in ("shared", "own"):
+        for key, values in zip(MATRIX, getattr(frames, name).reshape(-1, 4).T, strict=True):
+            out[f"{name}_{key}"] = values
+    for chip in truth.model.chips:
+        terms = np.array([truth.linear_terms(name, chip.number) for name in frames.names])
+        for key, values in zip(LINEAR_TERMS, terms.T, strict=True):
+            out[f"{key}_{chip.name}"] = values
+    for key, unit in (("epoch", "yr"), ("u", "pix"), ("v", "pix"), ("angle", "deg")):
+        out[key].unit = unit
+    return out
+
+
+def _matrices(table: Table, name: str) -> np.ndarray:
+    return np.column_stack([table[f"{name}_{key}"] for key in MATRIX]).reshape(-1, 2, 2)
+
+
+def _write_tables(truth: AcsTruth, path: Path) -> None:
+    """Write the look-up tables, one row for each node."""
+    rows: dict[str, list[Any]] = {key: [] for key in ("chip", "filter", "x", "y", "dx", "dy")}
+    labels = tuple(dict.fromkeys(table.filter for table in truth.tables))
+    for table in truth.tables:
+        x, y = (grid.ravel() for grid in np.meshgrid(*table.nodes()))
+        rows["chip"].append(np.full(x.size, table.chip))
+        rows["filter"].append(np.full(x.size, labels.index(table.filter)))
+        rows["x"].append(x)
+        rows["y"].append(y)
+        rows["dx"].append(table.values[0].ravel())
+        rows["dy"].append(table.values[1].ravel())
+    columns: dict[str, Any] = {key: np.concatenate(parts) for key, parts in rows.items()}
+    columns["filter"] = (columns["filter"], labels)
+    write_columns(path, columns, dict.fromkeys(("x", "y", "dx", "dy"), "pix"))
+
+
+def _read_tables(path: Path) -> tuple[LookupTable, ...]:
+    stored = read_table(path)
+    with naming_faults(path):
+        chip, filter = np.asarray(stored["chip"]), np.asarray(stored["filter"]).astype(str)
+        out = []
+        for key in dict.fromkeys(zip(chip.tolist(), filter.tolist(), strict=True)):
+            rows = stored[(chip == key[0]) & (filter == key[1])]
+            x, y = np.unique(rows["x"]), np.unique(rows["y"])
+            out.append(
+                LookupTable(
+                    chip=key[0],
+                    values=np.stack([rows["dx"], rows["dy"]]).reshape(2, y.size, x.size),
+                    filter=key[1],
+                    first=(float(x[0]), float(y[0])),
+                    step=(float(x[1] - x[0]), float(y[1] - y[0])),
+                )
+            )
+    return tuple(out)

@@ -1,0 +1,248 @@
+"""`bayesdist simulate acs`: the 47 Tuc campaign as files, and how to calibrate it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.app.screen import progress_bar, table_text
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
+from bayesdist.missions.acs.simulate import AcsCampaign, acs_solution, simulate_acs, write_acs
+from bayesdist.model import DistortionModel
+from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
+
+__all__ = ["simulate_campaign"]
+
+Float = NDArray[np.float64]
+
+START = "start_idc.fits"
+REFERENCE = "F606W"  # the filter of the detector's tables and of the drift
+SCALE_ARCSEC = 0.05
+V2V3 = (257.4, 302.6)  # arcsec: where the reference chip's zero point lies, about
+
+CONFIG = """\
+# Calibrates one filter of a simulated campaign: bayesdist run THIS -o {run}
+[campaign]
+catalog = "catalog.parquet"
+exposures = "exposures.ecsv"
+lists = "lists"
+start = "{start}"            # a known distortion, for the matching
+filter = "{filter}"
+mag = [-14.0, -10.0]         # instrumental; brighter ones are saturated
+q_max = 0.1
+
+[tables]{detector}
+method = "field"             # or "binned", as ACS ISR 2015-06; or "none"
+
+[detector]
+scale_mas = 50.0
+
+[[chip]]
+number = 2
+name = "WFC2"
+size = [4096.0, 2048.0]
+reference_pixel = [2048.0, 1024.0]
+reference = true             # its axes and zero point are the gauge
+
+[[chip]]
+number = 1
+name = "WFC1"
+size = [4096.0, 2048.0]
+reference_pixel = [2048.0, 1024.0]
+
+[model]
+order = 5
+
+[model.tdd]                  # before and after Servicing Mission 4
+epoch0 = [2004.5, 2012.5]
+breaks = [2009.4]
+terms = [["u", 1, 0], ["v", 1, 0], ["v", 0, 1]]{rates}
+
+[assess]
+epoch = 2006.5
+grid = [33, 17]
+
+[[requirement]]
+name = "alignment"
+statistic = "p95"
+limit = 0.05
+unit = "pix"
+"""
+
+RELEASE = """
+[products.release]
+name = "acs_wfc"
+reference = "{start}"        # how V2 and V3 lie
+[[products.release.period]]
+name = "pre"
+years = [2002.2, 2009.4]
+segment = 0
+[[products.release.period]]
+name = "post"
+years = [2009.4, 2015.0]
+segment = 1
+"""
+
+
+def simulate_campaign(
+    output: str | Path,
+    *,
+    seed: int = 1,
+    force: bool = False,
+    exposures: int = 110,
+    stars: int = 53_900,
+    filters: Sequence[str] = (REFERENCE,),
+    secondary_exposures: int = 15,
+    false: float = 0.05,
+    outlying: float = 0.0,
+    cte: bool = False,
+    no_tables: bool = False,
+) -> str:
+    """Simulate, and write into a folder.
+
+    Parameters
+    ----------
+    output : path
+        Folder.
+    seed : int
+    force : bool
+        Replace a campaign that is there.
+    exposures, stars : int
+        In the first filter, and of the catalogue.
+    filters : sequence of str
+    secondary_exposures : int
+        Of each further filter.
+    false, outlying : float
+        Fractions of detections that are none, and of outlying exposures.
+    cte : bool
+        Trailed charge moves the stars.
+    no_tables : bool
+        A distortion without look-up tables.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For options that cannot be used, and a folder in use.
+    """
+    folder = Path(output)
+    if (folder / "lists").exists() and not force:
+        raise InputError(
+            "the folder holds a campaign", where=str(folder), do="replace it by --force"
+        )
+    with progress_bar("exposures") as progress:
+        campaign = simulate_acs(
+            seed=seed,
+            n_exposures=exposures,
+            n_stars=stars,
+            filters=tuple(filters),
+            n_other=secondary_exposures,
+            fine_scale=not no_tables,
+            cte=cte,
+            outlying=outlying,
+            false=false,
+            progress=progress,
+        )
+    write_acs(campaign, folder, force=force)
+    write_idctab(_stale(), folder / START)
+    filters = campaign.log.filters
+    first = REFERENCE if REFERENCE in filters else filters[0]
+    names = [first, *(name for name in filters if name != first)]
+    for name in names:
+        with atomic_path(folder / _config_of(name)) as temporary:
+            temporary.write_text(_config(name, first), encoding="utf-8")
+    lines = [
+        f"bayesdist run {folder / _config_of(name)} -o {folder / _run(name)}" for name in names
+    ]
+    if len(names) > 1:
+        runs = " ".join(str(folder / _run(name)) for name in names)
+        lines.append(f"bayesdist release {runs} -o {folder / 'release'}")
+    return (
+        f"{table_text(_rows(campaign))}\n\n{folder / 'README.txt'} says what the files hold\n"
+        "calibrate it:\n  " + "\n  ".join(lines)
+    )
+
+
+def _config_of(filter: str) -> str:
+    return f"campaign_{filter.lower()}.toml"
+
+
+def _run(filter: str) -> str:
+    return f"run_{filter.lower()}"
+
+
+def _config(filter: str, reference: str) -> str:
+    """Text of a configuration: other filters take tables and drift from the reference's run."""
+    text = CONFIG + RELEASE if filter == reference else CONFIG
+    own = filter == reference
+    return text.format(
+        filter=filter,
+        start=START,
+        run=_run(filter),
+        detector=""
+        if own
+        else f'\ndetector = "{_run(reference)}"       # held; fitted is the filter\'s',
+        rates="" if own else f'\nrates = "{_run(reference)}"          # one drift for all filters',
+    )
+
+
+def _stale() -> IdcTab:
+    """What an observer has before the calibration: the distortion of 2004.5, without drift."""
+    model, theta = acs_solution()
+    known = replace(model, time=None)
+    return idctab_from_solution(
+        _Exact(known, theta[: known.n_params]),
+        instrument="ACS",
+        detector="WFC",
+        scale_arcsec=SCALE_ARCSEC,
+        v2ref=V2V3[0],
+        v3ref=V2V3[1],
+        description="Simulated: the distortion of 2004.5, without drift and tables",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Exact:
+    """Given parameters as a solution without errors."""
+
+    model: DistortionModel
+    mean: Float
+
+    @property
+    def cov(self) -> Float:
+        return np.zeros((len(self.mean), len(self.mean)))
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        return np.tile(self.mean, (n, 1))
+
+
+def _rows(campaign: AcsCampaign) -> list[dict[str, object]]:
+    """One row for each filter."""
+    epochs = campaign.log.values("epoch")
+    filters = np.array([one.filter for one in campaign.log])
+    sizes = np.array([len(one) for one in campaign.lists])
+    false = np.array([int((one.star < 0).sum()) for one in campaign.truth.detections])
+    rows: list[dict[str, object]] = []
+    for name in campaign.log.filters:
+        of = filters == name
+        rows.append(
+            {
+                "filter": name,
+                "exposures": int(of.sum()),
+                "first": f"{epochs[of].min():.2f}",
+                "last": f"{epochs[of].max():.2f}",
+                "detections": int(sizes[of].sum()),
+                "false": int(false[of].sum()),
+                "catalogue": len(campaign.catalog),
+            }
+        )
+    return rows

@@ -1,0 +1,19 @@
+"""WISE: simulated pairs, the tables and figures of its distortion report, and its files."""
+
+from bayesdist.mission import Mission
+
+__all__ = ["MISSION"]
+
+_COMMANDS = "bayesdist.missions.wise.commands"
+
+MISSION = Mission(
+    title="WISE: its bands beside each other, its pairs and its files.",
+    commands={
+        "bands": f"{_COMMANDS}:bands",
+        "bring-up": f"{_COMMANDS}:bring_up",
+        "rotate": f"{_COMMANDS}:rotate",
+        "rvb": f"{_COMMANDS}:rvb",
+    },
+    simulate={"wise": f"{_COMMANDS}:simulate"},
+    beside_core={"demo": f"{_COMMANDS}:demo"},
+)

@@ -1,0 +1,1 @@
+"""What the WISE report (WSDC D-T033) prints, and its residual tables beside it."""

@@ -1,0 +1,144 @@
+"""Where the numbers of residual tables contradict each other.
+
+What statistics of any numbers must satisfy, and what differences of two bands or of all pairs of
+bins must be, is known without the data: it tells misprints, and tables made from other models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+
+import numpy as np
+
+from bayesdist.assess.wise.bands import WISE_ARCSEC
+from bayesdist.missions.wise.assess.published import PrintedRow
+
+__all__ = ["contradictions_across", "contradictions_within"]
+
+
+def contradictions_within(row: PrintedRow) -> list[str]:
+    """What in a row no set of numbers can have.
+
+    The order of extremes, percentiles and median; a mean at most one sigma from the median; and
+    sigma^2 <= (max - mean) (mean - min), Bhatia and Davis.
+
+    Parameters
+    ----------
+    row : PrintedRow
+
+    Returns
+    -------
+    list of str
+        One sentence for each contradiction beyond the rounding of the digits.
+    """
+    v, h = row.value, row.rounding
+    out = []
+    for a, b in pairwise(("min", "p01", "median", "p99", "max")):
+        if v[a] - v[b] > h[a] + h[b]:
+            out.append(f"{row.label}: {a} {v[a]:g} is above {b} {v[b]:g}.")
+    apart = abs(v["mean"] - v["median"])
+    if apart > v["sigma"] + h["mean"] + h["median"] + h["sigma"]:
+        out.append(
+            f"{row.label}: mean {v['mean']:g} and median {v['median']:g} are {apart:.4g} apart, "
+            f"more than sigma {v['sigma']:g}, which no set of numbers allows."
+        )
+    above = max(v["max"] - v["mean"] + h["max"] + h["mean"], 0.0)
+    below = max(v["mean"] - v["min"] + h["mean"] + h["min"], 0.0)
+    if v["sigma"] - h["sigma"] > np.sqrt(above * below):
+        out.append(
+            f"{row.label}: sigma {v['sigma']:g} is more than the extremes allow "
+            f"({np.sqrt(above * below):.4g})."
+        )
+    return out
+
+
+def contradictions_across(
+    fitting: Mapping[str, PrintedRow],
+    band_to_band: Mapping[str, PrintedRow],
+    multiframe: Mapping[str, PrintedRow],
+    *,
+    arcsec: Mapping[str, float] = WISE_ARCSEC,
+) -> list[str]:
+    """What in Tables 5-2 and 5-3 does not follow from Table 5-1.
+
+    All pairs of the bins of one band have sqrt(2) times the sigma, and the range as maximum.  Two
+    bands have the difference of the means, and a sigma within what theirs allow.  And within Table
+    5-2 a difference must be what the way over any third band gives.
+
+    Parameters
+    ----------
+    fitting, band_to_band, multiframe : mapping of str to PrintedRow
+        Tables 5-1 (pixels), 5-2 and 5-3 (arcsec).
+    arcsec : mapping of str to float
+        Arcsec per pixel of each band.
+
+    Returns
+    -------
+    list of str
+        One sentence for each contradiction beyond the rounding of the digits, with the value that
+        the other numbers imply.
+    """
+    out = []
+    for label, row in multiframe.items():
+        one, scale = fitting[label], arcsec[label.partition("/")[0]]
+        sigma = np.sqrt(2) * scale * one.value["sigma"]
+        slack = np.sqrt(2) * scale * one.rounding["sigma"]
+        out += _unequal(row, "sigma", float(sigma), float(slack))
+        extent = scale * (one.value["max"] - one.value["min"])
+        out += _unequal(row, "max", extent, scale * (one.rounding["max"] + one.rounding["min"]))
+    for label, row in band_to_band.items():
+        bands, _, axis = label.partition("/")
+        scaled = [(arcsec[name], fitting[f"{name}/{axis}"]) for name in bands.split("-")]
+        (a, first), (b, second) = scaled
+        mean = a * first.value["mean"] - b * second.value["mean"]
+        slack = a * first.rounding["mean"] + b * second.rounding["mean"]
+        out += _unequal(row, "mean", mean, slack)
+        low, high = _sigma_limits(a, first, b, second)
+        if not low - row.rounding["sigma"] <= row.value["sigma"] <= high + row.rounding["sigma"]:
+            out.append(
+                f"{label}: sigma {row.value['sigma']:g} is outside {low:.4g} to {high:.4g}, which "
+                "the sigmas of the two bands allow."
+            )
+    return out + _open_triangles(band_to_band)
+
+
+def _open_triangles(band_to_band: Mapping[str, PrintedRow]) -> list[str]:
+    """Means of two bands that no detour over a third one confirms.
+
+    A wrong value opens all triangles it is a side of, and only one of those of another side.
+    """
+    sides: dict[tuple[str, str, str], tuple[float, float]] = {}
+    for label, row in band_to_band.items():
+        bands, _, axis = label.partition("/")
+        a, b = bands.split("-")
+        sides[a, b, axis] = row.value["mean"], row.rounding["mean"]
+        sides[b, a, axis] = -row.value["mean"], row.rounding["mean"]
+    names = sorted({a for a, _, _ in sides})
+    out = []
+    for label, row in band_to_band.items():
+        bands, _, axis = label.partition("/")
+        a, b = bands.split("-")
+        detours = [
+            (sides[a, c, axis], sides[c, b, axis], c)
+            for c in names
+            if (a, c, axis) in sides and (c, b, axis) in sides
+        ]
+        found = [(_unequal(row, "mean", one + two, h + k), c) for (one, h), (two, k), c in detours]
+        if len(found) > 1 and all(sentences for sentences, _ in found):
+            through = ", ".join(c for _, c in found)
+            out.append(found[0][0][0].replace(" follows.", f" follows by way of {through}."))
+    return out
+
+
+def _unequal(row: PrintedRow, name: str, implied: float, slack: float) -> list[str]:
+    if abs(row.value[name] - implied) <= slack + row.rounding[name]:
+        return []
+    return [f"{row.label}: {name} {row.value[name]:g} is printed, {implied:.4g} follows."]
+
+
+def _sigma_limits(a: float, first: PrintedRow, b: float, second: PrintedRow) -> tuple[float, float]:
+    """Limits of the sigma of a difference: those of correlation 1 and -1."""
+    one, two = a * first.value["sigma"], b * second.value["sigma"]
+    slack = a * first.rounding["sigma"] + b * second.rounding["sigma"]
+    return max(abs(one - two) - slack, 0.0), one + two + slack

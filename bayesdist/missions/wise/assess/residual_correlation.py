@@ -1,0 +1,161 @@
+"""Two-point correlation of residuals over the detector: how far structure reaches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from bayesdist.diagnose.residuals.binned import BinnedResiduals
+from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field
+
+__all__ = ["ResidualCorrelation", "residual_correlation"]
+
+Float = NDArray[np.float64]
+
+DRAWS = 500  # noise fields that give mean and sigma, and half a thousand more for the ranks
+_AT_ONCE = 50
+_PAIRS = (("uu", 0, 0), ("vv", 1, 1), ("uv", 0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualCorrelation:
+    """Mean products of the residuals of two bins, by their separation.
+
+    Parameters
+    ----------
+    separation : ndarray, shape (R,)
+        Mean distance of the pairs of bins in a ring, in pixels.
+    uu, vv, uv : ndarray, shape (R,)
+        Mean products, in the squared unit of the residuals, less what noise makes of them once a
+        polynomial is fitted: it is slightly below zero.
+    sigma_uu, sigma_vv, sigma_uv : ndarray, shape (R,)
+        Their standard deviations where noise is all there is.
+    n_pairs : ndarray of int, shape (R,)
+        Pairs of bins in the ring.
+    chi2 : float
+        Sum of the squares of all three functions over their sigmas.
+    p_value : float
+        Share of noise fields with as large a sum; not below 1 / 500.
+    """
+
+    separation: Float
+    uu: Float
+    vv: Float
+    uv: Float
+    sigma_uu: Float
+    sigma_vv: Float
+    sigma_uv: Float
+    n_pairs: NDArray[np.int64]
+    chi2: float
+    p_value: float
+
+    @property
+    def reach(self) -> float:
+        """Separation, in pixels, up to which uu + vv stays above three sigma; 0 if nowhere."""
+        above = self.uu + self.vv > 3 * np.hypot(self.sigma_uu, self.sigma_vv)
+        n = above.size if above.all() else int(np.argmin(above))
+        return float(self.separation[n - 1]) if n else 0.0
+
+
+def residual_correlation(
+    bins: BinnedResiduals, *, order: int = 0, rng: np.random.Generator
+) -> ResidualCorrelation:
+    """Two-point correlation of binned residuals, with its significance.
+
+    All pairs of bins count, by Fourier transforms padded to twice the size; rings are one bin wide
+    and reach to half the shorter side.  A bin is not paired with itself, so that noise, which is
+    independent between bins, adds nothing.  The fitted polynomial makes it slightly dependent:
+    mean and sigma come from noise fields that lost the same polynomial.
+
+    Parameters
+    ----------
+    bins : BinnedResiduals
+    order : int
+        Of the polynomial fitted to these stars.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ResidualCorrelation
+
+    Raises
+    ------
+    InputError, DegenerateError
+        As `bayesdist.missions.wise.assess.residual_field.residual_field`.
+    """
+    field = residual_field(bins, order=order)
+    rings = _Rings.of(field)
+    found = rings.products(field.image(field.sem * field.white)[None])[0]
+    by_chance = np.concatenate(
+        [
+            rings.products(field.image(field.sem * field.noise(_AT_ONCE, rng)))
+            for _ in range(2 * DRAWS // _AT_ONCE)
+        ]
+    )
+    # the first half says what to expect, the second how far chance goes: data and second half
+    # meet the same yardstick
+    mean, sigma = by_chance[:DRAWS].mean(axis=0), by_chance[:DRAWS].std(axis=0, ddof=1)
+    chi2 = float((((found - mean) / sigma) ** 2).sum())
+    others = (((by_chance[DRAWS:] - mean) / sigma) ** 2).sum(axis=(1, 2))
+    p_value = (1 + int((others >= chi2).sum())) / (len(others) + 1)
+    return ResidualCorrelation(
+        rings.separation, *(found - mean), *sigma, rings.n_pairs, chi2, p_value
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rings:
+    """Lags between bins, sorted into rings of separation."""
+
+    shape: tuple[int, int]
+    ring: NDArray[np.int64]
+    counts: Float
+    separation: Float
+
+    @property
+    def n_pairs(self) -> NDArray[np.int64]:
+        # every pair is met from both of its bins
+        return np.rint(self.counts / 2).astype(np.int64)
+
+    @classmethod
+    def of(cls, field: ResidualField) -> _Rings:
+        ny, nx = field.used.shape
+        shape = (fft.next_fast_len(2 * ny), fft.next_fast_len(2 * nx))
+        dx = fft.fftfreq(shape[1], 1 / shape[1]) * field.pitch[0]
+        dy = fft.fftfreq(shape[0], 1 / shape[0]) * field.pitch[1]
+        distance = np.hypot(dx, dy[:, None])
+        width = max(field.pitch)
+        ring = np.rint(distance / width).astype(np.int64) - 1
+        ring[0, 0] = -1
+        n_rings = max(int(min(nx * field.pitch[0], ny * field.pitch[1]) / (2 * width)), 1)
+        ring[ring >= n_rings] = -1
+        pairs = np.rint(_lagged(field.used[None].astype(float), None, shape)[0])
+        inside = ring >= 0
+        counts = np.bincount(ring[inside], pairs[inside], n_rings)
+        total = np.bincount(ring[inside], (pairs * distance)[inside], n_rings)
+        held = counts > 0
+        # rings without pairs are dropped
+        number = np.where(held, np.cumsum(held) - 1, -1)
+        ring = np.where(inside, number[np.maximum(ring, 0)], -1)
+        return cls(shape, ring, counts[held], total[held] / counts[held])
+
+    def products(self, images: Float) -> Float:
+        """Mean products (n, 3, R) in the rings of images (n, 2, ny, nx)."""
+        inside = self.ring >= 0
+        ring = self.ring[inside]
+        out = np.empty((len(images), len(_PAIRS), self.counts.size))
+        for k, (_, a, b) in enumerate(_PAIRS):
+            lagged = _lagged(images[:, a], images[:, b], self.shape)[:, inside]
+            for i, one in enumerate(lagged):
+                out[i, k] = np.bincount(ring, one, self.counts.size) / self.counts
+        return out
+
+
+def _lagged(a: Float, b: Float | None, shape: tuple[int, int]) -> Float:
+    """Sums over the grid of a(r) b(r + lag) for all lags; b is a where it is not given."""
+    first = fft.rfft2(a, shape)
+    second = first if b is None or b is a else fft.rfft2(b, shape)
+    return fft.irfft2(first.conj() * second, shape)

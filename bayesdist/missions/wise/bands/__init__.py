@@ -1,0 +1,1 @@
+"""`bayesdist wise bands`: tables and diagrams of several bands beside each other."""

@@ -1,0 +1,131 @@
+"""The command: from finished runs to a folder of tables, figures and one page."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+from bayesdist.app.folder import whole_folder
+from bayesdist.app.rundir import versions, write_json
+from bayesdist.app.screen import table_text
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.bands.context import BandsInput
+from bayesdist.missions.wise.bands.findings import overview_table
+from bayesdist.missions.wise.bands.inputs import BandRun, open_bands
+from bayesdist.missions.wise.bands.measure import measure_bands
+from bayesdist.missions.wise.bands.optical import optical_models
+from bayesdist.missions.wise.bands.page import draw_bands, write_bands
+from bayesdist.missions.wise.bands.record import record_of, write_tables
+from bayesdist.missions.wise.simulate import WISE_BANDS
+from bayesdist.products import sip_from_solution, write_wise_meta
+from bayesdist.report.drawing import save_drawings
+
+__all__ = ["bands_of_runs"]
+
+log = logging.getLogger("bayesdist")
+
+FEWEST_BINS = 6  # three show a block, and there are two of them at least
+META_ORDER = 4  # of the inverse, as WSDC D-T033, Appendix B has it
+
+
+def bands_of_runs(
+    runs: Sequence[str | Path],
+    output: str | Path,
+    *,
+    bins: int = 31,
+    optical: Sequence[str | Path] = (),
+    rotation: float = 0.0,
+    published: bool = True,
+    command: str = "",
+) -> str:
+    """Compare bands and write everything into a new folder.
+
+    Parameters
+    ----------
+    runs : sequence of path
+        Finished runs, one for each band.
+    output : path
+        New or empty folder.  It appears with all files in it, or not at all.
+    bins : int
+        Of residuals, on each axis.
+    optical : sequence of path
+        SIP headers or WISE meta-data of an optical model: one, or one for each run.
+    rotation : float
+        Degrees by which that is turned, from x towards y.
+    published : bool
+        Whether WISE's bands have the values of WSDC D-T033 beside them.
+    command : str
+        For the record.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For runs that are not finished or do not go together, an optical model that cannot be used,
+        and a folder that is in use.
+    """
+    if bins < FEWEST_BINS:
+        raise InputError(
+            f"{bins} bins show no structure", where="--bins", do=f"give {FEWEST_BINS} or more"
+        )
+    with ExitStack() as stack:
+        bands = open_bands(runs)
+        for band in bands.values():
+            stack.enter_context(closing(band.session))
+        folder = stack.enter_context(whole_folder(Path(output)))
+        order = {str(band.session.run.path): name for name, band in bands.items()}
+        named = [order[str(Path(path))] for path in runs]
+        inputs = measure_bands(
+            bands,
+            bins=bins,
+            optical=optical_models(optical, rotation, named),
+            published=published,
+            provenance={"command": command, **versions()},
+        )
+        files = [*write_tables(inputs, folder), *_meta(bands, folder)]
+        drawings = draw_bands(inputs)
+        save_drawings(drawings, folder / "figures")
+        write_bands(folder / "bands.html", inputs, drawings)
+        files += ["bands.html", *(f"figures/{name}.png" for name in drawings)]
+        files += [f"figures/{name}.pdf" for name in drawings]
+        write_json(folder / "bands.json", record_of(inputs) | {"files": files})
+    return _text(Path(output), inputs)
+
+
+def _meta(bands: Mapping[str, BandRun], folder: Path) -> list[str]:
+    """WISE meta-data, where all bands are WISE's and in pixels."""
+    models = [band.session.posterior.model for band in bands.values()]
+    if not set(bands) <= set(WISE_BANDS) or any(model.unit != "pix" for model in models):
+        return []
+    headers = {
+        int(name[1:]): sip_from_solution(
+            band.session.solution,
+            epoch=band.session.epoch,
+            linear="sip",
+            inverse_order=META_ORDER,
+            scale_arcsec=band.arcsec,
+        )
+        for name, band in bands.items()
+    }
+    try:
+        write_wise_meta(folder / "wise_meta.tbl", headers)
+    except InputError as error:  # arrays of another size, or orders that the layout has no room for
+        log.warning("bands: no wise_meta.tbl: %s", error.cause)
+        return []
+    return ["wise_meta.tbl"]
+
+
+def _text(output: Path, inputs: BandsInput) -> str:
+    table = overview_table(inputs)
+    lines = [table_text([dict(zip(table.columns, row, strict=False)) for row in table.rows])]
+    lines += [
+        f"WARNING: {b.name} has not converged ({'; '.join(b.reasons)})"
+        for b in inputs.not_converged
+    ]
+    return "\n".join([*lines, "", f"page: {output / 'bands.html'}"])

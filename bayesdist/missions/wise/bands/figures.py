@@ -1,0 +1,281 @@
+"""Maps of several bands beside each other, each band in its own pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bayesdist.missions.wise.bands.context import BANDS, BandsInput
+from bayesdist.report.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
+from bayesdist.report.fields import Grid, scalar_map
+from bayesdist.report.numbers import size_of
+from bayesdist.report.panels import ArrayPanels
+from bayesdist.report.registry import Plot
+from bayesdist.report.style import nice_below
+
+if TYPE_CHECKING:
+    from bayesdist.assess import UncertaintyMap, VectorMap
+
+__all__ = [
+    "alignment",
+    "coverage",
+    "differences",
+    "formal_uncertainty",
+    "minus_optical",
+    "residuals",
+    "vectors",
+]
+
+Float = NDArray[np.float64]
+Size = tuple[float, float]
+
+# magnifications in section 4 of WSDC D-T033
+FLOW, DIFFERENCE, OPTICAL = 10.0, 50.0, 20.0
+EVERY = 2  # every second vector of a map is drawn: more would hide each other in small panels
+FORMAL = 2000.0  # magnification in section 6 of WSDC D-T033
+SEEN = 0.15  # part of a grid step below which a cross is a dot
+DIVERGING = "RdBu_r"  # red and blue are told apart in every common colour blindness
+AXES = "xy"
+
+
+@BANDS.figure("vectors", printed=True)
+def vectors(inputs: BandsInput) -> Plot:
+    """The distortion of each band without its constant."""
+    bands = inputs.bands
+    arcsec = {b.name: b.arcsec for b in bands}
+    fig = _flows({b.name: b.vectors for b in bands}, arcsec, FLOW if inputs.wise else None)
+    return Plot(
+        fig,
+        "Distortion",
+        "From each place of the array towards where its light comes from, the constant suppressed."
+        " All bands are drawn to one scale in arcsec; the ring marks the longest vector.",
+        "Maps of arrows over the array of each band, longest in the corners.",
+    )
+
+
+@BANDS.figure("vectors", needs=("differences",), printed=True)
+def differences(inputs: BandsInput) -> Plot:
+    """Later bands minus the first one."""
+    first = inputs.names[0]
+    arcsec = dict.fromkeys(inputs.differences, inputs.bands[0].arcsec)
+    fig = _flows(inputs.differences, arcsec, DIFFERENCE if inputs.wise else None)
+    return Plot(
+        fig,
+        "Differences of bands",
+        f"Later bands minus {first} at the same place of the field, in pixels of {first},"
+        " constants suppressed.",
+        "Maps of arrows: how the distortion of each band differs from that of the first.",
+    )
+
+
+@BANDS.figure(
+    "vectors", when=lambda inputs: any(b.minus_optical for b in inputs.bands), printed=True
+)
+def minus_optical(inputs: BandsInput) -> Plot:
+    """What an optical model leaves of the distortion of each band."""
+    found = {b.name: (b.minus_optical, b.arcsec) for b in inputs.bands}
+    maps = {f"{name} − optical": v for name, (v, _) in found.items() if v is not None}
+    arcsec = {f"{name} − optical": size for name, (_, size) in found.items()}
+    fig = _flows(maps, arcsec, OPTICAL if inputs.wise else None)
+    return Plot(
+        fig,
+        "Bands minus the optical model",
+        f"In pixels of each band, constants suppressed. Optical model: {inputs.optical}.",
+        "Maps of arrows: what the optical model leaves of each band's distortion.",
+    )
+
+
+def _flows(
+    maps: Mapping[str, VectorMap], arcsec: Mapping[str, float], magnification: float | None
+) -> Figure:
+    """Vector-flow diagrams beside each other, as section 4 of WSDC D-T033.
+
+    Panels are equally wide and vectors are longer by one factor than the arrays' own pixels: of
+    bands that see the same field, one length in arcsec is the same length on the page.
+    """
+    arrows = {name: Arrows.of_map(v, EVERY) for name, v in maps.items()}
+    longest = {name: float(np.hypot(*v.on_detector).max()) for name, v in maps.items()}
+    sizes = {name: (float(v.x.max()), float(v.y.max())) for name, v in maps.items()}
+    M = magnification or min(
+        magnification_of(1.5 * one.step, longest[name]) for name, one in arrows.items()
+    )
+    panels = ArrayPanels(sizes)
+    panels.frame(
+        max(one.reach(M, sizes[name]) / max(sizes[name]) for name, one in arrows.items()) + 0.02
+    )
+    # about a step of the grid, a round number of the widest pixels
+    widest = max(arrows, key=lambda name: arcsec[name])
+    key = nice_below(arrows[widest].step / M) * arcsec[widest]
+    vector_map(
+        panels,
+        list(arrows.values()),
+        [
+            f"{name}\nMax = {length:.4g} pix ({length * arcsec[name]:.3g}″)"
+            for name, length in longest.items()
+        ],
+        magnification=M,
+        key=[key / arcsec[name] for name in arrows],
+        pad=17,
+        fine=True,
+    )
+    return panels.figure
+
+
+@BANDS.figure(
+    "structure", each=lambda inputs: {f"residuals_{axis}": axis for axis in AXES}, printed=True
+)
+def residuals(inputs: BandsInput, axis: str) -> Plot:
+    """Mean residuals in bins, along x or along y."""
+    images = {b.name: b.sums.bins.values(axis.upper()).mean for b in inputs.bands}
+    sizes = {b.name: b.size for b in inputs.bands}
+    return Plot(
+        _images(images, sizes, axis.upper(), "pix"),
+        f"Mean residuals in {axis.upper()}",
+        f"Of the pairs used, in {_bins(inputs)}; one colour scale for all bands, symmetric about"
+        " zero. Titles give the extremes. Blocks with sharp edges are no distortion.",
+        f"Images of the mean residual in {axis.upper()} over the array of each band.",
+    )
+
+
+@BANDS.figure(
+    "structure",
+    needs=("differences",),
+    each=lambda inputs: {f"alignment_{axis}": axis for axis in AXES},
+    printed=True,
+)
+def alignment(inputs: BandsInput, axis: str) -> Plot:
+    """Mean residuals of each pair of bands, one minus the other."""
+    images, sizes = {}, {}
+    for k, earlier in enumerate(inputs.bands):
+        for later in inputs.bands[k + 1 :]:
+            name = f"{later.name}−{earlier.name}"
+            one, two = (b.sums.bins.values(axis.upper()).scaled(b.arcsec) for b in (later, earlier))
+            images[name], sizes[name] = one.minus(two).mean, earlier.size
+    return Plot(
+        _images(images, sizes, axis.upper(), "arcsec", own_scale=True),
+        f"Mean residuals in {axis.upper()} of two bands, one minus the other",
+        f"In arcsec, in {_bins(inputs)}: by how much two bands observed together are misaligned."
+        " Each panel has its own colour scale.",
+        f"Images of differences of mean residuals in {axis.upper()} for each pair of bands.",
+    )
+
+
+def _bins(inputs: BandsInput) -> str:
+    return f"{inputs.n_bins} × {inputs.n_bins} bins"
+
+
+def _images(
+    images: Mapping[str, Float],
+    sizes: Mapping[str, Size],
+    axis: str,
+    unit: str,
+    *,
+    own_scale: bool = False,
+) -> Figure:
+    titles = [
+        f"{name} {axis}: {_signed(np.nanmin(image))} to {_signed(np.nanmax(image))}"
+        for name, image in images.items()
+    ]
+    label = f"mean residual in {axis} [{unit}]"
+    return _cells(images, sizes, titles, label, own_scale=own_scale)
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.3f}".replace("-", "−")
+
+
+def _cells(
+    images: Mapping[str, Float],
+    sizes: Mapping[str, Size],
+    titles: list[str],
+    label: str,
+    *,
+    centre: float = 0.0,
+    own_scale: bool = False,
+) -> Figure:
+    """Images of bins, in colours that run to all but one bin in two hundred on both sides."""
+    grids = []
+    for name, image in images.items():
+        steps = (n / cells for n, cells in zip(sizes[name], image.shape[::-1], strict=True))
+        x, y = (
+            0.5 + step * (np.arange(cells) + 0.5)
+            for step, cells in zip(steps, image.shape[::-1], strict=True)
+        )
+        grids.append(Grid(x, y, image))
+    norms = []
+    for shown in [[g] for g in grids] if own_scale else [grids]:
+        away = np.concatenate([np.abs(g.values - centre).ravel() for g in shown])
+        reach = max(float(np.quantile(away[np.isfinite(away)], 0.995)), 1e-12)
+        norms.append(Normalize(centre - reach, centre + reach))
+    panels = ArrayPanels(sizes, colorbar=True)
+    panels.frame()
+    norm = norms if own_scale else norms[0]
+    scalar_map(panels, grids, titles, label=label, norm=norm, cmap=DIVERGING)
+    return panels.figure
+
+
+@BANDS.figure("formal", printed=True)
+def formal_uncertainty(inputs: BandsInput) -> Plot:
+    """Four vectors from each position of the array, as section 6 of WSDC D-T033.
+
+    Drawn 2000 times larger as there, or more where they would be dots, by a factor that each panel
+    states.
+    """
+    maps = {b.name: b.formal_map for b in inputs.bands}
+    sizes = {name: (float(m.x[-1]), float(m.y[-1])) for name, m in maps.items()}
+    factors = {name: _magnification(m) for name, m in maps.items()}
+    widest = {name: max(m.sigma_u_max, m.sigma_v_max) for name, m in maps.items()}
+    panels = ArrayPanels(sizes)
+    panels.frame(max(factors[n] * widest[n] / max(sizes[n]) for n in maps) + 0.02)
+    cross_map(
+        panels,
+        list(maps.values()),
+        [f"{name}\nmax radius {size_of(m.radius_max, m.unit)}" for name, m in maps.items()],
+        magnification=list(factors.values()),
+        key=[nice_below(EVERY * spacing(m.x, m.y) / factors[name]) for name, m in maps.items()],
+        every=EVERY,
+    )
+    fig = panels.figure
+    return Plot(
+        fig,
+        "Formal uncertainty",
+        "Least squares: four vectors from each place to all combinations of ±1 σ in x and in y."
+        " Each panel states its magnification, 2000 or what shows the vectors.",
+        "Maps of small crosses over the array of each band, largest in the corners.",
+    )
+
+
+def _magnification(m: UncertaintyMap) -> float:
+    step = EVERY * spacing(m.x, m.y)
+    widest = max(m.sigma_u_max, m.sigma_v_max, 1e-300)
+    if SEEN * step <= FORMAL * widest <= 0.5 * step:
+        return FORMAL
+    return nice_below(0.5 * step / widest)
+
+
+@BANDS.figure("coverage", printed=True)
+def coverage(inputs: BandsInput) -> Plot:
+    """Pairs used in each bin over the mean of all bins."""
+    images, titles = {}, []
+    for b in inputs.bands:
+        count = b.sums.bins.axes.count
+        expected = float(count.mean())
+        images[b.name] = count / expected
+        titles.append(
+            f"{b.name}: {expected:.0f} ± {np.sqrt(expected):.0f} expected,\n"
+            f"{count.min()} to {count.max()} found"
+        )
+    sizes = {b.name: b.size for b in inputs.bands}
+    fig = _cells(images, sizes, titles, "pairs over those of even coverage", centre=1.0)
+    return Plot(
+        fig,
+        "Coverage by pairs",
+        "Pairs used in each bin over the mean of all bins. Titles give that mean with the Poisson"
+        " error of one bin, and the fewest and most found.",
+        "Images of the number of pairs over the array of each band.",
+    )

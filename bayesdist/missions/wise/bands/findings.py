@@ -1,0 +1,254 @@
+"""Tables of what was found of each band, as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bayesdist.missions.wise.assess.account import LONGEST_DIFFERENCES
+from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput
+from bayesdist.missions.wise.bands.curves import CASES, chance_of
+from bayesdist.report.numbers import MISSING, count, number, percent, probability, size_of
+from bayesdist.report.texttable import TextTable, listing
+
+__all__ = [
+    "coverage_table",
+    "formal_table",
+    "histogram_table",
+    "overview_table",
+    "provenance_table",
+    "structure_table",
+    "vector_table",
+]
+
+SAME_VECTOR = 0.005  # of the printed maximum
+
+
+@BANDS.table("overview")
+def overview_table(inputs: BandsInput) -> TextTable:
+    """A line for each band, what matters most."""
+    columns = ["Band", "Converged", "Pairs", "Structure", "Longest vector (pix)"]
+    if inputs.wise:
+        columns += ["vector printed", "difference"]
+    columns += ["Formal radius (pix)"]
+    if inputs.wise:
+        columns += ["radius printed"]
+    return TextTable(
+        "Overview",
+        tuple(columns),
+        tuple(tuple(_overview(b, wise=inputs.wise)) for b in inputs.bands),
+        words=(0, 1, 3),
+    )
+
+
+def _overview(b: BandResult, *, wise: bool) -> Iterator[str]:
+    yield b.name
+    yield "yes" if b.converged else "NO"
+    yield count(b.n_pairs)
+    yield _structure(b)
+    here = b.printed
+    yield number(b.vectors.length_max if here is None else here.longest_here, 4)
+    if wise and here is not None:
+        apart = here.longest_here / here.longest_vector - 1
+        yield number(here.longest_vector, 4)
+        error = 2 * b.posterior_map.radius_max / here.longest_vector
+        mark = "✗" if abs(apart) > error else "(within 2 σ)"
+        yield f"{percent(apart, 2)} {'✓' if abs(apart) <= SAME_VECTOR else mark}"
+    yield _length(b, b.formal_map.radius_max)
+    if wise and here is not None:
+        yield number(here.formal_radius, 2)
+
+
+def _length(b: BandResult, value: float) -> str:
+    unit = b.formal_map.unit
+    return number(value, 3) if unit == "pix" else size_of(value, unit)
+
+
+def _structure(b: BandResult) -> str:
+    p = b.partition
+    if p.significant:
+        what = f"{p.k} × {p.k} blocks" if p.edges_seen else "smooth"
+        return f"{what}, {probability(max(p.p_value, 0.0))}"
+    if _counted_out(b):
+        return f"correlated bins, {chance_of(b.correlation.p_value)}"
+    return f"none found, {probability(p.p_value)}"
+
+
+def _counted_out(b: BandResult) -> bool:
+    """Whether no noise field reached the correlation: as little as draws can tell."""
+    return chance_of(b.correlation.p_value).startswith("p <")
+
+
+@BANDS.table("structure")
+def structure_table(inputs: BandsInput) -> TextTable:
+    """Structure left in the residuals, by band and axis."""
+    rows: list[tuple[str, ...]] = []
+    for b in inputs.bands:
+        c, p = b.correlation, b.partition
+        for k, axis in enumerate("XY"):
+            row = inputs.tables["5-1"][f"{b.name}/{axis}"]
+            nearest, sigma = ((c.uu, c.sigma_uu), (c.vv, c.sigma_vv))[k]
+            free = row.noise_free["sigma"]
+            rows.append(
+                (
+                    f"{b.name}/{axis}",
+                    number(free, 3),
+                    # sigma is zero where noise alone explains it: its square has an error
+                    number(row.variance / max(row.variance_error, 1e-300), 3),
+                    number(nearest[0] / sigma[0], 3),
+                    number(c.reach, 3) if c.reach else MISSING,
+                    chance_of(c.p_value),
+                    f"{p.k} × {p.k}",
+                    probability(p.p_value),
+                    number(p.rms[k], 2) if p.significant else MISSING,
+                    "yes" if p.edges_seen else "no",
+                )
+            )
+    return TextTable(
+        "Structure left in the residuals",
+        (
+            "Band/Axis",
+            "sigma without noise (pix)",
+            "its square (σ)",
+            "correlation of neighbours (σ)",
+            "reach (pix)",
+            "both axes by chance",
+            "best partition",
+            "by chance",
+            "its rms (pix)",
+            "edges seen",
+        ),
+        tuple(rows),
+        words=(0, 5, 6, 7, 9),
+        note="The two probabilities are of both axes together; the reach is that of their sum.",
+    )
+
+
+@BANDS.table("vectors")
+def vector_table(inputs: BandsInput) -> TextTable | None:
+    """Longest difference vectors; None for one band without an optical model."""
+    first = inputs.bands[0]
+    lengths = [
+        (name, (later.name, first.name), v.length_max, first)
+        for later, (name, v) in zip(inputs.bands[1:], inputs.differences.items(), strict=True)
+    ]
+    lengths += [
+        (f"{b.name} − optical", (b.name, "optical"), b.minus_optical.length_max, b)
+        for b in inputs.bands
+        if b.minus_optical is not None
+    ]
+    if not lengths:
+        return None
+    rows = [
+        (name, b.name, number(length, 4), number(length * b.arcsec, 3))
+        + ((_three(LONGEST_DIFFERENCES.get(both)),) if inputs.wise else ())
+        for name, both, length, b in lengths
+    ]
+    return TextTable(
+        "Longest difference vectors",
+        ("Difference", "pixels of", "Max (pix)", "arcsec") + (("printed",) if inputs.wise else ()),
+        tuple(rows),
+        words=(0, 1),
+        note=f"Optical model: {inputs.optical}." if inputs.optical else "",
+    )
+
+
+def _three(value: float | None) -> str:
+    """A value as it is printed, with three decimals."""
+    return MISSING if value is None else f"{value:.3f}"
+
+
+@BANDS.table("histograms")
+def histogram_table(inputs: BandsInput) -> TextTable:
+    """Half widths of the histograms, and what lies beyond them."""
+    rows = []
+    for b in inputs.bands:
+        for case in (c for c in CASES if c in b.sums.histograms):
+            one = b.sums.histograms[case]
+            x, y = one.half_width()
+            rows.append(
+                (
+                    b.name,
+                    case,
+                    number(x, 3),
+                    number(y, 3),
+                    count(one.n),
+                    count(one.outside[0]),
+                    count(one.outside[1]),
+                )
+            )
+    return TextTable(
+        "Residuals of all pairs",
+        (
+            "Band",
+            "Case",
+            "half width X (pix)",
+            "half width Y (pix)",
+            "pairs",
+            "X beyond the histogram",
+            "Y beyond",
+        ),
+        tuple(rows),
+        words=(0, 1),
+        note="Half the width of the interval that holds 68.3 % of all pairs, false ones included.",
+    )
+
+
+@BANDS.table("coverage")
+def coverage_table(inputs: BandsInput) -> TextTable:
+    """Pairs in bins against even coverage."""
+    rows = []
+    for b in inputs.bands:
+        n = b.sums.bins.axes.count
+        mean = float(n.mean())
+        chi2 = float(((n - mean) ** 2).sum() / mean)
+        rows.append(
+            (
+                b.name,
+                count(b.n_pairs),
+                count(n.sum()),
+                f"{number(mean, 4)} ± {number(np.sqrt(mean), 2)}",
+                count(n.min()),
+                count(n.max()),
+                number(chi2 / (n.size - 1), 3),
+            )
+        )
+    heads = ("all pairs", "used", "even coverage", "fewest", "most", "chi² per bin")
+    return TextTable(
+        "Coverage: pairs used by the fit, in bins",
+        ("Band", *heads),
+        tuple(rows),
+        note="Even coverage with its Poisson error; chi² per bin is 1 where that is all there is.",
+    )
+
+
+@BANDS.table("formal")
+def formal_table(inputs: BandsInput) -> TextTable:
+    """Largest formal radii, and what printed ones imply."""
+    columns = ["Band", "least squares", "posterior"]
+    if inputs.wise:
+        columns += ["printed", "error of a pair it implies (pix)", "half width found (pix)"]
+    rows = []
+    for b in inputs.bands:
+        cells = [b.name, *(_length(b, m.radius_max) for m in (b.formal_map, b.posterior_map))]
+        if inputs.wise and b.printed is not None:
+            width = float(b.sums.histograms["calibrated"].half_width().mean())
+            cells += [number(b.printed.formal_radius, 2), number(b.printed.implied_sigma, 3)]
+            cells.append(number(width, 3))
+        rows.append(tuple(cells))
+    note = ""
+    if inputs.wise:
+        note = (
+            "A printed radius implies an error of each pair if all published pairs lie evenly"
+            " over the array; where that is not the scatter found, the print used other pairs or"
+            " weights."
+        )
+    unit = "pix" if inputs.bands[0].formal_map.unit == "pix" else "unit as given"
+    return TextTable(f"Largest formal radius ({unit})", tuple(columns), tuple(rows), note=note)
+
+
+@BANDS.table("provenance")
+def provenance_table(inputs: BandsInput) -> TextTable:
+    """What made the page."""
+    return listing("", {key: str(value) for key, value in inputs.provenance.items()})

@@ -1,0 +1,199 @@
+"""What is measured on each band, and on several together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bayesdist.assess import uncertainty_map
+from bayesdist.assess.wise import (
+    BandBins,
+    StatisticsTable,
+    band_to_band_table,
+    fitting_table,
+    multiframe_table,
+)
+from bayesdist.missions.wise.assess.account import PRINTED_BINS, accounts
+from bayesdist.missions.wise.assess.distortion_field import DistortionField, field_of_solution
+from bayesdist.missions.wise.assess.formal_radii import implied_sigma
+from bayesdist.missions.wise.assess.histograms import band_sums
+from bayesdist.missions.wise.assess.partition_parts import partition_parts
+from bayesdist.missions.wise.assess.residual_correlation import residual_correlation
+from bayesdist.missions.wise.assess.residual_structure import residual_partition
+from bayesdist.missions.wise.bands.context import BandResult, BandsInput, Printed
+from bayesdist.missions.wise.bands.inputs import BandRun
+from bayesdist.missions.wise.bands.optical import OpticalModel
+from bayesdist.missions.wise.simulate import FORMAL_RADII, LONGEST_VECTORS, SAMPLE_SIZES, WISE_BANDS
+from bayesdist.model.basis import polynomial_terms
+
+__all__ = ["measure_bands"]
+
+GRID = (33, 33)
+SEED = 20110201
+
+
+def measure_bands(
+    runs: Mapping[str, BandRun],
+    *,
+    bins: int = 31,
+    optical: Mapping[str, OpticalModel] | None = None,
+    published: bool = True,
+    provenance: Mapping[str, object] | None = None,
+) -> BandsInput:
+    """Everything that tables and diagrams show.
+
+    Parameters
+    ----------
+    runs : mapping of str to BandRun
+        Their stars are read once and let go of, band by band.
+    bins : int
+        On each axis.
+    optical : mapping of str to OpticalModel, optional
+    published : bool
+        Whether values of WSDC D-T033 stand beside those of WISE's bands.
+    provenance : mapping, optional
+
+    Returns
+    -------
+    BandsInput
+
+    Raises
+    ------
+    InputError
+        For an optical model of another shape.
+    DegenerateError
+        When too few bins hold stars.
+    """
+    wise = published and set(runs) <= set(WISE_BANDS)
+    fields = {
+        name: field_of_solution(run.session.solution, epoch=run.session.epoch)
+        for name, run in runs.items()
+    }
+    bands = tuple(
+        _measured(run, fields[name], (optical or {}).get(name), bins, wise)
+        for name, run in runs.items()
+    )
+    arcsec = {b.name: b.arcsec for b in bands}
+    tables = _tables(bands)
+    first, *others = bands
+    return BandsInput(
+        bands=bands,
+        tables=tables,
+        accounts=accounts(
+            tables,
+            partition_parts({b.name: b.partition for b in bands}, arcsec),
+            arcsec,
+            {b.name: b.n_used for b in bands},
+            published=wise and bins == PRINTED_BINS,
+        ),
+        differences={
+            # in the first band's pixels: this one's are b.arcsec / first.arcsec of them
+            f"{b.name}−{first.name}": _times(
+                fields[b.name].minus(fields[first.name], first.arcsec / b.arcsec),
+                b.arcsec / first.arcsec,
+                fields[first.name],
+            ).vectors(GRID)
+            for b in others
+        },
+        n_bins=bins,
+        wise=wise,
+        optical="; ".join(dict.fromkeys(one.label for one in (optical or {}).values())),
+        provenance=provenance or {},
+    )
+
+
+def _times(field: DistortionField, factor: float, like: DistortionField) -> DistortionField:
+    """A field on another array of the same part of the sky."""
+    order = field.basis.order
+    basis = type(like.basis)(order, like.basis.size, like.basis.reference_pixel)
+    return DistortionField(basis, factor * field.polynomial, like.to_pixels)
+
+
+def _measured(
+    run: BandRun, field: DistortionField, optical: OpticalModel | None, bins: int, wise: bool
+) -> BandResult:
+    session, fit = run.session, run.session.fit
+    less = None if optical is None else field.minus(optical.field(run.chip, run.arcsec))
+    vectors = field.vectors(GRID)
+    without = {"no correction": field} | ({} if less is None else {"optical model": less})
+    rms = float(np.linalg.norm(field.to_pixels) * max(fit.rms_u, fit.rms_v) / np.sqrt(2))
+    sums = session.shards.sum(
+        band_sums,
+        session.solution.mean,
+        fit.clip,
+        field.to_pixels,
+        without,
+        1.25 * vectors.length_max + 4 * rms,
+        bins,
+    )
+    session.close()
+    order = session.posterior.model.order
+    binned, rng = sums.bins.axes.residuals(), np.random.default_rng(SEED)
+    where = {"grid": GRID, "epoch": session.epoch}
+    convergence = session.posterior.convergence
+    return BandResult(
+        name=run.name,
+        path=run.path,
+        converged=convergence.converged,
+        reasons=tuple(convergence.reasons),
+        arcsec=run.arcsec,
+        size=run.chip.size,
+        order=order,
+        n_pairs=fit.n_rows,
+        n_used=fit.n_used,
+        sums=sums,
+        partition=residual_partition(binned, order=order, rng=rng),
+        correlation=residual_correlation(binned, order=order, rng=rng),
+        vectors=vectors,
+        formal_map=uncertainty_map(fit, **where),
+        posterior_map=uncertainty_map(session.solution, **where),
+        minus_optical=None if less is None else less.vectors(GRID),
+        printed=_printed(run.name, field) if wise else None,
+    )
+
+
+def _printed(band: str, field: DistortionField) -> Printed:
+    n = field.basis.size[0]
+    # the report's extremes of W4 are those to the edges of its array, of the others to the centres
+    # of the outermost pixels
+    reach = 1.0 if band == "W4" else (n - 1) / n
+    side = np.linspace(-reach, reach, GRID[0])
+    longest = float(np.hypot(*field.at_scaled(*np.meshgrid(side, side))).max())
+    return Printed(
+        LONGEST_VECTORS[band],
+        longest,
+        FORMAL_RADII[band],
+        implied_sigma(
+            FORMAL_RADII[band], SAMPLE_SIZES[band], order=field.basis.order, size=field.basis.size
+        ),
+    )
+
+
+def _tables(bands: tuple[BandResult, ...]) -> dict[str, StatisticsTable]:
+    """Tables 5-1 to 5-3; rows band by band, as the orders of the bands may differ."""
+    rng = np.random.default_rng(SEED)
+    arcsec = {b.name: b.arcsec for b in bands}
+    terms = {b.name: len(polynomial_terms(b.order)) for b in bands}
+
+    def rows(function: object, *several: BandResult, **options: object) -> StatisticsTable:
+        sums: dict[str, BandBins] = {b.name: b.sums.bins for b in several}
+        absorbed = max(terms[b.name] for b in several)
+        return function(sums, rng=rng, absorbed=absorbed, **options)  # type: ignore[operator]
+
+    pairs = [(a, b) for i, a in enumerate(bands) for b in bands[i + 1 :]]
+    made = {
+        "5-1": [rows(fitting_table, b) for b in bands],
+        "5-2": [rows(band_to_band_table, a, b, arcsec=arcsec) for a, b in pairs],
+        "5-3": [rows(multiframe_table, b, arcsec=arcsec) for b in bands],
+    }
+    return {
+        name: StatisticsTable(
+            several[0].title,
+            several[0].first,
+            several[0].unit,
+            tuple(row for table in several for row in table.rows),
+        )
+        for name, several in made.items()
+        if several
+    }

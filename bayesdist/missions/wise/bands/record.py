@@ -1,0 +1,211 @@
+"""The numbers of several bands for scripts: bands.json and one table for each of the report's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.session import write_table
+from bayesdist.missions.wise.assess.account import RowAccount
+from bayesdist.missions.wise.assess.histograms import ResidualHistogram
+from bayesdist.missions.wise.bands.context import BandResult, BandsInput
+
+__all__ = ["SCHEMA", "record_of", "write_tables"]
+
+SCHEMA = 1
+
+
+def record_of(inputs: BandsInput) -> dict[str, Any]:
+    """Content of bands.json.
+
+    Parameters
+    ----------
+    inputs : BandsInput
+
+    Returns
+    -------
+    dict
+    """
+    return {
+        "schema": SCHEMA,
+        "converged": not inputs.provisional,
+        "n_bins": inputs.n_bins,
+        "optical": inputs.optical or None,
+        "bands": [_band(b) for b in inputs.bands],
+        "differences": [
+            {
+                "name": name,
+                "unit": "pix",
+                "pixels_of": inputs.names[0],
+                "max": v.length_max,
+                "position_of_max": v.position_of_max,
+            }
+            for name, v in inputs.differences.items()
+        ],
+        "tables": {
+            name: {"unit": inputs.tables[name].unit, "rows": [_row(one) for one in several]}
+            for name, several in inputs.accounts.items()
+        },
+        "provenance": inputs.provenance,
+    }
+
+
+def _band(b: BandResult) -> dict[str, Any]:
+    c, p = b.correlation, b.partition
+    count = b.sums.bins.axes.count
+    out: dict[str, Any] = {
+        "name": b.name,
+        "run": b.path,
+        "converged": b.converged,
+        "reasons": b.reasons,
+        "order": b.order,
+        "arcsec_per_pixel": b.arcsec,
+        "n_pairs": b.n_pairs,
+        "n_used": b.n_used,
+        "vectors": {
+            "unit": "pix",
+            "max": b.vectors.length_max,
+            "position_of_max": b.vectors.position_of_max,
+        },
+        "formal_radius": {
+            "unit": b.formal_map.unit,
+            "least_squares": b.formal_map.radius_max,
+            "posterior": b.posterior_map.radius_max,
+        },
+        "partition": {
+            "blocks": p.k,
+            "p_value": p.p_value,
+            "significant": p.significant,
+            "edges_seen": p.edges_seen,
+            "rms_x": p.rms[0],
+            "rms_y": p.rms[1],
+            "unit": "pix",
+            "sentence": p.sentence,
+        },
+        "correlation": {
+            "unit": "pix2",
+            "p_value": c.p_value,
+            "chi2": c.chi2,
+            "reach": c.reach,
+            "separation": c.separation,
+            "xx": c.uu,
+            "yy": c.vv,
+            "xy": c.uv,
+            "sigma_xx": c.sigma_uu,
+            "sigma_yy": c.sigma_vv,
+            "sigma_xy": c.sigma_uv,
+        },
+        "histograms": {case: _histogram(h) for case, h in b.sums.histograms.items()},
+        "coverage": {
+            "expected": count.mean(),
+            "poisson_error": np.sqrt(count.mean()),
+            "min": count.min(),
+            "max": count.max(),
+            "chi2": ((count - count.mean()) ** 2).sum() / count.mean(),
+            "dof": count.size - 1,
+        },
+        "minus_optical_max": None if b.minus_optical is None else b.minus_optical.length_max,
+        "printed": None,
+    }
+    if b.printed is not None:
+        out["printed"] = {
+            "longest_vector": b.printed.longest_vector,
+            "longest_vector_here": b.printed.longest_here,
+            "formal_radius": b.printed.formal_radius,
+            "implied_sigma": b.printed.implied_sigma,
+        }
+    return out
+
+
+def _histogram(h: ResidualHistogram) -> dict[str, Any]:
+    return {
+        "unit": "pix",
+        "reach": h.reach,
+        "n": h.n,
+        "outside_x": h.outside[0],
+        "outside_y": h.outside[1],
+        "half_width_x": h.half_width()[0],
+        "half_width_y": h.half_width()[1],
+        "counts_x": h.counts[0],
+        "counts_y": h.counts[1],
+    }
+
+
+def _row(one: RowAccount) -> dict[str, Any]:
+    row = one.row
+    out: dict[str, Any] = {
+        "label": row.label,
+        "value": row.value,
+        "error": row.error,
+        "noise_free": row.noise_free,
+        "sigma_noise": row.sigma_noise,
+        "sigma_partition": one.partition,
+        "sigma_rest": one.rest,
+        "n_bins": row.n_bins,
+    }
+    if one.printed is not None:
+        out |= {
+            "printed": one.printed.value,
+            "printed_noise": one.printed_noise,
+            "printed_structure": one.printed_structure,
+            "printed_more": one.remains,
+            "verdict": one.verdict,
+            "account": one.sentence,
+            "contradictions": one.contradictions,
+        }
+    return out
+
+
+def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
+    """Write table_5_1.ecsv and so on, and return their names.
+
+    Parameters
+    ----------
+    inputs : BandsInput
+    folder : pathlib.Path
+
+    Raises
+    ------
+    InputError
+        When a file cannot be written.
+    """
+    names = []
+    for name, table in inputs.tables.items():
+        out = table.to_table(errors=True)
+        accounts = inputs.accounts[name]
+        _add(out, "Sigma partition", [one.partition for one in accounts], table.unit)
+        _add(out, "Sigma rest", [one.rest for one in accounts], table.unit)
+        if any(one.printed is not None for one in accounts):
+            for statistic, head in _HEADS.items():
+                values = [one.printed and one.printed.value[statistic] for one in accounts]
+                _add(out, f"{head} printed", values, table.unit)
+            for k, which in enumerate(("least", "most")):
+                values = [one.printed_noise and one.printed_noise[k] for one in accounts]
+                _add(out, f"Sigma printed noise, {which}", values, table.unit)
+            _add(out, "Sigma printed more", [one.remains for one in accounts], table.unit)
+            out["Account"] = [one.sentence for one in accounts]
+            out["Contradictions"] = [" ".join(one.contradictions) for one in accounts]
+        out.meta |= {"converged": not inputs.provisional, "bins": inputs.n_bins}
+        path = f"table_{name.replace('-', '_')}.ecsv"
+        write_table(out, folder / path)
+        names.append(path)
+    return tuple(names)
+
+
+_HEADS = {
+    "mean": "Mean",
+    "sigma": "Sigma",
+    "min": "Min",
+    "max": "Max",
+    "median": "Median",
+    "p01": "1%-tile",
+    "p99": "99%-tile",
+}
+
+
+def _add(table: Table, name: str, values: list[float | None], unit: str) -> None:
+    table[name] = np.array([np.nan if v is None else v for v in values], float)
+    table[name].unit = unit

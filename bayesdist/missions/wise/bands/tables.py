@@ -1,0 +1,133 @@
+"""Tables 5-1 to 5-3 as text, each with what its sigmas are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from bayesdist.assess.wise import STATISTICS
+from bayesdist.missions.wise.assess.account import RowAccount
+from bayesdist.missions.wise.assess.published import PrintedRow
+from bayesdist.missions.wise.bands.context import BANDS, BandsInput
+from bayesdist.report.numbers import MISSING, number, rounded
+from bayesdist.report.texttable import TextTable
+
+__all__ = ["account_table", "as_printed", "contradiction_table", "statistics_table", "tables_of"]
+
+TITLES = {
+    "5-1": "Residuals of the fit in bins",
+    "5-2": "Alignment of two bands observed together",
+    "5-3": "Alignment within a band in many frames, all pairs of bins",
+}
+_HEADS = ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile")
+
+
+@BANDS.table("tables")
+def tables_of(inputs: BandsInput) -> Sequence[TextTable]:
+    """Tables 5-1 to 5-3 with their accounts."""
+    return [
+        one(name, inputs) for name in inputs.tables for one in (statistics_table, account_table)
+    ]
+
+
+def statistics_table(name: str, inputs: BandsInput) -> TextTable:
+    """A table of the report: found with error, without noise, and printed."""
+    table = inputs.tables[name]
+    rows: list[tuple[str, ...]] = []
+    for one in inputs.accounts[name]:
+        row = one.row
+        found = [f"{rounded(row.value[s], row.error[s])}" for s in STATISTICS]
+        errors = [f"± {number(row.error[s], 2)}" if row.error[s] else MISSING for s in STATISTICS]
+        free = [rounded(row.noise_free[s], row.error[s]) for s in STATISTICS]
+        rows += [(row.label, "found", *found), ("", "error", *errors), ("", "noise-free", *free)]
+        if one.printed is not None:
+            rows.append(("", "printed", *(as_printed(one.printed, s) for s in STATISTICS)))
+    number_of = f"Table {name}. " if inputs.wise else ""
+    title = f"{number_of}{TITLES[name]}, {inputs.n_bins} × {inputs.n_bins} bins ({table.unit})"
+    note = ""
+    if name != "5-3" and any(one.printed is not None for one in inputs.accounts[name]):
+        note = (
+            "Found: the reference star minus the calibrated detection. The report speaks of WISE"
+            " minus 2MASS: there means and medians have the other sign, and minima and 1 % stand"
+            " for maxima and 99 %."
+        )
+    return TextTable(title, (table.first, "", *_HEADS), tuple(rows), words=(0, 1), note=note)
+
+
+def as_printed(row: PrintedRow, statistic: str) -> str:
+    """A printed value with the digits it was printed with."""
+    decimals = round(-np.log10(2 * row.rounding[statistic]))
+    return f"{row.value[statistic]:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def account_table(name: str, inputs: BandsInput) -> TextTable:
+    """What each sigma is made of, and how the printed one differs."""
+    unit = inputs.tables[name].unit
+    several = inputs.accounts[name]
+    printed = any(one.printed is not None for one in several)
+    columns = [inputs.tables[name].first, "Sigma", "noise", "partition", "rest"]
+    if printed:
+        columns += ["Printed", "its noise", "its structure", "more there", "Why"]
+    note = "sigma² = noise² + partition² + rest²; a partition counts where one was found."
+    if printed:
+        note += (
+            " The noise of a printed sigma follows from the printed radial mean and the number of"
+            " pairs, for errors that are normal or distributed as here; the last column but one is"
+            " the difference of the structures in quadrature."
+        )
+    return TextTable(
+        f"What these sigmas are made of ({unit})",
+        tuple(columns),
+        tuple(tuple(_account(one, printed=printed)) for one in several),
+        words=(0, 9),
+        note=note,
+    )
+
+
+def _account(one: RowAccount, *, printed: bool) -> Iterator[str]:
+    yield one.row.label
+    for value in (one.row.value["sigma"], one.row.sigma_noise, one.partition, one.rest):
+        yield number(value, 3)
+    if not printed:
+        return
+    if one.printed is None:
+        yield from (MISSING,) * 5
+        return
+    yield as_printed(one.printed, "sigma")
+    low, high = (number(noise, 2) for noise in one.printed_noise or (None, None))
+    yield low if low == high else f"{low} to {high}"
+    yield number(one.printed_structure, 2)
+    yield number(one.remains, 2)
+    yield _why(one)
+
+
+def _why(one: RowAccount) -> str:
+    if any("sigma" in sentence for sentence in one.contradictions):
+        return "the printed sigma contradicts other rows"
+    if one.verdict == "same":
+        return "structure is the same within its error"
+    if one.verdict == "below noise":
+        return "errors of the print are distributed otherwise"
+    where = "print" if one.verdict == "print has more" else "this set"
+    if one.row.label.endswith("/radial"):
+        return f"the scatter of stars changes more over the array in {where}"
+    if "-" in one.row.label:
+        return f"errors of the two bands are larger or less alike in {where}"
+    return f"{where} has systematic errors of its own"
+
+
+@BANDS.table("tables")
+def contradiction_table(inputs: BandsInput) -> TextTable | None:
+    """Where printed rows contradict themselves or each other; None where nothing is printed."""
+    rows = [
+        (f"Table {name}", sentence)
+        for name, several in inputs.accounts.items()
+        for one in several
+        for sentence in one.contradictions
+    ]
+    if not rows:
+        return None
+    return TextTable(
+        "Where the printed tables contradict themselves", ("", ""), tuple(rows), words=(0, 1)
+    )

@@ -1,0 +1,136 @@
+"""`bayesdist wise bring-up`: pairs and distortion from lists of stars that nobody has paired."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+from numpy.typing import NDArray
+
+from bayesdist.app.folder import whole_folder
+from bayesdist.app.screen import table_text
+from bayesdist.app.session import write_table
+from bayesdist.data import RadialLimit, RvbPairs
+from bayesdist.data.frame_stars import FrameStars
+from bayesdist.data.rvb_files import ARRAY_SIZE, RVB_ALIASES, band_name
+from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.files import read_table
+from bayesdist.data.tables.names import find_columns
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.bands.optical import optical_models
+from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
+from bayesdist.missions.wise.rvb.write import write_rvb
+from bayesdist.model import Chip, DistortionModel
+
+__all__ = ["bring_up_files"]
+
+Float = NDArray[np.float64]
+
+_COLUMNS = {
+    "x": ("x",),
+    "y": ("y",),
+    "sigma": ("sigma",),
+    "frame": RVB_ALIASES["exposure"],
+}
+_SHOWN = ("order", "n_pairs", "n_believed", "n_false", "coverage", "rms", "moved")
+
+
+def bring_up_files(
+    detections: str | Path,
+    reference: str | Path,
+    output: str | Path,
+    *,
+    band: str,
+    radius: float,
+    corner_radius: float,
+    order: int = 4,
+    optical: str | Path | None = None,
+    rotation: float = 0.0,
+) -> str:
+    """Write the pairs that matching and fitting in turn arrive at, and a table of the rounds.
+
+    Parameters
+    ----------
+    detections, reference : path
+        Tables with columns x, y, sigma and frame: detections in pixels, reference stars where an
+        array without distortion would see them in the frame, in pixels too.
+    output : path
+        New folder: pairs/ for `format = "rvb"`, rounds.ecsv.
+    band : str
+    radius, corner_radius : float
+        Within which pairs are accepted, in the array's centre and in its corners; pixels.
+    order : int
+        Of the polynomial in the end.
+    optical : path, optional
+        SIP header or WISE meta-data to begin with; by default no distortion.
+    rotation : float
+        Degrees by which that is turned, from x towards y.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For what cannot be read or written, and as `bring_up`.
+    """
+    band = band_name(band)
+    size = ARRAY_SIZE[band]
+    centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
+    model = DistortionModel(order, (Chip(1, band, size, centre),))
+    start = None if optical is None else _start(model, band, optical, rotation)
+    stars, others = _read_lists(Path(detections), Path(reference))
+    up = bring_up(stars, others, model, start, acceptance=RadialLimit(radius, corner_radius))
+    rows = [{"round": k, **asdict(one)} for k, one in enumerate(up.rounds, 1)]
+    rows = [{name: row[name] for name in ("round", *_SHOWN)} for row in rows]
+    with whole_folder(Path(output)) as folder:
+        write_rvb([_pairs(up, band)], folder / "pairs")
+        write_table(Table(rows), folder / "rounds.ecsv")
+    return f"{table_text(rows, 4)}\n{up.sentence}\n{output}/pairs: calibrate with format = 'rvb'"
+
+
+def _start(model: DistortionModel, band: str, optical: str | Path, rotation: float) -> Float:
+    """Parameters of an optical model, without terms beyond the order of the model."""
+    chip = model.chips[0]
+    arcsec = 2.75 * ARRAY_SIZE["W1"][0] / chip.size[0]
+    found = optical_models([optical], rotation, [band])[band].field(chip, arcsec)
+    basis = model.basis()
+    coefficients = np.zeros((2, basis.n_terms))
+    n = min(basis.n_terms, found.polynomial.shape[1])
+    coefficients[:, :n] = found.polynomial[:, :n]
+    # the pixels themselves
+    for axis, term in enumerate(((1, 0), (0, 1))):
+        coefficients[axis, 0] += chip.reference_pixel[axis]
+        coefficients[axis, basis.terms.index(term)] += basis.half_size[axis]
+    return coefficients.ravel()
+
+
+def _read_lists(*paths: Path) -> list[FrameStars]:
+    """Lists of stars with one numbering of their frames."""
+    columns, frames = [], []
+    for path in paths:
+        table = read_table(path)
+        found = find_columns(table.colnames, None, _COLUMNS, source=str(path))
+        missing = [name for name in _COLUMNS if name not in found]
+        if missing:
+            raise InputError(
+                f"has no column {missing[0]!r} among {', '.join(table.colnames)}",
+                where=str(path),
+                do="give x, y, sigma and frame",
+            )
+        one = {name: SourceColumn(table[key], str(path), key) for name, key in found.items()}
+        columns.append({name: one[name].numbers() for name in ("x", "y", "sigma")})
+        codes, names = one["frame"].labels()
+        frames.append(np.array(names, str)[codes])
+    code = np.unique(np.concatenate(frames), return_inverse=True)[1]
+    parts = np.split(code, np.cumsum([len(one) for one in frames])[:-1])
+    return [FrameStars(**one, frame=part) for one, part in zip(columns, parts, strict=True)]
+
+
+def _pairs(up: BringUp, band: str) -> RvbPairs:
+    """The believed pairs of the last round."""
+    return RvbPairs(replace(up.matches, filter_names=(band,)))

@@ -1,0 +1,156 @@
+"""Matches for a bring-up, taken from bins of the detector with more of them than chance gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import poisson
+
+from bayesdist.data.frame_stars import FrameStars
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.matching.pairs import mutual_pairs
+from bayesdist.data.rvb_accept import RadialLimit
+from bayesdist.errors import InputError
+from bayesdist.model import DistortionModel
+
+__all__ = ["Believed", "Field"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+RARE = 1e-3
+DISPLACED = 10.0  # in units of the radius in the corners
+GRID = 17  # points on each axis where models are compared
+OF_THE_BEST = 0.5  # a bin has at least this fraction of the matches that good bins have
+_DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """Matches in covered bins, and the statistics of the matching."""
+
+    index: Int  # row of each match in the detections
+    partner: Int  # row of each match in the reference
+    n_pairs: int  # all matches, outside covered bins too
+    n_false: float  # expected number of false ones in covered bins
+    covered: Bool
+    coverage: float  # fraction of the bins with detections that are covered
+
+
+class Field:
+    """Detections, reference stars and the bins of the detector."""
+
+    def __init__(
+        self, detections: FrameStars, reference: FrameStars, model: DistortionModel, bins: int
+    ) -> None:
+        self.detections, self.reference, self.model, self.bins = detections, reference, model, bins
+        size = model.chips[0].size
+        out = np.zeros(len(detections), bool)
+        for z, n in zip((detections.x, detections.y), size, strict=True):
+            out |= (z < 0.5) | (z > n + 0.5)
+        if out.any():
+            k = int(np.argmax(out))
+            raise InputError(
+                f"detection {k + 1} lies at pixel ({detections.x[k]:.2f}, {detections.y[k]:.2f}), "
+                f"outside the {size[0]:g} x {size[1]:g} detector",
+                where="detections",
+                do="correct the detector's size or drop the row",
+            )
+        ix, iy = (
+            np.clip(((z - 0.5) / n * bins).astype(np.int64), 0, bins - 1)
+            for z, n in zip((detections.x, detections.y), size, strict=True)
+        )
+        self.code = iy * bins + ix
+        self.size = size
+        x, y = (g.ravel() for g in np.meshgrid(*(np.linspace(1.0, n, GRID) for n in size)))
+        self.grid = FrameStars(x, y, np.ones(len(x)), np.zeros(len(x), np.int64))
+
+    def positions(self, theta: Float | None, stars: FrameStars) -> Float:
+        """Undistorted positions (N, 2); without parameters the pixel positions themselves."""
+        return stars.points if theta is None else self.model.predict(theta, stars.x, stars.y)
+
+    def distance(self, before: Float | None, now: Float) -> float:
+        """Largest difference of two models over the detector."""
+        step = self.positions(now, self.grid) - self.positions(before, self.grid)
+        return float(np.hypot(*step.T).max())
+
+    def _paired(self, position: Float, radius: Float) -> tuple[Int, Int]:
+        """Rows of detections (n,) and reference stars (n,) that are each other's nearest."""
+        stars, others = self.detections, self.reference
+        index, partner, _ = mutual_pairs(
+            position, others.points, radius, frame=stars.frame, reference_frame=others.frame
+        )
+        return index, partner
+
+    def match(self, theta: Float | None, rule: RadialLimit, number: int) -> Believed:
+        """Matches of a round in the bins that have more of them than chance gives."""
+        stars, n_bins = self.detections, self.bins**2
+        position = self.positions(theta, stars)
+        radius = rule.at(stars.x, stars.y, self.size)
+        index, partner = self._paired(position, radius)
+        # displaced by more than the detector is distorted, detections find false matches only
+        chance = np.zeros(n_bins)
+        for direction in _DIRECTIONS:
+            moved = position + DISPLACED * rule.corner * np.array(direction)
+            strangers, _ = self._paired(moved, radius)
+            chance += np.bincount(self.code[strangers], minlength=n_bins) / len(_DIRECTIONS)
+        count = np.bincount(self.code[index], minlength=n_bins)
+        there = np.bincount(self.code, minlength=n_bins)
+        covered = _covered(count, there, chance)
+        good = covered[self.code[index]]
+        if not good.any():
+            raise InputError(
+                f"{len(index)} pairs are found in round {number} where chance gives "
+                f"{chance.sum():.0f}, and no place on the detector stands out",
+                where="bring-up",
+                do="check orientation, offset and scale of the frames, or give another start or "
+                "a larger radius",
+            )
+        n, n_chance = int(there[covered].sum()), float(chance[covered].sum())
+        return Believed(
+            index=index[good],
+            partner=partner[good],
+            n_pairs=len(index),
+            # only a detection without its own reference star takes another one
+            n_false=n_chance * (n - int(good.sum())) / (n - n_chance),
+            covered=covered,
+            coverage=float(covered.sum() / (there > 0).sum()),
+        )
+
+    def table(self, found: Believed) -> MatchTable:
+        """Match table of the accepted matches, with the frames as exposures."""
+        stars, others = self.detections, self.reference
+        sigma = np.hypot(stars.sigma[found.index], others.sigma[found.partner])
+        frames, exposure = np.unique(stars.frame[found.index], return_inverse=True)
+        return MatchTable.of_distinct_rows(  # no detection has two reference stars
+            x=stars.x[found.index],
+            y=stars.y[found.index],
+            u=others.x[found.partner],
+            v=others.y[found.partner],
+            sigma_u=sigma,
+            sigma_v=sigma,
+            unit=self.model.unit,
+            exposure=exposure,
+            exposure_names=tuple(str(f) for f in frames),
+            chip_numbers=(self.model.chips[0].number,),
+            sources=("bring-up",),
+        )
+
+
+def _covered(count: Int, there: Int, chance: Float) -> Bool:
+    """Boolean mask (n_bins,) of bins with more matches than chance and not far below the best bins.
+
+    `count` has the matches, `there` the detections and `chance` the matches of displaced detections
+    in each bin.
+    """
+    has = there > 0
+    expected = np.maximum(chance, there * (chance.sum() / there.sum()))
+    # so rare that in all bins together chance does it once in a thousand times
+    clear = poisson.sf(count - 1, expected) < RARE / has.sum()
+    share = np.divide(count - expected, there, out=np.zeros(len(there)), where=has)
+    if not clear.any():
+        return np.zeros(len(there), bool)
+    return np.asarray(clear & (share > OF_THE_BEST * np.quantile(share[clear], 0.9)))

@@ -1,0 +1,209 @@
+"""Commands of WISE: demo, bands, bring-up, rotate, rvb, and its simulated pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import click
+
+from bayesdist.app.commands.options import (
+    CommaList,
+    column_names,
+    command,
+    force,
+    new_folder,
+    seed,
+)
+
+
+@command()
+@click.option("-o", "--output", default="bayesdist-demo", metavar="DIR")
+@click.option("--force", is_flag=True, help="Replace an earlier demo.")
+@click.pass_obj
+def demo(line: str, output: str, force: bool) -> None:
+    """The main job on simulated data, beside the truth."""
+    from bayesdist.missions.wise.demo import demo as simulated_and_run
+
+    click.echo(simulated_and_run(output, force=force, command=line))
+
+
+@command()
+@click.argument("runs", nargs=-1, required=True, metavar="RUN...")
+@new_folder
+@click.option("--bins", type=int, default=31, metavar="N", help="Of residuals, on each axis.")
+@click.option(
+    "--optical",
+    type=CommaList(),
+    default=(),
+    metavar="FILE,...",
+    help="SIP header or WISE meta-data of an optical model; one, or one for each run.",
+)
+@click.option("--rotation", type=float, default=0.0, metavar="DEG", help="Of the optical model.")
+@click.option("--no-published", is_flag=True, help="Without values of WISE's report.")
+@click.pass_obj
+def bands(
+    line: str,
+    runs: tuple[str, ...],
+    output: str,
+    bins: int,
+    optical: tuple[str, ...],
+    rotation: float,
+    no_published: bool,
+) -> None:
+    """Tables and diagrams of bands beside each other.
+
+    Each RUN is finished, and of another band.
+    """
+    from bayesdist.missions.wise.bands.command import bands_of_runs
+
+    text = bands_of_runs(
+        runs,
+        output,
+        bins=bins,
+        optical=optical,
+        rotation=rotation,
+        published=not no_published,
+        command=line,
+    )
+    click.echo(text)
+
+
+@command(name="bring-up")
+@click.argument("detections", metavar="DETECTIONS")
+@click.argument("reference", metavar="REFERENCE")
+@new_folder
+@click.option("--band", required=True, metavar="W1")
+@click.option("--order", type=int, default=4, metavar="N", help="Of the polynomial in the end.")
+@click.option(
+    "--radius",
+    type=float,
+    default=1.0,
+    metavar="A",
+    help="Within which pairs are accepted in the array's centre, pixels.",
+)
+@click.option("--corner-radius", type=float, default=3.0, metavar="A", help="... in its corners.")
+@click.option("--optical", metavar="FILE", help="SIP header or WISE meta-data to begin with.")
+@click.option("--rotation", type=float, default=0.0, metavar="DEG", help="Of the optical model.")
+def bring_up(detections: str, reference: str, output: str, **options: Any) -> None:
+    """Pairs and distortion from lists of stars that nobody has paired.
+
+    DETECTIONS and REFERENCE have columns x, y, sigma and frame, in pixels of the band.
+    """
+    from bayesdist.missions.wise.bring_up.command import bring_up_files
+
+    click.echo(bring_up_files(detections, reference, output, **options))
+
+
+@command()
+@click.argument("file", metavar="FILE")
+@click.option("--angle", type=float, default=0.0, metavar="DEG", help="From x towards y.")
+@click.option("--mirror", is_flag=True, help="Change the sign of x first.")
+@click.option("-o", "--output", required=True, metavar="OUT")
+@force
+def rotate(file: str, output: str, angle: float, mirror: bool, force: bool) -> None:
+    """A SIP header or WISE meta-data in rotated pixels."""
+    from bayesdist.missions.wise.rotate import rotate as write_rotated
+
+    click.echo(write_rotated(file, output, degrees=angle, mirror=mirror, force=force))
+
+
+@click.group()
+def rvb() -> None:
+    """Transform the reference positions of WISE's RvB pairs."""
+
+
+def _pairs(function: Callable[..., None]) -> Callable[..., None]:
+    """Argument and options of pairs, which both commands have."""
+    for decorate in (
+        click.option(
+            "--columns", type=column_names, metavar="KEY=NAME,...", help="As data.columns."
+        ),
+        click.option("--band", metavar="W1", help="Needed where the files hold several."),
+        new_folder,
+        click.argument("files", nargs=-1, required=True, metavar="FILE..."),
+    ):
+        function = decorate(function)
+    return function
+
+
+@command()
+@_pairs
+@click.option("--dx", type=float, default=0.0, metavar="A", help="Shift along x, pixels.")
+@click.option("--dy", type=float, default=0.0, metavar="A", help="Shift along y, pixels.")
+@click.option(
+    "--rotation",
+    type=float,
+    default=0.0,
+    metavar="DEG",
+    help="About the array's centre, from x towards y.",
+)
+@click.option(
+    "--scale-x",
+    type=float,
+    default=0.0,
+    metavar="A",
+    help="Relative to one: 1e-4 stretches x by so much.",
+)
+@click.option("--scale-y", type=float, default=0.0, metavar="A", help="Relative to one.")
+@click.option("--fit", is_flag=True, help="These five from the pairs, by least squares.")
+def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
+    """All pairs by one linear transformation.
+
+    FILE is an IPAC table, Parquet, or a folder.
+    """
+    from bayesdist.missions.wise.rvb.command import transform_files
+
+    click.echo(transform_files(files, output, **options))
+
+
+@command()
+@_pairs
+@click.option(
+    "--from", "free", required=True, metavar="TABLE", help="Solutions that pairs were made with."
+)
+@click.option(
+    "--to", "fixed", required=True, metavar="TABLE", help="Those that they are brought to."
+)
+def rereference(files: tuple[str, ...], output: str, **options: Any) -> None:
+    """Each frame from one solution to another."""
+    from bayesdist.missions.wise.rvb.command import rereference_files
+
+    click.echo(rereference_files(files, output, **options))
+
+
+rvb.add_command(transform)
+rvb.add_command(rereference)
+
+
+@command(name="wise")
+@new_folder
+@seed
+@force
+@click.option(
+    "--bands", type=CommaList(), default="W1,W2,W3,W4", metavar="W1,...", help="Of full sets."
+)
+@click.option("--pairs", type=int, metavar="N", show_default="as published", help="Of each band.")
+@click.option("--false-share", type=float, default=0.03, metavar="F", help="Of false matches.")
+@click.option("--partition-pattern", is_flag=True, help="Blocks in the residuals.")
+@click.option("--stars", type=int, metavar="N", help="One small table of one band instead.")
+@click.option("--band", metavar="W2", help="Of the small table.")
+@click.option("--fraction", type=float, help="Of false matches in the small table.")
+def simulate(
+    output: str,
+    seed: int,
+    force: bool,
+    stars: int | None,
+    band: str | None,
+    fraction: float | None,
+    **options: Any,
+) -> None:
+    """Matched stars of WISE and 2MASS, with a configuration."""
+    from bayesdist.missions.wise.simulated_pairs import simulate_sets, simulate_table
+
+    if stars is None and band is None and fraction is None:
+        click.echo(simulate_sets(output, seed=seed, force=force, **options))
+        return
+    asked: Mapping[str, Any] = {"stars": stars, "band": band, "fraction": fraction}
+    given = {name: value for name, value in asked.items() if value is not None}
+    click.echo(simulate_table(output, seed=seed, force=force, **given))

@@ -1,0 +1,179 @@
+"""`bayesdist demo`: the main job on simulated WISE W2 pairs, with the truth beside the estimate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from astropy.table import QTable
+
+from bayesdist.app.run import run
+from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.screen import number, table_text
+from bayesdist.app.session import Session
+from bayesdist.app.summary_text import results_text
+from bayesdist.data import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path, made_folder
+from bayesdist.missions.wise.simulate import simulate_wise
+from bayesdist.simulate import Truth
+
+__all__ = ["demo", "simulation_config", "write_simulation"]
+
+SEED = 20110201  # the date of the report that the coefficients come from
+N_STARS = 6000
+
+_CONFIG = """\
+# Matched WISE {band} and 2MASS positions, simulated from the published distortion
+# (WSDC D-T033, Appendix B); truth.ecsv holds what they were made from.
+
+[data]
+matches = "stars.ecsv"
+columns = {{x="x", y="y", u="u", v="v", sigma_u="sigma_u", sigma_v="sigma_v", mag="mag"}}
+
+[detector]
+name = "{band}"
+size = [1016, 1016]
+scale_mas = 2750.0
+
+[model]
+order = 4
+reference_pixel = [508.5, 508.5]
+
+[sampler]
+seed = 1
+
+[assess]
+grid = [33, 33]
+
+[[budget]]                      # the system of 2MASS positions against the sky
+name = "reference catalogue"
+kind = "systematic"
+sigma_u = 0.005
+sigma_v = 0.005
+unit = "pix"
+
+[[requirement]]
+name = "field-wide accuracy"
+statistic = "p95"
+limit = 0.03
+unit = "pix"
+probability = 0.95
+
+[[requirement]]
+name = "worst corner"
+statistic = "max"
+limit = 0.02
+unit = "pix"
+probability = 0.95
+
+[products]
+sip = {{inverse_order = 5, linear = "sip"}}
+"""
+
+
+def simulation_config(band: str) -> str:
+    """Configuration for a simulated band."""
+    return _CONFIG.format(band=band)
+
+
+def write_simulation(folder: Path, matches: MatchTable, truth: Truth, config: str) -> None:
+    """Write stars.ecsv, truth.ecsv and config.toml of a simulation.
+
+    Raises
+    ------
+    InputError
+        When the folder cannot be made or written.
+    """
+    made_folder(folder)
+    stars = QTable()
+    for name in ("x", "y", "u", "v", "sigma_u", "sigma_v"):
+        stars[name] = getattr(matches, name)
+        stars[name].unit = "pix"
+    if matches.mag is not None:
+        stars["mag"] = matches.mag
+    if matches.epoch is not None:
+        stars["epoch"] = matches.epoch
+    if len(matches.exposure_names) > 1:
+        stars["exposure"] = np.array(matches.exposure_names)[matches.exposure]
+    true = QTable({"name": list(truth.model.names), "value": truth.theta})
+    true.meta = {
+        "fraction": truth.fraction,
+        "jitter": truth.jitter,
+        "outlier_scale": truth.outlier_scale,
+        "false_matches": int(truth.false.sum()),
+    }
+    for table, name in ((stars, "stars.ecsv"), (true, "truth.ecsv")):
+        with atomic_path(folder / name) as temporary:
+            table.write(temporary, format="ascii.ecsv")
+    with atomic_path(folder / "config.toml") as temporary:
+        temporary.write_text(config, encoding="utf-8")
+
+
+def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
+    """Simulate, calibrate, and compare with the truth.
+
+    Parameters
+    ----------
+    folder : path
+        Holds ``input/`` and ``run/`` afterwards.
+    force : bool
+        Replace an earlier demo.
+    command : str
+        For the record.
+
+    Returns
+    -------
+    str
+        What to print.
+    """
+    folder = Path(folder)
+    known = {"input", "run"}
+    if folder.is_dir() and {p.name for p in folder.iterdir()} - known:
+        raise InputError("the folder holds other files", where=str(folder), do="choose another one")
+    if (folder / "run").exists() and not force:
+        raise InputError(
+            "the folder holds another demo", where=str(folder), do="replace it by --force"
+        )
+    matches, truth = simulate_wise(N_STARS, rng=np.random.default_rng(SEED))
+    write_simulation(folder / "input", matches, truth, simulation_config("W2"))
+    run(folder / "input" / "config.toml", folder / "run", force=force, command=command)
+    session = Session(RunDirectory.open(folder / "run"))
+    return f"{_against_truth(session, truth)}\n\n{results_text(session)}"
+
+
+def _against_truth(session: Session, truth: Truth) -> str:
+    posterior, fit = session.posterior, session.fit
+    rows = []
+    for k, name in enumerate(posterior.model.names):
+        rows.append(
+            {
+                "coefficient": name,
+                "truth": truth.theta[k],
+                "posterior mean": posterior.mean[k],
+                "sd": posterior.sigma[k],
+                "formal": fit.sigma[k],
+                "off by (sd)": (posterior.mean[k] - truth.theta[k]) / posterior.sigma[k],
+            }
+        )
+    true = {"f": truth.fraction, "j": truth.jitter, "s_out": truth.outlier_scale}
+    for key, values in posterior.hyper.items():
+        mean, sd = float(values.mean()), float(values.std(ddof=1))
+        rows.append(
+            {
+                "coefficient": key,
+                "truth": true[key],
+                "posterior mean": mean,
+                "sd": sd,
+                "formal": None,
+                "off by (sd)": (mean - true[key]) / sd,
+            }
+        )
+    for row in rows:
+        sd = row["sd"]
+        places = max(0, int(np.ceil(1 - np.log10(sd))))
+        row["truth"] = f"{row['truth']:.{places}f}"
+        row["posterior mean"] = f"{row['posterior mean']:.{places}f}"
+        row["sd"], row["formal"] = number(sd, 2), number(row["formal"], 2)
+        row["off by (sd)"] = f"{row['off by (sd)']:+.2f}"
+    return f"Coefficients (Legendre form, {posterior.unit})\n{table_text(rows)}"

@@ -1,0 +1,94 @@
+"""`bayesdist wise rotate`: a product in rotated or mirrored pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bayesdist.app.output import refuse_existing
+from bayesdist.app.screen import number
+from bayesdist.errors import InputError
+from bayesdist.products import (
+    SipHeader,
+    WiseBand,
+    read_sip,
+    read_wise_meta,
+    rotated_sip,
+    write_sip,
+    write_wise_meta,
+)
+from bayesdist.products.registry import open_document
+
+__all__ = ["rotate"]
+
+
+def rotate(
+    path: str | Path,
+    output: str | Path,
+    *,
+    degrees: float,
+    mirror: bool = False,
+    force: bool = False,
+) -> str:
+    """Write a SIP header or WISE meta-data in rotated or mirrored pixels.
+
+    Parameters
+    ----------
+    path : path
+    output : path
+        Of the same kind as the input; a SIP header is a FITS file where the name ends in .fits.
+    degrees, mirror
+        As `rotated_sip`.
+    force : bool
+        Replace a file that is there.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For a file of another kind, an output in use, an angle that is no finite number, and of
+        WISE meta-data one that is no multiple of 90 degrees, or a skew.
+    """
+    path, output = Path(path), Path(output)
+    refuse_existing(output, force)
+    key = open_document(path).format.key
+    if key == "sip":
+        turned = rotated_sip(read_sip(path), degrees, mirror=mirror)
+        write_sip(turned, output)
+        lines = [_line("", turned)]
+    elif key == "wise_meta":
+        bands = {one.band: _turned(one, degrees, mirror, str(path)) for one in read_wise_meta(path)}
+        write_wise_meta(output, bands)
+        lines = [_line(f"W{one.band}: ", one.sip) for one in read_wise_meta(output)]
+    else:
+        raise InputError(
+            "holds no SIP keywords", where=str(path), do="give a SIP header or WISE meta-data"
+        )
+    mirrored = "mirrored and " if mirror else ""
+    return "\n".join([f"{output}: {mirrored}rotated by {degrees:g} degrees", *lines])
+
+
+def _turned(one: WiseBand, degrees: float, mirror: bool, where: str) -> SipHeader:
+    if degrees % 90 != 0:
+        raise InputError(
+            f"the angle is {degrees:g}, and arrays of WISE meta-data lie along the pixel axes",
+            where=where,
+            do="give a multiple of 90",
+        )
+    if one.skew != 0:
+        # a factor on one axis becomes one on the other, and a rotation
+        raise InputError(
+            f"SKEW of band {one.band} is {one.skew:g} rad, which cannot be kept in a rotated frame",
+            where=where,
+            do="put it into A and B",
+        )
+    return rotated_sip(one.sip, degrees, mirror=mirror)
+
+
+def _line(name: str, sip: SipHeader) -> str:
+    said = {"A_DMAX": sip.a_dmax, "B_DMAX": sip.b_dmax, "worst closure": sip.closure}
+    parts = [f"{what} {number(value)} px" for what, value in said.items() if value is not None]
+    return f"  {name}{', '.join(parts) or 'no maxima and no closure stated'}"

@@ -1,0 +1,1 @@
+"""Reference positions of RvB pairs, moved by linear transformations: TRSrvb and RERrvb."""

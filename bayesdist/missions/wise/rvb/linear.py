@@ -1,0 +1,227 @@
+"""The linear transformation between reference stars and detections, by least squares.
+
+It takes constant and linear offsets out of a set of pairs (TRSrvb in WSDC D-T033, section 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import DegenerateError, InputError
+from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
+
+__all__ = [
+    "FIVE",
+    "LinearMoments",
+    "TransformFit",
+    "fit_transform",
+    "linear_moments",
+]
+
+Float = NDArray[np.float64]
+
+FIVE = PARAMETERS[:5]
+
+_RANK = 1e-12  # eigenvalues of the unit-diagonal normal matrix below this are zero
+
+
+@dataclass(frozen=True, eq=False)
+class LinearMoments:
+    """All that pairs say about a linear transformation: sums, which add over pieces of the data.
+
+    Parameters
+    ----------
+    weight : ndarray, shape (2, 3, 3)
+        sum of w p p^T with p = (1, u - centre, v - centre), for the axes x and y.
+    right : ndarray, shape (2, 3)
+        sum of w p times the offset of the detection, x - u or y - v.
+    chi2 : float
+        sum of w times the squared offsets.
+    n : int
+        Pairs.
+    centre : tuple of float
+    """
+
+    weight: Float
+    right: Float
+    chi2: float
+    n: int
+    centre: tuple[float, float]
+
+    def __add__(self, other: LinearMoments) -> LinearMoments:
+        if self.centre != other.centre:
+            raise ValueError("moments about different centres do not add")
+        return LinearMoments(
+            self.weight + other.weight,
+            self.right + other.right,
+            self.chi2 + other.chi2,
+            self.n + other.n,
+            self.centre,
+        )
+
+
+def linear_moments(matches: MatchTable, centre: tuple[float, float]) -> LinearMoments:
+    """Sums over some pairs.
+
+    Parameters
+    ----------
+    matches : MatchTable
+        With errors, and u, v in pixels of the array.
+    centre : tuple of float
+        Of the transformation that will be fitted: the array's centre.
+
+    Returns
+    -------
+    LinearMoments
+
+    Raises
+    ------
+    InputError
+        Without errors, and for another unit.
+    """
+    where = ", ".join(matches.sources)
+    if matches.sigma_u is None or matches.sigma_v is None:
+        raise InputError("the matches carry no errors", where=where, do="give sigma columns")
+    if matches.unit != "pix":
+        raise InputError(
+            f"u, v are in {matches.unit}, and the detections in pixels",
+            where=where,
+            do="bring u, v to pixels of the array",
+        )
+    design = np.stack([np.ones(len(matches)), matches.u - centre[0], matches.v - centre[1]])
+    offsets = (matches.x - matches.u, matches.y - matches.v)
+    weight, right, chi2 = np.empty((2, 3, 3)), np.empty((2, 3)), 0.0
+    for axis, (offset, sigma) in enumerate(
+        zip(offsets, (matches.sigma_u, matches.sigma_v), strict=True)
+    ):
+        weighted = design / sigma**2
+        weight[axis] = weighted @ design.T
+        right[axis] = weighted @ offset
+        chi2 += float(((offset / sigma) ** 2).sum())
+    return LinearMoments(weight, right, chi2, len(matches), centre)
+
+
+@dataclass(frozen=True, eq=False)
+class TransformFit:
+    """A fitted linear transformation from reference stars to detections.
+
+    Parameters
+    ----------
+    transform : RvbTransform
+    cov : ndarray, shape (6, 6)
+        Formal covariance in the order of `PARAMETERS`; zero for what was held.  Distortion that is
+        not yet corrected is no noise: where chi2 / dof is far from one it says more than this.
+    chi2 : float
+    dof : int
+    """
+
+    transform: RvbTransform
+    cov: Float
+    chi2: float
+    dof: int
+
+    @property
+    def sigma(self) -> Float:
+        """Formal errors of the six parameters."""
+        return np.sqrt(np.diag(self.cov))
+
+    @property
+    def sentence(self) -> str:
+        """The parameters with their errors, in words."""
+        values = zip(PARAMETERS, self.transform.values, self.sigma, strict=True)
+        found = ", ".join(f"{name} {value:.6g} +- {sigma:.2g}" for name, value, sigma in values)
+        return f"fitted: {found} (pixels, radians, relative); chi-square {self.chi2:.4g}/{self.dof}"
+
+
+def fit_transform(
+    moments: LinearMoments,
+    *,
+    free: Sequence[str] = FIVE,
+    start: RvbTransform | None = None,
+) -> TransformFit:
+    """Weighted least squares for up to six parameters of the map from (u, v) to (x, y).
+
+    Parameters
+    ----------
+    moments : LinearMoments
+    free : sequence of str
+        Of `PARAMETERS`; five by default.
+    start : RvbTransform, optional
+        Values of the parameters that are held; the identity by default.
+
+    Returns
+    -------
+    TransformFit
+        `transformed` with its transform takes constant and linear offsets out of the pairs.
+
+    Raises
+    ------
+    InputError
+        For unknown parameters, or none.
+    DegenerateError
+        When the pairs do not determine the free ones, as when they lie on a line.
+    """
+    unknown = [name for name in free if name not in PARAMETERS]
+    if unknown or not free:
+        raise InputError(
+            f"{unknown[0]!r} is no parameter of a linear transformation"
+            if unknown
+            else "no parameter of the linear transformation is free",
+            where="free",
+            do=f"choose among {', '.join(PARAMETERS)}",
+        )
+    which = [k for k, name in enumerate(PARAMETERS) if name in free]
+    centre = moments.centre
+    now = RvbTransform(centre=centre) if start is None else start.about(centre)
+    # the affine coefficients of x and y in the order of `jacobian`: shift, then matrix by rows
+    order = np.array([[0, 2, 3], [1, 4, 5]])
+    weight, right = np.zeros((6, 6)), np.zeros(6)
+    for axis in (0, 1):
+        weight[np.ix_(order[axis], order[axis])] = moments.weight[axis]
+        right[order[axis]] = moments.right[axis]
+    for _ in range(30):
+        by = now.jacobian()[:, which]
+        normal = by.T @ weight @ by
+        _require_rank(normal, [PARAMETERS[k] for k in which])
+        step = np.linalg.solve(normal, by.T @ (right - weight @ _offset(now)))
+        values = now.values
+        values[which] += step
+        now = replace(now, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
+        # in units of the errors: far below what matters, or what rounding leaves of the offsets
+        if step @ normal @ step < max(1e-16, 1e-28 * moments.chi2):
+            break
+    else:
+        raise DegenerateError(
+            "the linear transformation does not converge",
+            where=", ".join(free),
+            do="check that x, y and u, v are positions on the same array",
+        )
+    cov = np.zeros((6, 6))
+    cov[np.ix_(which, which)] = np.linalg.inv(normal)
+    offset = _offset(now)
+    chi2 = moments.chi2 - 2 * right @ offset + offset @ weight @ offset
+    return TransformFit(now, cov, float(chi2), 2 * moments.n - len(which))
+
+
+def _offset(transform: RvbTransform) -> Float:
+    """Shift and matrix by rows, minus the identity: what is small keeps its digits."""
+    return np.concatenate([transform.shift, (transform.matrix - np.eye(2)).ravel()])
+
+
+def _require_rank(normal: Float, names: Sequence[str]) -> None:
+    scale = np.sqrt(np.diag(normal))
+    dead = scale == 0
+    values, vectors = np.linalg.eigh(normal / np.outer(*[np.where(dead, 1.0, scale)] * 2))
+    if values[0] < _RANK * values[-1]:
+        parts = np.abs(vectors[:, 0])
+        free = [name for name, part in zip(names, parts, strict=True) if part > 0.1 * parts.max()]
+        raise DegenerateError(
+            f"the pairs do not determine {', '.join(free)}",
+            where="linear transformation",
+            do="give pairs all over the array, or hold some of these",
+        )

@@ -1,0 +1,282 @@
+"""Linear transformations of RvB pairs, from one set of frame solutions to another.
+
+What TRSrvb and RERrvb do in WSDC D-T033, section 3: up to five parameters (two shifts, a rotation,
+two scales), and pairs brought from frame solutions with free scales to those with fixed ones.  A
+sixth parameter, the skew that the report's gnDSTR holds at zero, makes the transformations a group:
+what two of them do one after the other is one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+
+__all__ = ["PARAMETERS", "RvbTransform", "rereference", "transformed"]
+
+Float = NDArray[np.float64]
+
+PARAMETERS = ("shift_u", "shift_v", "rotation", "scale_u", "scale_v", "skew")
+
+# Errors of u and v stay uncorrelated in a MatchTable.  A transformation that correlates them by
+# more than this cannot be represented; a rotation of 0.05 with errors 1 to 1.5 makes 0.04.
+CORRELATED = 0.1
+
+
+@dataclass(frozen=True)
+class RvbTransform:
+    """(u, v) -> centre + shift + R K S ((u, v) - centre).
+
+    R turns by `rotation` from u towards v, S scales by 1 + scale_u and 1 + scale_v, and
+    K = [[1, skew], [0, 1]].
+
+    Parameters
+    ----------
+    shift_u, shift_v : float
+        In the unit of u, v.
+    rotation : float
+        Radians.
+    scale_u, scale_v : float
+        Relative to one, above -1.
+    skew : float
+        Radians.
+    centre : tuple of float
+        The point that rotation and scales leave where it is; by default the centre of a W1 array.
+
+    Raises
+    ------
+    InputError
+        For values that are not finite, and scales that leave nothing or mirror.
+    """
+
+    shift_u: float = 0.0
+    shift_v: float = 0.0
+    rotation: float = 0.0
+    scale_u: float = 0.0
+    scale_v: float = 0.0
+    skew: float = 0.0
+    centre: tuple[float, float] = (508.5, 508.5)
+
+    def __post_init__(self) -> None:
+        for name, value in zip(PARAMETERS, self.values, strict=True):
+            if not np.isfinite(value) or (name.startswith("scale") and value <= -1.0):
+                raise InputError(
+                    f"{name} of a linear transformation is {value:g}",
+                    do="give a finite number, and scales above -1",
+                )
+
+    @property
+    def values(self) -> Float:
+        """The six parameters, in the order of `PARAMETERS`."""
+        return np.array(astuple(self)[:6], float)
+
+    @property
+    def matrix(self) -> Float:
+        """R K S, shape (2, 2)."""
+        c, s = np.cos(self.rotation), np.sin(self.rotation)
+        upper = np.array([[1.0, self.skew], [0.0, 1.0]])
+        return np.array([[c, -s], [s, c]]) @ upper * [1 + self.scale_u, 1 + self.scale_v]
+
+    @property
+    def shift(self) -> Float:
+        """Both shifts, shape (2,)."""
+        return np.array([self.shift_u, self.shift_v])
+
+    def __call__(self, points: ArrayLike) -> Float:
+        """Transformed points.
+
+        Parameters
+        ----------
+        points : array_like, shape (..., 2)
+
+        Returns
+        -------
+        ndarray, same shape
+        """
+        offset = np.asarray(points, float) - self.centre
+        return offset @ self.matrix.T + self.centre + self.shift
+
+    @staticmethod
+    def of_matrix(matrix: ArrayLike, shift: ArrayLike, centre: tuple[float, float]) -> RvbTransform:
+        """The transformation with a given matrix and shift.
+
+        Parameters
+        ----------
+        matrix : array_like, shape (2, 2)
+            Without a mirror: its determinant is positive.
+        shift : array_like, shape (2,)
+        centre : tuple of float
+
+        Returns
+        -------
+        RvbTransform
+        """
+        matrix, shift = np.asarray(matrix, float), np.asarray(shift, float)
+        along = float(np.hypot(*matrix[:, 0]))
+        area = float(np.linalg.det(matrix))
+        if not area > 0:
+            raise InputError(
+                f"a linear transformation has the determinant {area:g}",
+                do="give one that neither mirrors nor flattens",
+            )
+        across = area / along
+        skew = float(matrix[:, 0] @ matrix[:, 1]) / along / across
+        rotation = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
+        return RvbTransform(
+            float(shift[0]), float(shift[1]), rotation, along - 1, across - 1, skew, centre
+        )
+
+    def about(self, centre: tuple[float, float]) -> RvbTransform:
+        """The same map with another centre."""
+        away = np.subtract(centre, self.centre)
+        shift = self.shift + (self.matrix - np.eye(2)) @ away
+        return replace(self, shift_u=float(shift[0]), shift_v=float(shift[1]), centre=centre)
+
+    def then(self, after: RvbTransform) -> RvbTransform:
+        """This one first, then another."""
+        after = after.about(self.centre)
+        shift = after.matrix @ self.shift + after.shift
+        return RvbTransform.of_matrix(after.matrix @ self.matrix, shift, self.centre)
+
+    def inverse(self) -> RvbTransform:
+        """The way back, about the same centre."""
+        back = np.linalg.inv(self.matrix)
+        return RvbTransform.of_matrix(back, -back @ self.shift, self.centre)
+
+    def jacobian(self) -> Float:
+        """Derivatives of shift and matrix by the parameters.
+
+        Returns
+        -------
+        ndarray, shape (6, 6)
+            Rows: both shifts, then the matrix row by row; columns in the order of `PARAMETERS`.
+        """
+        c, s = np.cos(self.rotation), np.sin(self.rotation)
+        turn, turned = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
+        scale = np.diag([1 + self.scale_u, 1 + self.scale_v])
+        upper = np.array([[1.0, self.skew], [0.0, 1.0]])
+        out = np.zeros((6, 6))
+        out[:2, :2] = np.eye(2)
+        for column, by in enumerate(
+            (
+                turned @ upper @ scale,
+                turn @ upper @ np.diag([1.0, 0.0]),
+                turn @ upper @ np.diag([0.0, 1.0]),
+                turn @ np.array([[0.0, 1.0], [0.0, 0.0]]) @ scale,
+            ),
+            2,
+        ):
+            out[2:, column] = by.ravel()
+        return out
+
+
+def transformed(matches: MatchTable, transform: RvbTransform) -> MatchTable:
+    """Pairs with their reference positions transformed, and the errors with them.
+
+    Parameters
+    ----------
+    matches : MatchTable
+    transform : RvbTransform
+
+    Returns
+    -------
+    MatchTable
+
+    Raises
+    ------
+    InputError
+        When errors of u and v would come out correlated by more than 0.1, which a table of matches
+        does not hold: unequal errors turned by an angle that is neither small nor a right one.
+    """
+    everywhere = np.zeros(len(matches), np.int64)
+    return _moved(matches, everywhere, transform.matrix[None], transform.shift[None],
+                  np.array([transform.centre]))  # fmt: skip
+
+
+def rereference(
+    matches: MatchTable,
+    free: Mapping[str, RvbTransform],
+    fixed: Mapping[str, RvbTransform],
+) -> MatchTable:
+    """Pairs as they would be with other solutions of their frames.
+
+    The reference positions of a frame are its stars' nominal pixels, brought to the band frame by
+    the frame's solution.  A solution with free scales takes up part of the distortion, another part
+    in each frame, so that linear terms of a calibration mean nothing; with scales held at one value
+    they do, and so do shifts and rotations between bands.  The pairs alone cannot tell what a free
+    solution took up: it has to be given.
+
+    Parameters
+    ----------
+    matches : MatchTable
+        Made with the free solutions.
+    free, fixed : mapping of str to RvbTransform
+        Solution of each frame: from nominal pixels, which are common to both, to the band frame.
+        Those of other bands than the one that is solved for are its solution, then the band's
+        translation and rotation known beforehand (`RvbTransform.then`).
+
+    Returns
+    -------
+    MatchTable
+
+    Raises
+    ------
+    InputError
+        For a frame without a solution, and as `transformed`.
+    """
+    moves = []
+    used, code = np.unique(matches.exposure, return_inverse=True)
+    for name in (matches.exposure_names[k] for k in used):
+        for kind, solutions in (("free", free), ("fixed", fixed)):
+            if name not in solutions:
+                raise InputError(
+                    f"frame {name!r} has no solution with {kind} scales",
+                    where=", ".join(matches.sources),
+                    do="give the solutions of all frames, or leave its pairs out",
+                )
+        moves.append(free[name].inverse().then(fixed[name]))
+    return _moved(
+        matches,
+        code,
+        np.array([one.matrix for one in moves]),
+        np.array([one.shift for one in moves]),
+        np.array([one.centre for one in moves]),
+    )
+
+
+def _moved(
+    matches: MatchTable, code: NDArray[np.int64], matrix: Float, shift: Float, centre: Float
+) -> MatchTable:
+    """Pairs moved by a linear map each: that of its code."""
+
+    def moved(u: Float, v: Float) -> Float:
+        points = np.stack([u, v])
+        offset = points.T - centre[code]
+        # the change is added: an identity leaves every digit
+        change = np.einsum("nij,nj->ni", (matrix - np.eye(2))[code], offset) + shift[code]
+        return points + change.T
+
+    columns = dict(zip(("u", "v"), moved(matches.u, matches.v), strict=True))
+    if matches.u_nominal is not None and matches.v_nominal is not None:
+        nominal = moved(matches.u_nominal, matches.v_nominal)
+        columns |= dict(zip(("u_nominal", "v_nominal"), nominal, strict=True))
+    if matches.sigma_u is not None and matches.sigma_v is not None:
+        var = np.stack([matches.sigma_u, matches.sigma_v], axis=1) ** 2
+        out = np.sqrt(np.einsum("nij,nj->ni", (matrix**2)[code], var))
+        both = np.einsum("nj,nj->n", (matrix[:, 0] * matrix[:, 1])[code], var)
+        correlation = np.abs(both / (out[:, 0] * out[:, 1]))
+        if correlation.max() > CORRELATED:
+            worst = int(np.argmax(correlation))
+            raise InputError(
+                f"the errors of u and v would be correlated by {correlation[worst]:.2f}",
+                where=f"{matches.sources[matches.source[worst]]}, row {matches.row[worst] + 1}",
+                do="give both axes the same errors before, or transform the detections instead",
+            )
+        columns |= {"sigma_u": out[:, 0], "sigma_v": out[:, 1]}
+    same = {one.name: getattr(matches, one.name) for one in fields(matches)}
+    return MatchTable.of_distinct_rows(**(same | columns))

@@ -1,0 +1,80 @@
+"""Pattern in the residuals by the partition of the point-spread function.
+
+WSDC D-T033, section 5: point sources are fitted with a template that changes from block to block of
+the array; the residuals show the blocks, 5 x 5 of them in W1 and W2, 2 x 2 in W3, none in W4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from bayesdist.model import PolynomialBasis
+
+__all__ = ["BLOCKS", "PartitionPattern", "partition_pattern"]
+
+Float = NDArray[np.float64]
+
+BLOCKS = {"W1": 5, "W2": 5, "W3": 2}  # on each axis
+
+
+@dataclass(frozen=True, eq=False)
+class PartitionPattern:
+    """Offsets that are linear within each block and jump at its edges.
+
+    `smooth` is the polynomial that is subtracted, so that the truth of the coefficients is unique:
+    over the array the pattern has no part that the polynomial could follow.
+    """
+
+    basis: PolynomialBasis
+    local: Float  # (2, k, k, 3), by axis, row, column: offset, tilts on x, y; pixels
+    smooth: Float  # (2, n_terms)
+
+    @property
+    def blocks(self) -> int:
+        """Blocks on each axis."""
+        return self.local.shape[1]
+
+    def offsets(self, x: Float, y: Float) -> Float:
+        """Offsets (N, 2) in pixels at FITS 1-based pixels (N,)."""
+        return self.blocked(x, y) - self.basis.evaluate(x, y) @ self.smooth.T
+
+    def blocked(self, x: Float, y: Float) -> Float:
+        """Offsets (N, 2) without the subtracted polynomial, at pixels (N,)."""
+        k = self.blocks
+        at = []
+        for scaled in self.basis.scaled(x, y):
+            within = (scaled + 1.0) * (k / 2)
+            block = np.clip(within.astype(np.int64), 0, k - 1)
+            at.append((block, 2.0 * (within - block) - 1.0))
+        (column, dx), (row, dy) = at
+        offset, tilt_x, tilt_y = np.moveaxis(self.local[:, row, column], 2, 0)
+        return (offset + tilt_x * dx + tilt_y * dy).T
+
+
+def partition_pattern(
+    basis: PolynomialBasis, blocks: int, sigma: tuple[float, float], rng: np.random.Generator
+) -> PartitionPattern:
+    """Pattern of so many blocks on each axis, with an rms of `sigma` pixels on x and y."""
+    local = rng.standard_normal((2, blocks, blocks, 3))
+    raw = PartitionPattern(basis, local, np.zeros((2, basis.n_terms)))
+    x, y, weight = _nodes(basis, blocks)
+    phi = basis.evaluate(x, y)
+    weighted = phi * weight[:, None]
+    smooth = np.linalg.solve(weighted.T @ phi, weighted.T @ raw.offsets(x, y)).T
+    rms = np.sqrt(weight @ PartitionPattern(basis, local, smooth).offsets(x, y) ** 2)
+    factor = np.asarray(sigma) / rms
+    return PartitionPattern(basis, local * factor[:, None, None, None], smooth * factor[:, None])
+
+
+def _nodes(basis: PolynomialBasis, blocks: int) -> tuple[Float, Float, Float]:
+    """Pixels and weights of sum 1 that integrate polynomials over all blocks exactly."""
+    nodes, weights = legendre.leggauss(basis.order + 1)
+    within = ((np.arange(blocks)[:, None] + (nodes + 1.0) / 2.0) / blocks).ravel()
+    one = np.tile(weights / (2.0 * blocks), blocks)
+    nx, ny = basis.size
+    x, y = np.meshgrid(0.5 + nx * within, 0.5 + ny * within)
+    return x.ravel(), y.ravel(), np.outer(one, one).ravel()

@@ -1,0 +1,103 @@
+"""Printed values of the report of the WISE calibration (WSDC D-T033)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = [
+    "FORMAL_RADII",
+    "LARGEST_CORRECTIONS",
+    "LONGEST_VECTORS",
+    "RADIAL_RESIDUALS",
+    "RESIDUAL_SIGMAS",
+    "SAMPLE_SIZES",
+    "WISE_ARRAYS",
+    "WISE_BANDS",
+    "WISE_COEFFICIENTS",
+    "WiseArray",
+]
+
+WISE_BANDS = ("W1", "W2", "W3", "W4")
+
+# Appendix B.  band: (A, B), each in the order of polynomial_terms(4): 00, 10, 01, 20, 11, 02, 30,
+# ...  All as printed but for one: as B_0_2 of W1 the report prints B_1_1 once more.  The value here
+# is the one for which the printed inverse closes best (0.0002 px rms over the array); with it
+# B_DMAX is 1.066 as printed, with the printed one 1.97.  A_1_0 of W3 is printed with a digit too
+# many; which one it is changes no position by more than 3e-7 px.
+# fmt: off
+WISE_COEFFICIENTS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "W1": (
+        (7.228039e-01, -7.790246e-04, -1.243220e-04, -1.629945e-06, 1.344445e-06, -7.793528e-06,
+         2.756392e-09, -1.186318e-10, 1.228555e-09, -2.928111e-10,
+         1.794526e-12, -4.586393e-13, 1.503974e-12, -5.895443e-13, -6.270019e-13),
+        (-7.946909e-02, -2.481941e-04, 3.218232e-04, -6.590985e-08, -3.541684e-06, 1.1657e-06,
+         -6.360093e-11, -2.600160e-10, -4.987962e-10, -3.174803e-09,
+         8.797685e-13, 7.028808e-13, -2.594371e-13, 1.458031e-12, -8.545365e-13),
+    ),
+    "W2": (
+        (7.597772e-01, -5.040463e-04, -1.192789e-04, -1.349460e-06, 1.082862e-06, -8.064834e-06,
+         2.959435e-09, -1.297961e-09, 3.389170e-10, -4.935791e-10,
+         1.787756e-12, -6.743610e-13, 2.075723e-12, -5.769507e-13, -1.303108e-13),
+        (-9.433609e-02, -2.026974e-04, 5.505028e-04, 8.038015e-08, -3.953933e-06, 1.091415e-06,
+         1.067827e-10, 4.101600e-10, -9.316313e-10, -3.840921e-09,
+         -1.788157e-13, 1.952342e-12, -5.705721e-13, 8.534495e-13, -5.181754e-13),
+    ),
+    "W3": (
+        (7.358456e-01, -4.8377784e-04, -6.410136e-04, -1.754315e-06, 8.952514e-07, -8.308111e-06,
+         2.879012e-09, -9.762929e-10, 3.550849e-10, -1.625272e-10,
+         3.033166e-12, -3.960689e-12, 1.454345e-12, -9.680264e-13, 2.677086e-13),
+        (-8.389715e-02, -6.788420e-04, 5.030167e-04, 5.414236e-07, -3.515651e-06, 5.610990e-07,
+         8.619879e-11, 1.285471e-10, -2.476911e-10, -3.660396e-09,
+         -7.304812e-13, 1.482141e-12, -2.083238e-12, 9.798616e-13, 1.671433e-14),
+    ),
+    "W4": (
+        (4.454888e-01, -6.246135e-04, 1.798126e-04, -4.103560e-06, 1.123638e-06, -1.719398e-05,
+         1.242150e-08, -2.036670e-09, 3.241247e-09, 3.413039e-10,
+         1.445548e-11, -3.249992e-11, 1.857739e-11, -3.767396e-12, 3.375647e-12),
+        (-5.775286e-02, -1.431559e-04, 5.474906e-04, 1.315098e-06, -7.968204e-06, 1.364385e-06,
+         -5.358762e-10, 9.606579e-10, -9.571209e-10, -1.534179e-08,
+         -1.173857e-11, 1.290359e-11, -1.052149e-11, 5.169349e-12, -1.931603e-12),
+    ),
+}
+# fmt: on
+
+# Appendix B: A_DMAX, B_DMAX; section 4: longest vector, the zeroth order suppressed
+LARGEST_CORRECTIONS = {
+    "W1": (2.046, 1.066),
+    "W2": (2.083, 1.089),
+    "W3": (2.095, 1.300),
+    "W4": (0.971, 0.582),
+}
+LONGEST_VECTORS = {"W1": 2.931, "W2": 3.048, "W3": 3.004, "W4": 1.435}
+
+# section 4: pairs in the calibrations; section 6: largest radius of the formal uncertainty, px
+SAMPLE_SIZES = {"W1": 10_350_744, "W2": 11_213_542, "W3": 3_765_817, "W4": 315_505}
+FORMAL_RADII = {"W1": 0.0093, "W2": 0.0082, "W3": 0.0028, "W4": 0.0026}
+
+# Table 5-1, px: mean radial residual, and sigma over 31 x 31 bins of the mean residual in X and Y
+RADIAL_RESIDUALS = {"W1": 0.1050, "W2": 0.1153, "W3": 0.2993, "W4": 0.4832}
+RESIDUAL_SIGMAS = {
+    "W1": (0.01949, 0.01159),
+    "W2": (0.01679, 0.008914),
+    "W3": (0.01608, 0.008846),
+    "W4": (0.0236, 0.02276),
+}
+
+
+@dataclass(frozen=True)
+class WiseArray:
+    """Detector array: columns and rows, and arcsec per pixel."""
+
+    size: tuple[float, float]
+    scale: float
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Reference pixel, FITS 1-based: u = v = 0 of Appendix B."""
+        return (self.size[0] + 1) / 2, (self.size[1] + 1) / 2
+
+
+# W4 is binned 2 x 2.  The printed A_DMAX and B_DMAX are reached with u, v within +-507.5 pixels,
+# the centres of the outermost ones; of W4 within +-254, their edges.
+_FULL = WiseArray((1016.0, 1016.0), 2.75)
+WISE_ARRAYS = {"W1": _FULL, "W2": _FULL, "W3": _FULL, "W4": WiseArray((508.0, 508.0), 5.5)}

@@ -1,0 +1,110 @@
+"""Published distortion of a band as a model, and small tables of pairs that follow it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import MatchTable
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.simulate.published import WISE_ARRAYS, WISE_COEFFICIENTS
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.simulate.matches import Truth, simulate_matches
+
+__all__ = ["simulate_wise", "wise_solution"]
+
+Float = NDArray[np.float64]
+
+FAINT, BRIGHT = 14.5, 7.0
+
+
+def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
+    """Published distortion of a band as a model and its parameters.
+
+    Parameters
+    ----------
+    band : str
+        'W1', 'W2', 'W3' or 'W4'.
+
+    Returns
+    -------
+    model : DistortionModel
+        Order 4; u, v are distortion-free band-frame pixels.
+    theta : ndarray, shape (30,)
+
+    Raises
+    ------
+    InputError
+        For another band.
+    """
+    if band not in WISE_COEFFICIENTS:
+        raise InputError(
+            f"there is no band {band!r}", where="band", do=f"choose {', '.join(WISE_COEFFICIENTS)}"
+        )
+    array = WISE_ARRAYS[band]
+    model = DistortionModel(4, (Chip(1, band, array.size, array.centre),))
+    terms = model.basis().terms
+    theta = np.empty(model.n_params)
+    for axis, sip in enumerate(WISE_COEFFICIENTS[band]):
+        # SIP: the corrected offset from the reference pixel is the raw one plus the polynomial
+        monomial = np.array(sip)
+        monomial[0] += array.centre[axis]
+        monomial[terms.index((1, 0) if axis == 0 else (0, 1))] += 1.0
+        theta[model.coefficient_slice(None, axis)] = model.basis().from_monomials(monomial)
+    return model, theta
+
+
+def _errors(mag: Float) -> tuple[Float, Float]:
+    """Quoted error of a pair: a floor, and photon noise towards the faint end, in pixels."""
+    sigma = np.hypot(0.03, 0.12 * 10 ** (0.3 * (mag - FAINT)))
+    return sigma, 1.1 * sigma  # pairs are measured a little worse along the scan
+
+
+def simulate_wise(
+    n: int = 6000,
+    *,
+    band: str = "W2",
+    rng: np.random.Generator,
+    fraction: float = 0.03,
+    jitter: float = 0.03,
+    outlier_scale: float = 1.0,
+) -> tuple[MatchTable, Truth]:
+    """Pairs of WISE detections and 2MASS stars, in memory.
+
+    All bands have the magnitudes and errors of W2; sets of full size with those of each band are
+    written by `write_wise_set`.
+
+    Parameters
+    ----------
+    n : int
+    band : str
+    rng : numpy.random.Generator
+    fraction : float
+        Fraction of false matches.
+    jitter : float
+        Error beyond the quoted ones, in pixels: the partition of the point-spread function
+        (section 5 of the report) leaves residuals of this size.
+    outlier_scale : float
+        Standard deviation of false matches on each axis, in pixels.
+
+    Returns
+    -------
+    matches : MatchTable
+    truth : Truth
+    """
+    model, theta = wise_solution(band)
+    # star counts rise as 10^(0.3 m)
+    p = rng.uniform(size=n)
+    low, high = 10 ** (0.3 * BRIGHT), 10 ** (0.3 * FAINT)
+    mag = np.log10(low + p * (high - low)) / 0.3
+    return simulate_matches(
+        model,
+        theta,
+        n,
+        rng=rng,
+        sigma=_errors,
+        mag=mag,
+        fraction=fraction,
+        jitter=jitter,
+        outlier_scale=outlier_scale,
+    )

@@ -1,0 +1,207 @@
+"""`bayesdist simulate wise`: pairs of WISE and 2MASS, and how to calibrate them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.app.screen import table_text
+from bayesdist.errors import InputError
+from bayesdist.files import atomic_path
+from bayesdist.missions.wise.demo import simulation_config, write_simulation
+from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
+from bayesdist.missions.wise.simulate.stand_in import STAND_IN_TURN, write_stand_in
+
+__all__ = ["simulate_sets", "simulate_table"]
+
+WISE_CONFIG = """\
+# Calibrates WISE {band} from simulated pairs: bayesdist run THIS -o {run}
+# {truth} holds what they were made from
+[data]
+matches = "{folder}"
+format = "rvb"
+band = "{band}"
+columns = {{exposure = ""}}    # without the frames: one distortion serves all
+
+[detector]
+name = "{band}"
+size = [{columns:.0f}, {rows:.0f}]
+scale_mas = {scale_mas:.1f}
+
+[model]
+order = 4
+reference_pixel = [{centre[0]}, {centre[1]}]
+
+[fit]
+clip_abs = 3.0               # pixels: the match circle in the corners
+
+[assess]
+grid = [33, 33]
+
+[[budget]]
+name = "reference catalogue"
+kind = "random"
+sigma_u = 0.0                # the simulation's is exact; of 2MASS state yours
+sigma_v = 0.0
+source = "simulation"
+
+[[requirement]]
+name = "worst corner"
+statistic = "max"
+limit = 0.05
+unit = "pix"
+
+[products]
+sip = {{inverse_order = 5, linear = "sip"}}
+"""
+
+
+def simulate_table(
+    output: str | Path,
+    *,
+    stars: int = 6000,
+    band: str = "W2",
+    fraction: float = 0.03,
+    seed: int = 1,
+    force: bool = False,
+) -> str:
+    """One small table of one band, and how to calibrate it.
+
+    Parameters
+    ----------
+    output : path
+        Folder.
+    stars : int
+    band : str
+    fraction : float
+        Of false matches.
+    seed : int
+    force : bool
+        Replace a configuration that is there.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For options that cannot be used, and a folder in use.
+    """
+    if stars < 1 or not 0 <= fraction < 1:
+        raise InputError(
+            "a simulation needs stars, and true matches among them",
+            do="give --stars 1 or more and --fraction in [0, 1)",
+        )
+    folder = Path(output)
+    if (folder / "config.toml").exists() and not force:
+        raise InputError(
+            "the folder holds a configuration", where=str(folder), do="replace it by --force"
+        )
+    rng = np.random.default_rng(seed)
+    matches, truth = simulate_wise(stars, band=band, fraction=fraction, rng=rng)
+    write_simulation(folder, matches, truth, simulation_config(band))
+    return (
+        f"{len(matches)} pairs, {int(truth.false.sum())} of them false: {folder / 'stars.ecsv'}\n"
+        f"calibrate them:  bayesdist run {folder / 'config.toml'} -o {folder / 'run'}"
+    )
+
+
+def simulate_sets(
+    output: str | Path,
+    *,
+    bands: Sequence[str] = ("W1", "W2", "W3", "W4"),
+    pairs: int | None = None,
+    false_share: float = 0.03,
+    partition_pattern: bool = False,
+    seed: int = 1,
+    force: bool = False,
+) -> str:
+    """Full sets of bands in Parquet, and how to calibrate them.
+
+    Parameters
+    ----------
+    output : path
+        Folder.
+    bands : sequence of str
+    pairs : int, optional
+        Of each band; by default those of section 4 of WSDC D-T033.
+    false_share : float
+        Fraction of false matches.
+    partition_pattern : bool
+        Blocks in the residuals.
+    seed : int
+    force : bool
+        Replace sets that are there.
+
+    Returns
+    -------
+    str
+        What to print.
+
+    Raises
+    ------
+    InputError
+        For options that cannot be used, and a folder in use.
+    """
+    folder = Path(output)
+    if len(set(bands)) < len(bands):
+        raise InputError("a band is named twice", where="--bands", do="name each once")
+    sets = [
+        wise_set(
+            band,
+            pairs=pairs,
+            seed=seed,
+            false_share=false_share,
+            partition=partition_pattern,
+        )
+        for band in bands
+    ]
+    names = [one.band.lower() for one in sets]
+    used = [name for name in ("config.toml", *names) if (folder / name).exists()]
+    if used and not force:
+        raise InputError(
+            f"the folder holds {used[0]} already", where=str(folder), do="replace it by --force"
+        )
+    rows: list[dict[str, object]] = []
+    lines = []
+    for one, name in zip(sets, names, strict=True):
+        n_false = write_wise_set(one, folder, threads=os.cpu_count() or 1, force=force)
+        with atomic_path(folder / f"{name}.toml") as temporary:
+            temporary.write_text(_wise_config(one), encoding="utf-8")
+        blocks = 0 if one.pattern is None else one.pattern.blocks
+        rows.append(
+            {
+                "band": one.band,
+                "pairs": one.pairs,
+                "false": n_false,
+                "partition": f"{blocks} x {blocks}" if blocks else "none",
+            }
+        )
+        lines.append(f"bayesdist run {folder / f'{name}.toml'} -o {folder / f'run_{name}'}")
+    write_stand_in(folder / "optical_w2.hdr")
+    runs = " ".join(str(folder / f"run_{name}") for name in names)
+    compare = (
+        f"compare them:\n  bayesdist wise bands {runs} -o {folder / 'bands'} "
+        f"--optical {folder / 'optical_w2.hdr'} --rotation {STAND_IN_TURN}"
+    )
+    return f"{table_text(rows)}\n\ncalibrate them:\n  " + "\n  ".join([*lines, compare])
+
+
+def _wise_config(one: WiseSet) -> str:
+    name = one.band.lower()
+    array = one.array
+    return WISE_CONFIG.format(
+        band=one.band,
+        folder=name,
+        run=f"run_{name}",
+        truth=f"truth/{name}.ecsv",
+        columns=array.size[0],
+        rows=array.size[1],
+        centre=array.centre,
+        scale_mas=1000.0 * array.scale,
+    )

@@ -1,0 +1,323 @@
+"""Structure of a distortion model, and the only parameter layout."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.errors import InputError
+from bayesdist.model.basis import PolynomialBasis
+from bayesdist.model.frames import CHIP_DEVIATIONS, FRAME_KINDS, RIGID, frame_names
+from bayesdist.model.timedep import AXES, TimeDependence
+
+__all__ = ["GAUGES", "Chip", "Parameter", "ParameterLayout"]
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+GAUGES = ("first", "held")
+
+
+@dataclass(frozen=True)
+class Chip:
+    """One detector chip.
+
+    Parameters
+    ----------
+    number : int
+        As in the data and in the IDCTAB column DETCHIP.
+    name : str
+    size : tuple of float
+        Columns, rows.
+    reference_pixel : tuple of float
+        Zero point of the polynomial, FITS 1-based pixels.
+    """
+
+    number: int
+    name: str
+    size: tuple[float, float]
+    reference_pixel: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Description of one entry of theta."""
+
+    name: str
+    unit: str
+    kind: str  # 'polynomial', 'tdd' or 'frame'
+    chip: int | None = None  # number; of a frame's parameter: a chip's own deviation
+    axis: str | None = None  # 'u' or 'v'
+    i: int | None = None  # degree in x, Legendre ('polynomial') or monomial ('tdd')
+    j: int | None = None  # degree in y
+    exposure: str | None = None
+
+
+@dataclass(frozen=True)
+class ParameterLayout:
+    """Fields of `DistortionModel`, which describes them, and the order of its parameters."""
+
+    order: int
+    chips: tuple[Chip, ...]
+    unit: str = "pix"
+    time: TimeDependence | None = None
+    frames: str = "none"
+    exposures: tuple[str, ...] = ("1",)
+    origin: tuple[float, float] = (0.0, 0.0)
+    gauge: str = "first"
+    held: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    chip_deviations: bool = False
+    _bases: tuple[PolynomialBasis, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.frames not in FRAME_KINDS:
+            raise InputError(
+                f"unknown kind of frame {self.frames!r}",
+                where="model.frames",
+                do=f"choose one of {', '.join(FRAME_KINDS)}",
+            )
+        self._check_gauge()
+        if not self.chips:
+            raise InputError("no chip is given", where="chip", do="describe at least one chip")
+        for what, given in (
+            ("chip number", [c.number for c in self.chips]),
+            ("chip name", [c.name for c in self.chips]),
+            ("exposure", self.exposures),
+        ):
+            name, count = Counter(given).most_common(1)[0]
+            if count > 1:
+                raise InputError(
+                    f"{what} {name!r} stands twice", where="model", do="name each one once"
+                )
+        for axis, i, j in self.time.terms if self.time else ():
+            if i + j > self.order:
+                raise InputError(
+                    f"term {axis}_{i}_{j} is above the polynomial order {self.order}",
+                    where="model.tdd.terms",
+                    do="raise model.order or drop the term",
+                )
+        bases = tuple(PolynomialBasis(self.order, c.size, c.reference_pixel) for c in self.chips)
+        object.__setattr__(self, "_bases", bases)
+
+    def _check_gauge(self) -> None:
+        if self.gauge not in GAUGES:
+            raise InputError(
+                f"unknown gauge {self.gauge!r}",
+                where="model.gauge",
+                do=f"choose {' or '.join(GAUGES)}",
+            )
+        if self.gauge == "first" and any(self.held):
+            raise InputError(
+                f"the first exposure is held at {self.held} and is the identity",
+                where="model.held",
+                do="choose gauge 'held' or leave the values out",
+            )
+        if self.gauge == "held" and self.frames == "none":
+            raise InputError(
+                "gauge 'held' holds the frame of the first exposure, and there are no frames",
+                where="model.gauge",
+                do="choose a kind of frame or gauge 'first'",
+            )
+        if self.chip_deviations and self.gauge != "held":
+            raise InputError(
+                "chips that deviate by themselves have the polynomials for their mean",
+                where="model.chip_deviations",
+                do="choose gauge 'held'",
+            )
+        if self.frames == "shift" and self.held[2]:
+            raise InputError(
+                "a frame 'shift' has no rotation to be held",
+                where="model.held",
+                do="choose another kind of frame",
+            )
+
+    @property
+    def bases(self) -> tuple[PolynomialBasis, ...]:
+        """Polynomial basis of each chip."""
+        return self._bases
+
+    @property
+    def n_terms(self) -> int:
+        """Polynomial terms of one chip and axis."""
+        return self.bases[0].n_terms
+
+    @property
+    def summary(self) -> str:
+        """Summary in a few words."""
+        names = ", ".join(chip.name or str(chip.number) for chip in self.chips[:4])
+        chips = f"{len(self.chips)} chip{'s' if len(self.chips) > 1 else ''}"
+        more = ", ..." if len(self.chips) > 4 else ""
+        frames = f", frames '{self.frames}'" if self.n_frame else ""
+        drift = f", {len(self.time.terms)} terms of time" if self.time is not None else ""
+        return (
+            f"order {self.order}, {chips} ({names}{more}){frames}{drift}, "
+            f"{self.n_params} parameters"
+        )
+
+    @property
+    def n_frame(self) -> int:
+        """Parameters of one exposure: of its frame, and of the chips' own deviations."""
+        return len(frame_names(self.frames)) + len(self._own_names)
+
+    @cached_property
+    def _own_names(self) -> tuple[str, ...]:
+        """Names of the deviations of single chips."""
+        if not self.chip_deviations:
+            return ()
+        return tuple(f"{chip.name}.{name}" for chip in self.chips[1:] for name in CHIP_DEVIATIONS)
+
+    @property
+    def n_tdd(self) -> int:
+        """Time-dependent parameters of one chip."""
+        return len(self.time.terms) * self.time.n_values if self.time else 0
+
+    @property
+    def n_polynomial(self) -> int:
+        """Polynomial coefficients of all chips."""
+        return 2 * self.n_terms * len(self.chips)
+
+    @property
+    def n_distortion(self) -> int:
+        """Parameters of the polynomials and of their drift: all but the frames."""
+        return self.n_polynomial + self.n_tdd * len(self.chips)
+
+    @property
+    def n_global(self) -> int:
+        """Parameters that are in no local block."""
+        return self.n_distortion + len(self.free_frame_names(0))
+
+    def free_frame_names(self, exposure: int) -> tuple[str, ...]:
+        """Names of the fitted parameters of an exposure (by code): frame, then single chips."""
+        if exposure > 0:
+            return (*frame_names(self.frames), *self._own_names)
+        if self.gauge == "first" or exposure < 0:
+            return ()
+        free = (name for name in frame_names(self.frames) if name not in RIGID)
+        return (*free, *self._own_names)
+
+    @property
+    def n_params(self) -> int:
+        """Length of theta."""
+        return self.n_global + self.n_frame * (len(self.exposures) - 1 if self.n_frame else 0)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Description of every entry of theta, in order."""
+        out = []
+        several = len(self.chips) > 1
+        prefix = {c.number: f"{c.name}." if several else "" for c in self.chips}
+        for chip in self.chips:
+            for axis in AXES:
+                for i, j in self.bases[0].terms:
+                    name = f"{prefix[chip.number]}{axis}_{i}_{j}"
+                    out.append(Parameter(name, self.unit, "polynomial", chip.number, axis, i, j))
+        for chip in self.chips:
+            for axis, i, j in self.time.terms if self.time else ():
+                for value in self.time.value_names():  # type: ignore[union-attr]
+                    name = f"{prefix[chip.number]}tdd.{axis}_{i}_{j}.{value}"
+                    unit = f"{self.unit}/yr" if value.startswith("rate") else self.unit
+                    out.append(Parameter(name, unit, "tdd", chip.number, axis, i, j))
+        owner = dict(
+            zip(
+                self._own_names,
+                (c.number for c in self.chips[1:] for _ in CHIP_DEVIATIONS),
+                strict=bool(self._own_names),
+            )
+        )
+        for code, exposure in enumerate(self.exposures):
+            for p in self.free_frame_names(code):
+                unit = self.unit if "shift" in p.split(".")[-1] else ""
+                out.append(
+                    Parameter(f"{exposure}.{p}", unit, "frame", owner.get(p), exposure=exposure)
+                )
+        return tuple(out)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries of theta."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the entries of theta ('' where there is none)."""
+        return tuple(p.unit for p in self.parameters)
+
+    def chip_code(self, number: int) -> int:
+        """Index of a chip by its number.
+
+        Raises
+        ------
+        InputError
+            When no chip has that number.
+        """
+        for code, chip in enumerate(self.chips):
+            if chip.number == number:
+                return code
+        raise InputError(
+            f"there is no chip {number}",
+            do=f"known chips are {', '.join(str(c.number) for c in self.chips)}",
+        )
+
+    def basis(self, chip: int | None = None) -> PolynomialBasis:
+        """Polynomial basis of a chip (by number; the first one by default)."""
+        return self.bases[0 if chip is None else self.chip_code(chip)]
+
+    def coefficient_slice(self, chip: int | None, axis: int) -> slice:
+        """Slice of theta with the Legendre coefficients of a chip (number) and axis (0 u, 1 v)."""
+        code = 0 if chip is None else self.chip_code(chip)
+        start = (2 * code + axis) * self.n_terms
+        return slice(start, start + self.n_terms)
+
+    def tdd_slice(self, chip: int | None = None) -> slice:
+        """Slice of theta with the time-dependent parameters of a chip (by number)."""
+        return self.drift_slice(0 if chip is None else self.chip_code(chip))
+
+    def drift_slice(self, chip_code: int) -> slice:
+        """Slice of theta with the time-dependent parameters of a chip (by code)."""
+        start = self.n_polynomial + chip_code * self.n_tdd
+        return slice(start, start + self.n_tdd)
+
+    def frame_slice(self, exposure: int) -> slice:
+        """Slice of theta with the `free_frame_names` of an exposure (by code)."""
+        if not self.free_frame_names(exposure):
+            return slice(0, 0)
+        if exposure == 0:
+            return slice(self.n_distortion, self.n_global)
+        start = self.n_global + (exposure - 1) * self.n_frame
+        return slice(start, start + self.n_frame)
+
+    @property
+    def local_blocks(self) -> tuple[slice, ...]:
+        """Local blocks of theta, one for each exposure but the first."""
+        if not self.n_frame:
+            return ()
+        return tuple(self.frame_slice(e) for e in range(1, len(self.exposures)))
+
+    def has_frame(self, exposure: int) -> bool:
+        """True where an exposure (by code) has a frame that is not the identity."""
+        return self.n_frame > 0 and (exposure > 0 or (exposure == 0 and self.gauge == "held"))
+
+    def own_slice(self, chip_code: int, exposure: int) -> slice:
+        """Slice of `frame_slice` of an exposure with a chip's own deviations (by codes), if any."""
+        if not (self.chip_deviations and chip_code > 0 and self.has_frame(exposure)):
+            return slice(0, 0)
+        n, q = len(self.free_frame_names(exposure)) - len(self._own_names), len(CHIP_DEVIATIONS)
+        return slice(n + (chip_code - 1) * q, n + chip_code * q)
+
+    @cached_property
+    def drift_columns(self) -> tuple[tuple[Float, ...], Int]:
+        """Legendre coefficients (n terms, K) of each drifting monomial, for each chip; and axes."""
+        if self.time is None:
+            return tuple(np.zeros((0, self.n_terms)) for _ in self.chips), np.zeros(0, np.int64)
+        columns = []
+        for basis in self.bases:
+            sx, sy = basis.half_size
+            unit = np.zeros((len(self.time.terms), self.n_terms))
+            for row, (_, i, j) in enumerate(self.time.terms):
+                unit[row, basis.terms.index((i, j))] = sx**-i * sy**-j
+            columns.append(basis.from_monomials(unit))
+        return tuple(columns), np.array([AXES.index(t[0]) for t in self.time.terms], np.int64)

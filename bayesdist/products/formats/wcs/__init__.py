@@ -1,0 +1,1 @@
+"""Headers with world coordinate systems, described as astropy.wcs has them."""

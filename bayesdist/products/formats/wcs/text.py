@@ -1,0 +1,196 @@
+"""Text on the world coordinate systems of a file, as astropy.wcs reads them."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+from astropy import log
+from astropy.io import fits
+from astropy.wcs import WCS, FITSFixedWarning
+
+from bayesdist.products.formats.common.cards import holds_wcs
+from bayesdist.products.formats.common.content import Content, Hdu
+from bayesdist.products.formats.common.document import finding_lines
+from bayesdist.products.formats.sip.lint import lint_sip
+from bayesdist.products.formats.sip.read import image_size, parsed
+from bayesdist.products.formats.sip.text import coefficient_lines, sip_lines
+from bayesdist.products.formats.wcs.sky import Words, first_line, pv_keywords, sky_words
+
+__all__ = ["describe_wcs"]
+
+_WCS = re.compile(
+    r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|LTV)\d+[A-Z]?$|(CD|PC|PV|PS|LTM)\d+_\d+[A-Z]?$|"
+    r"(A|B|AP|BP)_(ORDER|\d_\d)$|(CPDIS|CPERR|D2IMDIS|D2IMERR)\d$|(DP|DQ|D2IM)\d$|(LON|LAT)POLE"
+)
+
+_TABLE_HDUS = ("D2IMARR", "WCSDVARR")
+_TABLES = ("CPDIS1", "CPDIS2", "D2IMDIS1", "D2IMDIS2", "AXISCORR")
+
+
+def _wcs_cards(header: fits.Header) -> tuple[tuple[str, str], ...]:
+    """Cards that the positions of a header depend on: of two with equal ones, one is shown."""
+    found = {(c.keyword, str(c.value)) for c in header.cards if _WCS.match(c.keyword)}
+    return tuple(sorted(found))
+
+
+def describe_wcs(file: Content) -> list[str]:
+    """Lines of text on every world coordinate system of a file, with its findings.
+
+    HDUs that repeat the system of an earlier one are named with it.  FormatError for SIP keywords
+    that are missing or no numbers.
+    """
+    shown: dict[tuple[tuple[str, str], ...], list[Hdu]] = {}
+    several = sum(holds_wcs(hdu.header) for hdu in file.hdus) > 1
+    for hdu in file.hdus:
+        # the nodes of a table are described with the image that uses it
+        aside = several and hdu.label.partition(",")[0] in _TABLE_HDUS
+        if holds_wcs(hdu.header) and not aside:
+            shown.setdefault((*_wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
+    groups = list(shown.values())
+    if len(file.hdus) == 1:
+        return _hdu_lines(file, groups[0][0], file.name)
+    out = [f"{file.name}: {len(file.hdus)} HDUs, {len(groups)} different WCS"]
+    for first, *others in groups:
+        out += ["", *_hdu_lines(file, first, _label(first), others)]
+    return out
+
+
+def _extent(header: fits.Header) -> tuple[str, str]:
+    return "size", str(image_size(header))
+
+
+def _label(hdu: Hdu) -> str:
+    return f"HDU {hdu.number}" + (f" ({hdu.label})" if hdu.label else "")
+
+
+def _hdu_lines(file: Content, hdu: Hdu, name: str, others: Sequence[Hdu] = ()) -> list[str]:
+    """Lines of one HDU."""
+    header, words, terms = hdu.header, Words(), list[str]()
+    size = image_size(header)
+    if "A_ORDER" in header:
+        sip = parsed(header, name)
+        words.lines += sip_lines(sip, name)
+        terms = coefficient_lines(sip)
+        words.findings += lint_sip(sip)
+    else:
+        extent = "unknown" if size is None else f"{size[0]} x {size[1]} px"
+        words.lines.append(f"{name}: WCS, image size {extent}")
+    if others:
+        words.lines.append(f"  same in   {', '.join(_label(other) for other in others)}")
+    if hdu.state == "none":
+        words.lines.append("  data      none: a header alone")
+    elif hdu.state == "cut":
+        words.doubt("error", "data", "the file ends before its data do: it is truncated")
+    systems = _systems(file, hdu, words)
+    for wcs in systems:
+        key = wcs.wcs.alt.strip()
+        if len(systems) > 1 or key or wcs.wcs.name:
+            title = f"WCS {key}" if key else "primary WCS"
+            words.lines.append(f"  {title}{f', {wcs.wcs.name!r}' if wcs.wcs.name else ''}")
+        words.lines += _axes(wcs, header, key, above="A_ORDER" in header and not key)
+        if wcs.has_celestial:
+            sky_words(wcs, header, size, words)
+    return [*words.lines, *terms, "", *finding_lines(words.findings)]
+
+
+# -- the systems ----------------------------------------------------------------------------------
+
+
+def _systems(file: Content, hdu: Hdu, words: Words) -> list[WCS]:
+    """Systems of a header that astropy.wcs can make."""
+    out = []
+    header = hdu.header
+    primary = any(k.startswith(("CTYPE", "CRVAL")) and k[-1].isdigit() for k in header)
+    table = "TABLE" in str(header.get("XTENSION", "")) and not header.get("ZIMAGE", False)
+    if table or not (primary or "A_ORDER" in header or any(k[:5] == "CTYPE" for k in header)):
+        words.doubt("note", "columns", "a WCS of the columns of a table is not looked at")
+        return []
+    keys = {k[-1] for k in header if k.startswith(("CTYPE", "CRVAL")) and k[-1].isalpha()}
+    for key in [*([" "] if primary or not keys else []), *sorted(keys)]:
+        with _quiet_log():
+            wcs = _system(file, header, key, words)
+        if wcs is not None:
+            out.append(wcs)
+    return out
+
+
+def _system(file: Content, header: fits.Header, key: str, words: Words) -> WCS | None:
+    where = f"WCS {key}".strip()
+    stated = [k for k in _TABLES if k in header]
+    fobj = file.opened
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if stated and fobj is None:
+            words.doubt(
+                "warning", ", ".join(stated),
+                "the tables are extensions of the image, which are not here: positions are without "
+                "them",
+            )  # fmt: skip
+            header = header.copy()
+            for keyword in stated:
+                del header[keyword]
+        try:
+            wcs = WCS(header, fobj, key=key)
+            wcs.wcs.set()
+        except Exception as error:  # any of them is astropy.wcs's finding on this header
+            words.doubt("error", where, f"astropy.wcs cannot read it: {first_line(error)}")
+            return None
+    old = []
+    for message in dict.fromkeys(str(w.message) for w in caught if _tells(w)):
+        if "is deprecated" in message:
+            old.append(message.partition("=")[0].strip())
+            continue
+        level = "warning" if message.startswith("Removed redundant") else "note"
+        words.doubt(level, where, f"astropy.wcs: {' '.join(message.split())}")
+    if old:
+        words.doubt("note", ", ".join(old), "a deprecated form, which astropy.wcs still reads")
+    wcs.pixel_shape = None  # the size is that of `image_size`, also where NAXIS says none
+    return wcs
+
+
+@contextmanager
+def _quiet_log() -> Iterator[None]:
+    """Context without astropy's own remarks on CTYPE, which the findings repeat."""
+    before = log.level
+    log.setLevel("ERROR")
+    try:
+        yield
+    finally:
+        log.setLevel(before)
+
+
+def _tells(warning: warnings.WarningMessage) -> bool:
+    """True for a warning on positions: those on dates and on the lint of units are left out."""
+    message = str(warning.message)
+    return issubclass(warning.category, FITSFixedWarning) and not message.startswith(
+        ("'datfix'", "'obsfix'", "RADECSYS", "The WCS transformation has more axes")
+    )
+
+
+def _axes(wcs: WCS, header: fits.Header, key: str, *, above: bool) -> list[str]:
+    """Lines on every axis; `above` where SIP's lines have given a part."""
+    w = wcs.wcs
+    frame = f", {w.radesys}" if w.radesys else ""
+    if w.radesys and np.isfinite(w.equinox) and w.radesys.startswith("FK"):
+        frame += f" {w.equinox:g}"
+    # as the header has it: wcslib takes TPV for TAN with a distortion
+    types = [str(header.get(f"CTYPE{k + 1}{key}", c)) for k, c in enumerate(w.ctype)]
+    lines = [f"  axes      {', '.join(t.strip() or 'linear' for t in types)}{frame}"]
+    if not above:
+        values = [_with_unit(v, u) for v, u in zip(w.crval, w.cunit, strict=True)]
+        lines += [
+            f"  CRPIX     {', '.join(f'{v:.10g}' for v in w.crpix)}",
+            f"  CRVAL     {', '.join(values)}",
+        ]
+    pv = pv_keywords(header, key)
+    if pv:
+        lines.append(f"  PV terms  {len(pv)}: {pv[0]}" + (f" to {pv[-1]}" if len(pv) > 1 else ""))
+    return lines
+
+
+def _with_unit(value: float, unit: object) -> str:
+    return f"{value:.10g} {unit}".strip()

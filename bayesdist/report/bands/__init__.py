@@ -1,1 +1,0 @@
-"""Tables and diagrams of several bands beside each other."""

@@ -1,0 +1,112 @@
+"""Missions: those of the package, and one that another package adds."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from importlib import import_module
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from bayesdist.app.commands.groups import LazyGroup
+from bayesdist.mission import GROUP, Mission, load_object
+from tests.app.support import REPOSITORY, one_sentence
+
+MEGACAM = """
+import click
+from bayesdist.app.commands.options import command
+from bayesdist.mission import Mission
+
+MISSION = Mission(title="MegaCam: mosaics.", commands={"ccds": "megacam:ccds"})
+
+@command()
+@click.option("--rows", type=int, default=4, help="Of the mosaic.")
+def ccds(rows):
+    click.echo(f"{9 * rows} CCDs")
+"""
+
+
+PAIRS = """
+import numpy as np
+from astropy.table import Table
+from bayesdist.data import MatchFormat
+from bayesdist.mission import Mission
+
+def read(path):
+    x, y, u, v = np.loadtxt(path, skiprows=1).T / 10
+    table = Table({"x": x, "y": y, "u": u, "v": v})
+    table["u"].unit = table["v"].unit = "arcsec"
+    return table
+
+TENTHS = MatchFormat(lambda path: path.read_text().startswith("tenths"), read)
+MISSION = Mission(title="MegaCam.", match_formats={"tenths": "megacam:TENTHS"})
+"""
+
+
+def installed(folder: Path, source: str) -> None:
+    """A package with one module, as an installer leaves it."""
+    (folder / "megacam.py").write_text(source)
+    info = folder / "megacam-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: megacam\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{GROUP}]\nmegacam = megacam:MISSION\n")
+
+
+def called(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "bayesdist", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(REPOSITORY)])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_a_package_adds_its_mission(tmp_path):
+    installed(tmp_path, MEGACAM)
+    assert "megacam       MegaCam: mosaics." in called(tmp_path, "--help").stdout
+    assert called(tmp_path, "megacam", "ccds", "-q").stdout == "36 CCDs\n"
+    shown = called(tmp_path, "megacam", "ccds", "--help").stdout
+    assert "[default: 4]" in shown and "--quiet" in shown
+
+
+def test_a_package_adds_a_format_of_matches(tmp_path):
+    """Of others' names, of a text that would else be a table: what it reads is a table's."""
+    installed(tmp_path, PAIRS)
+    values = np.random.default_rng(1).integers(10, 10_000, (50, 4))
+    rows = "\n".join(" ".join(map(str, row)) for row in values)
+    (tmp_path / "pairs.txt").write_text(f"tenths of a pixel\n{rows}\n")
+    done = called(tmp_path, "init", "c.toml", "--matches", "pairs.txt")
+    assert "for 50 matches" in done.stdout, done.stderr
+    config = tomllib.loads((tmp_path / "c.toml").read_text())
+    assert max(config["detector"]["size"]) <= 1024  # a tenth of the numbers in the file
+    assert config["data"].get("unit", "arcsec") == "arcsec"
+
+
+def test_a_mission_that_cannot_be_loaded_is_named(tmp_path):
+    installed(tmp_path, "import no_such_package")
+    done = called(tmp_path, "megacam", "ccds")
+    assert done.returncode == 1
+    one_sentence(done.stderr, "megacam = megacam:MISSION", "no_such_package", "install")
+
+
+@pytest.mark.parametrize("name", ["hst", "wise"])
+def test_our_missions_name_commands_that_are_there(name):
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))
+    target = project["project"]["entry-points"][GROUP][name]
+    mission = EntryPoint(name, target, GROUP).load()
+    assert isinstance(mission, Mission)
+    for commands in (mission.commands, mission.simulate, mission.beside_core):
+        for command, where in commands.items():
+            found = LazyGroup.load(where)
+            assert isinstance(found, click.Command) and found.name == command
+    for where in (*mission.match_formats.values(), *mission.error_terms.values()):
+        assert load_object(where)
+    assert not mission.report or import_module(mission.report)

@@ -1,0 +1,136 @@
+"""docs/new_instrument.md, followed to the letter: a package from outside adds an instrument."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from .docs_blocks import DOCS, blocks
+
+PAGE = DOCS / "new_instrument.md"
+FILE = "megacam_gaia/megacam744331p_gaiadr1_pairs_8arcsec.csv"
+POSITIONS = [f"{z}_{which}_arcsec" for which in ("hdrwcs", "gaia") for z in "xy"]
+MIDDLE = ((-640.4, 148.0), (-950.0, 862.0))  # arcsec: four CCDs, a minute of processor time
+
+
+def named_blocks() -> dict[str, str]:
+    """Blocks of the page that are files, or changes of files, by the names in their first lines."""
+    found = {}
+    for language, text in blocks(PAGE):
+        if language in ("python", "toml"):
+            name = re.match(r"# (\S+)\n", text)
+            assert name, text
+            found[name.group(1)] = text
+    return found
+
+
+def installed(folder: Path, texts: dict[str, str]) -> None:
+    """The package as an installer leaves it: its modules, and what its pyproject.toml says."""
+    for name in ("megacam.py", "megacam_report.py"):
+        (folder / name).write_text(texts[name], encoding="utf-8")
+    project = tomllib.loads(texts["pyproject.toml"])["project"]
+    info = folder / f"{project['name']}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    lines = []
+    for group, entries in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{name} = {target}" for name, target in entries.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+
+
+def changed(text: str, changes: str) -> str:
+    """A configuration with keys set in its sections, and blocks of lists at its end."""
+    for block in re.split(r"\n(?=\[)", changes.partition("\n")[2].strip()):
+        header, *lines = block.splitlines()
+        if header.startswith("[["):
+            text += f"\n{block}\n"
+            continue
+        before, found, after = text.partition(f"\n{header}\n")
+        assert found, f"{header} is not in the configuration"
+        section, bracket, rest = after.partition("\n[")
+        for line in filter(None, lines):
+            key = line.split(" = ")[0]
+            section, n = re.subn(rf"^(# )?{key} = .*$", line, section, count=1, flags=re.M)
+            section = section if n else f"{line}\n{section}"
+        text = before + found + section + bracket + rest
+    return text
+
+
+@pytest.fixture(scope="module")
+def pairs(data_dir, full) -> Table:
+    """Pairs of the middle of the mosaic, or all of them."""
+    table = Table.read(data_dir / FILE)
+    if full:
+        return table
+    inside = [
+        (table[f"{name}_hdrwcs_arcsec"] >= low) & (table[f"{name}_hdrwcs_arcsec"] < high)
+        for name, (low, high) in zip("xy", MIDDLE, strict=True)
+    ]
+    return table[inside[0] & inside[1]]
+
+
+@pytest.fixture(scope="module")
+def followed(tmp_path_factory, pairs):
+    """Folder in which the page was followed, and what each command printed."""
+    folder = tmp_path_factory.mktemp("megacam")
+    pairs.write(folder / "pairs.csv", format="ascii.csv")
+    texts = named_blocks()
+    installed(folder, texts)
+    path = os.pathsep.join([str(folder), str(DOCS.parent)])
+    printed = {}
+    for language, text in blocks(PAGE):
+        if language == "toml" and text.startswith("# megacam.toml\n"):
+            config = folder / "megacam.toml"
+            config.write_text(changed(config.read_text("utf-8"), text), encoding="utf-8")
+        for line in text.splitlines() if language == "console" else ():
+            words = shlex.split(line)
+            assert words[:2] == ["$", "bayesdist"]
+            done = subprocess.run(
+                [sys.executable, "-m", "bayesdist", *words[2:]],
+                cwd=folder, env={**os.environ, "PYTHONPATH": path},
+                capture_output=True, text=True, check=False,
+            )  # fmt: skip
+            assert done.returncode == 0, done.stderr
+            printed[words[2]] = done.stdout
+    return folder, printed
+
+
+def test_the_format_is_recognised(followed, pairs, full):
+    folder, printed = followed
+    once = len({tuple(row) for row in pairs.as_array()[POSITIONS].tolist()})
+    assert f"for {once} matches" in printed["init"]
+    config = tomllib.loads((folder / "megacam.toml").read_text("utf-8"))
+    ccds = range(36) if full else (12, 13, 21, 22)
+    assert [one["name"] for one in config["chip"]] == [f"ccd{k:02d}" for k in ccds]
+    n = 12 * len(ccds)
+    assert f"{n} of {n}, nothing is degenerate" in printed["check"]
+
+
+def test_the_term_is_a_row_of_the_budget(followed, pairs):
+    """A stretch by 2e-5 of the distance from the tangent point, along v alone."""
+    folder, _ = followed
+    budget = Table.read(folder / "megacam-run" / "budget.ecsv")
+    row = next(one for one in budget if one["name"] == "refraction that is left over")
+    distance = np.sqrt(np.mean(np.square(pairs["y_gaia_arcsec"])))
+    assert row["u"] == 0 and row["v"] == pytest.approx(2e-5 * distance, rel=0.1)
+
+
+def test_the_table_is_in_the_report(followed):
+    folder, _ = followed
+    report = (folder / "megacam-run" / "report.md").read_text("utf-8")
+    assert "Residuals of the least-squares fit, CCD by CCD" in report
+    used = sum(int(n) for n in re.findall(r"^\| ccd\d\d \| \d+ \| (\d+) \|", report, re.M))
+    summary = json.loads((folder / "megacam-run" / "summary.json").read_text("utf-8"))
+    assert used == summary["data"]["n_used"]
