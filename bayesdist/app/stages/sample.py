@@ -5,14 +5,11 @@ from __future__ import annotations
 import logging
 from dataclasses import asdict
 
+from bayesdist.app.kinds.stars import sample_stars
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import FOLDER, write_star_files
 from bayesdist.data import MatchTable
-from bayesdist.infer import (
-    Posterior,
-    sample,
-    save_posterior,
-)
+from bayesdist.infer import Posterior, save_posterior
 
 __all__ = ["keep_posterior", "run_sample"]
 
@@ -20,34 +17,21 @@ log = logging.getLogger("bayesdist")
 
 
 def run_sample(session: Session) -> None:
-    config, run = session.config, session.run
-    s = config.sampler
-    posterior = sample(
-        session.fit,
+    """Sample the posterior of the fit, and write it."""
+    posterior = sample_stars(
+        session.fitted,
         session.shards,
-        outliers=config.mixture(),
-        priors=session.priors,
-        seed=s.seed,
-        ensembles=s.ensembles,
-        walkers=s.walkers,
-        target_ess=s.target_ess,
-        target_rhat=s.target_rhat,
-        max_steps=s.max_steps,
-        checkpoint_every=s.checkpoint_every,
-        folder=run.path,
+        session.config,
+        folder=session.run.path,
         progress=session.progress,
-        method=s.method,
-        second_stage=s.second_stage,
     )
-    keep_posterior(session, session.settled(posterior))
+    keep_posterior(session, posterior)
 
 
 def keep_posterior(session: Session, posterior: Posterior) -> None:
     """Write a posterior, what it says of each star, and its part of summary.json."""
     run = session.run
-    for name in ("stars", "systematics"):
-        session.__dict__.pop(name, None)
-    session.__dict__["posterior"] = posterior
+    session.renew("posterior", posterior)
     record = run.record
     provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}
     provenance |= {"gauge": session.gauge_words} if session.gauge_words else {}
