@@ -22,7 +22,8 @@ from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
 from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, read_hierarchy, read_series
 from bayesdist.app.kinds.fitted import FIT, TABLES, Fitted, moved_by
 from bayesdist.app.kinds.table_file import read_tables
-from bayesdist.data import MatchTable, centroid_errors
+from bayesdist.data import centroid_errors
+from bayesdist.data.matches import MatchTable
 from bayesdist.infer import load, load_fit
 from bayesdist.infer.exposures.alone import ExposureSolutions, fit_exposures
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit, fit_hierarchical, held_in_reference
@@ -37,8 +38,10 @@ __all__ = ["fit_campaign", "load_fitted_campaign"]
 
 TREND = 1e-3  # probability of a trend by chance, over all kinds of deviation
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
-SECTIONS = ("gauge", "lines", "tables", "scatter", "deviations", "exposures_skipped")
-SECTIONS += ("exposures_outlying",)  # of summary.json, which only the making of the fit knows
+SECTIONS = (  # of summary.json, which only the making of the fit knows
+    *("gauge", "lines", "tables", "scatter"),
+    *("deviations", "exposures_skipped", "exposures_outlying"),
+)
 
 
 def fit_campaign(matched: CampaignMatched, config: Config, base: Path) -> Fitted:

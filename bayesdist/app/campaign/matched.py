@@ -12,7 +12,8 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.split import split_of, whole_exposures
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.data import MatchTable, read_matches, write_partitioned
+from bayesdist.data import read_matches, write_partitioned
+from bayesdist.data.matches import MatchTable
 from bayesdist.model import DistortionModel
 
 __all__ = ["CampaignMatched", "load_matched_campaign", "matched_campaign"]

@@ -19,7 +19,8 @@ from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fitted import moved_by
 from bayesdist.app.kinds.table_file import StoredLookupTables
-from bayesdist.data import MagnitudeErrors, MatchTable
+from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import LinearFit, fit_by_magnitude
 from bayesdist.infer.nodes import Round, TableFit, fit_with_tables, pixel_jacobian

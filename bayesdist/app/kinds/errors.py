@@ -10,9 +10,11 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.output import write_table
-from bayesdist.data import MagnitudeErrors, MatchTable, with_centroid_errors
 from bayesdist.data.added_errors import AddedErrors
-from bayesdist.infer import Matches
+from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.data.matches import MatchTable
+from bayesdist.data.preparing import with_centroid_errors
+from bayesdist.infer.stars.shards import Matches
 
 __all__ = ["QUOTED", "ErrorLaw", "read_magnitude_errors"]
 

@@ -15,12 +15,13 @@ from bayesdist.app.kinds.exposures import FIT_AGAIN, ExposureScatter, write_hier
 from bayesdist.app.kinds.matched import Matched, Prepared
 from bayesdist.app.kinds.table_file import StoredLookupTables, write_tables
 from bayesdist.app.selfcal.solved import SelfCalibrated
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.infer import GaussianPriors, LinearFit, Matches, save_fit
+from bayesdist.infer import GaussianPriors, LinearFit, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes.alternation import inside_chips, on_the_chips, with_columns
 from bayesdist.infer.series import Series
+from bayesdist.infer.stars.shards import Matches
 from bayesdist.model import LookupTable, corrected
 
 __all__ = ["FIT", "TABLES", "Fitted", "moved_by", "required"]

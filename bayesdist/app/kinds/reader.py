@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.assess import SAMPLE
-from bayesdist.data import MatchTable
-from bayesdist.infer import Matches, Shards, load
-from bayesdist.infer.stars.shards import Compute
+from bayesdist.data.matches import MatchTable
+from bayesdist.infer import Shards, load
+from bayesdist.infer.stars.shards import Compute, Matches
 from bayesdist.model import DistortionModel
 
 __all__ = ["StarReader"]

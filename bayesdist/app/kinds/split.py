@@ -6,7 +6,7 @@ from bayesdist.app.config import Config
 from bayesdist.data.holdout import SetAside, Split, exposures_drawn, split_matches
 from bayesdist.diagnose.holdout.validation import LEAST_HELD
 from bayesdist.errors import InputError
-from bayesdist.infer import Matches
+from bayesdist.infer.stars.shards import Matches
 
 __all__ = ["split_of", "whole_exposures"]
 

@@ -25,7 +25,6 @@ from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettle
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
-    Matches,
     Posterior,
     Shards,
     build_model,
@@ -36,6 +35,7 @@ from bayesdist.infer import (
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.linear import Rejection
+from bayesdist.infer.stars.shards import Matches
 from bayesdist.model import DistortionModel
 
 __all__ = [

@@ -97,5 +97,8 @@ def read_tables(path: Path, *, do: str) -> StoredLookupTables:
         }
         for kind in (ERRORS, BETWEEN)
     )
-    measured = {chip: BetweenNodes(chip, *v[:2], int(v[2, 0])) for chip, v in between.items()}
+    measured = {
+        chip: BetweenNodes(chip, square, error, int(n[0]))
+        for chip, (square, error, n) in between.items()
+    }
     return StoredLookupTables(tuple(tables), errors, measured)

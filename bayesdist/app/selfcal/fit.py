@@ -144,6 +144,7 @@ def _solved(
     given, held = matched.given, arrays["held"].astype(np.int64)
     theta, stars = arrays["theta"], arrays["stars"]
     jitter, fraction = (float(v) for v in arrays["mixture"])
+    n_null, n_open = (int(n) for n in arrays["n_free"])
     mixture, known = Mixture(jitter, fraction), given.known_for(model)
     problem = given.problem(model, matched.detections, theta, matched.theta)
     for _ in range(RELINEARISED):
@@ -157,7 +158,7 @@ def _solved(
         np.setdiff1d(np.arange(model.n_params), held),
         found,
         known(arrays["reference"]),
-        Decision(*(int(n) for n in arrays["n_free"]), held),
+        Decision(n_null, n_open, held),
     )
     gauge = gauge_of(problem, theta, known(theta), solution)
     places = solution.stars

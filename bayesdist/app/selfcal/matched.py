@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.selfcal.given import Given
 from bayesdist.app.selfcal.matches import matches_of
-from bayesdist.data import MatchTable
 from bayesdist.data.detections import Detections
+from bayesdist.data.matches import MatchTable
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.normal import Mixture

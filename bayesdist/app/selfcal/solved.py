@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.output import write_table
 from bayesdist.app.selfcal.gauge import gauge_table
-from bayesdist.data import MatchTable
+from bayesdist.data.matches import MatchTable
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, Solution
 
