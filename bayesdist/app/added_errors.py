@@ -24,7 +24,7 @@ __all__ = [
 
 log = logging.getLogger("bayesdist")
 
-MOST_TOLD = 4  # groups that are told one by one
+MOST_LISTED = 4  # groups that are listed one by one
 
 
 def compared_errors(
@@ -129,7 +129,7 @@ def grouping_sentence(found: GroupedErrors, unit: str) -> str:
     if found.grouping == ONE:
         return f"one jitter for both axes ({head})"
     each, joint = list(_each(found)), ", "
-    if len(each) > MOST_TOLD:
+    if len(each) > MOST_LISTED:
         each, joint = [min(each), max(each)], " to "
     sizes = joint.join(f"{value:.3g} +- {error:.2g} {unit} {where}" for value, error, where in each)
     return (

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,13 +89,12 @@ class Session:
 
     # -- values of the stages ---------------------------------------------------------------------
 
-    def renew(self, name: str, value: object) -> None:
+    def renew(self, name: Literal["matched", "fitted", "posterior"], value: object) -> None:
         """Replace the value of a stage: a new state, without anything that followed from it.
 
         Parameters
         ----------
         name : str
-            'matched', 'fitted' or 'posterior'.
         value : Matched, Fitted or Posterior
         """
         later = VALUES[VALUES.index(name) :]
@@ -218,7 +217,7 @@ class Session:
 
     @property
     def in_circle(self) -> bool:
-        """Whether the likelihood is that of stars matched in circles about nominal positions."""
+        """Truth of a likelihood of stars that were matched in circles about nominal positions."""
         return knows_circle(self.config) and self.matched.stars.has_nominal
 
     @property

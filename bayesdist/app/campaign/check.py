@@ -9,9 +9,9 @@ import numpy as np
 from bayesdist.app.campaign.inputs import cuts_of
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.campaign.soundness import (
-    input_doubts,
+    input_warnings,
     segment_counts,
-    shear_doubts,
+    shear_warnings,
 )
 from bayesdist.app.campaign.stages import rehearse_campaign
 
@@ -42,7 +42,7 @@ def campaign_lines(session: CampaignSession) -> Iterator[str]:
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
     for number, names in _without(session).items():
         yield f"chip {number}       no detections that pass the cuts in {', '.join(names)}"
-    for text in [*input_doubts(config, inputs), *shear_doubts(rolls, "PA_V3")]:
+    for text in [*input_warnings(config, inputs), *shear_warnings(rolls, "PA_V3")]:
         yield f"WARNING      {text[0].upper() + text[1:]}"
 
 

@@ -1,8 +1,8 @@
-"""Stage 1 of a campaign: tables, errors, every exposure alone, and all of them jointly."""
+"""The fit of a campaign: tables, errors, all exposures jointly, and every one alone."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -157,20 +157,20 @@ def _series(alone: ExposureSolutions, reference: Chip) -> Series:
     return Series(epoch, values, cov, tuple(labels), alone.names, source="exposures")
 
 
-def _trends(joint: HierarchicalFit, matches: MatchTable) -> list[str]:
+def _trends(joint: HierarchicalFit, stars: MatchTable) -> list[str]:
     """Deviations that go with time although they are taken to scatter, each as a clause.
 
-    Those of scale and shears: how the chips move against each other has a test of its own
+    Only scale and shears: how the chips move against each other has a test of its own
     (`bayesdist.diagnose.score.gap`).
     """
+    if stars.epoch is None:
+        return []
     model = joint.model
-    assert matches.epoch is not None
-    names = np.array(model.exposures)
-    code = {name: k for k, name in enumerate(matches.exposure_names)}
-    first = {int(k): float(matches.epoch[row]) for k, row in _first_rows(matches)}
-    kept = [k for k, name in enumerate(names) if name not in joint.outlying]
-    epoch = np.array([first[code[str(names[k])]] for k in kept])
-    values = joint.fit.mean[joint.index].reshape(len(joint.scatter.kinds), -1).T[kept]
+    codes, rows = np.unique(stars.exposure, return_index=True)
+    dates = dict(zip((stars.exposure_names[k] for k in codes), stars.epoch[rows], strict=True))
+    typical = [k for k, name in enumerate(model.exposures) if name not in joint.outlying]
+    epoch = np.array([dates[model.exposures[k]] for k in typical])
+    values = joint.fit.mean[joint.index].reshape(len(joint.scatter.kinds), -1).T[typical]
     breaks = () if model.time is None else model.time.breaks
     p = trend_p_values(values, epoch, breaks)
     return [
@@ -179,12 +179,6 @@ def _trends(joint: HierarchicalFit, matches: MatchTable) -> list[str]:
         for kind, one in zip(joint.scatter.kinds, p, strict=True)
         if kind.split(".")[-1] not in RIGID and one * len(p) < TREND
     ]
-
-
-def _first_rows(matches: MatchTable) -> Iterator[tuple[int, int]]:
-    """Code of each exposure, and a row of it."""
-    codes, rows = np.unique(matches.exposure, return_index=True)
-    yield from zip(codes.tolist(), rows.tolist(), strict=True)
 
 
 def _scatter(joint: HierarchicalFit, name: str) -> dict[str, object]:

@@ -189,11 +189,10 @@ def read_campaign_catalog(
         )
     if catalog.tangent_point is None:
         return catalog, ""
-    point, middle = _middle_of(log, catalog), "stars"
+    (ra, dec), middle = catalog.tangent_point, "stars"
+    point = _middle_of(log, catalog)
     if point is not None:
-        catalog, middle = read(point), "exposures"
-    assert catalog.tangent_point is not None
-    ra, dec = catalog.tangent_point
+        catalog, (ra, dec), middle = read(point), point, "exposures"
     return catalog, (
         f"tangent plane at RA {ra:.5f}, Dec {dec:+.5f} (the middle of the {middle}), arcsec"
     )
@@ -215,7 +214,7 @@ def _middle_of(log: ExposureLog, catalog: ReferenceCatalog) -> tuple[float, floa
 
 
 def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) -> tuple[bool, ...]:
-    """Whether the catalogue is taken mirrored, the more probable first.
+    """Parities of the catalogue to try, the more probable first: True is mirrored.
 
     V2 and V3 lie on the sky as east and north do but for a rotation, and the table says how its
     axes lie along V2 and V3.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bayesdist.infer.transforms import (
     LinearTerms,
+    ReferenceGauge,
     Solution,
     View,
     lines,
@@ -26,12 +27,13 @@ def line_sections(solution: Solution, chip: int) -> dict[str, object]:
         Number of the reference chip.
     """
     view = reference_gauge(without_frames(solution), chip)
-    return {"gauge": _gauge(view), "lines": _lines(view)}
+    return {"gauge": _gauge(view.gauge), "lines": _lines(view)}
 
 
-def _gauge(view: View) -> dict[str, object]:
-    gauge = view.gauge
-    assert gauge is not None
+def _gauge(gauge: ReferenceGauge | None) -> dict[str, object] | None:
+    """Section 'gauge'; None for a solution in no gauge of its own."""
+    if gauge is None:
+        return None
     return {
         "chip": gauge.chip,
         "fixed": list(FIXED),

@@ -10,7 +10,7 @@ from typing import Any
 from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.app.kinds.split import split_of, whole_exposures
+from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import read_matches, write_partitioned
 from bayesdist.data.matches import MatchTable
@@ -72,14 +72,10 @@ def matched_campaign(
     Raises
     ------
     InputError
-        As `split_of`.
+        As `set_aside`.
     """
-    split = split_of(config, pairs, GAUGE_EXPOSURES)
-    if split is None or not isinstance(split.kept, MatchTable):
-        return CampaignMatched(pairs, inputs=inputs, pairs=pairs, **more)
-    held = split.held if isinstance(split.held, MatchTable) else None
-    whole = whole_exposures(config, pairs.exposure_names, GAUGE_EXPOSURES)
-    return CampaignMatched(split.kept, held, whole, inputs=inputs, pairs=pairs, **more)
+    parts = set_aside(config, pairs, GAUGE_EXPOSURES)
+    return CampaignMatched(*parts, inputs=inputs, pairs=pairs, **more)
 
 
 def load_matched_campaign(

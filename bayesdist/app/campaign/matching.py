@@ -20,7 +20,7 @@ from bayesdist.app.campaign.inputs import (
 )
 from bayesdist.app.campaign.matched import CampaignMatched, matched_campaign
 from bayesdist.app.campaign.reference import free_rates
-from bayesdist.app.campaign.soundness import input_doubts, refuse_few, shear_doubts
+from bayesdist.app.campaign.soundness import input_warnings, refuse_few, shear_warnings
 from bayesdist.app.config import Config
 from bayesdist.data import (
     ExposureLog,
@@ -87,9 +87,9 @@ def match_lists(config: Config, base: Path, *, inputs: Inputs | None = None) -> 
     warnings = [
         *_doubtful_parity(found.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
         *found.warnings(inputs.log),
-        *input_doubts(config, inputs),
+        *input_warnings(config, inputs),
         # as the stars show them, for the log need not have them
-        *shear_doubts(np.asarray(table["rotation"]), "of the matches"),
+        *shear_warnings(np.asarray(table["rotation"]), "of the matches"),
     ]
     pairs = neutralise_aberration(found.table, inputs.log)
     facts = _facts(found, table, inputs, warnings)
@@ -157,7 +157,7 @@ def _log(matched: CampaignMatched, n_detected: int) -> None:
 
 
 def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) -> list[str]:
-    """Whether the stars have another parity than the known distortion says, as a clause."""
+    """A warning, as a clause, of stars with another parity than the known distortion says."""
     if mirrored == parities[0]:
         return []
     return [

@@ -1,4 +1,4 @@
-"""Does what a campaign begins with go together, and what can it not tell?"""
+"""Validation of what a campaign begins with: refusals, and warnings of what it cannot tell."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from bayesdist.model import Chip, TimeDependence
 
 __all__ = [
     "frames_not_set",
-    "input_doubts",
+    "input_warnings",
     "refuse_few",
     "refuse_unsound",
     "segment_counts",
     "segment_text",
-    "shear_doubts",
+    "shear_warnings",
 ]
 
 Float = NDArray[np.float64]
@@ -72,12 +72,12 @@ def refuse_unsound(config: Config, inputs: Inputs) -> None:
         refuse_strangers(held.exposures, inputs.log.names, inputs.log.source)
 
 
-def input_doubts(config: Config, inputs: Inputs) -> list[str]:
-    """What a campaign will not be able to tell, or takes on trust, each as a clause."""
+def input_warnings(config: Config, inputs: Inputs) -> list[str]:
+    """Warnings of what a campaign cannot tell, or takes on trust, each as a clause."""
     log, catalog = inputs.log, inputs.catalog
     out = []
     if inputs.strangers:
-        out.append(_said_of_strangers(inputs.strangers, log.source))
+        out.append(_unlogged(inputs.strangers, log.source))
     epochs = log.values("epoch")
     span = float(np.ptp(epochs))
     if catalog.pm_u is None and span > STILL:
@@ -107,7 +107,7 @@ def input_doubts(config: Config, inputs: Inputs) -> list[str]:
     return out
 
 
-def _said_of_strangers(names: tuple[str, ...], log: str) -> str:
+def _unlogged(names: tuple[str, ...], log: str) -> str:
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     several = len(names) > 1
     return (
@@ -118,7 +118,7 @@ def _said_of_strangers(names: tuple[str, ...], log: str) -> str:
 
 
 def one_roll_angle(angles: Float) -> bool:
-    """Whether exposures at these angles (E,), in radians, see a shear of the catalogue alike.
+    """Truth of roll angles (E,), in radians, that see a shear of the catalogue alike.
 
     An exposure at roll angle a sees a shear of the catalogue as one of its detector turned by 2a:
     at one angle, or at angles half a turn apart, nothing tells the two apart.
@@ -127,7 +127,7 @@ def one_roll_angle(angles: Float) -> bool:
     return bool(spread < 2.0 * np.radians(ONE_ROLL) ** 2)
 
 
-def shear_doubts(rolls: Float, of: str) -> list[str]:
+def shear_warnings(rolls: Float, of: str) -> list[str]:
     """Warnings of exposures at roll angles, in degrees, that leave a catalogue's shear open."""
     known = np.asarray(rolls, float)
     known = known[np.isfinite(known)]

@@ -60,8 +60,7 @@ def fit_tables(
 ) -> FittedTables:
     """The look-up tables that are asked for, and those that are held.
 
-    Those that are fitted are the detector's, unless these are taken from another run: then they
-    are the filter's.
+    Fitted are the detector's, unless these are taken from another run: then the filter's.
 
     Parameters
     ----------
@@ -195,7 +194,7 @@ def _errors_of(tables: tuple[LookupTable, ...], fit: LinearFit) -> ErrorsAt:
 
 
 def _warnings(config: Config, found: FittedTables) -> Iterator[str]:
-    """What is to be known of the tables' errors, each as a clause."""
+    """Warnings of the tables' errors, each as a clause."""
     block, stored, fit = config.tables, found.stored, found.fit
     if block.detector is not None and any(t.sigma is None for t in stored.tables if not t.filter):
         yield "the detector's tables have no errors, and none are counted"

@@ -16,7 +16,7 @@ from bayesdist.app.kinds.errors import QUOTED, ErrorLaw, read_magnitude_errors
 from bayesdist.app.kinds.fitted import FIT, Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.kinds.split import split_of, whole_exposures
+from bayesdist.app.kinds.split import set_aside
 from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.rvb import load_rvb
 from bayesdist.assess import SAMPLE
@@ -71,7 +71,7 @@ def match_stars(config: Config, base: Path, *, stars: Matches | None = None) -> 
     Raises
     ------
     InputError
-        For files that cannot be read, and as `split_of`.
+        For files that cannot be read, and as `set_aside`.
     ConfigError
         For settings that do not go with nominal positions.
     """
@@ -82,10 +82,7 @@ def match_stars(config: Config, base: Path, *, stars: Matches | None = None) -> 
         except ValueError as error:
             cause, _, do = str(error).partition("; ")
             raise ConfigError(cause, where=", ".join(stars.sources), do=do) from None
-    split = split_of(config, stars)
-    if split is None:
-        return Matched(stars)
-    return Matched(split.kept, split.held, whole_exposures(config, stars.exposure_names))
+    return Matched(*set_aside(config, stars))
 
 
 def read_stars(config: Config, base: Path) -> Matches:

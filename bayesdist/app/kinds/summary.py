@@ -1,18 +1,19 @@
-"""What summary.json says of a fit."""
+"""Sections of summary.json that follow from the values of stages."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from bayesdist.app.added_errors import added_errors_rows
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.infer import LinearFit
+from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.skew import Skew, skew_of
 from bayesdist.infer.stars.shards import Matches
 
-__all__ = ["fit_sections", "log_fit"]
+__all__ = ["fit_sections", "log_fit", "sample_sections"]
 
 log = logging.getLogger("bayesdist")
 
@@ -91,3 +92,61 @@ def _skew_row(skew: Skew) -> dict[str, float]:
         "sigma_rad": skew.sigma,
         "significance": skew.significance,
     }
+
+
+def sample_sections(posterior: Posterior, *, in_circle: bool) -> dict[str, Any]:
+    """Sections 'outliers' and 'sampler' of summary.json.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    in_circle : bool
+        Stars were matched in circles about nominal positions.
+    """
+    c, i = posterior.convergence, posterior.sampler
+    return {
+        "outliers": _outliers(posterior, in_circle),
+        "sampler": {
+            "method": i.method,
+            "exact": i.exact,
+            "converged": c.converged,
+            "reasons": list(c.reasons),
+            "rhat_max": c.rhat_max,
+            "ess_bulk_min": c.ess_bulk_min,
+            "ess_tail_min": c.ess_tail_min,
+            "pareto_k": c.pareto_k,
+            "importance_efficiency": c.importance_efficiency,
+            "ensembles": i.ensembles,
+            "walkers": i.walkers,
+            "steps": i.steps,
+            "passes": i.passes,
+            "acceptance": i.acceptance,
+            "wall_s": i.wall_s,
+            **_certificate(posterior),
+        },
+    }
+
+
+def _outliers(posterior: Posterior, in_circle: bool) -> dict[str, object]:
+    out: dict[str, object] = {"model": posterior.mixture.model, "unit": posterior.unit}
+    names = {"f": "fraction", "j": "jitter", "s_out": "scale"}
+    for key, name in names.items():
+        values = posterior.hyper.get(key)
+        if values is not None:
+            out[name] = {"mean": float(values.mean()), "sd": float(values.std(ddof=1))}
+        elif key == "j":
+            out[name] = {"mean": posterior.mixture.jitter, "sd": 0.0}
+        elif key == "f":
+            out[name] = {"mean": 0.0, "sd": 0.0}
+    out["n_flagged"] = posterior.n_flagged
+    if in_circle:
+        out["match_circle"] = posterior.mixture.match_radius
+    return out
+
+
+def _certificate(posterior: Posterior) -> dict[str, object]:
+    """Evidence for draws that were not made from the posterior itself."""
+    c = posterior.certificate
+    if c is None:
+        return {}
+    return {"certificate": asdict(c) | {"granted": c.granted, "statement": c.statement}}

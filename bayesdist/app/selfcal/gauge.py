@@ -1,4 +1,4 @@
-"""What fixes the gauge of a self-calibration, and how its directions are told."""
+"""What fixes the gauge of a self-calibration, and its directions in words."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> I
     return tie(theta, row, float(np.log(size / model.linear_scale(theta))), sigma)
 
 
-# -- told -----------------------------------------------------------------------------------------
+# -- in words -------------------------------------------------------------------------------------
 
 
 def fixed_by(gauge: Gauge, solution: Solution, pieces: Known) -> dict[str, str]:
@@ -221,7 +221,7 @@ def _state(d: NamedDirection) -> str:
 def gauge_summary(
     gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel
 ) -> dict[str, object]:
-    """The same for summary.json; what is infinite is null there."""
+    """Part 'gauge' of the section 'selfcal' of summary.json; infinite sigmas are null there."""
     return {
         "n_free": int(gauge.null.shape[1]),
         "n_by_convention": int(gauge.open.shape[1]),

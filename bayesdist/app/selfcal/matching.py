@@ -40,7 +40,7 @@ AMBIGUOUS = 0.05  # share of groups of which it is not clear what they are, that
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """What was found.
+    """How detections became stars.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Matching:
 
     @property
     def sentence(self) -> str:
-        """What was found, in a line."""
+        """Stars, detections and exposures, in a line."""
         n = self.summary
         return (
             f"{n['n_stars']} stars of {n['detections']['used']} of {n['detections']['read']} "
@@ -81,10 +81,10 @@ class Matching:
         k = int(np.nanargmin(np.where(strange, share / usual, np.nan)))
         name = str(self.table["exposure"][k])
         half = k in half_turned(np.radians(np.asarray(self.table["rotation"], float)))
-        told = ", and it lies half a turn from all the others" if half else ""
+        turned = ", and it lies half a turn from all the others" if half else ""
         raise InputError(
             f"exposure {name} has {100 * share[k]:.0f} % of its detections where others look in "
-            f"common with them, and the usual share is {100 * usual[k]:.0f} %{told}",
+            f"common with them, and the usual share is {100 * usual[k]:.0f} %{turned}",
             where="selfcal.lists",
             do=TURN_BACK
             if half
@@ -271,7 +271,7 @@ def _moved(detections: Detections, inputs: Inputs) -> float:
 def _seen_by_others(
     model: DistortionModel, theta: Float, places: Float, exposure: NDArray[np.int64]
 ) -> Bool:
-    """Which detections lie on the sky where another exposure has a chip."""
+    """Boolean mask (N,) of detections that lie on the sky where another exposure has a chip."""
     E = len(model.exposures)
     outlines = [
         [hull_of(_corners(model, theta, e, chip.number, chip.size))[0] for chip in model.chips]

@@ -13,7 +13,7 @@ from bayesdist.app.selfcal.stars import write_stars
 from bayesdist.app.stages import rehearse_solution
 from bayesdist.app.stages.assess import run_assess
 from bayesdist.app.stages.fit import save_fitted
-from bayesdist.app.stages.sample import keep_posterior
+from bayesdist.app.stages.sample import save_sampled
 from bayesdist.products import read_idctab
 
 __all__ = ["SELFCAL_STAGES", "rehearse_selfcal"]
@@ -55,7 +55,7 @@ def _sample(session: SelfcalSession) -> None:
     posterior = sample_detections(
         session.fitted, session.config, folder=session.run.path, progress=session.progress
     )
-    keep_posterior(session, posterior)
+    save_sampled(session, posterior)
 
 
 def _assess(session: SelfcalSession) -> None:
