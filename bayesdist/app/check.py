@@ -59,10 +59,7 @@ def check(path: str | Path) -> str:
 def _lines(session: Session) -> Iterator[str]:
     rehearse(session)
     matches, model = session.raw_matches, session.model
-    fit, errors = session.linear
-    session.fit = fit  # what a run would read from its files
-    if errors is not None:
-        session.magnitude_errors = errors
+    fit = session.fit
     sigma = session.shards.survey.reference_sigma
     yield (
         f"matches      {len(matches)} of {matches.n_rows} rows, "
@@ -74,7 +71,7 @@ def _lines(session: Session) -> Iterator[str]:
         yield f"left out     {count} rows: {reason}"
     yield (
         f"errors       median {number(sigma)} {matches.unit}"
-        + (" (by magnitude)" if errors is not None else "")
+        + (" (by magnitude)" if session.magnitude_errors is not None else "")
     )
     if session.grouped_errors is not None:
         yield f"jitter       {grouping_sentence(session.grouped_errors, fit.unit)}"

@@ -1,4 +1,4 @@
-"""Stars set aside before the fit: which ones, what they say afterwards, what is written of it."""
+"""Stars set aside before the fit: what they say afterwards, and what is written of it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,12 @@ from astropy.table import Table
 from bayesdist.app.kept import kept
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.local import table_of
-from bayesdist.data.holdout import SetAside, Split, exposures_drawn, split_matches
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
-from bayesdist.diagnose.holdout.validation import LEAST_HELD, HeldOutTruth, held_out_truth
-from bayesdist.errors import InputError
+from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
 from bayesdist.model import LookupTable
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
-    from bayesdist.infer import Matches
 
 __all__ = [
     "held_out_of",
@@ -27,49 +24,7 @@ __all__ = [
     "holdout_table",
     "local_errors",
     "predictive_of_run",
-    "split_of",
-    "whole_exposures",
 ]
-
-
-def whole_exposures(session: Session, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Exposures that are set aside whole: the named ones, or so many drawn by the seed."""
-    block, seed = session.config.holdout, session.config.sampler.seed
-    if block is None:
-        return ()
-    needed = names[: session.needed_exposures]
-    if isinstance(block.exposures, int):
-        return exposures_drawn(names[len(needed) :], block.exposures, seed)
-    for name in block.exposures:
-        if name in needed:
-            raise InputError(
-                f"exposure {name!r} is to be held out, and defines the gauge",
-                where="holdout.exposures",
-                do="name another one",
-            )
-    return tuple(dict.fromkeys(block.exposures))
-
-
-def split_of(session: Session, matches: Matches) -> Split | None:
-    """Matches that are fitted, and those that are set aside; None where none are.
-
-    Raises
-    ------
-    InputError
-        For an unknown exposure, and when nothing would be left, or too little set aside.
-    """
-    block = session.config.holdout
-    if block is None:
-        return None
-    whole = whole_exposures(session, matches.exposure_names)
-    split = split_matches(matches, SetAside(block.fraction, whole, session.config.sampler.seed))
-    if len(split.held) < LEAST_HELD:
-        raise InputError(
-            f"{len(split.held)} of {len(matches)} stars are held out, which say too little",
-            where=", ".join(matches.sources),
-            do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
-        )
-    return split
 
 
 def held_out_of(session: Session, *, anew: bool = False) -> HeldOutTruth | None:
@@ -96,8 +51,7 @@ def held_out_of(session: Session, *, anew: bool = False) -> HeldOutTruth | None:
         return None
 
     def judged() -> HeldOutTruth:
-        whole = whole_exposures(session, held.exposure_names)
-        return held_out_truth(session.predictive, held, whole=whole)
+        return held_out_truth(session.predictive, held, whole=session.matched.whole)
 
     return kept(session, "held_out_truth", judged, anew=anew)
 

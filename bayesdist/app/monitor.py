@@ -14,6 +14,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.folder import whole_folder
+from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.rvb import load_rvb
@@ -159,7 +160,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
         matches = load_matches(path, **reading_options(data, config.chip))
     if data.sigma != "by_magnitude":
         return matches
-    errors = Session(run).kept_errors()
+    errors = read_magnitude_errors(run.path)
     if errors is None:
         raise InputError(
             "errors by magnitude are asked for, and the run has measured none",

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
-from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.added_errors import compared_errors, kept_grouped_errors
-from bayesdist.app.chips import check_chips
+from bayesdist.app.added_errors import knows_circle
 from bayesdist.app.config import CATALOGUE_WORDS, Config
 from bayesdist.app.discrepancy import RunDiscrepancy, keep_discrepancy, kept_discrepancy
-from bayesdist.app.holdout import predictive_of_run, split_of
-from bayesdist.app.matches import load_matches, reading_options
+from bayesdist.app.holdout import predictive_of_run
+from bayesdist.app.kinds.errors import ErrorLaw
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.matched import Matched, Prepared
+from bayesdist.app.kinds.reader import StarReader
+from bayesdist.app.kinds.stars import load_fitted_stars, match_stars
+from bayesdist.app.output import write_table
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.rvb import RvbInput
 from bayesdist.app.score_tests import keep_score_tests, kept_score_tests
@@ -41,46 +44,32 @@ from bayesdist.assess.terms.centroid import centroid_scatter
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import MagnitudeErrors, MatchTable
-from bayesdist.data.holdout import Split
 from bayesdist.diagnose import ScoreTest, score_tests
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
 from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.diagnose.residuals.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
-from bayesdist.diagnose.residuals.quoted import error_scale, error_scale_sentence
-from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
-from bayesdist.files import atomic_path
-from bayesdist.infer import (
-    GaussianPriors,
-    LinearFit,
-    Matches,
-    Posterior,
-    Shards,
-    build_model,
-    fit_by_magnitude,
-    fit_linear,
-    load,
-    load_fit,
-    load_posterior,
-)
+from bayesdist.diagnose.residuals.quoted import error_scale_sentence
+from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards, load_posterior
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
-from bayesdist.infer.linear import Rejection
 from bayesdist.model import DistortionModel
 
 Float = NDArray[np.float64]
 
-__all__ = ["ERROR_COLUMNS", "STAGES", "Session", "write_table"]
+__all__ = ["STAGES", "Session", "write_table"]
 
 STAGES = ("match", "fit", "sample", "assess", "export", "report")
 
-ERROR_COLUMNS = ("mag", "sigma_u", "sigma_v", "n", "scatter_u", "scatter_v")
+VALUES = ("matched", "fitted", "prepared", "posterior")  # each rests on those before it
+
+T = TypeVar("T")
 
 
 @dataclass
 class Session:
-    """What the stages of one run share; everything is read when it is first needed.
+    """What the stages of one run share: a value of each stage, and what follows from them.
 
     Parameters
     ----------
@@ -91,24 +80,135 @@ class Session:
 
     run: RunDirectory
     progress: Callable[[int, int], None] | None = None
+    _values: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    _made: set[str] = field(default_factory=set, init=False, repr=False)
+    _reader: StarReader | None = field(default=None, init=False, repr=False)
+    _rvb: RvbInput | None = field(default=None, init=False, repr=False)
+
+    things = "stars"  # what a row of the data is, in words
+
+    # -- values of the stages ---------------------------------------------------------------------
+
+    def renew(self, name: Literal["matched", "fitted", "posterior"], value: object) -> None:
+        """Replace the value of a stage: a new state, without anything that followed from it.
+
+        Parameters
+        ----------
+        name : str
+        value : Matched, Fitted or Posterior
+        """
+        later = VALUES[VALUES.index(name) :]
+        own = {one.name for one in fields(self)}
+        for derived in vars(self).keys() - own:
+            del vars(self)[derived]
+        for one in later:
+            self._values.pop(one, None)
+        self._made.difference_update(later)
+        self._made.add(name)
+        self._values[name] = value
+
+    def made(self, name: str) -> bool:
+        """Truth of a value that this session made, and did not read from the run's folder."""
+        return name in self._made
+
+    def _value(self, name: str, load: Callable[[], T]) -> T:
+        """A value that was made in this session, or is loaded now."""
+        if name not in self._values:
+            self._values[name] = load()
+        return cast(T, self._values[name])
+
+    @property
+    def matched(self) -> Matched:
+        """Stars that are fitted and stars that are held out, as they were read or matched."""
+        return self._value("matched", self._load_matched)
+
+    def _load_matched(self) -> Matched:
+        stars, data = None, self.config.data
+        if data is not None and data.format == "rvb":
+            self._rvb = self._rvb or RvbInput(self.run)
+            stars = self._rvb.load()
+        return match_stars(self.config, self.base, stars=stars)
+
+    @property
+    def fitted(self) -> Fitted:
+        """The linear fit, with what its stars were given."""
+        return self._value("fitted", self._load_fitted)
+
+    def _load_fitted(self) -> Fitted:
+        return load_fitted_stars(self.run.path, self.config, self.run.summary)
+
+    @property
+    def prepared(self) -> Prepared:
+        """Stars as the fit took them."""
+        return self._value("prepared", lambda: self.fitted.prepared(self.matched))
+
+    @property
+    def posterior(self) -> Posterior:
+        """The posterior."""
+        return self._value("posterior", lambda: load_posterior(self.run / "posterior.nc"))
+
+    def begun(self) -> None:
+        """Move into the run's folder what was prepared beside it: the run has begun."""
+        if self._rvb is not None and self._rvb.settle():
+            fitted = self.fitted
+            self.renew("matched", self._load_matched())
+            self.renew("fitted", fitted)
+            self.reader.moved(self.matched.stars)
+
+    def close(self) -> None:
+        """Let go of the data, and of whoever holds them."""
+        for one in (self._reader, self._rvb):
+            if one is not None:
+                one.close()
+
+    # -- what follows from them -------------------------------------------------------------------
 
     @cached_property
     def config(self) -> Config:
         """The resolved configuration."""
         return self.run.config
 
-    @cached_property
-    def _split(self) -> Split | None:
-        """Matches that are fitted and those that are held out, where some are."""
-        return None if self.config.holdout is None else split_of(self, self._all_matches)
+    @property
+    def base(self) -> Path:
+        """Folder that the configuration's files are relative to."""
+        return Path(self.run.record["base"])
 
     @property
     def raw_matches(self) -> Matches:
-        """Matches as read, without those that are held out."""
-        return self._all_matches if self._split is None else self._split.kept
+        """Matches with their quoted errors, without those that are held out."""
+        return self.matched.stars
 
-    things = "stars"  # what a row of the data is, in words
-    needed_exposures = 0  # the first ones, which cannot be held out
+    @property
+    def matches(self) -> Matches:
+        """Matches with their errors."""
+        return self.prepared.stars
+
+    @property
+    def held_matches(self) -> Matches | None:
+        """Matches that are held out, with their errors; None where there are none."""
+        return self.prepared.held
+
+    @property
+    def _read(self) -> tuple[Matches, ErrorLaw]:
+        """What the reader is asked for: stars, and by which law they have their errors."""
+        return self.matched.stars, self.fitted.errors
+
+    @property
+    def reader(self) -> StarReader:
+        """Reads stars once for all stages."""
+        if self._reader is None:
+            self._reader = StarReader(self.config.resources())
+        return self._reader
+
+    @property
+    def shards(self) -> Shards:
+        """All stars as the passes go over them: they are read once."""
+        return self.reader.shards(self.model, *self._read)
+
+    @property
+    def _sample(self) -> MatchTable:
+        """Some of the matches, or all."""
+        return self.reader.sample(*self._read)
 
     @property
     def predictive(self) -> Predictive:
@@ -116,26 +216,39 @@ class Session:
         return predictive_of_run(self)
 
     @property
-    def held_matches(self) -> Matches | None:
-        """Those that are held out, with their errors; None where there are none."""
-        if self._split is None:
-            return None
-        held, errors = self._split.held, self.magnitude_errors
-        return self.with_added_errors(
-            held if errors is None else held.with_errors_by_magnitude(errors)
-        )
+    def in_circle(self) -> bool:
+        """Truth of a likelihood of stars that were matched in circles about nominal positions."""
+        return knows_circle(self.config) and self.matched.stars.has_nominal
 
     @property
-    def in_circle(self) -> bool:
-        """Whether the likelihood is that of stars matched in circles about nominal positions."""
-        if self.config.data is None or self.config.outliers.match_radius is None:
-            return False
-        return self._all_matches.has_nominal
+    def fit(self) -> LinearFit:
+        """The linear fit itself."""
+        return self.fitted.linear
 
-    @cached_property
+    @property
+    def model(self) -> DistortionModel:
+        """The model that was fitted."""
+        return self.fit.model
+
+    @property
+    def priors(self) -> GaussianPriors:
+        """Priors of the model's parameters."""
+        return self.fitted.priors
+
+    @property
+    def magnitude_errors(self) -> MagnitudeErrors | None:
+        """Errors by magnitude, as the fit left them."""
+        return self.fitted.errors.by_magnitude
+
+    @property
+    def grouped_errors(self) -> GroupedErrors | None:
+        """Errors beyond the quoted ones by groups of stars; None where these are not compared."""
+        return self.fitted.grouped
+
+    @property
     def error_scale(self) -> float:
         """Factor on all quoted errors that the fit found them to need; 1 where they will do."""
-        return float(self.run.summary.get("fit", {}).get("error_scale", 1.0))
+        return self.fitted.errors.factor
 
     @property
     def error_scale_sentence(self) -> str:
@@ -150,189 +263,11 @@ class Session:
         )
 
     @cached_property
-    def grouped_errors(self) -> GroupedErrors | None:
-        """Errors beyond the quoted ones by groups of stars; None where these are not compared."""
-        return kept_grouped_errors(self.run.summary.get("fit", {}).get("added_errors"))
-
-    def with_added_errors(self, matches: Matches) -> Matches:
-        """Matches with what their group has beyond the quoted errors and the jitter."""
-        added = None if self.grouped_errors is None else self.grouped_errors.added
-        return matches if added is None else matches.with_added_errors(added)
-
-    @cached_property
-    def _all_matches(self) -> Matches:
-        """Matches as read, their errors multiplied by `error_scale`."""
-        matches = self._read_matches()
-        if self.error_scale != 1.0:
-            matches = matches.with_errors_times(self.error_scale)
-        if matches.has_nominal:
-            try:  # columns may be found by their names
-                self.config.refuse_circle()
-            except ValueError as error:
-                cause, _, do = str(error).partition("; ")
-                raise ConfigError(cause, where=", ".join(matches.sources), do=do) from None
-        return matches
-
-    def _read_matches(self) -> Matches:
-        data = self.config.data
-        assert data is not None
-        if data.format == "rvb":
-            return self._rvb.load()
-        return load_matches(self.run.matches, **reading_options(data, self.config.chip))
-
-    @cached_property
-    def _rvb(self) -> RvbInput:
-        """RvB pairs, where the configuration names such."""
-        return RvbInput(self.run)
-
-    def begun(self) -> None:
-        """Move into the run's folder what was prepared beside it: the run has begun."""
-        if "_rvb" in self.__dict__ and self._rvb.settle():
-            for name in ("_all_matches", "_split", "matches"):
-                self.__dict__.pop(name, None)
-            if self.config.compute.engine == "dask":  # workers may read the pairs again
-                self.errors_changed()
-
-    @cached_property
-    def magnitude_errors(self) -> MagnitudeErrors | None:
-        """Errors by magnitude, as the fit left them."""
-        assert self.config.data is not None
-        return self.kept_errors() if self.config.data.sigma == "by_magnitude" else None
-
-    def kept_errors(self) -> MagnitudeErrors | None:
-        """Errors by magnitude that an earlier stage wrote; None where there are none."""
-        path = self.run / "magnitude_errors.ecsv"
-        if not path.exists():
-            return None
-        table = Table.read(path)
-        return MagnitudeErrors(**{name: np.asarray(table[name]) for name in ERROR_COLUMNS})
-
-    @cached_property
-    def matches(self) -> Matches:
-        """Matches with their errors."""
-        raw, errors = self.raw_matches, self.magnitude_errors
-        return self.with_added_errors(
-            raw if errors is None else raw.with_errors_by_magnitude(errors)
-        )
-
-    @cached_property
-    def shards(self) -> Shards:
-        """All stars as the passes go over them: they are read once."""
-        shards = load(self.model, self.matches, self.config.resources())
-        if self.in_circle:  # said before anything is fitted
-            shards.survey.check_circle(self.config.outliers.match_radius)
-        return shards
-
-    def errors_changed(self) -> None:
-        """Forget what rests on the errors of the stars."""
-        shards = self.__dict__.get("shards")
-        if shards is not None:
-            shards.close()
-        for name in (
-            "matches",
-            "magnitude_errors",
-            "shards",
-            "sums",
-            "stars",
-            "misfits",
-            "_sample",
-            "epoch_shift",
-        ):
-            self.__dict__.pop(name, None)
-
-    def close(self) -> None:
-        """Let go of the data, and of whoever holds them."""
-        if "shards" in self.__dict__:
-            self.__dict__.pop("shards").close()
-        if "_rvb" in self.__dict__:
-            self._rvb.close()
-
-    @cached_property
-    def model(self) -> DistortionModel:
-        """The model that the configuration asks for."""
-        config = self.config
-        check_chips(config.chips(), self.raw_matches.chip_numbers)
-        return build_model(
-            self.raw_matches,
-            order=config.model.order,
-            size=config.detector.size,
-            reference_pixel=config.model.reference_pixel,
-            name=config.detector.name,
-            chips=config.chips(),
-            frames=config.model.frames,
-            time=config.time(),
-        )
-
-    @cached_property
-    def priors(self) -> GaussianPriors:
-        """Priors of the model's parameters."""
-        named = {p.parameter: (p.mean, p.sigma) for p in self.config.prior}
-        return GaussianPriors.of(self.model, named)
-
-    def settled(self, posterior: Posterior) -> Posterior:
-        """The posterior as the stages that follow take it."""
-        return posterior
-
-    @cached_property
-    def linear(self) -> tuple[LinearFit, MagnitudeErrors | None]:
-        """The linear fit that the configuration asks for, made now; nothing is written.
-
-        Raises
-        ------
-        InputError
-            Where it cannot be made; with the frames of the exposures that would help.
-        """
-        try:
-            return self._linear()
-        except (DegenerateError, NotSettledError) as error:
-            if self.better_frames is None:
-                raise
-            do = self.better_frames.sentence
-            raise type(error)(error.cause, where=error.where, do=do) from error
-
-    @cached_property
     def better_frames(self) -> FrameChoice | None:
         """Frames with which matches of several exposures scatter far less; None where none do."""
         if self.config.data is None:
             return None
         return frames_that_help(self.raw_matches.sample(SAMPLE), self.model)
-
-    def _linear(self) -> tuple[LinearFit, MagnitudeErrors | None]:
-        fit = self.config.fit
-        options: dict[str, Any] = {
-            "rejection": Rejection(fit.clip_chi2, fit.clip_abs, fit.radial_weight),
-            "priors": self.priors,
-        }
-        if self.config.data is not None and self.config.data.sigma == "by_magnitude":
-            options["compute"] = self.config.resources()
-            solution, _, errors = fit_by_magnitude(self.raw_matches, self.model, **options)
-            return solution, errors
-        if self.grouped_errors is not None:  # of a fit that was made before this one
-            self.grouped_errors = None
-            self.errors_changed()
-        solution = fit_linear(self.shards, self.model, **options)
-        factor = error_scale(solution, self._sample)
-        if factor != 1.0:
-            self.error_scale *= factor
-            self.__dict__["_all_matches"] = self._all_matches.with_errors_times(factor)
-            self.__dict__.pop("_split", None)
-            self.errors_changed()
-            solution = fit_linear(self.shards, self.model, **options)
-        found = self.grouped_errors = compared_errors(self, solution)
-        if found is None or found.added is None:
-            return solution, None
-        self.errors_changed()
-        return fit_linear(self.shards, self.model, **options), None
-
-    @cached_property
-    def fit(self) -> LinearFit:
-        """The linear fit of an earlier stage."""
-        return load_fit(self.run / "fit.nc")
-
-    @cached_property
-    def posterior(self) -> Posterior:
-        """The posterior of an earlier stage."""
-        return load_posterior(self.run / "posterior.nc")
 
     @cached_property
     def systematics(self) -> Systematics:
@@ -587,16 +522,6 @@ class Session:
         matches = self.matches
         return star_sample(self._sample, len(matches), self.fit, self.posterior)
 
-    @cached_property
-    def _sample(self) -> MatchTable:
-        """Some of the matches, or all."""
-        return self.matches.sample(SAMPLE)
-
-    @property
-    def sampled_matches(self) -> MatchTable:
-        """The same: what is estimated from single residuals before anything is sampled."""
-        return self._sample
-
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""
         return np.random.default_rng([self.config.sampler.seed, STAGES.index(stage) - 1])
@@ -614,8 +539,3 @@ class Session:
         table = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
         assert table.epoch is not None
         return float(np.median(table.epoch))
-
-
-def write_table(table: Table, path: Path) -> None:
-    with atomic_path(path) as temporary:
-        table.write(temporary, format="ascii.ecsv")

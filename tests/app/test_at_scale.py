@@ -8,6 +8,7 @@ import pytest
 
 from bayesdist.app import matches as app_matches
 from bayesdist.app.config import load_config
+from bayesdist.app.kinds.stars import fit_stars
 from bayesdist.app.matches import load_matches
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
@@ -111,7 +112,7 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     monkeypatch.setattr(
         MatchTable, "_complete", lambda self: (sizes.append(np.size(self.x)), complete(self))[1]
     )
-    for name in ("session", "stages.report"):
+    for name in ("session", "kinds.reader", "kinds.stars", "stages.report"):
         monkeypatch.setattr(f"bayesdist.app.{name}.SAMPLE", 900, raising=False)
     monkeypatch.setattr("bayesdist.infer.linear.MEDIAN_STARS", 900)
     good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")
@@ -142,7 +143,7 @@ def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path, on_disk, monkeyp
         monkeypatch.setattr(app_matches, "IN_MEMORY", limit)
         run = RunDirectory.plan(tmp_path / "none", config, text, job.parent)
         session = Session(run)
-        session.fit = session.linear[0]
+        session.renew("fitted", fit_stars(session.matched, session.config))
         sums.append(session.sums)
         session.close()
     one, other = sums

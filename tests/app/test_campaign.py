@@ -7,7 +7,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.app.campaign import series
-from bayesdist.app.campaign.table_file import read_tables
+from bayesdist.app.kinds.table_file import read_tables
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.data.tables.files import read_table
 from bayesdist.infer import load_posterior

@@ -11,7 +11,7 @@ from astropy.table import Table, vstack
 from astropy.time import Time
 
 from bayesdist.app import stages
-from bayesdist.app.campaign.soundness import frames_not_set, shear_doubts
+from bayesdist.app.campaign.soundness import frames_not_set, shear_warnings
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
 from bayesdist.data import MatchTable
@@ -223,7 +223,7 @@ def test_one_roll_angle_is_said_to_be_degenerate(campaign, rolls):
 
 @pytest.mark.parametrize("rolls", [[20.0, 110.0], [20.0, 40.0], [20.0, np.nan, 60.0], [np.nan]])
 def test_several_roll_angles_are_not(rolls):
-    assert shear_doubts(np.array(rolls), "PA_V3") == []
+    assert shear_warnings(np.array(rolls), "PA_V3") == []
 
 
 def test_one_roll_angle_shows_in_the_matches_whatever_the_log_says(campaign):

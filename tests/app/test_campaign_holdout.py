@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from bayesdist.app.campaign.fit import fit_campaign
+from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.stages.assess import _assess_holdout
 from bayesdist.data import read_matches
 from bayesdist.data.tables.files import read_table
+from bayesdist.infer import load_fit
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 
 N, LATER = 14, 3  # exposures, and how many of them the release does not see
@@ -98,6 +102,26 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
     whole = np.isin(np.array(held.exposure_names)[held.exposure], found["exposures"])
     assert not set(kept.star) & set(held.star[~whole])
     assert len(set(held.star[~whole])) == pytest.approx(0.2 * len(set(pairs.star)), rel=0.25)
+
+
+def test_functions_find_what_the_run_has_found(run) -> None:
+    """Lists are matched and fitted without a run's folder, and are prepared as the session's."""
+    config, _ = load_config(run / "config.toml")
+    matched = match_lists(config, run)
+    fitted = fit_campaign(matched, config, run)
+    known = load_fit(run / "fit.nc")
+    np.testing.assert_array_equal(fitted.linear.mean, known.mean)
+    np.testing.assert_array_equal(fitted.linear.cov, known.cov)
+    session, prepared = CampaignSession(RunDirectory.open(run)), fitted.prepared(matched)
+    for name in ("x", "u", "sigma_u", "star", "exposure"):
+        for made, read in (
+            (prepared.stars, session.matches),
+            (prepared.held, session.held_matches),
+        ):
+            np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
+    assert matched.whole == session.matched.whole and len(matched.whole) == 2
+    np.testing.assert_array_equal(fitted.alone.values, session.terms.values)
+    np.testing.assert_array_equal(fitted.scatter.tau, session.scatter[1])
 
 
 def test_what_is_held_out_agrees_with_the_prediction(run) -> None:

@@ -13,8 +13,8 @@ from unittest import mock
 import numpy as np
 
 from bayesdist.app.campaign import fit as stage
-from bayesdist.app.campaign.matching import run_match
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.campaign.stages import CAMPAIGN_STAGES
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.data import MatchTable
@@ -132,14 +132,14 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
         run = RunDirectory.plan(Path(folder) / "run", settings, text, base)
         run.begin()
         with closing(CampaignSession(run)) as session:
-            run_match(session)
+            CAMPAIGN_STAGES["match"](session)
             with _results_of("fit_tables", "fit_hierarchical") as made:
-                stage.run_campaign_fit(session)
+                CAMPAIGN_STAGES["fit"](session)
             bare = made["fit_hierarchical"]
             yield Calibrated(
                 campaign=read_acs(base),
                 session=session,
-                tables=made["fit_tables"],
+                tables=made["fit_tables"].fit,
                 bare=bare,
                 joint=_with_catalogue(bare, session),
                 terms=session.terms,

@@ -9,10 +9,9 @@ import numpy as np
 from bayesdist.app.campaign.inputs import cuts_of
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.campaign.soundness import (
-    input_doubts,
-    refuse_unsound,
+    input_warnings,
     segment_counts,
-    shear_doubts,
+    shear_warnings,
 )
 from bayesdist.app.campaign.stages import rehearse_campaign
 
@@ -21,7 +20,6 @@ __all__ = ["campaign_lines"]
 
 def campaign_lines(session: CampaignSession) -> Iterator[str]:
     """Inputs, dates and roll angles of a campaign, as lines of text."""
-    refuse_unsound(session)
     rehearse_campaign(session)
     inputs, config = session.inputs, session.config
     log, catalog = inputs.log, inputs.catalog
@@ -44,7 +42,7 @@ def campaign_lines(session: CampaignSession) -> Iterator[str]:
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
     for number, names in _without(session).items():
         yield f"chip {number}       no detections that pass the cuts in {', '.join(names)}"
-    for text in [*input_doubts(session), *shear_doubts(rolls, "PA_V3")]:
+    for text in [*input_warnings(config, inputs), *shear_warnings(rolls, "PA_V3")]:
         yield f"WARNING      {text[0].upper() + text[1:]}"
 
 

@@ -8,30 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bayesdist.app.campaign.systematics import errors_by_star
-from bayesdist.app.holdout import local_errors, whole_exposures
+from bayesdist.app.holdout import local_errors
 from bayesdist.data import MatchTable
-from bayesdist.data.holdout import refuse_strangers
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.infer.catalogue.star_influence import star_influence
 
 if TYPE_CHECKING:
     from bayesdist.app.campaign.session import CampaignSession
 
-__all__ = ["check_named", "predictive_of_campaign"]
+__all__ = ["predictive_of_campaign"]
 
 TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
-
-
-def check_named(session: CampaignSession) -> None:
-    """Refuse exposures to be held out that the log does not have, before anything is matched.
-
-    Raises
-    ------
-    InputError
-    """
-    block, log = session.config.holdout, session.inputs.log
-    if block is not None and not isinstance(block.exposures, int):
-        refuse_strangers(block.exposures, log.names, log.source)
 
 
 def predictive_of_campaign(session: CampaignSession) -> Predictive:
@@ -46,7 +33,7 @@ def predictive_of_campaign(session: CampaignSession) -> Predictive:
     errors = errors_by_star(session.inputs.catalog, session.largest_vafactor)
     stars = None
     if errors is not None and held is not None and held.star is not None:
-        whole = np.isin(held.exposure_names, whole_exposures(session, held.exposure_names))
+        whole = np.isin(held.exposure_names, session.matched.whole)
         codes = np.unique(held.star[whole[held.exposure]])
         stars = star_influence(session.fit, fitted, errors, codes)
     return replace(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.config import CampaignBlock, StarListsBlock
+from bayesdist.app.config import Config
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import (
     ExposureLog,
@@ -23,19 +24,21 @@ from bayesdist.data import (
 )
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.data.tables.files import read_table
-from bayesdist.errors import InputError
+from bayesdist.errors import ConfigError, InputError
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.products.formats.idctab.hst import parity_of
 
 __all__ = [
     "Inputs",
+    "campaign_block",
     "cuts_of",
     "lists_of",
     "parities_of",
     "read_campaign_catalog",
     "read_inputs",
     "start_of",
+    "unit_arcsec_of",
 ]
 
 Float = NDArray[np.float64]
@@ -69,9 +72,33 @@ class Inputs:
     plane: str = ""
 
     @property
+    def largest_vafactor(self) -> float:
+        """By which the catalogue's errors are divided: all factors are nearly the same."""
+        return float(self.log.values("vafactor").max())
+
+    @property
     def filter(self) -> str:
         """The one filter of the exposures."""
         return self.log.filters[0]
+
+
+def campaign_block(config: Config) -> CampaignBlock:
+    """The campaign's part of a configuration.
+
+    Raises
+    ------
+    ConfigError
+        Where it has none.
+    """
+    if config.campaign is None:
+        raise ConfigError("names no star lists", where="campaign", do="give the section [campaign]")
+    return config.campaign
+
+
+def unit_arcsec_of(unit: str, config: Config) -> float:
+    """Size of a unit of u and v; of pixels that of the detector's, or 0.05 arcsec."""
+    scale = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}.get(unit)
+    return scale or (config.detector.scale_mas or 50.0) / 1000
 
 
 def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
@@ -162,11 +189,10 @@ def read_campaign_catalog(
         )
     if catalog.tangent_point is None:
         return catalog, ""
-    point, middle = _middle_of(log, catalog), "stars"
+    (ra, dec), middle = catalog.tangent_point, "stars"
+    point = _middle_of(log, catalog)
     if point is not None:
-        catalog, middle = read(point), "exposures"
-    assert catalog.tangent_point is not None
-    ra, dec = catalog.tangent_point
+        catalog, (ra, dec), middle = read(point), point, "exposures"
     return catalog, (
         f"tangent plane at RA {ra:.5f}, Dec {dec:+.5f} (the middle of the {middle}), arcsec"
     )
@@ -188,7 +214,7 @@ def _middle_of(log: ExposureLog, catalog: ReferenceCatalog) -> tuple[float, floa
 
 
 def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) -> tuple[bool, ...]:
-    """Whether the catalogue is taken mirrored, the more probable first.
+    """Parities of the catalogue to try, the more probable first: True is mirrored.
 
     V2 and V3 lie on the sky as east and north do but for a rotation, and the table says how its
     axes lie along V2 and V3.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
@@ -92,10 +93,10 @@ def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
     code = {name: k for k, name in enumerate(names)}
     codes = np.array([code.get(name, -1) for name in pairs.exposure_names])[pairs.exposure]
     pairs = replace(pairs, exposure=codes, exposure_names=names)
-    own = None if run is None else CampaignSession(run).kept_errors()
+    own = None if run is None else read_magnitude_errors(run.path)
     return NewExposures(
         released,
-        prepared(session, pairs, own or session.kept_errors()),
+        prepared(session, pairs, own or session.magnitude_errors),
         _catalogue_errors(pairs),
         run is not None and _catalogue_of(run) == _catalogue_of(session.run),
         left_out,

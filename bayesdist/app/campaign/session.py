@@ -3,64 +3,80 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.config import CampaignBlock
+from bayesdist.app.campaign.fit import load_fitted_campaign
 from bayesdist.app.campaign.holdout import predictive_of_campaign
-from bayesdist.app.campaign.inputs import Inputs, read_inputs
+from bayesdist.app.campaign.inputs import Inputs, campaign_block, read_inputs, unit_arcsec_of
 from bayesdist.app.campaign.interpolation import interpolation_term
-from bayesdist.app.campaign.outrun import refuse_outrun_stars
-from bayesdist.app.campaign.reference import FREE, rate_priors
+from bayesdist.app.campaign.matched import CampaignMatched, load_matched_campaign
+from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.campaign.systematics import (
     errors_by_star,
     kept_covariance,
     systematics_of,
     with_kept_stars,
 )
-from bayesdist.app.campaign.table_file import KeptTables, read_tables, write_tables
+from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
+from bayesdist.app.kinds.exposures import ExposureScatter
+from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.session import Session
-from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics
 from bayesdist.assess import SAMPLE, LocalErrors
 from bayesdist.assess.terms.forms import GIVEN, MEASURED
-from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
+from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
-from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, fit_by_magnitude
+from bayesdist.infer import Matches, Posterior
 from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.nodes.alternation import inside_chips, on_the_chips, with_columns
-from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.nodes.alternation import with_columns
 from bayesdist.infer.series import Series
-from bayesdist.model import DistortionModel, LookupTable, corrected
+from bayesdist.model import DistortionModel, LookupTable
 
-__all__ = ["HIERARCHY", "TABLES", "TERMS", "CampaignSession"]
+__all__ = ["CampaignSession"]
 
 Float = NDArray[np.float64]
-
-TABLES, HIERARCHY, TERMS = "tables.h5", "hierarchy.h5", "exposure_terms.h5"
-_AGAIN = "run the stage 'fit' again"
 
 
 @dataclass
 class CampaignSession(Session):
     """What the stages share: pairs as matched, tables, scatter of the exposures, the fit."""
 
+    _inputs: Inputs | None = field(default=None, init=False, repr=False)
+
     @property
     def block(self) -> CampaignBlock:
         """The campaign's part of the configuration."""
-        assert self.config.campaign is not None
-        return self.config.campaign
+        return campaign_block(self.config)
 
     @property
-    def base(self) -> Path:
-        """Folder that the configuration's files are relative to."""
-        return Path(self.run.record["base"])
+    def inputs(self) -> Inputs:
+        """Catalogue, exposures and star lists."""
+        if self._inputs is None:
+            self._inputs = read_inputs(self.block, self.base)
+        return self._inputs
+
+    @property
+    def matched(self) -> CampaignMatched:
+        """Matches of the star lists, fitted and held out."""
+        return self._value("matched", self._load_matched)
+
+    def _load_matched(self) -> CampaignMatched:
+        run = self.run
+        return load_matched_campaign(run.path, self.config, self.inputs, run.summary)
+
+    def _load_fitted(self) -> Fitted:
+        return load_fitted_campaign(self.run.path, self.run.summary)
+
+    @property
+    def _read(self) -> tuple[Matches, ErrorLaw]:
+        return self.matches, QUOTED
 
     @property
     def reference_chip(self) -> int:
@@ -70,63 +86,81 @@ class CampaignSession(Session):
     @property
     def unit_arcsec(self) -> float:
         """Size of the catalogue's unit."""
-        scale = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}.get(self.inputs.catalog.unit)
-        return scale or (self.scale_arcsec or 0.05)
-
-    @cached_property
-    def inputs(self) -> Inputs:
-        """Catalogue, exposures and star lists."""
-        return read_inputs(self.block, self.base)
+        return unit_arcsec_of(self.inputs.catalog.unit, self.config)
 
     @property
     def mirrored(self) -> bool:
-        """Whether the pairs' u has the sign that is opposite to the catalogue's."""
-        return bool(self.run.summary.get("matching", {}).get("parity") == "mirrored")
-
-    @cached_property
-    def _all_matches(self) -> MatchTable:  # type: ignore[override]
-        """All pairs as matched, those that are held out among them."""
-        return read_matches(self.run / PAIRS, unit=self.inputs.catalog.unit)
+        """Truth of a u that has the sign opposite to the catalogue's."""
+        return self.matched.mirrored
 
     @property
     def pairs(self) -> MatchTable:
         """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors."""
-        kept = self._all_matches if self._split is None else self._split.kept
-        assert isinstance(kept, MatchTable)
-        return kept
+        return self.matched.stars
 
     @property
     def held_pairs(self) -> MatchTable | None:
-        """The same of what is held out; None where nothing is."""
-        held = None if self._split is None else self._split.held
-        assert held is None or isinstance(held, MatchTable)
-        return held
+        """What is held out, in the same way; None where nothing is."""
+        return self.matched.held
 
-    needed_exposures = 1  # it defines the gauge
+    @cached_property
+    def raw_matches(self) -> Matches:
+        """Pairs at the pixels that the tables have corrected."""
+        return self.fitted.placed(self.pairs)
 
     @property
     def largest_vafactor(self) -> float:
         """By which the catalogue's errors are divided: all factors are nearly the same."""
-        return float(self.inputs.log.values("vafactor").max())
+        return self.inputs.largest_vafactor
 
-    @cached_property
-    def _kept_tables(self) -> KeptTables:
-        return read_tables(self.run / TABLES, do=_AGAIN)
+    @property
+    def plain_model(self) -> DistortionModel:
+        """The configured polynomial with a free linear part of each exposure."""
+        return self.matched.affine_model(self.config)
 
     @property
     def tables(self) -> tuple[LookupTable, ...]:
-        """Look-up tables of an earlier stage: the detector's, and those of the filter."""
-        return self._kept_tables.tables
+        """Look-up tables: the detector's, and those of the filter."""
+        return self.fitted.tables.tables
+
+    @property
+    def inside_with_tables(self) -> NDArray[np.bool_]:
+        """Boolean mask of the pairs that the tables do not move off their chip."""
+        return self.fitted.inside(self.pairs)
+
+    @property
+    def scatter(self) -> tuple[tuple[str, ...], Float]:
+        """Kinds of deviation of the exposures, and draws (n, k) of their scatter."""
+        return self._joint.kinds, self._joint.tau
+
+    @property
+    def settling(self) -> Settling:
+        """How the constant terms of chips follow from the shifts of single chips."""
+        return self._joint.offsets
+
+    @property
+    def terms(self) -> Series:
+        """Linear terms of the exposures, each fitted by itself."""
+        return required(self.fitted.alone, "fits of single exposures")
+
+    @property
+    def _joint(self) -> ExposureScatter:
+        return required(self.fitted.scatter, "joint fit of exposures")
+
+    @property
+    def free_rates(self) -> bool:
+        """Truth of a drift that is that of this run's own exposures."""
+        return free_rates(self.config)
 
     @property
     def structure_is_left(self) -> bool:
         """Not where the errors of tables stand for it."""
-        return not self._kept_tables.position_sigma
+        return not self.fitted.tables.position_sigma
 
     @cached_property
     def local_terms(self) -> tuple[LocalErrors, ...]:
         """What the errors of the tables leave of the position, and what lies between nodes."""
-        kept, grid = self._kept_tables, self.config.assess.grid
+        kept, grid = self.fitted.tables, self.config.assess.grid
         between = interpolation_term(kept.between, self.posterior, grid=grid, epoch=self.epoch)
         sigma, block = kept.position_sigma, self.config.tables
         if not sigma:
@@ -141,7 +175,7 @@ class CampaignSession(Session):
     @property
     def between_nodes(self) -> Mapping[int, BetweenNodes]:
         """What the tables leave between their nodes, by chip, where it has been measured."""
-        return self._kept_tables.between
+        return self.fitted.tables.between
 
     @property
     def published_tables(self) -> tuple[LookupTable, ...]:
@@ -158,30 +192,6 @@ class CampaignSession(Session):
                 table = replace(table, sigma=whole)
             out.append(table)
         return tuple(out)
-
-    def keep_tables(
-        self,
-        tables: tuple[LookupTable, ...],
-        position_sigma: Mapping[int, Float] | None = None,
-        between: tuple[BetweenNodes, ...] = (),
-    ) -> None:
-        """Write tables, and their errors at nodes and between them, for the other stages."""
-        write_tables(self.run / TABLES, tables, position_sigma, between)
-        self.forget()
-
-    @cached_property
-    def raw_matches(self) -> Matches:
-        """Pairs at the pixels that the tables have corrected."""
-        return self._corrected(self.pairs)
-
-    @property
-    def held_matches(self) -> MatchTable | None:
-        """What is held out, in the same way, with its errors; None where nothing is."""
-        held, errors = self.held_pairs, self.magnitude_errors
-        if held is None:
-            return None
-        held = self._corrected(held)
-        return held if errors is None else with_centroid_errors(held, errors)
 
     @property
     def signed(self) -> Posterior:
@@ -200,41 +210,6 @@ class CampaignSession(Session):
     def predictive(self) -> Predictive:
         """The posterior as it predicts what is held out."""
         return predictive_of_campaign(self)
-
-    def _corrected(self, pairs: MatchTable) -> MatchTable:
-        return on_the_chips(self._moved(pairs), self.plain_model) if self.tables else pairs
-
-    def _moved(self, pairs: MatchTable) -> MatchTable:
-        """Pairs at the pixels that the tables move them to."""
-        x, y = corrected(
-            self.tables, pairs.x, pairs.y, chip=pairs.chip_number, filter=self.inputs.filter
-        )
-        return with_columns(pairs, x=x, y=y)
-
-    @property
-    def inside_with_tables(self) -> NDArray[np.bool_]:
-        """Boolean mask of the pairs that the tables do not move off their chip."""
-        if not self.tables:
-            return np.ones(len(self.pairs), bool)
-        return inside_chips(self._moved(self.pairs), self.plain_model)
-
-    def errors_by_magnitude(self, pairs: Matches) -> tuple[LinearFit, Matches, MagnitudeErrors]:
-        """Fit of every exposure by itself and errors by magnitude, as `fit_by_magnitude`.
-
-        Raises
-        ------
-        InputError
-            Where stars have outrun a catalogue without proper motions.
-        """
-        found = fit_by_magnitude(pairs, self.plain_model)
-        if isinstance(found[1], MatchTable):
-            refuse_outrun_stars(self.inputs, found[0], found[1])
-        return found
-
-    @cached_property
-    def magnitude_errors(self) -> MagnitudeErrors | None:
-        """Errors of the centroids, as the fit left them."""
-        return self.kept_errors()
 
     def estimate_discrepancy(self) -> Discrepancy:
         """What the model may leave out, beyond what the campaign's own hierarchy describes.
@@ -278,38 +253,6 @@ class CampaignSession(Session):
         found = self.discrepancy
         return self.magnitude_errors if found is None else found.of_centroids(self.magnitude_errors)
 
-    @cached_property
-    def matches(self) -> Matches:
-        """The same with the errors of centroid and catalogue."""
-        raw, errors = self.raw_matches, self.magnitude_errors
-        assert isinstance(raw, MatchTable)
-        return raw if errors is None else with_centroid_errors(raw, errors)
-
-    @cached_property
-    def plain_model(self) -> DistortionModel:
-        """The configured polynomial with a free linear part of each exposure.
-
-        For tables and errors: whatever drifts or scatters in the linear terms is taken up.
-        """
-        return DistortionModel(
-            self.config.model.order,
-            self.config.chips(),
-            unit=self.inputs.catalog.unit,
-            frames="affine",
-            exposures=self.pairs.exposure_names,
-        )
-
-    @cached_property
-    def model(self) -> DistortionModel:
-        """The model that was fitted."""
-        return self.fit.model
-
-    @cached_property
-    def priors(self) -> GaussianPriors:
-        """Of the deviations of the exposures, as the fit found them to scatter."""
-        arrays = read_arrays(self.run / HIERARCHY, "", do=_AGAIN)
-        return GaussianPriors(arrays["prior_centre"], arrays["prior_precision"])
-
     @property
     def catalogue_stated(self) -> bool:
         """Whether the catalogue has errors of its own, or a row of the budget names it."""
@@ -333,73 +276,7 @@ class CampaignSession(Session):
         own = [text for part in parts for text in found.get(part, {}).get("warnings", [])]
         return [*own, *super().doubts]
 
-    @property
-    def scatter(self) -> tuple[tuple[str, ...], Float]:
-        """Kinds of deviation of the exposures, and draws (n, k) of their scatter."""
-        arrays = read_arrays(self.run / HIERARCHY, "", do=_AGAIN)
-        return tuple(str(t, "utf-8") for t in arrays["kinds"]), arrays["tau_draws"]
-
-    @property
-    def settling(self) -> Settling:
-        """What was done to the shifts of single chips."""
-        return Settling.from_arrays(read_arrays(self.run / HIERARCHY, "", do=_AGAIN))
-
-    def settled(self, posterior: Posterior) -> Posterior:
-        """The draws with the chips where the exposures have them on average."""
-        settling, (_, tau) = self.settling, self.scatter
-        rng = self.rng("sample")
-        some = tau[rng.integers(len(tau), size=len(posterior.flat))]
-        theta = settling.draws(posterior.flat, some, rng).reshape(posterior.theta.shape)
-        return replace(posterior, theta=theta)
-
     @cached_property
     def systematics(self) -> Systematics:
         """The posterior with the errors of the catalogue, and what a new exposure adds."""
         return systematics_of(self)
-
-    @cached_property
-    def terms(self) -> Series:
-        """Linear terms of the exposures, each fitted by itself."""
-        arrays = read_arrays(self.run / TERMS, "", do=_AGAIN)
-        names, labels = ([str(t, "utf-8") for t in arrays[key]] for key in ("names", "labels"))
-        return Series(
-            arrays["epoch"],
-            arrays["values"],
-            arrays["cov"],
-            tuple(labels),
-            tuple(names),
-            source="exposures",
-        )
-
-    def keep_terms(self, series: Series) -> None:
-        """Write the linear terms for the stages that follow."""
-        arrays = {"epoch": series.epoch, "values": series.values, "cov": series.cov}
-        for key, texts in (("names", series.names), ("labels", series.coefficients)):
-            arrays[key] = np.array([text.encode() for text in texts])
-        write_arrays(self.run / TERMS, "", arrays)
-
-    def rate_priors(self, model: DistortionModel) -> GaussianPriors | None:
-        """Priors on the drift, where it is taken from the run of another filter."""
-        return rate_priors(self._rates, model, chip=self.reference_chip, base=self.base)
-
-    @property
-    def free_rates(self) -> bool:
-        """Whether the drift is that of this run's own exposures."""
-        return self._rates == FREE
-
-    @property
-    def _rates(self) -> str:
-        tdd = self.config.model.tdd
-        return FREE if tdd is None else tdd.rates
-
-    def fit_changed(self) -> None:
-        """Forget what rests on the fit."""
-        self.errors_changed()
-        for name in ("fit", "model", "priors", "terms", "systematics", "discrepancy", "solution"):
-            self.__dict__.pop(name, None)
-
-    def forget(self) -> None:
-        """Forget what rests on pairs, tables and errors."""
-        self.fit_changed()
-        for name in ("_all_matches", "_split", "_kept_tables", "raw_matches", "plain_model"):
-            self.__dict__.pop(name, None)

@@ -1,4 +1,4 @@
-"""What fixes the gauge of a self-calibration, and how its directions are told."""
+"""What fixes the gauge of a self-calibration, and its directions in words."""
 
 from __future__ import annotations
 
@@ -86,7 +86,10 @@ class Known:
         """
         block, pieces = config.gauge, dict[str, Piece]()
         if commanded is not None and commanded.offsets is not None:
-            pieces["commanded offsets"] = lambda theta: _offsets(model, theta, commanded)
+            offsets, errors, groups = commanded.offsets, commanded.sigma, commanded.group
+            pieces["commanded offsets"] = lambda theta: pointing_information(
+                model, theta, offsets, errors, group=groups
+            )
         if block.roll_sigma_deg is not None:
             if commanded is None or commanded.roll is None:
                 raise InputError(
@@ -102,8 +105,7 @@ class Known:
             pieces["scatter of the scales"] = lambda theta: frame_information(
                 model, theta, "scale", same, scatter
             )
-        if block.scale is not None:
-            assert unit_arcsec is not None
+        if block.scale is not None and unit_arcsec is not None:
             size, sigma = block.scale.mas / 1000 / unit_arcsec, block.scale.sigma
             name = f"scale of {block.scale.detector}" if block.scale.detector else "given scale"
             pieces[name] = lambda theta: _scale(model, theta, size, sigma)
@@ -114,13 +116,6 @@ class Known:
                 theta, np.diag(priors.precision), priors.pull(theta)
             )
         return cls(pieces)
-
-
-def _offsets(model: DistortionModel, theta: Float, commanded: Commanded) -> Information:
-    assert commanded.offsets is not None
-    return pointing_information(
-        model, theta, commanded.offsets, commanded.sigma, group=commanded.group
-    )
 
 
 def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> Information:
@@ -142,7 +137,7 @@ def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> I
     return tie(theta, row, float(np.log(size / model.linear_scale(theta))), sigma)
 
 
-# -- told -----------------------------------------------------------------------------------------
+# -- in words -------------------------------------------------------------------------------------
 
 
 def fixed_by(gauge: Gauge, solution: Solution, pieces: Known) -> dict[str, str]:
@@ -226,7 +221,7 @@ def _state(d: NamedDirection) -> str:
 def gauge_summary(
     gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel
 ) -> dict[str, object]:
-    """The same for summary.json; what is infinite is null there."""
+    """Part 'gauge' of the section 'selfcal' of summary.json; infinite sigmas are null there."""
     return {
         "n_free": int(gauge.null.shape[1]),
         "n_by_convention": int(gauge.open.shape[1]),

@@ -18,6 +18,7 @@ from bayesdist.infer.linear import Clip, LinearFit
 from bayesdist.infer.selfcal import Solution
 from bayesdist.infer.selfcal.errors import scatter_by_magnitude
 from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = ["fit_of", "magnitude_errors_of", "matches_of"]
 
@@ -27,22 +28,29 @@ CHI2 = 25.0  # of both axes, beyond which a detection counts as rejected in the 
 
 
 def matches_of(
-    solution: Solution, detections: Detections, inputs: Inputs, unused: Mapping[str, int]
+    problem: Problem,
+    stars: Float,
+    detections: Detections,
+    inputs: Inputs,
+    unused: Mapping[str, int],
 ) -> MatchTable:
     """Detections of the stars beside these, in the frame of each exposure's own VAFACTOR.
 
     Parameters
     ----------
-    solution : Solution
+    problem : Problem
+        Linearised at a solution.
+    stars : ndarray, shape (S, q)
+        Of the solution.
     detections : Detections
-        Of which the solution has some.
+        Of which the problem has some.
     inputs : Inputs
     unused : mapping of str to int
         Detections that are of no star, by reason.
     """
-    p, d = solution.problem, detections
+    p, d = problem, detections
     rows, model = p.rows, p.model
-    places = p.star_places(solution.stars)
+    places = p.star_places(stars)
     if p.dilation is not None:
         o = np.asarray(model.origin)
         places = o + (places - o) / p.dilation[d.exposure[rows], None]

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 
 from bayesdist.app.judging import budget_of, margins_of
+from bayesdist.app.kinds.stars import fit_stars
 from bayesdist.app.made_files import made_files
 from bayesdist.app.periods import check_pairs
 from bayesdist.app.session import Session
@@ -14,9 +15,8 @@ from bayesdist.app.stages.export import run_export
 from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.report import run_report
 from bayesdist.app.stages.sample import run_sample
-from bayesdist.assess import SAMPLE, star_sample
+from bayesdist.assess import star_sample
 from bayesdist.assess.terms.centroid import centroid_scatter
-from bayesdist.data import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit
 
@@ -63,9 +63,9 @@ def rehearse(session: Session) -> None:
     BayesdistError
     """
     check_pairs(session)
-    fit, errors = session.linear
-    _check_residuals(session, fit, errors)
-    rehearse_solution(session, fit)
+    session.renew("fitted", fit_stars(session.matched, session.config, reader=session.reader))
+    _check_residuals(session)
+    rehearse_solution(session, session.fit)
 
 
 def rehearse_solution(session: Session, fit: LinearFit) -> None:
@@ -81,20 +81,17 @@ def rehearse_solution(session: Session, fit: LinearFit) -> None:
     made_files(session, fit)
 
 
-def _check_residuals(session: Session, fit: LinearFit, errors: MagnitudeErrors | None) -> None:
+def _check_residuals(session: Session) -> None:
     """Refuse a budget with errors that are said to be in the residuals and are larger than these.
 
     Raises
     ------
     InputError
     """
+    fit = session.fit
     held = session.config.held_in_residuals(fit.model.unit)
     if held:
-        raw = session.raw_matches
-        matches = session.with_added_errors(
-            raw if errors is None else raw.with_errors_by_magnitude(errors)
-        )
-        stars = star_sample(matches.sample(SAMPLE), len(matches), fit)
+        stars = star_sample(session.tested_matches, len(session.matches), fit)
         centroid_scatter(stars, held, n_params=fit.model.n_params)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.table import Table, vstack
@@ -126,7 +128,7 @@ def test_a_free_direction_is_no_relative_error(free):
     fit, null = free.fit, free.gauge.null
     rng = np.random.default_rng(2)
     move = null @ rng.standard_normal((null.shape[1], 2))
-    wider = type(fit)(**{**fit.__dict__, "cov": fit.cov + move @ move.T})
+    wider = replace(fit, cov=fit.cov + move @ move.T)
     one, other = (
         uncertainty_map(gauge_free(each, null), grid=(7, 7)).radius for each in (fit, wider)
     )

@@ -12,9 +12,12 @@ from astropy.table import Table
 from scipy import stats
 
 from bayesdist.app import sessions
-from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.config import load_config
+from bayesdist.app.rundir import RunDirectory, as_json
+from bayesdist.app.selfcal.fit import fit_selfcal
+from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.sessions import session_of
-from bayesdist.infer import load_posterior
+from bayesdist.infer import load_fit, load_posterior
 from tests.app.selfcal.support import affine_left
 from tests.app.support import cli, good, one_sentence, snapshot, summary_of
 
@@ -69,6 +72,25 @@ def test_false_detections_are_told_as_in_the_posterior(name, request):
     # expected numbers of the mode, and at the mean of the draws
     assert said.sum() == pytest.approx(posterior.n_false, rel=0.15, abs=2)
     assert abs(int((said > 0.5).sum()) - posterior.n_flagged) <= 2 + 0.1 * posterior.n_flagged
+
+
+def test_functions_find_what_the_run_has_found(one_roll):
+    """Lists become stars and a solution without a run's folder, the very ones that a run reads."""
+    config, _ = load_config(one_roll.config)
+    matched = match_dithers(config, one_roll.config.parent)
+    fitted = fit_selfcal(matched)
+    known = load_fit(one_roll.path / "fit.nc")
+    np.testing.assert_array_equal(fitted.linear.mean, known.mean)
+    np.testing.assert_array_equal(fitted.linear.cov, known.cov)
+    session = session_of(RunDirectory.open(one_roll.path))
+    np.testing.assert_array_equal(fitted.solved.solution.stars, session.solved.stars)
+    np.testing.assert_array_equal(fitted.solved.gauge.held, session.gauge.held)
+    assert fitted.solved.fixed == session.fixed
+    made, read = fitted.prepared(matched).stars, session.matches
+    for name in ("x", "u", "sigma_u", "exposure", "row"):
+        np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
+    facts, summary = as_json(fitted.facts["selfcal"]), summary_of(one_roll.path)["selfcal"]
+    assert {name: summary[name] for name in facts} == facts
 
 
 def test_stars_are_where_they_were(three_rolls):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.model import LookupTable
 
-__all__ = ["KeptTables", "read_tables", "write_tables"]
+__all__ = ["StoredLookupTables", "read_tables", "write_tables"]
 
 Float = NDArray[np.float64]
 
@@ -22,8 +22,8 @@ ERRORS, BETWEEN = "position_sigma", "between"
 
 
 @dataclass(frozen=True, eq=False)
-class KeptTables:
-    """What a run keeps of its look-up tables.
+class StoredLookupTables:
+    """Look-up tables of a run, with their errors.
 
     Parameters
     ----------
@@ -40,23 +40,18 @@ class KeptTables:
     between: Mapping[int, BetweenNodes] = field(default_factory=dict)
 
 
-def write_tables(
-    path: Path,
-    tables: Sequence[LookupTable],
-    position_sigma: Mapping[int, Float] | None = None,
-    between: Sequence[BetweenNodes] = (),
-) -> None:
+def write_tables(path: Path, stored: StoredLookupTables) -> None:
     """Write the file; without tables there is none."""
-    if not tables:
+    if not stored.tables:
         path.unlink(missing_ok=True)
         return
     arrays: dict[str, Any] = {
-        f"{chip}.{ERRORS}": sigma for chip, sigma in (position_sigma or {}).items()
+        f"{chip}.{ERRORS}": sigma for chip, sigma in stored.position_sigma.items()
     }
-    for one in between:
+    for one in stored.between.values():
         n = np.full(2, one.n_pairs)
         arrays[f"{one.chip}.{BETWEEN}"] = np.stack([one.square, one.error, n])
-    for table in tables:
+    for table in stored.tables:
         of = f"{table.chip}.{table.filter}." if table.filter else f"{table.chip}."
         arrays |= {
             f"{of}values": table.values,
@@ -68,7 +63,7 @@ def write_tables(
     write_arrays(path, "", arrays)
 
 
-def read_tables(path: Path, *, do: str) -> KeptTables:
+def read_tables(path: Path, *, do: str) -> StoredLookupTables:
     """Read what `write_tables` wrote; nothing where there is no file.
 
     Raises
@@ -77,7 +72,7 @@ def read_tables(path: Path, *, do: str) -> KeptTables:
         For a damaged file, with `do` as the advice.
     """
     if not path.exists():
-        return KeptTables()
+        return StoredLookupTables()
     arrays = read_arrays(path, "", do=do)
     of_all = [name.removesuffix("values") for name in arrays if name.endswith(".values")]
     tables = []
@@ -102,5 +97,8 @@ def read_tables(path: Path, *, do: str) -> KeptTables:
         }
         for kind in (ERRORS, BETWEEN)
     )
-    told = {chip: BetweenNodes(chip, *v[:2], int(v[2, 0])) for chip, v in between.items()}
-    return KeptTables(tuple(tables), errors, told)
+    measured = {
+        chip: BetweenNodes(chip, square, error, int(n[0]))
+        for chip, (square, error, n) in between.items()
+    }
+    return StoredLookupTables(tuple(tables), errors, measured)
