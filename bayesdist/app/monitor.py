@@ -115,7 +115,7 @@ def _fitted(
             where=str(run.path),
             do="calibrate the new exposures by themselves, and use 'bayesdist compare'",
         )
-    posterior = Session(run).signed
+    posterior = Session(run).solution
     matches = _new_matches(run, config, new)
     found = fit_new(
         posterior,

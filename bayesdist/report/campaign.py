@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from bayesdist.assess import BinnedResiduals, Misfit
+    from bayesdist.assess import BinnedResiduals
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose.alignment import Alignment
     from bayesdist.model import Chip, LookupTable
@@ -237,9 +237,6 @@ class CampaignResults:
     tables : tuple of LookupTable
     series : LinearSeries or None
     overlap : OverlapTest or None
-    doubts : tuple of str
-    misfits : tuple of Misfit
-        Structure that the joint fit leaves in the residuals of each chip.
     held : tuple of str
         Parameters of which nothing is known but their prior.
     """
@@ -258,8 +255,6 @@ class CampaignResults:
     tables: tuple[LookupTable, ...] = field(default=())
     series: LinearSeries | None = None
     overlap: OverlapTest | None = None
-    doubts: tuple[str, ...] = ()
-    misfits: tuple[Misfit, ...] = ()
     held: tuple[str, ...] = ()
 
     def section(self, name: str) -> Mapping[str, Any]:

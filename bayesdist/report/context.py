@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.checks import Check, warnings_of
+from bayesdist.numbers import MISSING, count, with_mas
 from bayesdist.report.mosaic import Mosaic
-from bayesdist.report.numbers import MISSING, count, with_mas
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -26,42 +27,19 @@ if TYPE_CHECKING:
     )
     from bayesdist.assess.budget.budget import ErrorBudget
     from bayesdist.assess.budget.surface import BudgetSurface
-    from bayesdist.assess.periods import TimeVariation
     from bayesdist.assess.requirements.validity import Horizon
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
     from bayesdist.diagnose.holdout.validation import HeldOutTruth
-    from bayesdist.diagnose.residuals.misfit import Misfit
+    from bayesdist.diagnose.periods import TimeVariation
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.infer.catalogue.added_errors import GroupedErrors
     from bayesdist.model import Chip
     from bayesdist.report.campaign import CampaignResults
 
-__all__ = ["Check", "ChipResults", "Product", "ReportInput", "SelfcalResults", "campaign_of"]
+__all__ = ["ChipResults", "Product", "ReportInput", "SelfcalResults", "campaign_of"]
 
 Float = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Check:
-    """One criterion: what was found, against what.
-
-    Parameters
-    ----------
-    name : str
-        What was checked, with its unit.
-    value : float or str
-        What was found.
-    limit : str
-        What is asked, in words; empty where nothing is.
-    level : str
-        'pass', 'warn', 'fail', or 'note' where nothing is asked.
-    """
-
-    name: str
-    value: float | str
-    limit: str = ""
-    level: str = "note"
 
 
 @dataclass(frozen=True)
@@ -239,11 +217,8 @@ class ReportInput:
     horizons : tuple of Horizon
         Until when requirements are met; empty where nothing depends on time.
     products : tuple of Product
-    warnings : tuple of str
-        Sentences that belong on top.
-    misfits : tuple of Misfit
-        Structure that the fit leaves in the residuals of each chip; a campaign's are among its own
-        results.
+    checks : tuple of Check
+        All criteria and remarks but those of requirements and products.
     score_tests : tuple of ScoreTest
         What the residuals were asked, and what they say.
     magnitude_errors : MagnitudeErrors or None
@@ -277,8 +252,7 @@ class ReportInput:
     margins: tuple[Margin, ...] = ()
     horizons: tuple[Horizon, ...] = ()
     products: tuple[Product, ...] = ()
-    warnings: tuple[str, ...] = ()
-    misfits: tuple[Misfit, ...] = ()
+    checks: tuple[Check, ...] = ()
     score_tests: tuple[ScoreTest, ...] = ()
     magnitude_errors: MagnitudeErrors | None = None
     added_errors: GroupedErrors | None = None
@@ -293,6 +267,11 @@ class ReportInput:
     def unit(self) -> str:
         """Unit of u and v."""
         return self.fit.model.unit
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences that belong on top."""
+        return warnings_of(self.checks)
 
     @property
     def words(self) -> Words:

@@ -13,8 +13,8 @@ from lxml import html as lxml_html
 
 from bayesdist.app import matches as app_matches
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.assess.periods import time_variation
 from bayesdist.data import MatchTable, write_partitioned
+from bayesdist.diagnose.periods import time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import (

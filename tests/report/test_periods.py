@@ -10,8 +10,8 @@ from lxml import html as lxml_html
 from matplotlib.colors import to_hex
 from matplotlib.quiver import Quiver
 
-from bayesdist.assess.periods import time_variation
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.periods import time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.order import select_order
 from bayesdist.model import Chip, DistortionModel

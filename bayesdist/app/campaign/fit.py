@@ -24,6 +24,7 @@ from bayesdist.infer.exposures.trends import trend_p_values
 from bayesdist.infer.linear import Rejection
 from bayesdist.infer.sampler.checkpoints import write_arrays
 from bayesdist.infer.series import Series
+from bayesdist.limits import TREND
 from bayesdist.model import Chip
 from bayesdist.model.frames import RIGID
 
@@ -33,7 +34,6 @@ Float = NDArray[np.float64]
 
 log = logging.getLogger("bayesdist")
 
-TREND = 1e-3  # probability of a trend by chance, over all kinds of deviation
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 
@@ -127,7 +127,7 @@ def _trends(joint: HierarchicalFit, matches: MatchTable) -> list[str]:
         f"the {kind} of the exposures drifts with time (p = {one:.1g}), and is taken to scatter "
         "between exposures: extend model.tdd.terms"
         for kind, one in zip(joint.scatter.kinds, p, strict=True)
-        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND
+        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND.value
     ]
     for text in out:
         log.warning("fit: WARNING: %s", text)

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.app.campaign.systematics import errors_by_star
-from bayesdist.app.holdout import local_errors, whole_exposures
+from bayesdist.app.holdout import whole_exposures
+from bayesdist.assess.error_model import solution_with_errors
 from bayesdist.data import MatchTable
 from bayesdist.data.holdout import refuse_strangers
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.infer.catalogue.star_influence import star_influence
 
@@ -34,26 +35,24 @@ def check_named(session: CampaignSession) -> None:
         refuse_strangers(block.exposures, log.names, log.source)
 
 
-def predictive_of_campaign(session: CampaignSession) -> Predictive:
+def predictive_of_campaign(session: CampaignSession, found: Diagnostics) -> Predictive:
     """The posterior with errors of catalogue and tables, and the scatter of the exposures.
 
     The stars of exposures that are held out whole were in the fit, in other exposures: what their
     errors in the catalogue did there is known and no part of their residuals.
     """
-    kinds, tau = session.scatter
     fitted, held = session.matches, session.held_pairs
     assert isinstance(fitted, MatchTable)
-    errors = errors_by_star(session.inputs.catalog, session.largest_vafactor)
-    stars = None
+    errors, stars = session.catalogue_errors, None
     if errors is not None and held is not None and held.star is not None:
         whole = np.isin(held.exposure_names, whole_exposures(session, held.exposure_names))
         codes = np.unique(held.star[whole[held.exposure]])
         stars = star_influence(session.fit, fitted, errors, codes)
     return replace(
-        predictive_of(session.solution),
-        deviations=ExposureDeviations(kinds, tau),
+        predictive_of(solution_with_errors(session.posterior, found, session.hierarchy)),
+        deviations=ExposureDeviations(*session.scatter),
         stars=stars,
-        local=local_errors(session),
+        local=session.errors_from(found).local_tables(session.config.assess.grid, session.epoch),
         cell=_cell(session),
     )
 

@@ -69,8 +69,6 @@ def campaign_results(session: CampaignSession) -> CampaignResults:
         tables=session.tables,
         series=_series(session, matching),
         overlap=overlap_test(session),
-        doubts=tuple(session.doubts),
-        misfits=session.misfits,
         held=held_parameters(session.fit, session.priors),
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.discrepancy import RunDiscrepancy, kept_discrepancy
 from bayesdist.app.selfcal.config import SelfcalBlock
 from bayesdist.app.selfcal.gauge import Known, fixed_by, gauge_words
 from bayesdist.app.selfcal.inputs import (
@@ -26,28 +25,18 @@ from bayesdist.app.selfcal.matches import matches_of
 from bayesdist.app.selfcal.matching import TURN_BACK, half_turned
 from bayesdist.app.selfcal.start import started
 from bayesdist.app.session import Session
-from bayesdist.assess import StarSample, UncertaintyMap, uncertainty_map
-from bayesdist.assess.maps import with_local
-from bayesdist.assess.solution import Solution as Assessed
+from bayesdist.checks import Check
 from bayesdist.data import MagnitudeErrors, MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.sky.earth import parallax_factors
-from bayesdist.diagnose import ScoreTest
-from bayesdist.diagnose.residuals.misfit import Misfit
-from bayesdist.diagnose.selfcal.misfit import dithered_misfit
-from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer import GaussianPriors, Matches
-from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.selfcal import Gauge, ReferenceStars, SelfCalibration, Solution, gauge_free
+from bayesdist.infer.selfcal import Gauge, ReferenceStars, SelfCalibration, Solution
 from bayesdist.infer.selfcal.calibrate import self_calibrate
-from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
-from bayesdist.infer.selfcal.following import taken_by_stars
 from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem, prepared
-from bayesdist.infer.selfcal.relative import gauge_free_matrix
 from bayesdist.infer.selfcal.settled import gauge_of
 from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import DistortionModel
@@ -69,6 +58,7 @@ class SelfcalSession(Session):
     """What the stages share: detections, stars, the solution with its stars, its gauge."""
 
     things = "detections"
+    chooser = "limits of residuals"
 
     @property
     def block(self) -> SelfcalBlock:
@@ -348,80 +338,42 @@ class SelfcalSession(Session):
         """Errors of the centroids, as their scatter about the stars shows them."""
         return self.kept_errors()
 
-    @property
-    def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
-        """The same, less the structure that residuals show."""
-        errors, found = self.magnitude_errors, self.discrepancy
-        return errors if found is None else found.of_centroids(errors)
+    contained = ()  # the errors of the centroids are those that the fit has found
 
-    def _sampled(self) -> StarSample:
-        sample, solution = super()._sampled(), self.solved
-        taken = np.zeros(len(self.detections))
-        taken[solution.problem.rows] = taken_by_stars(solution)
-        return replace(sample, taken=taken[sample.table.row])
+    def diagnosis(self) -> dict[str, Any]:
+        """The solution with its stars, which were fitted too."""
+        return {"eliminated": self.solved, "centroid": self.magnitude_errors}
 
-    @cached_property
-    def misfits(self) -> tuple[Misfit, ...]:  # type: ignore[override]
-        """Structure that the solution leaves, of all chips together: they share stars."""
-        return (dithered_misfit(self.solved),)
-
-    def estimate_discrepancy(self) -> Discrepancy:
-        """What the model may leave out, from the residuals with the stars eliminated."""
-        return selfcal_discrepancy(
-            self.solved, rng=self.rng("assess"), priors=self.config.discrepancy.priors()
-        )
-
-    @cached_property
-    def discrepancy(self) -> RunDiscrepancy | None:
-        """What the model may leave out; exposures overlap in part, and their frames follow it."""
-        found = kept_discrepancy(self)
-        return found and replace(found, frames=True)
-
-    def made_score_tests(self) -> tuple[ScoreTest, ...]:
-        """Targeted tests of the residuals for what the model lacks, with the stars eliminated."""
-        matches = self.raw_matches
-        return selfcal_score_tests(self.solved, mag=matches.mag, epoch=matches.epoch)
+    def error_options(self) -> dict[str, Any]:
+        """Exposures overlap in part, and their frames follow correlated errors."""
+        return super().error_options() | {"frames": True}
 
     catalogue_stated = None
     motions_stated = None
 
     @property
-    def relative(self) -> Assessed:
-        """The solution of relative positions, whatever the gauge."""
-        return gauge_free(self.solution, self.gauge.null)
-
-    def relative_map(self, **where: Any) -> UncertaintyMap:
-        """Uncertainty of relative positions over a chip, with what the model leaves out."""
-        found, local = self.discrepancy, None
-        if found is not None:
-            S = gauge_free_matrix(self.model, self.solution.mean, self.gauge.null)
-            relative = replace(found.moved(S), frames=False)  # of the detector alone
-            local = relative.structure_sigma(self._domain(**where))
-        return with_local(uncertainty_map(self.relative, **where), local)
+    def free_directions(self) -> Float:
+        """Directions (D, d) that the detections leave free."""
+        return self.gauge.null
 
     @property
     def gauge_words(self) -> str:
         """In which gauge the products stand."""
         return gauge_words(self.gauge, self.fixed, self.model)
 
-    @property
-    def doubts(self) -> list[str]:
+    def kind_checks(self, found: Sequence[Check]) -> tuple[Check, ...]:
         """What cannot be known, and what the match found odd."""
         warnings = self.run.summary.get("selfcal", {}).get("warnings", [])
         known = self.known_for(self.model).contradictions(self.solved.theta)
-        hidden = [
-            f"{100 * (1 - one.told):.0f} % of the structure that the model might leave is hidden: "
-            "places of stars take it up where dithers are small"
-            for one in self.misfits
-            if one.hidden
-        ]
-        return [*self.gauge.sentences, *known, *warnings, *hidden, *super().doubts]
+        return tuple(
+            Check("Gauge", level="warn", sentence=text)
+            for text in (*self.gauge.sentences, *known, *warnings)
+        )
 
     def fit_changed(self) -> None:
         """Forget what rests on the solution."""
         self.errors_changed()
         names = ("fit", "model", "priors", "solved", "gauge", "fixed", "raw_matches")
-        names += ("systematics", "solution", "discrepancy", "local_terms", "score_tests")
         for name in names:
             self.__dict__.pop(name, None)
 

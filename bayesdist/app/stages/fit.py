@@ -8,8 +8,9 @@ from typing import Any
 from astropy.table import Table
 
 from bayesdist.app.added_errors import added_errors_rows, grouping_sentence
+from bayesdist.app.checks import frames_doubt
 from bayesdist.app.session import ERROR_COLUMNS, Session, write_table
-from bayesdist.app.trust import frames_doubt
+from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.diagnose.residuals.majority import majority_sentence
 from bayesdist.infer import LinearFit, save_fit
 from bayesdist.infer.skew import Skew, skew_of
@@ -29,20 +30,19 @@ def run_fit(session: Session) -> None:
     # this fit is what all goes by from now on
     if errors is not None:
         session.errors_changed()
-    for stale in ("fit", "sums", "misfits", "stars", "epoch_shift"):
-        session.__dict__.pop(stale, None)
+    session.__dict__.pop("fit", None)
     summarise_fit(session, fit)
     for note in session.raw_matches.notes:
         log.info("fit: %s", note)
     for reason, count in session.raw_matches.rejected.items():
         log.info("fit: %d rows were left out in reading: %s", count, reason)
-    shift = session.epoch_shift
+    shift = epoch_shift(session.sampled_matches, fit)
     if shift is not None and shift.significant:
         log.warning("fit: WARNING: %s", shift.sentence)
     majority = majority_sentence(fit)
     if session.error_scale_sentence:
         log.warning("fit: WARNING: %s", session.error_scale_sentence)
-    if text := frames_doubt(session):
+    if text := frames_doubt(session, majority):
         log.warning("fit: WARNING: %s", text)
     if session.grouped_errors is not None:
         log.info("fit: %s", grouping_sentence(session.grouped_errors, fit.unit))

@@ -45,8 +45,6 @@ def run_sample(session: Session) -> None:
 def keep_posterior(session: Session, posterior: Posterior) -> None:
     """Write a posterior, what it says of each star, and its part of summary.json."""
     run = session.run
-    for name in ("stars", "systematics"):
-        session.__dict__.pop(name, None)
     session.__dict__["posterior"] = posterior
     record = run.record
     provenance = {k: record[k] for k in ("inputs", "seed", "versions", "created")}

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+from bayesdist.numbers import MISSING, count, display_scale, interval, number, rounded
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, campaign_of
-from bayesdist.report.numbers import MISSING, count, display_scale, interval, number, rounded
 from bayesdist.report.sections.campaign.published import (
     SOURCE,
     WHERE,
