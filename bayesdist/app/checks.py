@@ -18,7 +18,7 @@ __all__ = ["frames_doubt", "provenance_notes", "run_checks"]
 def run_checks(session: Session) -> tuple[Check, ...]:
     """Checks of a run that has been sampled, or of a fit alone, beside those of its diagnostics."""
     fit, found = session.fit, session.diagnostics
-    posterior = session.posterior if session.run.done("sample") else None
+    posterior = session.posterior if session.is_sampled else None
     return (
         *session.kind_checks(tuple(score_checks(found.score_tests, found.correlated))),
         *sampling_checks(posterior),

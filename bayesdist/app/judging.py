@@ -33,6 +33,7 @@ __all__ = [
     "margins_of",
     "probability_met",
     "rehearse_evaluation",
+    "validity_periods_of",
 ]
 
 log = logging.getLogger("bayesdist")
@@ -70,13 +71,29 @@ def errors_of(session: Session) -> DrawnErrors:
     )
 
 
-def margins_of(
+def margins_of(session: Session, requirements: Sequence[Requirement]) -> tuple[Margin, ...]:
+    """Margins of a run against requirements."""
+    return judged(
+        session.errors,
+        session.diagnostics,
+        requirements,
+        session.evaluation_settings,
+        session.rng("assess"),
+        checks=all_checks(session),
+    )
+
+
+def validity_periods_of(
     session: Session, requirements: Sequence[Requirement]
-) -> tuple[tuple[Margin, ...], tuple[Horizon, ...]]:
-    """Margins of a run and, where something depends on time, its validity periods."""
-    made_from = session.errors, session.diagnostics, requirements, session.evaluation_settings
-    rng = session.rng("assess")
-    return judged(*made_from, rng, checks=all_checks(session)), validity_of(*made_from, rng)
+) -> tuple[Horizon, ...]:
+    """Until when requirements are met by a run, where something depends on time."""
+    return validity_of(
+        session.errors,
+        session.diagnostics,
+        requirements,
+        session.evaluation_settings,
+        session.rng("assess"),
+    )
 
 
 def _files(session: Session) -> tuple[Known, ...]:

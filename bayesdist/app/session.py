@@ -315,6 +315,11 @@ class Session:
     # -- what residuals say, and what errors come to -----------------------------------------------
 
     @property
+    def is_sampled(self) -> bool:
+        """Whether there is a posterior."""
+        return "posterior" in self.__dict__ or (self.run / "posterior.nc").exists()
+
+    @property
     def stored(self) -> Diagnostics | None:
         """What `assess` has found of this fit and posterior; None before."""
         made_from = self.fit, self.posterior
@@ -325,7 +330,7 @@ class Session:
     @property
     def diagnostics(self) -> Diagnostics:
         """What residuals say, as `assess` has found it or found now; less of a fit alone."""
-        if not self.run.done("sample"):
+        if not self.is_sampled:
             made_from = self.fit, self.shards
             return self._derived.get("of the fit", made_from, self._of_fit)
         if self.stored is not None:

@@ -10,7 +10,7 @@ from typing import Any
 from bayesdist.app.config import load_requirements
 from bayesdist.app.dates import idle_dates
 from bayesdist.app.evaluation_files import save_margins
-from bayesdist.app.judging import margins_of
+from bayesdist.app.judging import margins_of, validity_periods_of
 from bayesdist.app.margins import margin_rows
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
@@ -50,7 +50,8 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
     with closing(session_of(RunDirectory.open(run))) as session:
         require(session, "requirements", ("fit", "sample"))
         with _named_after(requirements, asked):
-            margins, horizons = margins_of(session, asked)
+            margins = margins_of(session, asked)
+            horizons = validity_periods_of(session, asked)
         before = _judgement(session)
         save_margins(session, margins, horizons)
         if _judgement(session) != before:

@@ -46,7 +46,7 @@ from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
 from bayesdist.infer.selfcal.following import taken_by_stars
 from bayesdist.streams import restarted
 
-__all__ = ["Diagnostics", "diagnose", "diagnose_fit", "hold_out"]
+__all__ = ["Diagnostics", "catalogue_covariance", "diagnose", "diagnose_fit", "hold_out"]
 
 Int = NDArray[np.int64]
 Bins = tuple[int, int]
@@ -323,8 +323,7 @@ def diagnose(
             priors=priors,
             match_radius=match_radius,
         )
-        if catalogue is not None and in_memory is not None and in_memory.star is not None:
-            shared = _of_catalogue(fit, in_memory, catalogue)
+        shared = catalogue_covariance(fit, in_memory, catalogue)
     return replace(
         found,
         flagged=flagged_by_exposure(shards, posterior) if len(fit.model.exposures) > 1 else None,
@@ -344,13 +343,29 @@ def _column(stars: Matches, name: str) -> NDArray[np.float64] | None:
     return values
 
 
-def _of_catalogue(fit: LinearFit, stars: MatchTable, errors: StarErrors) -> StarCovariance:
+def catalogue_covariance(
+    fit: LinearFit, stars: MatchTable | None, errors: StarErrors | None
+) -> StarCovariance | None:
     """What the errors of the catalogue do to the parameters.
 
     It is computed for the linear fit, whose covariance has no noise of sampling: with hundreds of
     parameters a few thousand draws leave factors of several in the eigenvalues of theirs.
     Polynomials and drift are followed exactly, frames as far as they are correlated with these.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    stars : MatchTable or None
+        With errors that contain the catalogue's, and codes of the stars.
+    errors : StarErrors or None
+
+    Returns
+    -------
+    StarCovariance or None
+        None where the catalogue has no errors, or the matches no codes of stars.
     """
+    if errors is None or stars is None or stars.star is None:
+        return None
     log.info("assess: errors of the catalogue, one for each star in all of its exposures")
     motion = None if errors.motion is None else errors.motion.T
     return star_covariance(

@@ -12,7 +12,7 @@ from astropy.table import Table
 
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.stages.assess import _assess_holdout
+from bayesdist.app.stages.assess import diagnose_run
 from bayesdist.data import read_matches
 from bayesdist.data.tables.files import read_table
 from tests.app.support import cli, good, one_sentence, refused, summary_of
@@ -70,7 +70,7 @@ def run(folder):
     for stage in ("match", "fit", "sample"):
         good("stage", stage, run, "-q")
     session = CampaignSession(RunDirectory.open(run))
-    _assess_holdout(session)
+    diagnose_run(session)
     session.close()
     return run
 
@@ -127,7 +127,7 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path) -> None:
         if one.is_file():
             shutil.copy(one, tmp_path / "other" / one.name)
     session = CampaignSession(RunDirectory.open(tmp_path / "other"))
-    _assess_holdout(session)
+    diagnose_run(session)
     found = summary_of(tmp_path / "other")["holdout"]
     assert found["level"] == "fail" and f"exposure {name}, held out whole" in found["verdict"]
 
