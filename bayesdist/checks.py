@@ -5,10 +5,36 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-__all__ = ["EITHER", "LARGER", "LEVELS", "Check", "doubts_of", "level_of", "warnings_of", "worst"]
+__all__ = [
+    "EITHER",
+    "LARGER",
+    "LEVELS",
+    "Check",
+    "doubts_of",
+    "in_order",
+    "level_of",
+    "warnings_of",
+    "worst",
+]
 
 LEVELS = ("note", "pass", "warn", "fail")  # from the least to the worst
 LARGER, EITHER = "larger", "either"
+
+# in which order a reader meets them
+GROUPS = (
+    "Sampling",
+    "Held-out truth",
+    "Campaign",
+    "Gauge",
+    "Score tests",
+    "Fit",
+    "Matching",
+    "Errors",
+    "Assumptions",
+    "Periods",
+    "Requirements",
+    "Products",
+)
 
 
 @dataclass(frozen=True)
@@ -18,7 +44,7 @@ class Check:
     Parameters
     ----------
     group : str
-        What it concerns.
+        What it concerns: one of `GROUPS`.
     name : str
         What was checked, with its unit; empty for a remark, which has a sentence alone.
     value : float or str
@@ -47,6 +73,11 @@ class Check:
     def text(self) -> str:
         """The sentence with a capital."""
         return self.sentence[:1].upper() + self.sentence[1:]
+
+
+def in_order(checks: Iterable[Check]) -> tuple[Check, ...]:
+    """Checks by their groups, in each as they come."""
+    return tuple(sorted(checks, key=lambda one: GROUPS.index(one.group)))
 
 
 def level_of(good: bool, bad: str = "fail") -> str:

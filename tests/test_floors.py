@@ -21,7 +21,7 @@ ROOT = Path(bayesdist.__file__).parent
 
 # Packages on one floor do not see each other; each may import what lies on the floors before.
 FLOORS = (
-    ("errors", "lazy", "limits", "numbers"),
+    ("errors", "lazy", "limits", "numbers", "records", "streams"),
     ("checks", "names"),
     ("files",),
     ("mission",),

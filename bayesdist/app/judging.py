@@ -23,7 +23,7 @@ from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.requirements.validity import Horizon
 from bayesdist.assess.solution import Solution
 from bayesdist.assess.terms.forms import Known
-from bayesdist.checks import Check
+from bayesdist.checks import Check, in_order
 from bayesdist.errors import BayesdistError, InputError
 
 __all__ = [
@@ -57,7 +57,7 @@ def evaluated(session: Session, requirements: Sequence[Requirement]) -> Evaluati
 
 def all_checks(session: Session) -> tuple[Check, ...]:
     """All checks of a run that is not evaluated."""
-    return (*run_checks(session), *session.diagnostics.checks)
+    return in_order((*run_checks(session), *session.diagnostics.checks))
 
 
 def errors_of(session: Session) -> DrawnErrors:
@@ -133,7 +133,7 @@ def rehearse_evaluation(session: Session, solution: Solution, n_draws: int) -> N
     InputError
         For terms and requirements that the run could not be judged by.
     """
-    settings = replace(session.evaluation_settings, draws=n_draws)
+    settings = replace(session.rehearsal_settings, draws=n_draws)
     errors, rng = session.errors_from(None, solution), session.rng("assess")
     budget_over(errors, settings, rng)
     # without a posterior centroids have no errors yet

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -443,6 +443,11 @@ class Session:
     @property
     def evaluation_settings(self) -> EvaluationSettings:
         """Where and how errors are evaluated."""
+        return replace(self.rehearsal_settings, dates=self.dates)
+
+    @property
+    def rehearsal_settings(self) -> EvaluationSettings:
+        """The same without the dates of the matches, which only verdicts name."""
         config = self.config
         return EvaluationSettings(
             grid=config.assess.grid,
@@ -453,7 +458,6 @@ class Session:
             single=config.assess.exposure == "single",
             contained=self.contained,
             given=tuple(block.name for block in config.budget),
-            dates=self.dates,
         )
 
     @property

@@ -25,7 +25,7 @@ from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.assess.terms.forms import Known
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.assess.units import pixel_scale_of
-from bayesdist.checks import Check, worst
+from bayesdist.checks import Check, in_order, worst
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
@@ -193,7 +193,8 @@ def evaluate(
     on_chip = [
         {"grid": settings.grid, "epoch": settings.epoch, "chip": chip.number} for chip in chips
     ]
-    every = (*checks, *diagnostics.checks, *_own_checks(errors, diagnostics, settings))
+    own = _own_checks(errors, diagnostics, settings)
+    every = in_order((*checks, *diagnostics.checks, *own))
     whole = drawn_errors(errors, diagnostics, settings, rng, files=files)
     surface = None
     if _contradiction(diagnostics, settings) is None:
