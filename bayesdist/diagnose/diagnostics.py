@@ -46,7 +46,15 @@ from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
 from bayesdist.infer.selfcal.following import taken_by_stars
 from bayesdist.streams import restarted
 
-__all__ = ["Diagnostics", "catalogue_covariance", "diagnose", "diagnose_fit", "hold_out"]
+__all__ = [
+    "Diagnostics",
+    "catalogue_covariance",
+    "diagnose",
+    "diagnose_fit",
+    "hold_out",
+    "misfits_of",
+    "residual_sums",
+]
 
 Int = NDArray[np.int64]
 Bins = tuple[int, int]
@@ -172,13 +180,7 @@ def diagnose_fit(
     Diagnostics
     """
     model, survey = fit.model, shards.survey
-    partitions = {}
-    for chip, found in zip(model.chips, survey.chips, strict=True):
-        n = round(fit.n_used * found.n / len(shards))
-        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MOST_BINS))
-        partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
-    wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
-    sums = shards.sum(star_sums, fit.mean, fit.clip, wanted)
+    partitions, sums = residual_sums(fit, shards)
     several = len(model.chips) > 1
     sample = star_sample(table, len(stars), fit, posterior)
     if eliminated is not None:
@@ -188,7 +190,7 @@ def diagnose_fit(
     return Diagnostics(
         sums=sums,
         partitions=partitions,
-        misfits=_misfits(fit, sums, partitions)
+        misfits=misfits_of(fit, partitions, sums)
         if eliminated is None
         else (dithered_misfit(eliminated),),
         coverage=tuple(
@@ -206,10 +208,35 @@ def diagnose_fit(
     )
 
 
-def _misfits(
-    fit: LinearFit, sums: StarSums, partitions: Mapping[int, Mapping[str, Bins]]
+def residual_sums(fit: LinearFit, shards: Shards) -> tuple[dict[int, dict[str, Bins]], StarSums]:
+    """Bins of each chip by the name of the partition, and sums of residuals in them.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    shards : Shards
+        All stars that were fitted.
+    """
+    partitions = {}
+    for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True):
+        n = round(fit.n_used * found.n / len(shards))
+        side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MOST_BINS))
+        partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
+    wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
+    return partitions, shards.sum(star_sums, fit.mean, fit.clip, wanted)
+
+
+def misfits_of(
+    fit: LinearFit, partitions: Mapping[int, Mapping[str, Bins]], sums: StarSums
 ) -> tuple[Misfit, ...]:
-    """Structure in the residuals of each chip."""
+    """Structure in the residuals of each chip.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    partitions, sums
+        As of `residual_sums`.
+    """
     out = []
     for chip, bins in zip(fit.model.chips, partitions.values(), strict=True):
         binned = {
