@@ -146,7 +146,7 @@ def validity_rows(validity: Sequence[Horizon]) -> list[dict[str, Any]]:
 
 def _map_summary(found: Evaluation) -> dict[str, Any]:
     """The worst of all chips, and each chip."""
-    chips = [
+    chips: list[dict[str, Any]] = [
         {
             "chip": m.chip,
             "sigma_u_max": m.sigma_u_max,

@@ -126,7 +126,7 @@ def _run_stage(session: Session, stage: str) -> None:
 
 def _judge(session: Session, strict: bool) -> None:
     posterior = session.posterior
-    if strict and convergence_check(posterior).level == "fail":
+    if strict and convergence_check(posterior.convergence).level == "fail":
         exact = posterior.sampler.exact
         raise NotConvergedError(
             f"the sampler has not converged ({'; '.join(posterior.convergence.reasons)})",

@@ -22,7 +22,7 @@ from bayesdist.assess.terms.correlated import Deviations, StructureErrors
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
 from bayesdist.assess.terms.local import LocalErrors, table_of
-from bayesdist.assess.terms.parameters import catalogue_terms
+from bayesdist.assess.terms.parameters import CatalogueErrors, catalogue_terms
 from bayesdist.assess.terms.seeds import generators
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.assess.units import pixel_scale_of
@@ -214,7 +214,8 @@ def _with_diagnosed(
     posterior: Posterior, diagnostics: Diagnostics, hierarchy: LinearFit | None, catalogue: str
 ) -> SolutionErrors:
     """Errors of the parameters with those of the catalogue, and of the stars as they scatter."""
-    solution, stars, terms = posterior, diagnostics.catalogue, ()
+    solution, stars = posterior, diagnostics.catalogue
+    terms: tuple[CatalogueErrors, ...] = ()
     if stars is not None:
         assert hierarchy is not None
         solution = with_shared_stars(posterior, hierarchy, stars)

@@ -8,6 +8,7 @@ from scipy.stats import chi2
 from bayesdist.checks import EITHER, Check, level_of
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.sampler.convergence import Convergence
 from bayesdist.limits import (
     CHI2_TOO_LARGE,
     CHI2_TOO_SMALL,
@@ -115,9 +116,8 @@ def _of_chi2(fit: LinearFit, small: bool, in_circle: bool) -> str:
     return ""
 
 
-def convergence_check(posterior: Posterior) -> Check:
-    """Whether the draws can be relied on at all."""
-    c = posterior.convergence
+def convergence_check(c: Convergence) -> Check:
+    """Whether draws can be relied on at all."""
     sentence = ""
     if not c.converged:
         why = "; ".join(getattr(c, "reasons", ()))
@@ -151,7 +151,7 @@ def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
     # what only advises does not fail by itself: the limits of R-hat and ESS decide
     return (
         *remarks,
-        convergence_check(posterior),
+        convergence_check(c),
         Check(
             SAMPLING,
             f"Largest R-hat, {posterior.sampler.ensembles} independent ensembles",

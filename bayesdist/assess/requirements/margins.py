@@ -355,9 +355,8 @@ def _of_extremes(
 
 def _convergence(solution: Solution) -> tuple[Check, ...]:
     """Whether the draws can be relied on, of a solution that has draws of its own."""
-    if getattr(solution, "convergence", None) is None:
-        return ()
-    return (convergence_check(solution),)
+    convergence = getattr(solution, "convergence", None)
+    return () if convergence is None else (convergence_check(convergence),)
 
 
 def _margin(
