@@ -15,6 +15,7 @@ from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
+from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
 from bayesdist.diagnose.residuals.binned import BinnedSums
 from bayesdist.diagnose.residuals.centroid import centroid_scatter
@@ -97,6 +98,8 @@ class Diagnostics:
         Models of several periods compared, where that was asked for.
     holdout : HeldOutTruth or None
         What stars say that were set aside before the fit, where there are any.
+    overlap : OverlapTest or None
+        Two exposures far apart in time laid on each other, of a campaign.
     """
 
     sums: StarSums
@@ -113,6 +116,7 @@ class Diagnostics:
     catalogue: StarCovariance | None = None
     periods: TimeVariation | None = None
     holdout: HeldOutTruth | None = None
+    overlap: OverlapTest | None = None
 
     @property
     def misfit(self) -> Misfit:

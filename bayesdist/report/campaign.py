@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from bayesdist.assess import BinnedResiduals
     from bayesdist.data import MagnitudeErrors
-    from bayesdist.diagnose.alignment import Alignment
-    from bayesdist.model import Chip, LookupTable
+    from bayesdist.diagnose.overlap import OverlapTest
+from bayesdist.model import Chip, LookupTable
 
 __all__ = [
     "CampaignResults",
@@ -24,7 +24,6 @@ __all__ = [
     "Detections",
     "Footprints",
     "LinearSeries",
-    "OverlapTest",
 ]
 
 Float = NDArray[np.float64]
@@ -171,44 +170,6 @@ class LinearSeries:
     def outlying(self) -> NDArray[np.bool_]:
         """Exposures that are more likely off the course than not."""
         return np.asarray(self.exposures["outlier_probability"], float) > 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class OverlapTest:
-    """Two exposures of the run laid on each other, through the old files and the new ones.
-
-    Parameters
-    ----------
-    names : tuple of str
-    epochs : tuple of float
-    pa_v3 : tuple of float
-        NaN where it is not known.
-    old, new : Alignment
-        Of the same stars: through the known distortion of the start, and through the solution.
-    binned_old, binned_new : BinnedResiduals
-        Over the area that both exposures see; axes (xi, eta), pixels.
-    corner : tuple of float
-        (xi, eta) of the area's corner, which the cells count from, pixels.
-    pixel_mas : float
-    with_motions : bool
-        Whether the catalogue's proper motions between the two epochs were taken out.
-    """
-
-    names: tuple[str, str]
-    epochs: tuple[float, float]
-    pa_v3: tuple[float, float]
-    old: Alignment
-    new: Alignment
-    binned_old: BinnedResiduals
-    binned_new: BinnedResiduals
-    corner: tuple[float, float]
-    pixel_mas: float
-    with_motions: bool
-
-    @property
-    def n_stars(self) -> int:
-        """Stars that both exposures have."""
-        return len(self.new.residual)
 
 
 @dataclass(frozen=True, eq=False)

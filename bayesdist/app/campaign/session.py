@@ -15,7 +15,7 @@ from bayesdist.app.campaign.aberration import aberration_term
 from bayesdist.app.campaign.checks import campaign_checks, campaign_remarks
 from bayesdist.app.campaign.config import CampaignBlock
 from bayesdist.app.campaign.holdout import predictive_of_campaign
-from bayesdist.app.campaign.inputs import Inputs, errors_by_star, read_inputs
+from bayesdist.app.campaign.inputs import Inputs, errors_by_star, known_calibration, read_inputs
 from bayesdist.app.campaign.interpolation import interpolation_term
 from bayesdist.app.campaign.outrun import refuse_outrun_stars
 from bayesdist.app.campaign.reference import FREE, rate_priors
@@ -30,6 +30,7 @@ from bayesdist.checks import Check
 from bayesdist.data import MagnitudeErrors, MatchTable, read_matches, with_centroid_errors
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import Predictive
+from bayesdist.diagnose.overlap import overlap_test
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, fit_by_magnitude
 from bayesdist.infer.catalogue.star_influence import StarErrors
@@ -207,6 +208,18 @@ class CampaignSession(Session):
             "catalogue": self.catalogue_errors,
             "centroid": self.magnitude_errors,
         }
+
+    def _diagnosed(self) -> Diagnostics:
+        overlap = overlap_test(
+            self.pairs,
+            self.posterior,
+            known_calibration(self.base / self.block.start, self.block.filter),
+            self.tables,
+            unit_arcsec=self.unit_arcsec,
+            pixel=self.scale_arcsec or 0.05,
+            rolls={one.name: one.pa_v3 for one in self.inputs.log},
+        )
+        return replace(super()._diagnosed(), overlap=overlap)
 
     contained = ()  # the errors of the centroids are those that the fit has found
 
