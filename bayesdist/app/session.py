@@ -482,7 +482,7 @@ class Session:
     def dates(self) -> Float:
         """Distinct dates of the matches, in decimal years; none where they have none."""
         raw = self.raw_matches
-        table = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
+        table = raw if isinstance(raw, MatchTable) else self._sample
         return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
 
     @property
