@@ -97,7 +97,7 @@ def _as_assessed(folder: Path) -> Solution:
     if not (folder / "run.json").exists():
         return load_posterior(folder)
     with closing(session_of(RunDirectory(folder))) as session:
-        return session.signed
+        return session.solution
 
 
 def _scale_of_run(path: Path, solution: Solution) -> tuple[float, str] | None:

@@ -10,12 +10,13 @@ from tempfile import TemporaryDirectory
 from bayesdist.app.added_errors import grouping_sentence
 from bayesdist.app.config import load_config
 from bayesdist.app.dates import idle_dates
+from bayesdist.app.judging import all_checks
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import own_lines, session_of
 from bayesdist.app.stages import rehearse
-from bayesdist.app.trust import warnings_of
+from bayesdist.checks import warnings_of
 from bayesdist.infer import Limits
 from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
 from bayesdist.infer.sampler.move_schedule import expected_passes
@@ -88,7 +89,11 @@ def _lines(session: Session) -> Iterator[str]:
     yield _cost(session)
     idle = idle_dates(session.config, session.config.requirements())
     scaled = session.error_scale_sentence
-    for text in (*warnings_of(session), *([idle] if idle else []), *([scaled] if scaled else [])):
+    for text in (
+        *warnings_of(all_checks(session)),
+        *([idle] if idle else []),
+        *([scaled] if scaled else []),
+    ):
         yield f"WARNING      {text}"
 
 

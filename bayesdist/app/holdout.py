@@ -8,83 +8,35 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.kept import kept
-from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.terms.local import table_of
+from bayesdist.assess.error_model import solution_with_errors
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
-from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
-from bayesdist.model import LookupTable
+from bayesdist.diagnose.holdout.validation import HeldOutTruth
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
 
 __all__ = [
-    "held_out_of",
     "holdout_summary",
     "holdout_table",
-    "local_errors",
     "predictive_of_run",
 ]
 
 
-def held_out_of(session: Session, *, anew: bool = False) -> HeldOutTruth | None:
-    """What held-out stars say of the posterior, once in a session.
-
-    Parameters
-    ----------
-    session : Session
-    anew : bool
-        Also where it has been done: the posterior may be another one.
-
-    Returns
-    -------
-    HeldOutTruth or None
-        None where no stars were set aside.
-
-    Raises
-    ------
-    InputError
-        For too few stars.
-    """
-    held = session.held_matches
-    if held is None:
-        return None
-
-    def judged() -> HeldOutTruth:
-        return held_out_truth(session.predictive, held, whole=session.matched.whole)
-
-    return kept(session, "held_out_truth", judged, anew=anew)
-
-
-def predictive_of_run(session: Session) -> Predictive:
+def predictive_of_run(session: Session, found: Diagnostics) -> Predictive:
     """The solution as it is assessed, as it predicts.
 
     Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
     neighbours err by it together.
     """
-    found, discrepancy = predictive_of(session.solution), session.discrepancy
-    rows = None if discrepancy is None else discrepancy.found.facts.get("structure")
+    out = predictive_of(solution_with_errors(session.posterior, found, session.hierarchy))
+    correlated = found.correlated
+    rows = None if correlated is None else correlated.facts.get("structure")
     if not rows:
-        return found
+        return out
     side = max(row["length_pix"] for row in rows)
-    return replace(found, local=local_errors(session), cell=(side, side), local_in_noise=True)
-
-
-def local_errors(session: Session) -> tuple[LookupTable, ...]:
-    """Errors of positions that belong to places on the detector, as tables of their own."""
-    grid, out = session.config.assess.grid, []
-    for chip in session.posterior.model.chips:
-        where = {"grid": grid, "epoch": session.epoch, "chip": chip.number}
-        domain = EvaluationDomain.of_chips(
-            session.posterior.model, grid, chips=(chip.number,), epoch=session.epoch
-        )
-        structure = session.structure_sigma(**where)
-        parts = [term.sigma(domain) for term in session.local_terms]
-        parts += [] if structure is None else [structure]
-        if parts:
-            sigma = np.sqrt(sum(part**2 for part in parts)).reshape(grid[1], grid[0], 2)
-            out.append(table_of(chip.number, chip.size, sigma))
-    return tuple(out)
+    local = session.errors_from(found).local_tables(session.evaluation_settings.grid, session.epoch)
+    return replace(out, local=local, cell=(side, side), local_in_noise=True)
 
 
 def holdout_table(found: HeldOutTruth) -> Table:

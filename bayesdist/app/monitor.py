@@ -19,12 +19,12 @@ from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.rvb import load_rvb
 from bayesdist.app.session import Session, write_table
-from bayesdist.assess import misfit_of, partitions_for, star_sums
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.data import input_files
-from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
+from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
+from bayesdist.diagnose.residuals.misfit import worst_misfit
 from bayesdist.errors import InputError
 from bayesdist.files import sha256_of
 from bayesdist.infer import Matches, Posterior
@@ -74,6 +74,7 @@ def monitor(
     config = directory.config
     posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
     try:
+        shards = fitted.target.shards
         change = change_of(fitted, draws=posterior.convergence.ess_bulk_min)
         scores: tuple[PeriodScore, ...] = ()
         if matches.has_epoch:
@@ -90,7 +91,7 @@ def monitor(
                 grid=(nx, ny),
             ),
             date=date,
-            misfit=_misfit(fitted),
+            misfit=worst_misfit(misfits_of(fitted.fit, *residual_sums(fitted.fit, shards))),
             pixel_mas=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
         )
         facts = _facts(fitted, posterior) | {"left_out": list(left_out)}
@@ -116,7 +117,7 @@ def _fitted(
             where=str(run.path),
             do="calibrate the new exposures by themselves, and use 'bayesdist compare'",
         )
-    posterior = Session(run).signed
+    posterior = Session(run).solution
     matches = _new_matches(run, config, new)
     found = fit_new(
         posterior,
@@ -180,21 +181,6 @@ def _refuse_the_same(run: RunDirectory, path: Any) -> None:
                 where=str(file),
                 do="give matches that were not in its fit",
             )
-
-
-def _misfit(new: NewFit) -> Misfit:
-    """Structure that the least-squares fit of the new matches leaves."""
-    shards, fit, out = new.target.shards, new.fit, []
-    partitions = {
-        chip.number: partitions_for(round(found.n * fit.n_used / fit.n_rows))
-        for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True)
-    }
-    wanted = {number: tuple(bins.values()) for number, bins in partitions.items()}
-    sums = shards.sum(star_sums, fit.mean, fit.clip, wanted)
-    for number, bins in partitions.items():
-        binned = {name: sums.binned[number, size] for name, size in bins.items()}
-        out.append(misfit_of(binned, order=fit.model.order, unit=fit.unit))
-    return worst_misfit(out)
 
 
 def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:

@@ -8,18 +8,17 @@ import numpy as np
 from astropy.table import Table, vstack
 from astropy.time import Time
 
-from bayesdist.app.kept import kept
 from bayesdist.assess import SAMPLE, convert, pixel_scale_of
-from bayesdist.assess.periods import TimeVariation, bins_for, time_variation
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
 from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
-    from bayesdist.assess.wise import PatternChange, StatisticsTable
+    from bayesdist.diagnose.statistics import PatternChange, StatisticsTable
     from bayesdist.infer.compare.positions import PositionChange
 
-__all__ = ["check_pairs", "periods_of", "periods_summary", "periods_table"]
+__all__ = ["check_pairs", "period_settings", "periods_summary", "periods_table"]
 
 
 def check_pairs(session: Session) -> dict[str, int]:
@@ -68,32 +67,26 @@ def check_pairs(session: Session) -> dict[str, int]:
     return out
 
 
-def periods_of(session: Session, *, anew: bool = False) -> TimeVariation | None:
-    """The configured periods compared, once in a session.
+def period_settings(session: Session) -> PeriodSettings | None:
+    """Which periods are compared, and how; None where none are asked for.
 
     Parameters
     ----------
     session : Session
-    anew : bool
-        Also where it has been done: the fit may be another one.
 
     Returns
     -------
-    TimeVariation or None
-        None where no periods are asked for.
+    PeriodSettings or None
 
     Raises
     ------
     InputError
-        As `check_pairs` and `time_variation`.
+        As `check_pairs`.
     """
-    if session.config.periods is None:
+    config = session.config
+    if config.periods is None:
         return None
-    return kept(session, "time_variation", lambda: _compared(session), anew=anew)
-
-
-def _compared(session: Session) -> TimeVariation:
-    fit, config = session.fit, session.config
+    fit = session.fit
     least = min(check_pairs(session).values())
     scale = pixel_scale_of(fit, scale_mas=config.detector.scale_mas)
     angle = fit.unit != "pix" or scale is not None
@@ -101,11 +94,8 @@ def _compared(session: Session) -> TimeVariation:
         convert(r.limit, r.unit, fit.unit, scale, where=f"requirement {r.name!r}")
         for r in config.requirements()
     ]
-    return time_variation(
-        fit,
-        session.matches,
+    return PeriodSettings(
         config.spans(),
-        rng=session.rng("assess"),
         bins=bins_for(least // len(fit.model.chips)),
         radial_weight=config.fit.radial_weight,
         tolerance=min(limits, default=None),

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.horizon import last_epoch
 from bayesdist.app.judging import probability_met
 from bayesdist.app.margins import judged_requirements
 from bayesdist.app.rundir import RunDirectory
@@ -75,7 +74,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
 
 def _content(session: Session) -> ExposureContent:
     """The average exposure of the run."""
-    stars = session.stars
+    stars = session.diagnostics.sample
     jitter = float(np.mean(session.posterior.hyper.get("j", [0.0])))
     sigma = np.stack([np.asarray(stars.table.sigma_u), np.asarray(stars.table.sigma_v)], axis=1)
     true = np.ones(len(stars))
@@ -102,7 +101,7 @@ def _lines(
         schedules.append(Schedule("at any date", exposure_information(solution, content, None)))
     else:
         wanted = requirement.epoch or (requirement.epochs or [session.epoch])[-1]
-        last = last_epoch(session)
+        last = float(np.max(session.diagnostics.sample.table.epoch))
         for date in dict.fromkeys([*epochs, wanted]):
             schedules.append(
                 Schedule(f"at {date:.2f}", exposure_information(solution, content, date))

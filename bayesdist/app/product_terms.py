@@ -92,7 +92,7 @@ def _sip_terms(
         back_x, back_y = sip.inverse(*sip.forward(x, y))
         return np.stack([back_x - x, back_y - y], axis=-1)
 
-    rotates = session.systematics.aligned
+    rotates = session.errors.aligned
     turned = _Laid(session, place, scaled=False) if rotates else None
     forward = turned or (lambda x, y, c, t: place(x, y, c, t) - _solution(session, x, y, c, t))
     return [

@@ -13,6 +13,7 @@ from bayesdist.app.session import STAGES, Session
 from bayesdist.app.sessions import own_stages, rehearse_run, session_of
 from bayesdist.app.stages import NEEDS, require, run_stage
 from bayesdist.errors import InputError, NotConvergedError
+from bayesdist.infer.checks import convergence_check
 
 __all__ = ["continue_stage", "run"]
 
@@ -124,11 +125,11 @@ def _run_stage(session: Session, stage: str) -> None:
 
 
 def _judge(session: Session, strict: bool) -> None:
-    convergence = session.posterior.convergence
-    if strict and not convergence.converged:
-        exact = session.posterior.sampler.exact
+    posterior = session.posterior
+    if strict and convergence_check(posterior.convergence).level == "fail":
+        exact = posterior.sampler.exact
         raise NotConvergedError(
-            f"the sampler has not converged ({'; '.join(convergence.reasons)})",
+            f"the sampler has not converged ({'; '.join(posterior.convergence.reasons)})",
             where=str(session.run.path),
             do="raise sampler.max_steps and resume, or simplify the model"
             if exact

@@ -38,7 +38,8 @@ PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 OWN_FILES = re.compile(
     r"config\.toml|run\.json|bayesdist\.log|fit\.nc|magnitude_errors\.ecsv|chain-\d+-\w+\.h5|"
     r"posterior\.nc|(coefficients|budget|margins|periods|holdout|matching|series|drift|gauge|stars)\.ecsv|maps\.fits|"
-    r"(tables|hierarchy|exposure_terms|catalogue_errors|detections|solution)\.h5|stars\.parquet|"
+    r"(tables|hierarchy|exposure_terms|catalogue_errors|detections|solution|discrepancy|diagnostics|"
+    r"evaluation)\.h5|stars\.parquet|"
     r"summary\.json|report\.(html|md)"
 )
 

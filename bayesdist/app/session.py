@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from bayesdist.app.added_errors import knows_circle
 from bayesdist.app.config import CATALOGUE_WORDS, Config
-from bayesdist.app.discrepancy import RunDiscrepancy, keep_discrepancy, kept_discrepancy
+from bayesdist.app.derived import Derived
+from bayesdist.app.diagnostics_files import load_diagnostics, save_diagnostics
 from bayesdist.app.holdout import predictive_of_run
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
@@ -21,38 +22,22 @@ from bayesdist.app.kinds.matched import Matched, Prepared
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.stars import load_fitted_stars, match_stars
 from bayesdist.app.output import write_table
+from bayesdist.app.periods import period_settings
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.rvb import RvbInput
-from bayesdist.app.score_tests import keep_score_tests, kept_score_tests
-from bayesdist.app.systematics import Systematics
-from bayesdist.assess import (
-    SAMPLE,
-    BinnedSums,
-    Misfit,
-    StarSample,
-    StarSums,
-    misfit_of,
-    partitions_for,
-    star_sample,
-    star_sums,
-)
-from bayesdist.assess.coverage import Coverage, coverage_of
-from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.maps import UncertaintyMap, uncertainty_map, with_local
+from bayesdist.assess import SAMPLE, pixel_scale_of
+from bayesdist.assess.error_model import ErrorModel, error_model, solution_with_errors
+from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.assess.solution import Solution
-from bayesdist.assess.terms.centroid import centroid_scatter
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.local import LocalErrors
+from bayesdist.checks import Check
 from bayesdist.data import MagnitudeErrors, MatchTable
-from bayesdist.diagnose import ScoreTest, score_tests
+from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit, hold_out
 from bayesdist.diagnose.holdout.predictive import Predictive
-from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
-from bayesdist.diagnose.residuals.majority import majority_sentence
-from bayesdist.diagnose.residuals.misfit import MOST_BINS, STARS_PER_BIN, worst_misfit
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards, load_posterior
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
-from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.model import DistortionModel
 
@@ -84,8 +69,10 @@ class Session:
     _made: set[str] = field(default_factory=set, init=False, repr=False)
     _reader: StarReader | None = field(default=None, init=False, repr=False)
     _rvb: RvbInput | None = field(default=None, init=False, repr=False)
+    _derived: Derived = field(default_factory=Derived, init=False, repr=False)
 
     things = "stars"  # what a row of the data is, in words
+    chooser = "least-squares fit"  # what leaves out rows that are far off
 
     # -- values of the stages ---------------------------------------------------------------------
 
@@ -211,11 +198,6 @@ class Session:
         return self.reader.sample(*self._read)
 
     @property
-    def predictive(self) -> Predictive:
-        """The solution as it predicts stars that are held out."""
-        return predictive_of_run(self)
-
-    @property
     def in_circle(self) -> bool:
         """Truth of a likelihood of stars that were matched in circles about nominal positions."""
         return knows_circle(self.config) and self.matched.stars.has_nominal
@@ -269,59 +251,162 @@ class Session:
             return None
         return frames_that_help(self.raw_matches.sample(SAMPLE), self.model)
 
-    @cached_property
-    def systematics(self) -> Systematics:
-        """The posterior with all that is known of its errors."""
-        found = self.discrepancy
-        if found is None:
-            return Systematics(self.posterior)
-        single = self.config.assess.exposure == "single"
-        return Systematics(found.with_noise(self.posterior), found.terms(single=single))
+    # -- what residuals say, and what errors come to -----------------------------------------------
 
-    @cached_property
-    def discrepancy(self) -> RunDiscrepancy | None:
-        """What the model may leave out, as `assess` has estimated it."""
-        return kept_discrepancy(self)
+    @property
+    def is_sampled(self) -> bool:
+        """True where there is a posterior."""
+        return "posterior" in self._values or (self.run / "posterior.nc").exists()
 
-    def estimate_discrepancy(self) -> Discrepancy:
-        """What the model may leave out, from the residuals of all stars."""
-        matches = self.matches
-        return estimate_discrepancy(
-            self.shards,
-            self.posterior,
-            rng=self.rng("assess"),
-            priors=self.config.discrepancy.priors(),
-            parameter_priors=self.priors,
-            sample=self._sample,
-            stars=matches if isinstance(matches, MatchTable) else None,
+    @property
+    def stored(self) -> Diagnostics | None:
+        """What `assess` has found of this fit and posterior; None before."""
+        made_from = self.fit, self.posterior
+        return self._derived.get(
+            "stored", made_from, lambda: load_diagnostics(self.run, *made_from)
         )
 
-    def measure(self) -> None:
-        """What the assessment estimates beside the posterior, anew."""
-        keep_discrepancy(self, self.estimate_discrepancy)
-        keep_score_tests(self.run, self.made_score_tests())
-        rest = ("systematics", "solution", "centroid", "local_terms", "score_tests")
-        for name in ("discrepancy", *rest):
-            self.__dict__.pop(name, None)
+    @property
+    def diagnostics(self) -> Diagnostics:
+        """What residuals say, as `assess` has found it or found now; less of a fit alone."""
+        if not self.is_sampled:
+            made_from = self.fit, self.shards
+            return self._derived.get("of the fit", made_from, self._of_fit)
+        if self.stored is not None:
+            return self.stored
+        return self._derived.get("diagnostics", (self.fit, self.posterior), self._diagnosed)
+
+    def diagnose(self) -> Diagnostics:
+        """What residuals say, found anew and written for the stages that follow."""
+        found = self._diagnosed()
+        save_diagnostics(self.run, self.fit, self.posterior, found)
+        self._derived.put("stored", (self.fit, self.posterior), found)
+        return found
+
+    def _of_fit(self) -> Diagnostics:
+        options = self.diagnosis()
+        known = {key: options[key] for key in ("eliminated", "centroid") if key in options}
+        return diagnose_fit(
+            self.fit, None, self.matches, self.shards, self._sample, things=self.pairs_word, **known
+        )
+
+    def _diagnosed(self) -> Diagnostics:
+        found = diagnose(
+            self.fit,
+            self.posterior,
+            self.matches,
+            self.shards,
+            self._sample,
+            rng=self.rng("assess"),
+            discrepancy=self.config.discrepancy.priors(),
+            priors=self.priors,
+            match_radius=self.config.outliers.match_radius,
+            periods=period_settings(self),
+            things=self.pairs_word,
+            **self.diagnosis(),
+        )
+        held = self.held_matches
+        if held is None:
+            return found
+        return hold_out(found, self.predictive(found), held, self.matched.whole)
+
+    def diagnosis(self) -> dict[str, Any]:
+        """What runs of one kind have for `diagnose`, beside what all have."""
+        return {}
+
+    def predictive(self, found: Diagnostics) -> Predictive:
+        """The solution as it predicts stars that are held out."""
+        return predictive_of_run(self, found)
+
+    @property
+    def pairs_word(self) -> str:
+        """What is true or false, in words."""
+        return "pairs" if self.things == "stars" else self.things
+
+    @property
+    def errors(self) -> ErrorModel:
+        """All errors of a position."""
+        made_from = self.posterior, self.diagnostics
+        return self._derived.get("errors", made_from, lambda: self.errors_from(self.diagnostics))
+
+    def errors_from(
+        self, found: Diagnostics | None, solution: Solution | None = None
+    ) -> ErrorModel:
+        """The error model of the posterior, or of another solution, with what residuals say."""
+        posterior = self.posterior if solution is None else solution
+        options = {} if found is None else self.error_options()
+        return error_model(
+            posterior,
+            found,
+            self.terms_of(posterior, alone=found is None),
+            pixel_scale=pixel_scale_of(posterior, scale_mas=self.config.detector.scale_mas),
+            **options,
+        )
+
+    def error_options(self) -> dict[str, Any]:
+        """What `error_model` has to know of a run of this kind."""
+        return {"single": self.config.assess.exposure == "single"}
+
+    def terms_of(self, solution: Solution, *, alone: bool) -> tuple[ErrorTerm, ...]:
+        """Error terms beside what residuals say; `alone` without those that rest on the fit."""
+        config = self.config
+        return (*config.linear_terms(solution), *self.local_terms, *config.user_terms())
+
+    @property
+    def local_terms(self) -> tuple[LocalErrors, ...]:
+        """Errors that were measured beside the solution, and differ from place to place."""
+        return ()
+
+    @property
+    def hierarchy(self) -> LinearFit | None:
+        """The fit of a hierarchy of exposures, where there is one."""
+        return None
+
+    @property
+    def solution(self) -> Posterior:
+        """What is exported and shown: with all errors of the parameters that `assess` has found.
+
+        Neither catalogue nor matches are needed for it.
+        """
+        made_from = self.posterior, self.stored
+        return self._derived.get(
+            "solution", made_from, lambda: solution_with_errors(*made_from, self.hierarchy)
+        )
+
+    @property
+    def free_directions(self) -> Float | None:
+        """Directions (D, d) that the gauge decides; None where that is no question."""
+        return None
+
+    @property
+    def evaluation_settings(self) -> EvaluationSettings:
+        """Where and how errors are evaluated."""
+        return replace(self.rehearsal_settings, dates=self.dates)
+
+    @property
+    def rehearsal_settings(self) -> EvaluationSettings:
+        """The same without the dates of the matches, which only verdicts name."""
+        config = self.config
+        return EvaluationSettings(
+            grid=config.assess.grid,
+            epoch=self.epoch,
+            draws=config.assess.draws,
+            years_ahead=config.assess.horizon or 0.0,
+            scale_mas=config.detector.scale_mas,
+            single=config.assess.exposure == "single",
+            contained=self.contained,
+            given=tuple(block.name for block in config.budget),
+        )
+
+    @property
+    def contained(self) -> Sequence[tuple[str, float, float]]:
+        """Errors that the residuals are said to hold beside those of the centroids."""
+        return self.config.held_in_residuals(self.model.unit)
 
     @property
     def tested_matches(self) -> MatchTable:
         """Matches that the score tests look at: all, or every k-th."""
         return self._sample
-
-    def made_score_tests(self) -> tuple[ScoreTest, ...]:
-        """Targeted tests of the residuals for what the model lacks."""
-        return score_tests(
-            self.tested_matches,
-            self.posterior,
-            priors=self.priors,
-            match_radius=self.config.outliers.match_radius,
-        )
-
-    @cached_property
-    def score_tests(self) -> tuple[ScoreTest, ...]:
-        """Those that `assess` has made."""
-        return kept_score_tests(self.run)
 
     @property
     def tangent_point(self) -> tuple[float, float] | None:
@@ -335,7 +420,7 @@ class Session:
     def dates(self) -> Float:
         """Distinct dates of the matches, in decimal years; none where they have none."""
         raw = self.raw_matches
-        table = raw if isinstance(raw, MatchTable) else raw.sample(SAMPLE)
+        table = raw if isinstance(raw, MatchTable) else self._sample
         return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
 
     @property
@@ -348,84 +433,9 @@ class Session:
         """Whether an error of the catalogue's proper motions is; None without a catalogue."""
         return self.config.states("motion")
 
-    @property
-    def single_exposures(self) -> bool:
-        """Whether it is known by how much single exposures deviate."""
-        linear = None if self.discrepancy is None else self.discrepancy.found.linear
-        return self.systematics.aligned or (linear is not None and bool(linear.kinds))
-
-    @cached_property
-    def solution(self) -> Posterior:
-        """What is exported and shown: all errors of the parameters are in its draws."""
-        found = self.discrepancy
-        return self.posterior if found is None else found.with_everything(self.posterior)
-
-    def position_map(self, **where: Any) -> UncertaintyMap:
-        """Uncertainty of positions over a chip: of coefficients, and of what they leave out.
-
-        Parameters
-        ----------
-        **where
-            As `uncertainty_map`, on the grid and at the epoch of the assessment.
-        """
-        return with_local(uncertainty_map(self.solution, **where), self.structure_sigma(**where))
-
-    def structure_sigma(self, **where: Any) -> NDArray[np.float64] | None:
-        """Standard deviations (N, 2) of what the model leaves out on the grid of a chip, if any."""
-        found = self.discrepancy
-        if found is None or not self.structure_is_left:
-            return None
-        return found.structure_sigma(self._domain(**where))
-
-    @property
-    def structure_is_left(self) -> bool:
-        """Whether what the model leaves out at a position is an error of its own."""
-        return True
-
-    def _domain(
-        self, *, grid: tuple[int, int], epoch: float | None, chip: int | None = None
-    ) -> EvaluationDomain:
-        model = self.posterior.model
-        number = model.chips[0].number if chip is None else chip
-        return EvaluationDomain.of_chips(model, grid, chips=(number,), epoch=epoch)
-
-    @property
-    def signed(self) -> Posterior:
-        """The same, from what the run's folder holds: data are not needed."""
-        return self.solution
-
-    @property
-    def error_terms(self) -> tuple[ErrorTerm, ...]:
-        """Terms of the error model: those of the run, then those that the user gives."""
-        return (*self.systematics.terms, *self.terms_beside(self.systematics.solution))
-
-    def terms_beside(self, solution: Solution) -> tuple[ErrorTerm, ...]:
-        """Those of them that do not rest on the run's solution."""
-        config = self.config
-        return (*config.linear_terms(solution), *self.local_terms, *config.user_terms())
-
-    @cached_property
-    def centroid(self) -> MagnitudeErrors | None:
-        """Errors of the centroids by magnitude, where the stars have magnitudes."""
-        held = self.config.held_in_residuals(self.posterior.model.unit)
-        errors = centroid_scatter(self.stars, held, n_params=self.posterior.model.n_params)
-        found = self.discrepancy
-        return errors if found is None else found.of_centroids(errors)
-
-    @property
-    def further_caveats(self) -> tuple[str, ...]:
-        """What else keeps verdicts from being given, in runs of one kind."""
+    def kind_checks(self, found: Sequence[Check]) -> tuple[Check, ...]:
+        """Checks that runs of one kind have, given what tests of the residuals have found."""
         return ()
-
-    @property
-    def doubts(self) -> list[str]:
-        """What else, beside misfit and errors, a reader of the numbers has to know."""
-        return [f"{t.finding}: {t.remedy}" for t in self.score_tests if t.significant]
-
-    @cached_property
-    def epoch_shift(self) -> EpochShift | None:
-        """Error of the epochs that the residuals of the fit show; None without proper motions."""
-        return None if self.config.data is None else epoch_shift(self._sample, self.fit)
 
     @property
     def gauge_words(self) -> str:
@@ -433,94 +443,15 @@ class Session:
         return ""
 
     @property
-    def relative(self) -> Solution | None:
-        """The solution of relative positions, where the gauge is no part of it."""
-        return None
-
-    def relative_map(self, **where: Any) -> UncertaintyMap | None:
-        """Uncertainty of relative positions, as `position_map`; None without a gauge."""
-        return None
-
-    @cached_property
-    def local_terms(self) -> tuple[LocalErrors, ...]:
-        """Errors that were measured beside the solution, and differ from place to place."""
-        return ()
-
-    @property
     def scale_arcsec(self) -> float | None:
         """Size of a pixel in arcsec, where the configuration gives it."""
         scale = self.config.detector.scale_mas
         return None if scale is None else scale / 1000
 
-    @cached_property
-    def _partitions(self) -> dict[int, dict[str, tuple[int, int]]]:
-        """Bins of each chip, by its number: of the tests for structure, and of the diagram."""
-        out = {}
-        for chip, found in zip(self.fit.model.chips, self.shards.survey.chips, strict=True):
-            n = round(self.fit.n_used * found.n / len(self.shards))
-            side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MOST_BINS))
-            out[chip.number] = partitions_for(n) | {"shown": (side, side)}
-        return out
-
-    @cached_property
-    def sums(self) -> StarSums:
-        """Residuals of the least-squares fit, summed over all stars."""
-        partitions = {
-            chip: tuple(dict.fromkeys(bins.values())) for chip, bins in self._partitions.items()
-        }
-        return self.shards.sum(star_sums, self.fit.mean, self.fit.clip, partitions)
-
     @property
-    def shown_sums(self) -> tuple[BinnedSums, ...]:
-        """Those of them that the diagrams of mean residuals show, one for each chip."""
-        return tuple(self.sums.binned[c, b["shown"]] for c, b in self._partitions.items())
-
-    @cached_property
-    def misfits(self) -> tuple[Misfit, ...]:
-        """Structure that the least-squares fit leaves in the residuals of each chip."""
-        fit, out = self.fit, []
-        for chip, bins in zip(fit.model.chips, self._partitions.values(), strict=True):
-            sums = {
-                name: self.sums.binned[chip.number, bins[name]] for name in bins if name != "shown"
-            }
-            found = misfit_of(sums, order=fit.model.order, unit=fit.unit)
-            out.append(replace(found, chip=chip) if len(fit.model.chips) > 1 else found)
-        return tuple(out)
-
-    @property
-    def misfit(self) -> Misfit:
-        """The worst of them, its probability corrected for the number of chips."""
-        return worst_misfit(self.misfits)
-
-    @property
-    def coverages(self) -> tuple[Coverage, ...]:
-        """The area of each chip that its stars cover."""
-        chips, several = self.fit.model.chips, len(self.fit.model.chips) > 1
-        return tuple(
-            coverage_of(
-                self.sums.binned[chip.number, bins["cells"]], found.corners, chip, several=several
-            )
-            for chip, bins, found in zip(
-                chips, self._partitions.values(), self.shards.survey.chips, strict=True
-            )
-        )
-
-    @property
-    def majority(self) -> str:
-        """What it means that most pairs are false; empty where they are not."""
-        posterior = self.posterior if self.run.done("sample") else None
-        quoted = self.shards.survey.reference_sigma
-        things = "pairs" if self.things == "stars" else self.things
-        return majority_sentence(self.fit, posterior, quoted=quoted, things=things)
-
-    @cached_property
-    def stars(self) -> StarSample:
-        """Some stars, or all of them, and what fit and posterior say of each."""
-        return self._sampled()
-
-    def _sampled(self) -> StarSample:
-        matches = self.matches
-        return star_sample(self._sample, len(matches), self.fit, self.posterior)
+    def sampled_matches(self) -> MatchTable:
+        """Some of the matches, or all: for what is estimated from single residuals."""
+        return self._sample
 
     def rng(self, stage: str) -> np.random.Generator:
         """Random numbers of a stage: all follow from the one seed."""

@@ -17,12 +17,12 @@ from bayesdist.app.file_positions import sky_of_header
 from bayesdist.app.session import Session
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
+from bayesdist.limits import SKY_CLOSURE
 
 __all__ = ["SkyClosure", "sky_closure"]
 
 Float = NDArray[np.float64]
 
-FAITHFUL = 1e-3  # of a pixel: a header that misses its own solution by more is wrong
 FALSE = 0.5  # probability above which a match is taken for a false one
 
 
@@ -74,7 +74,7 @@ class SkyClosure:
     @property
     def faithful(self) -> bool:
         """Whether the header is where the solution is."""
-        return self.solution <= FAITHFUL * self.pixel
+        return SKY_CLOSURE.met_by(self.solution / self.pixel)
 
     @property
     def level(self) -> int:
@@ -106,7 +106,7 @@ def sky_closure(session: Session, path: Path, chip: int) -> SkyClosure | None:
     point = session.tangent_point
     if point is None:
         return None
-    stars, solution = session.stars, session.solution
+    stars, solution = session.diagnostics.sample, session.solution
     table, model = stars.table, solution.model
     mine = stars.used & (np.array(table.chip_numbers)[table.chip] == chip)
     if model.n_frame:

@@ -9,9 +9,9 @@ from typing import Any
 
 from bayesdist.app.config import load_requirements
 from bayesdist.app.dates import idle_dates
-from bayesdist.app.horizon import write_horizons
-from bayesdist.app.judging import assessed_horizons, margins_of
-from bayesdist.app.margins import margin_rows, write_margins
+from bayesdist.app.evaluation_files import save_margins
+from bayesdist.app.judging import margins_of, validity_periods_of
+from bayesdist.app.margins import margin_rows
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
@@ -51,10 +51,9 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
         require(session, "requirements", ("fit", "sample"))
         with _named_after(requirements, asked):
             margins = margins_of(session, asked)
-            horizons = assessed_horizons(session, asked)
+            horizons = validity_periods_of(session, asked)
         before = _judgement(session)
-        write_margins(session, margins)
-        write_horizons(session, horizons)
+        save_margins(session, margins, horizons)
         if _judgement(session) != before:
             session.run.outdate("report")
         report = session.run / "report.html"
@@ -85,7 +84,7 @@ def _judgement(session: Session) -> list[Any]:
 
 
 def _lines(margins: Sequence[Margin]) -> Iterator[str]:
-    yield margins_text(margin_rows(tuple(margins)))
+    yield margins_text(margin_rows(margins))
     for m in margins:
         if m.verdict != "met":
             yield f"{m.requirement.name}: {m.verdict}: {m.reason}"

@@ -12,6 +12,7 @@ _HOMES = {
     "bayesdist.assess.budget.detector": ("detector_budget", "error_budget"),
     "bayesdist.assess.domain": ("EvaluationDomain",),
     "bayesdist.assess.error_model": ("ErrorModel", "error_model"),
+    "bayesdist.assess.evaluation": ("Evaluation", "EvaluationSettings", "evaluate"),
     "bayesdist.assess.maps": ("UncertaintyMap", "uncertainty_map"),
     "bayesdist.assess.mosaic": ("chip_places",),
     "bayesdist.assess.requirements.margins": ("Margin", "Requirement", "check_requirements"),

@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.names import require_known
+from bayesdist.names import require_known
 
 __all__ = ["STATISTICS", "extent", "field_statistic"]
 

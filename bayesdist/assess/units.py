@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-from bayesdist.assess.names import require_known
 from bayesdist.assess.solution import Solution
 from bayesdist.data.tables.units import UNITS
 from bayesdist.errors import InputError
+from bayesdist.limits import PIXEL_SIZE
+from bayesdist.names import require_known
 
 __all__ = ["UNITS", "convert", "pixel_doubt", "pixel_scale_of", "require_scale"]
-
-PIXELS_OF_ONE_KIND = 3.0  # factor by which two kinds of pixels differ at most
 
 _MAS = {"mas": 1.0, "arcsec": 1e3, "deg": 3.6e6}
 
@@ -120,7 +119,7 @@ def pixel_doubt(solution: Solution) -> str:
     if model.unit != "pix":
         return ""
     size = model.linear_scale(solution.mean)
-    if 1 / PIXELS_OF_ONE_KIND <= size <= PIXELS_OF_ONE_KIND:
+    if 1 / PIXEL_SIZE.value <= size <= PIXEL_SIZE.value:
         return ""
     return (
         f"u and v are called pixels, and one pixel of x, y is {size:.4g} of theirs: if they are "

@@ -10,13 +10,13 @@ import numpy as np
 from bayesdist.app.campaign.interpolation import INTERPOLATION as BETWEEN
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
-from bayesdist.app.judging import budget_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import own_stages, rehearse_run, session_of
 from bayesdist.app.stages import run_stage
 from bayesdist.app.stages.assess import run_assess
 from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.evaluation import budget_over
 from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
@@ -167,5 +167,5 @@ def table_errors(session: CampaignSession, truth: CampaignTruth) -> np.ndarray:
 
 def stated_sigma(session: Session) -> np.ndarray:
     """Standard deviations (N, 2) of all terms of the budget together, over the same grid."""
-    total = budget_of(session).total
+    total = budget_over(session.errors, session.evaluation_settings, session.rng("assess")).total
     return np.column_stack([total.u, total.v])

@@ -15,13 +15,14 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.config import load_config
-from bayesdist.app.judging import budget_of, margins_of
+from bayesdist.app.judging import margins_of
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.selfcal.session import SelfcalSession
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import own_stages, rehearse_run, session_of
 from bayesdist.app.stages import run_stage
 from bayesdist.assess import Margin, Requirement
+from bayesdist.assess.evaluation import budget_over
 from bayesdist.assess.requirements.verdict import clopper_pearson
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.model.grid import grid_pixels, mesh
@@ -105,7 +106,7 @@ def actual_error(session: Session, truth: Truth, rng: np.random.Generator) -> np
 
 def stated_sigma(session: Session) -> np.ndarray:
     """Standard deviations (ny * nx, 2) of all terms of the budget together, over the same grid."""
-    total = budget_of(session).total
+    total = budget_over(session.errors, session.evaluation_settings, session.rng("assess")).total
     return np.column_stack([total.u, total.v])
 
 

@@ -34,7 +34,7 @@ def outcome(kind: str, seed: int, n: int | None = None) -> dict[str, Any]:
             "chi2": float(error @ np.linalg.solve(cov, error)),
             "pull": error / np.sqrt(np.diag(cov)),
             "tables": table_errors(session, truth) if session.tables else None,
-            "tests": {one.name: one for one in session.score_tests},
+            "tests": {one.name: one for one in session.diagnostics.score_tests},
         }
 
 

@@ -144,7 +144,7 @@ def test_sums_over_pieces_are_those_of_the_whole(job, tmp_path, on_disk, monkeyp
         run = RunDirectory.plan(tmp_path / "none", config, text, job.parent)
         session = Session(run)
         session.renew("fitted", fit_stars(session.matched, session.config))
-        sums.append(session.sums)
+        sums.append(session.diagnostics.sums)
         session.close()
     one, other = sums
     np.testing.assert_array_equal(one.exposures.n_used, other.exposures.n_used)

@@ -15,7 +15,7 @@ from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.stages.assess import _assess_holdout
+from bayesdist.app.stages.assess import diagnose_run
 from bayesdist.data import read_matches
 from bayesdist.data.tables.files import read_table
 from bayesdist.infer import load_fit
@@ -74,7 +74,7 @@ def run(folder):
     for stage in ("match", "fit", "sample"):
         good("stage", stage, run, "-q")
     session = CampaignSession(RunDirectory.open(run))
-    _assess_holdout(session)
+    diagnose_run(session)
     session.close()
     return run
 
@@ -151,7 +151,7 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path) -> None:
         if one.is_file():
             shutil.copy(one, tmp_path / "other" / one.name)
     session = CampaignSession(RunDirectory.open(tmp_path / "other"))
-    _assess_holdout(session)
+    diagnose_run(session)
     found = summary_of(tmp_path / "other")["holdout"]
     assert found["level"] == "fail" and f"exposure {name}, held out whole" in found["verdict"]
 

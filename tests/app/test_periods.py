@@ -13,8 +13,8 @@ from lxml import html as lxml_html
 
 from bayesdist.app import matches as app_matches
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.assess.periods import time_variation
 from bayesdist.data import MatchTable, write_partitioned
+from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import (
@@ -285,7 +285,7 @@ def test_stars_of_several_periods_are_counted():
     edges = Time(np.array([[c - 2.5, c + 2.5] for c in CENTRES]), format="mjd").decimalyear
     spans = {"a": tuple(edges[0]), "c": tuple(edges[2])}
     rng = np.random.default_rng(1)
-    found = time_variation(fit, matches, spans, rng=rng, bins=4)
+    found = time_variation(fit, matches, PeriodSettings(spans, bins=4), rng=rng)
     assert found.n_repeated == 10 and found.n_outside == (period == 1).sum()
     assert (found.first, found.last) == ("a", "c")
     outside, repeated = found.cautions
@@ -309,7 +309,8 @@ def test_chips_are_compared_together():
     matches = MatchTable(x, y, *uv.T, sigma_u=sigma, sigma_v=sigma, epoch=2010.05 + late,
                          chip=chip, chip_numbers=(1, 2))  # fmt: skip
     spans = {"early": (2010.0, 2010.1), "late": (2011.0, 2011.1)}
-    found = time_variation(fit_linear(matches, model), matches, spans, rng=rng, bins=8)
+    fit = fit_linear(matches, model)
+    found = time_variation(fit, matches, PeriodSettings(spans, bins=8), rng=rng)
     assert found.significant and found.ends.chip == 2
     assert abs(found.ends.largest - 0.05) < 5 * found.ends.sigma
     quiet, loud = ([one.p_value for one in several] for several in found.patterns)

@@ -12,11 +12,9 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from bayesdist.app.file_positions import sip_positions
-from bayesdist.app.judging import products_of
-from bayesdist.app.product_terms import _Laid
+from bayesdist.app.product_terms import _Laid, product_terms
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
-from bayesdist.app.systematics import Systematics
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from tests.app.support import good, summary_of
@@ -115,7 +113,7 @@ def test_the_inverse_row_is_what_astropy_leaves(run):
 def test_forward_it_is_exact_at_its_own_date_and_lacks_the_drift_at_others(run, session):
     row = rows_of(run)["sip.hdr, forward"]
     assert row["radial"] < 1e-10
-    [term] = [t for t in products_of(session) if t.row.name == "sip.hdr, forward"]
+    [term] = [t for t in product_terms(session) if t.row.name == "sip.hdr, forward"]
     x, y = np.array([1.0, 300.0, 512.0]), np.array([200.0, 7.0, 256.0])
     solution = session.solution
     at = [solution.model.predict(solution.mean, x, y, epoch=t) for t in (2008.0, 2016.5)]
@@ -162,7 +160,7 @@ def test_axes_and_size_of_a_file_are_its_own_and_a_wave_is_not():
             at = model.basis(chip.number).terms.index(k)
             mean[model.coefficient_slice(chip.number, axis)][at] = half
     solution = SimpleNamespace(model=model, mean=mean)
-    session = SimpleNamespace(solution=solution, epoch=None, systematics=Systematics(solution))
+    session = SimpleNamespace(solution=solution, epoch=None)
 
     def wave(x, y, chip, epoch):
         return 0.01 * np.sin(np.stack([x, y], axis=-1) * 2 * np.pi / 32 + chip)

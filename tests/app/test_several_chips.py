@@ -277,12 +277,13 @@ def test_structure_is_looked_for_on_each_chip(run):
     session = Session(RunDirectory.open(run))
     fit, table = session.fit, session.matches
     residual, used = residuals(fit, table), fit.uses(table)
+    found = session.diagnostics
     p = {}
     for chip in CHIPS:
         here = used & (table.chip_number == chip.number)
-        bins = session._partitions[chip.number]
+        bins = found.partitions[chip.number]
         arrays = (table.x[here], table.y[here], *residual[here].T)
-        sums = {n: session.sums.binned[chip.number, bins[n]] for n in bins if n != "shown"}
+        sums = {n: found.sums.binned[chip.number, bins[n]] for n in bins if n != "shown"}
         for name, one in sums.items():
             expected = binned_residuals(*arrays, bins=bins[name], size=chip.size)
             np.testing.assert_array_equal(one.residuals().count, expected.count)

@@ -142,7 +142,7 @@ SOLUTIONS = {name for name in TERMS if name.startswith("solution")}
 
 def drawn(*terms, aligned=False, n=DRAWS, seed=1):
     [*own] = [t.solution for t in terms if isinstance(t, SolutionErrors)] or [CERTAIN]
-    model = error_model(own[0], terms, aligned=aligned, pixel_scale=50.0)
+    model = error_model(own[0], terms=terms, aligned=aligned, pixel_scale=50.0)
     return model.drawn(n, np.random.default_rng(seed))
 
 

@@ -81,7 +81,8 @@ def run(sizes: Sizes) -> dict[str, Any]:
             detector_budget(solution, epoch=epoch, rng=np.random.default_rng(1), **what)
 
     def followed(statistic: str) -> None:
-        errors = error_model(solution, what["terms"]).drawn(sizes.draws, np.random.default_rng(1))
+        model = error_model(solution, terms=what["terms"])
+        errors = model.drawn(sizes.draws, np.random.default_rng(1))
         asked = Requirement("r", statistic, 0.1, "pix", probability=0.95)
         horizon_of(errors, asked, epochs, grid=sizes.grid)
 

@@ -187,5 +187,5 @@ def assessed(kind: Kind, seed: int, stars: Table, folder: Path) -> Session:
     session.begun()
     run_fit(session)
     run_sample(session)
-    session.measure()
+    session.diagnose()
     return session

@@ -90,7 +90,7 @@ def covered(name: str, seed: int) -> dict[str, dict[str, np.ndarray]]:
         truth = campaign(kind, seed)
         with closing(assessed(kind, seed, truth.stars, Path(folder))) as session:
             solution, errors = session.solution, errors_of(session)
-            discrepancy = session.discrepancy.found
+            discrepancy = session.diagnostics.correlated
         rng = truth.rng
         x, y = rng.uniform(0.5, SIDE + 0.5, (2, PLACES))
         mag = np.repeat(rng.uniform(BRIGHT, FAINT, DATES), PLACES // DATES)

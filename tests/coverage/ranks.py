@@ -110,10 +110,10 @@ def ranks(seed: int) -> dict[str, float]:
         basis, points = model.basis(), fields.even_pixels(24)
         at = np.stack(points, axis=1) - fields.MIDDLE + polynomial(*points)
         true = np.linalg.lstsq(basis.evaluate(*points), at, rcond=None)[0].T.ravel()
-        errors, kept = errors_of(session), session.discrepancy.found
+        errors, kept = errors_of(session), session.diagnostics.correlated
         n, rng = errors.n_draws, np.random.default_rng([32, seed])
         with_structure = kept.structure_theta[np.arange(n) % kept.n_draws]
-        coefficients = session.systematics.solution.draws(n, rng) - mean + with_structure
+        coefficients = session.errors.solution.solution.draws(n, rng) - mean + with_structure
         found = {
             name: float(np.mean(draws < actual))
             for name, draws, actual in zip(model.names, coefficients.T, true - mean, strict=True)

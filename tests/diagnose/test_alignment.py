@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from bayesdist.assess import residual_statistics
-from bayesdist.assess.wise import (
+from bayesdist.diagnose.statistics import (
     STATISTICS,
     BinValues,
     band_bins,

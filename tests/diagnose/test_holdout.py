@@ -23,11 +23,12 @@ from bayesdist.diagnose.holdout.predictive import (
 )
 from bayesdist.diagnose.holdout.spread import SpreadMoments, sum_tails
 from bayesdist.diagnose.holdout.sums import _beyond
-from bayesdist.diagnose.holdout.validation import DOUBTFUL, held_out_truth
+from bayesdist.diagnose.holdout.validation import held_out_truth
 from bayesdist.diagnose.significance import holm
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
+from bayesdist.limits import HELD_OUT_DOUBTFUL
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 
@@ -374,4 +375,4 @@ def test_sums_of_squares_have_their_exact_probability():
 def test_correction_for_the_number_of_tests():
     """The example of Holm's procedure worked by hand."""
     np.testing.assert_allclose(holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
-    assert DOUBTFUL < 0.01
+    assert HELD_OUT_DOUBTFUL.value < 0.01

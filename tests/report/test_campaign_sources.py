@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayesdist.app.campaign.overlap import _aligned, _at_first_epoch, chosen_exposures
 from bayesdist.app.campaign.report import _residuals
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.overlap import _aligned, _at_first_epoch, chosen_exposures
 from bayesdist.infer.nodes.alternation import inside_chips, with_columns
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 

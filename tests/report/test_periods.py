@@ -10,8 +10,8 @@ from lxml import html as lxml_html
 from matplotlib.colors import to_hex
 from matplotlib.quiver import Quiver
 
-from bayesdist.assess.periods import time_variation
 from bayesdist.data import MatchTable
+from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.order import select_order
 from bayesdist.model import Chip, DistortionModel
@@ -45,7 +45,8 @@ def pairs():
 @pytest.fixture(scope="module")
 def found(pairs):
     fit = fit_linear(pairs, MODEL)
-    return time_variation(fit, pairs, SPANS, rng=np.random.default_rng(1), bins=8, tolerance=0.5)
+    settings = PeriodSettings(SPANS, bins=8, tolerance=0.5)
+    return time_variation(fit, pairs, settings, rng=np.random.default_rng(1))
 
 
 def designed(x, y):

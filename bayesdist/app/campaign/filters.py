@@ -16,6 +16,7 @@ from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.series import Course, FilterDependence, Series, filter_dependence
 from bayesdist.infer.transforms import linear_terms, reference_gauge
+from bayesdist.limits import DIFFERENCE
 from bayesdist.model import TimeDependence
 
 __all__ = ["FilterComparison", "compare_filters", "comparison_table"]
@@ -23,7 +24,6 @@ __all__ = ["FilterComparison", "compare_filters", "comparison_table"]
 Float = NDArray[np.float64]
 Measured = tuple[float, float]  # value and standard deviation
 
-DOUBTFUL = 0.01  # p-value below which the drift is not taken to be the same
 # places of the linear terms: power of x, power of y
 POWERS = {"2": (1, 0), "3": (0, 1)}
 
@@ -56,7 +56,7 @@ class FilterComparison:
     @property
     def alike(self) -> bool:
         """Whether one drift serves all filters."""
-        return not self.depends and self.p_value >= DOUBTFUL
+        return not self.depends and DIFFERENCE.met_by(self.p_value)
 
     @property
     def sentence(self) -> str:

@@ -31,12 +31,12 @@ from bayesdist.infer.exposures.trends import trend_p_values
 from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes.alternation import on_the_chips
 from bayesdist.infer.series import Series
+from bayesdist.limits import TREND
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.frames import RIGID
 
 __all__ = ["fit_campaign", "load_fitted_campaign"]
 
-TREND = 1e-3  # probability of a trend by chance, over all kinds of deviation
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 SECTIONS = (  # of summary.json, which only the making of the fit knows
     *("gauge", "lines", "tables", "scatter"),
@@ -177,7 +177,7 @@ def _trends(joint: HierarchicalFit, stars: MatchTable) -> list[str]:
         f"the {kind} of the exposures drifts with time (p = {one:.1g}), and is taken to scatter "
         "between exposures: extend model.tdd.terms"
         for kind, one in zip(joint.scatter.kinds, p, strict=True)
-        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND
+        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND.value
     ]
 
 

@@ -25,6 +25,7 @@ from bayesdist.data import (
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.data.tables.files import read_table
 from bayesdist.errors import ConfigError, InputError
+from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.products.formats.idctab.hst import parity_of
@@ -33,6 +34,7 @@ __all__ = [
     "Inputs",
     "campaign_block",
     "cuts_of",
+    "errors_by_star",
     "lists_of",
     "parities_of",
     "read_campaign_catalog",
@@ -278,3 +280,36 @@ def known_calibration(tab: IdcTab | Path, filter: str | None) -> Calibration:
     known = read_idctab(tab) if isinstance(tab, Path) else tab
     names = {name for row in known.filters() for name in row}
     return idctab_calibration(known, filter if filter in names else None)
+
+
+def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> StarErrors | None:
+    """Errors of the catalogue by code of the star; None where it has none.
+
+    Parameters
+    ----------
+    catalog : ReferenceCatalog
+    largest_vafactor : float
+        By which catalogue positions were divided; a star in many exposures has one error, and the
+        factors differ by less than a ten-thousandth.
+    """
+    if catalog.sigma_u is None or not (np.any(catalog.sigma_u) or np.any(catalog.sigma_v)):
+        return None
+
+    def by_code(name: str) -> Float | None:
+        values = getattr(catalog, name)
+        if values is None:
+            return None
+        out = np.zeros(int(catalog.star.max()) + 1)
+        out[catalog.star] = values
+        return out
+
+    position, motion = (
+        [by_code(f"{name}_{axis}") for axis in "uv"] for name in ("sigma", "sigma_pm")
+    )
+    return StarErrors(
+        np.stack([one for one in position if one is not None], axis=1) / largest_vafactor,
+        None
+        if motion[0] is None or motion[1] is None
+        else np.stack([motion[0], motion[1]], axis=1) / largest_vafactor,
+        by_code("epoch"),
+    )

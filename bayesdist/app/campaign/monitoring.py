@@ -72,7 +72,7 @@ def read_new_exposures(session: CampaignSession, new: Path) -> NewExposures:
         For star lists, which have to be matched first; pairs in another unit or filter, without
         epochs, or without a way to errors; when all exposures are those of the release.
     """
-    released = session.signed
+    released = session.solution
     run = RunDirectory(new) if (new / "run.json").exists() else None
     pairs = _pairs(run, new, released.model.unit)
     where = ", ".join(pairs.sources)

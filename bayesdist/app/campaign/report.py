@@ -7,7 +7,6 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.campaign.inputs import cuts_of, read_campaign_catalog
-from bayesdist.app.campaign.overlap import overlap_test
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import as_json
 from bayesdist.data import MatchTable, with_centroid_errors
@@ -68,9 +67,7 @@ def campaign_results(session: CampaignSession) -> CampaignResults:
         residuals=_residuals(session),
         tables=session.tables,
         series=_series(session, matching),
-        overlap=overlap_test(session),
-        doubts=tuple(session.doubts),
-        misfits=session.misfits,
+        overlap=session.diagnostics.overlap,
         held=held_parameters(session.fit, session.priors),
     )
 

@@ -2,38 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.campaign.aberration import aberration_term
+from bayesdist.app.campaign.checks import campaign_checks, campaign_remarks
 from bayesdist.app.campaign.config import CampaignBlock
 from bayesdist.app.campaign.fit import load_fitted_campaign
 from bayesdist.app.campaign.holdout import predictive_of_campaign
-from bayesdist.app.campaign.inputs import Inputs, campaign_block, read_inputs, unit_arcsec_of
+from bayesdist.app.campaign.inputs import (
+    Inputs,
+    campaign_block,
+    errors_by_star,
+    known_calibration,
+    read_inputs,
+    unit_arcsec_of,
+)
 from bayesdist.app.campaign.interpolation import interpolation_term
 from bayesdist.app.campaign.matched import CampaignMatched, load_matched_campaign
 from bayesdist.app.campaign.reference import free_rates
-from bayesdist.app.campaign.systematics import (
-    errors_by_star,
-    kept_covariance,
-    systematics_of,
-    with_kept_stars,
-)
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.exposures import ExposureScatter
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.session import Session
-from bayesdist.app.systematics import Systematics
-from bayesdist.assess import SAMPLE, LocalErrors
-from bayesdist.assess.terms.forms import GIVEN, MEASURED
-from bayesdist.data import MagnitudeErrors, MatchTable
+from bayesdist.assess import LocalErrors
+from bayesdist.assess.solution import Solution
+from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
+from bayesdist.assess.terms.parameters import ExposureVariation
+from bayesdist.checks import Check
+from bayesdist.data import MatchTable
+from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import Predictive
+from bayesdist.diagnose.overlap import overlap_test
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
-from bayesdist.infer import Matches, Posterior
-from bayesdist.infer.discrepancy import Discrepancy, estimate_discrepancy
+from bayesdist.infer import LinearFit, Matches
+from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.nodes.alternation import with_columns
 from bayesdist.infer.series import Series
@@ -153,11 +162,6 @@ class CampaignSession(Session):
         return free_rates(self.config)
 
     @property
-    def structure_is_left(self) -> bool:
-        """Not where the errors of tables stand for it."""
-        return not self.fitted.tables.position_sigma
-
-    @cached_property
     def local_terms(self) -> tuple[LocalErrors, ...]:
         """What the errors of the tables leave of the position, and what lies between nodes."""
         kept, grid = self.fitted.tables, self.config.assess.grid
@@ -193,45 +197,70 @@ class CampaignSession(Session):
             out.append(table)
         return tuple(out)
 
-    @property
-    def signed(self) -> Posterior:
-        """The solution with the errors of the catalogue as `assess` has kept them."""
-        posterior, found = with_kept_stars(self), self.discrepancy
-        if found is None:
-            return posterior
-        return found.with_everything(posterior, kept_covariance(self))
-
-    @cached_property
-    def solution(self) -> Posterior:  # type: ignore[override]
-        """What is exported and shown: all errors of the parameters are in its draws."""
-        return self.signed
-
-    @property
-    def predictive(self) -> Predictive:
+    def predictive(self, found: Diagnostics) -> Predictive:
         """The posterior as it predicts what is held out."""
-        return predictive_of_campaign(self)
+        return predictive_of_campaign(self, found)
 
-    def estimate_discrepancy(self) -> Discrepancy:
-        """What the model may leave out, beyond what the campaign's own hierarchy describes.
+    @property
+    def hierarchy(self) -> LinearFit:
+        """The joint fit of all exposures."""
+        return self.fit
+
+    @property
+    def catalogue_errors(self) -> StarErrors | None:
+        """Errors of the catalogue by code of the star; None where it has none."""
+        return errors_by_star(self.inputs.catalog, self.largest_vafactor)
+
+    def diagnosis(self) -> dict[str, Any]:
+        """What a campaign has beside: a hierarchy of exposures, tables, a catalogue's errors.
 
         Tables that were fitted in this run have taken the structure; their errors, and what they
         leave between their nodes, are terms of the budget.  The catalogue's errors are counted by
         star where it states them.
         """
-        matches = self.matches
-        assert isinstance(matches, MatchTable)
-        stated = errors_by_star(self.inputs.catalog) is not None
-        return estimate_discrepancy(
-            self.shards,
+        return {
+            "tested": self.tested_matches,
+            "structure": self.config.tables.method == "none",
+            "exposures": False,
+            "settling": self.settling,
+            "catalogue": self.catalogue_errors,
+            "centroid": self.magnitude_errors,
+        }
+
+    def _diagnosed(self) -> Diagnostics:
+        overlap = overlap_test(
+            self.pairs,
             self.posterior,
-            rng=self.rng("assess"),
-            priors=self.config.discrepancy.priors(),
-            parameter_priors=self.priors,
-            sample=matches.sample(SAMPLE),
-            stars=None if stated else matches,
-            structure=self.config.tables.method == "none",
-            exposures=False,
-            settling=self.settling,
+            known_calibration(self.base / self.block.start, self.block.filter),
+            self.tables,
+            unit_arcsec=self.unit_arcsec,
+            pixel=self.scale_arcsec or 0.05,
+            rolls={one.name: one.pa_v3 for one in self.inputs.log},
+        )
+        return replace(super()._diagnosed(), overlap=overlap)
+
+    contained = ()  # the errors of the centroids are those that the fit has found
+
+    def error_options(self) -> dict[str, Any]:
+        """Errors are those in a new exposure, whose shift and rotation its user fits."""
+        return {
+            "hierarchy": self.fit,
+            "catalogue": Path(self.inputs.catalog.source).name,
+            "aligned": True,
+            # not where the errors of tables stand for it
+            "structure_left": not self.fitted.tables.position_sigma,
+        }
+
+    def terms_of(self, solution: Solution, *, alone: bool) -> tuple[ErrorTerm, ...]:
+        """Error terms beside what residuals say: a new exposure deviates as those at hand."""
+        others = super().terms_of(solution, alone=alone)
+        if alone:
+            return others
+        aberration = aberration_term(self, solution)
+        mean = np.asarray(solution.mean, float)
+        return (
+            ExposureVariation(solution.model, mean, *self.scatter, aberration=aberration),
+            *others,
         )
 
     @property
@@ -248,12 +277,6 @@ class CampaignSession(Session):
         return with_columns(table, **columns)
 
     @property
-    def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
-        """The same: the catalogue's errors have been taken off, and what is left out at a place."""
-        found = self.discrepancy
-        return self.magnitude_errors if found is None else found.of_centroids(self.magnitude_errors)
-
-    @property
     def catalogue_stated(self) -> bool:
         """Whether the catalogue has errors of its own, or a row of the budget names it."""
         return self.inputs.catalog.sigma_u is not None or bool(super().catalogue_stated)
@@ -263,20 +286,7 @@ class CampaignSession(Session):
         """Whether the catalogue has errors of its motions, or a row of the budget names them."""
         return self.inputs.catalog.sigma_pm_u is not None or bool(super().motions_stated)
 
-    @property
-    def further_caveats(self) -> tuple[str, ...]:
-        """Deviations that go with time: no draw of the errors of a later exposure has that."""
-        return tuple(self.run.summary.get("deviations", {}).get("warnings", ()))
-
-    @property
-    def doubts(self) -> list[str]:
-        """What the stages found odd, and what the campaign cannot tell."""
-        found = self.run.summary
-        parts = ("matching", "deviations", "tables", "time_dependence")
-        own = [text for part in parts for text in found.get(part, {}).get("warnings", [])]
-        return [*own, *super().doubts]
-
-    @cached_property
-    def systematics(self) -> Systematics:
-        """The posterior with the errors of the catalogue, and what a new exposure adds."""
-        return systematics_of(self)
+    def kind_checks(self, found: Sequence[Check]) -> tuple[Check, ...]:
+        """Checks of matching, tables and series, and what the stages found odd."""
+        remarks = campaign_remarks(self.run.summary)
+        return (*remarks, *campaign_checks(self.run.summary, (*remarks, *found)))

@@ -7,9 +7,9 @@ from typing import TypeVar, cast
 from bayesdist.app.config import Config
 from bayesdist.app.holdout_config import HoldoutBlock
 from bayesdist.data.holdout import SetAside, exposures_drawn, split_matches
-from bayesdist.diagnose.holdout.validation import LEAST_HELD
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.shards import Matches
+from bayesdist.limits import HELD_OUT
 
 __all__ = ["set_aside"]
 
@@ -44,11 +44,11 @@ def set_aside(config: Config, matches: M, needed: int = 0) -> tuple[M, M | None,
         return matches, None, ()
     whole = _whole_exposures(block, config.sampler.seed, matches.exposure_names, needed)
     split = split_matches(matches, SetAside(block.fraction, whole, config.sampler.seed))
-    if len(split.held) < LEAST_HELD:
+    if not HELD_OUT.met_by(len(split.held)):
         raise InputError(
             f"{len(split.held)} of {len(matches)} stars are held out, which say too little",
             where=", ".join(matches.sources),
-            do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
+            do=f"hold out at least {HELD_OUT.value}: raise holdout.fraction",
         )
     return cast(M, split.kept), cast(M, split.held), whole
 

@@ -24,6 +24,7 @@ from bayesdist.infer.selfcal.information import (
 from bayesdist.infer.selfcal.moves import functionals
 from bayesdist.infer.selfcal.settled import curvatures
 from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.limits import GAUGE_CONTRADICTION
 from bayesdist.model import DistortionModel
 
 __all__ = ["CONVENTION", "Known", "fixed_by", "gauge_summary", "gauge_table", "gauge_words"]
@@ -32,7 +33,6 @@ Float = NDArray[np.float64]
 Piece = Callable[[Float], Information]
 
 CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference stars"
-CONTRADICTS = 1e-4  # probability of a chi-square at which a piece and the detections do not agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Known:
             measured = values > 1e-10 * values[-1]
             right = vectors[:, measured].T @ known.right
             square, n = float(np.sum(right**2 / values[measured])), int(measured.sum())
-            if chi2.sf(square, n) < CONTRADICTS:
+            if chi2.sf(square, n) < GAUGE_CONTRADICTION.value:
                 yield (
                     f"the {name} contradict the detections: chi-square {square:.4g} of {n}; an "
                     "error is too small, or a value is wrong"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bayesdist.app.discrepancy import RunDiscrepancy, kept_discrepancy
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.selfcal.config import SelfcalBlock
@@ -20,21 +19,13 @@ from bayesdist.app.selfcal.inputs import Inputs, selfcal_block
 from bayesdist.app.selfcal.matched import SelfcalMatched, load_matched_selfcal
 from bayesdist.app.selfcal.solved import SelfCalibrated
 from bayesdist.app.session import Session
-from bayesdist.assess import StarSample, UncertaintyMap, uncertainty_map
-from bayesdist.assess.maps import with_local
-from bayesdist.assess.solution import Solution as Assessed
-from bayesdist.data import MagnitudeErrors, MatchTable, ReferenceCatalog
+from bayesdist.checks import Check
+from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
-from bayesdist.diagnose import ScoreTest
-from bayesdist.diagnose.residuals.misfit import Misfit
-from bayesdist.diagnose.selfcal.misfit import dithered_misfit
-from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.infer import Matches
-from bayesdist.infer.discrepancy import Discrepancy
-from bayesdist.infer.selfcal import Gauge, Solution, gauge_free
-from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
-from bayesdist.infer.selfcal.following import taken_by_stars
-from bayesdist.infer.selfcal.relative import gauge_free_matrix
+from bayesdist.infer.selfcal import Gauge, Solution
+
+Float = NDArray[np.float64]
 
 __all__ = ["SelfcalSession"]
 
@@ -44,6 +35,7 @@ class SelfcalSession(Session):
     """What the stages share: detections, stars, the solution with its stars, its gauge."""
 
     things = "detections"
+    chooser = "limits of residuals"
 
     _given: Given | None = field(default=None, init=False, repr=False)
 
@@ -113,71 +105,34 @@ class SelfcalSession(Session):
         """Detections beside their stars, with their errors."""
         return self._solved.matches
 
-    @property
-    def centroid(self) -> MagnitudeErrors | None:  # type: ignore[override]
-        """The same, less the structure that residuals show."""
-        errors, found = self.magnitude_errors, self.discrepancy
-        return errors if found is None else found.of_centroids(errors)
+    contained = ()  # the errors of the centroids are those that the fit has found
 
-    def _sampled(self) -> StarSample:
-        sample, solution = super()._sampled(), self.solved
-        taken = np.zeros(len(self.detections))
-        taken[solution.problem.rows] = taken_by_stars(solution)
-        return replace(sample, taken=taken[sample.table.row])
+    def diagnosis(self) -> dict[str, Any]:
+        """The solution with its stars, which were fitted too."""
+        return {"eliminated": self.solved, "centroid": self.magnitude_errors}
 
-    @cached_property
-    def misfits(self) -> tuple[Misfit, ...]:  # type: ignore[override]
-        """Structure that the solution leaves, of all chips together: they share stars."""
-        return (dithered_misfit(self.solved),)
-
-    def estimate_discrepancy(self) -> Discrepancy:
-        """What the model may leave out, from the residuals with the stars eliminated."""
-        return selfcal_discrepancy(
-            self.solved, rng=self.rng("assess"), priors=self.config.discrepancy.priors()
-        )
-
-    @cached_property
-    def discrepancy(self) -> RunDiscrepancy | None:
-        """What the model may leave out; exposures overlap in part, and their frames follow it."""
-        found = kept_discrepancy(self)
-        return found and replace(found, frames=True)
-
-    def made_score_tests(self) -> tuple[ScoreTest, ...]:
-        """Targeted tests of the residuals for what the model lacks, with the stars eliminated."""
-        matches = self.raw_matches
-        return selfcal_score_tests(self.solved, mag=matches.mag, epoch=matches.epoch)
+    def error_options(self) -> dict[str, Any]:
+        """Exposures overlap in part, and their frames follow correlated errors."""
+        return super().error_options() | {"frames": True}
 
     catalogue_stated = None
     motions_stated = None
 
     @property
-    def relative(self) -> Assessed:
-        """The solution of relative positions, whatever the gauge."""
-        return gauge_free(self.solution, self.gauge.null)
-
-    def relative_map(self, **where: Any) -> UncertaintyMap:
-        """Uncertainty of relative positions over a chip, with what the model leaves out."""
-        found, local = self.discrepancy, None
-        if found is not None:
-            S = gauge_free_matrix(self.model, self.solution.mean, self.gauge.null)
-            relative = replace(found.moved(S), frames=False)  # of the detector alone
-            local = relative.structure_sigma(self._domain(**where))
-        return with_local(uncertainty_map(self.relative, **where), local)
+    def free_directions(self) -> Float:
+        """Directions (D, d) that the detections leave free."""
+        return self.gauge.null
 
     @property
     def gauge_words(self) -> str:
         """In which gauge the products stand."""
         return gauge_words(self.gauge, self.fixed, self.model)
 
-    @property
-    def doubts(self) -> list[str]:
+    def kind_checks(self, found: Sequence[Check]) -> tuple[Check, ...]:
         """What cannot be known, and what the match found odd."""
         warnings = self.run.summary.get("selfcal", {}).get("warnings", [])
         known = self.given.known_for(self.model).contradictions(self.solved.theta)
-        hidden = [
-            f"{100 * (1 - one.told):.0f} % of the structure that the model might leave is hidden: "
-            "places of stars take it up where dithers are small"
-            for one in self.misfits
-            if one.hidden
-        ]
-        return [*self.gauge.sentences, *known, *warnings, *hidden, *super().doubts]
+        return tuple(
+            Check("Gauge", level="warn", sentence=text)
+            for text in (*self.gauge.sentences, *known, *warnings)
+        )

@@ -9,9 +9,9 @@ import numpy as np
 from astropy.table import Table
 from astropy.units import Unit
 
+from bayesdist.app.checks import provenance_notes
 from bayesdist.app.selfcal.session import SelfcalSession
 from bayesdist.app.session import write_table
-from bayesdist.app.trust import labelled, trust
 from bayesdist.data.write import write_columns
 from bayesdist.infer.selfcal import StarCatalogue, star_catalogue
 
@@ -37,11 +37,11 @@ def write_stars(session: SelfcalSession) -> dict[str, Any]:
         For summary.json.
     """
     solution = session.solved
-    left_out = session.discrepancy
-    cov = None if left_out is None else left_out.found.covariance
+    correlated = session.diagnostics.correlated
+    cov = None if correlated is None else correlated.covariance
     found = star_catalogue(solution, cov)
     table = star_table(session, found)
-    table.meta |= trust(session) | labelled(session)
+    table.meta |= provenance_notes(session)
     write_table(table, session.run / "stars.ecsv")
     path = session.run / "stars.parquet"
     path.unlink(missing_ok=True)

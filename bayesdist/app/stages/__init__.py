@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from bayesdist.app.judging import budget_of, margins_of
+from bayesdist.app.judging import rehearse_evaluation
 from bayesdist.app.kinds.stars import fit_stars
 from bayesdist.app.made_files import made_files
 from bayesdist.app.periods import check_pairs
@@ -16,7 +16,8 @@ from bayesdist.app.stages.fit import run_fit
 from bayesdist.app.stages.report import run_report
 from bayesdist.app.stages.sample import run_sample
 from bayesdist.assess import star_sample
-from bayesdist.assess.terms.centroid import centroid_scatter
+from bayesdist.assess.terms.centroid import centroid_errors
+from bayesdist.diagnose.residuals.centroid import centroid_scatter
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit
 
@@ -75,9 +76,7 @@ def rehearse_solution(session: Session, fit: LinearFit) -> None:
     ------
     BayesdistError
     """
-    config = session.config
-    budget_of(session, fit, REHEARSAL_DRAWS)
-    margins_of(session, config.requirements(), fit, REHEARSAL_DRAWS)
+    rehearse_evaluation(session, fit, REHEARSAL_DRAWS)
     made_files(session, fit)
 
 
@@ -92,7 +91,9 @@ def _check_residuals(session: Session) -> None:
     held = session.config.held_in_residuals(fit.model.unit)
     if held:
         stars = star_sample(session.tested_matches, len(session.matches), fit)
-        centroid_scatter(stars, held, n_params=fit.model.n_params)
+        scatter = centroid_scatter(stars, n_params=fit.model.n_params)
+        if scatter is not None:
+            centroid_errors(scatter, held)
 
 
 def require(session: Session, stage: str, needs: tuple[str, ...]) -> None:

@@ -12,11 +12,10 @@ from bayesdist.app.sky_closure import sky_closure
 from bayesdist.assess.budget.budget import with_product
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.files import atomic_path
+from bayesdist.limits import FILE_ERROR
 from bayesdist.products.registry import lint
 
 __all__ = ["run_export"]
-
-NOTICED = 0.3  # of the total error: it makes that 4 % larger
 
 log = logging.getLogger("bayesdist")
 
@@ -59,7 +58,7 @@ def _compare(product: dict[str, Any], budget: Sequence[dict[str, Any]]) -> None:
         total = budget[-1]["radial"]
         if direction == "forward":
             product["total_rms"] = with_product(total, row["radial"])
-            if row["radial"] > NOTICED * total:
+            if row["radial"] > FILE_ERROR.value * total:
                 product["findings"].append(
                     f"warning: forward: differs from the solution by {row['radial']:.2g} rms over "
                     f"the detector, whose total error is {total:.2g}"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 
 from bayesdist.app.added_errors import grouping_sentence
+from bayesdist.app.checks import frames_doubt
 from bayesdist.app.kinds.stars import fit_stars
 from bayesdist.app.kinds.summary import fit_sections, log_fit
 from bayesdist.app.session import Session
-from bayesdist.app.trust import frames_doubt
+from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.diagnose.residuals.majority import majority_sentence
 
 __all__ = ["run_fit", "save_fitted"]
@@ -26,16 +27,17 @@ def run_fit(session: Session) -> None:
         log.info("fit: %s", note)
     for reason, count in matches.rejected.items():
         log.info("fit: %d rows were left out in reading: %s", count, reason)
-    shift = session.epoch_shift
+    shift = epoch_shift(session.sampled_matches, fit)
     if shift is not None and shift.significant:
         log.warning("fit: WARNING: %s", shift.sentence)
+    majority = majority_sentence(fit)
     if session.error_scale_sentence:
         log.warning("fit: WARNING: %s", session.error_scale_sentence)
-    if text := frames_doubt(session):
+    if text := frames_doubt(session, majority):
         log.warning("fit: WARNING: %s", text)
     if session.grouped_errors is not None:
         log.info("fit: %s", grouping_sentence(session.grouped_errors, fit.unit))
-    if majority := majority_sentence(fit):  # said before hours of sampling
+    if majority:  # said before hours of sampling
         log.warning("fit: WARNING: %s", majority)
 
 

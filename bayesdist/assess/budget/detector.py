@@ -111,5 +111,5 @@ def detector_budget(
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution, None if chips is None else chips[0])
     domain = EvaluationDomain.of_chips(solution.model, grid, chips=chips, epoch=epoch)
-    errors = error_model(solution, terms, aligned=aligned, pixel_scale=pixel_scale)
+    errors = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
     return errors.at(domain, n=n_draws, rng=rng)

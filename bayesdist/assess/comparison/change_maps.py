@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as fisher
 
-from bayesdist.assess.comparison.compare import SIGNIFICANT, Comparison, compare
+from bayesdist.assess.comparison.compare import Comparison, compare
 from bayesdist.assess.comparison.sentences import probability
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer.compare.change_date import ChangeDate
 from bayesdist.infer.compare.monitoring import Change
+from bayesdist.limits import DIFFERENCE
 from bayesdist.model.grid import DEFAULT_GRID
 
 __all__ = ["Monitored", "change_maps", "is_late"]
@@ -43,7 +44,7 @@ class Monitored:
     @property
     def scatters(self) -> bool:
         """Whether periods scatter more than their errors, so that these are not independent."""
-        return self.date is not None and self.date.p_scatter < SIGNIFICANT
+        return self.date is not None and self.date.p_scatter < DIFFERENCE.value
 
     @property
     def p_value(self) -> float:
@@ -78,7 +79,7 @@ class Monitored:
     @property
     def changed(self) -> bool:
         """Whether the release no longer describes the matches."""
-        return self.p_either < SIGNIFICANT
+        return self.p_either < DIFFERENCE.value
 
     @property
     def since_a_date(self) -> bool:
@@ -147,7 +148,7 @@ def is_late(change: Change, date: ChangeDate | None) -> bool:
     """Whether a change within the new matches is significant, and more so than the mean change."""
     if date is None or not np.isfinite(date.after):
         return False
-    return date.p_value < min(SIGNIFICANT / 2, change.test.p_value)
+    return date.p_value < min(DIFFERENCE.value / 2, change.test.p_value)
 
 
 def change_maps(

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from bayesdist.assess.comparison.frame import CommonFrame, Similarity, common_frame
 from bayesdist.calibration.chip_map import ChipMap, position_moments
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, known_terms
+from bayesdist.limits import DIFFERENCE
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
-__all__ = ["SIGNIFICANT", "Comparison", "compare", "term_sigmas"]
+__all__ = ["Comparison", "compare", "term_sigmas"]
 
 Float = NDArray[np.float64]
-
-SIGNIFICANT = 0.01  # probability under which a difference is called one
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +124,7 @@ class Comparison:
     @property
     def differs(self) -> bool | None:
         """Whether the difference is more than the errors; None where these are not known."""
-        return None if self.field is None else self.field.p_value < SIGNIFICANT
+        return None if self.field is None else self.field.p_value < DIFFERENCE.value
 
 
 def compare(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import norm
 
-from bayesdist.assess.comparison.compare import SIGNIFICANT, Comparison
+from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.comparison.gap import GapDifference
 from bayesdist.assess.comparison.tables import comparison_table
+from bayesdist.limits import DIFFERENCE
 
 __all__ = ["comparison_lines", "gap_lines", "gap_verdict", "probability", "verdict"]
 
@@ -168,7 +169,7 @@ def gap_verdict(gap: GapDifference) -> str:
     )
     if gap.errors_of != "both":
         test += f", on the errors of {gap.errors_of} alone"
-    if gap.test.p_value < SIGNIFICANT:
+    if gap.test.p_value < DIFFERENCE.value:
         return f"Chip {gap.chip} lies elsewhere {chips}, significantly: {size} ({test})."
     return f"Chip {gap.chip} lies alike {chips} within the errors: {size} ({test})."
 
@@ -211,7 +212,7 @@ def _why_untested(found: Comparison) -> str:
 
 
 def _share(p: float) -> str:
-    return f"p = {p:.2g}" + (" (significant)" if p < SIGNIFICANT else "")
+    return f"p = {p:.2g}" + (" (significant)" if p < DIFFERENCE.value else "")
 
 
 def _length(value: float, found: Comparison, pixel_mas: float | None) -> str:

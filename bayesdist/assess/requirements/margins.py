@@ -14,7 +14,6 @@ from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.remedy import Remedy, find_remedy
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import (
-    Caveat,
     counting_error,
     effective_draws,
     verdict_of,
@@ -22,11 +21,13 @@ from bayesdist.assess.requirements.verdict import (
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
+from bayesdist.checks import Check, doubts_of
 from bayesdist.errors import InputError
+from bayesdist.infer.checks import convergence_check
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 
-__all__ = ["Margin", "Requirement", "check_requirements", "domains_of"]
+__all__ = ["Margin", "Requirement", "check_requirements", "domains_of", "judge"]
 
 Float = NDArray[np.float64]
 
@@ -106,7 +107,7 @@ def check_requirements(
     n_draws: int = 2000,
     rng: np.random.Generator,
     pixel_scale: float | None = None,
-    caveats: Sequence[Caveat] = (),
+    checks: Sequence[Check] = (),
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws of the position error.
 
@@ -143,9 +144,9 @@ def check_requirements(
     rng : numpy.random.Generator
     pixel_scale : float, optional
         Size of one pixel in mas; `pixel_scale_of` the solution by default.
-    caveats : sequence of Caveat
-        Reasons why the errors may not be as stated, beside a posterior that is not converged: its
-        verdicts are all 'undecided'.
+    checks : sequence of Check
+        Reasons why the errors may not be as stated are among them, beside a posterior that is not
+        converged: its verdicts are all 'undecided'.
 
     Returns
     -------
@@ -159,16 +160,59 @@ def check_requirements(
         scale that is not known, an unknown chip, a bad grid, a region without points of the grid, a
         magnitude without errors by magnitude, or fewer than two draws.
     """
-    unit = solution.model.unit
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution, chip)
     for r in requirements:
-        convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
-    model = error_model(solution, terms, aligned=aligned, pixel_scale=pixel_scale)
+        convert(r.limit, r.unit, solution.model.unit, pixel_scale, where=r.where)
+    model = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
+    if not requirements:  # terms in units that need a scale are refused all the same
+        return ()
+    return judge(
+        model.drawn(n_draws, rng),
+        requirements,
+        grid=grid,
+        epoch=epoch,
+        chip=chip,
+        pixel_scale=pixel_scale,
+        checks=(*_convergence(solution), *checks),
+    )
+
+
+def judge(
+    errors: DrawnErrors,
+    requirements: Sequence[Requirement],
+    *,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chip: int | None = None,
+    pixel_scale: float | None = None,
+    checks: Sequence[Check] = (),
+) -> tuple[Margin, ...]:
+    """Judge requirements on draws that are there.
+
+    Parameters
+    ----------
+    errors : DrawnErrors
+    requirements, grid, epoch, chip, pixel_scale
+        As `check_requirements`.
+    checks : sequence of Check
+        That of convergence among them.
+
+    Returns
+    -------
+    tuple of Margin
+
+    Raises
+    ------
+    InputError
+        As `check_requirements`.
+    """
     if not requirements:
         return ()
-    cases = [domains_of(r, solution.model, grid, epoch=epoch, chip=chip) for r in requirements]
-    errors = model.drawn(n_draws, rng)
+    model, unit = errors.solution.model, errors.unit
+    for r in requirements:
+        convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
+    cases = [domains_of(r, model, grid, epoch=epoch, chip=chip) for r in requirements]
     wanted: dict[EvaluationDomain, set[str]] = {}
     for r, case in zip(requirements, cases, strict=True):
         for domain in case:
@@ -183,24 +227,21 @@ def check_requirements(
                 error.cause, where=f"{owner.where}, {error.where}", do=error.do
             ) from None
 
-    caveats = (*_not_converged(solution), *caveats)
-    n_effective = effective_draws(solution, n_draws)
+    doubts = doubts_of(checks)
+    n_effective = effective_draws(errors.solution, errors.n_draws)
+    varying = [t.rows[0].name for t in errors.terms if getattr(t, "varies", False)]
     margins = []
     for r, case in zip(requirements, cases, strict=True):
         factor = convert(1.0, unit, r.unit, pixel_scale)
         extremes = [
-            _margin(r, case, draws, way, factor, n_effective, caveats)
+            _margin(r, case, draws, way, factor, n_effective, doubts)
             for way, *draws in zip(
                 ways,
                 *([factor * one[r.statistic] for one in found[domain]] for domain in case),
                 strict=True,
             )
         ]
-        margins.append(
-            _of_extremes(
-                extremes, [t.rows[0].name for t in terms if getattr(t, "varies", False)], caveats
-            )
-        )
+        margins.append(_of_extremes(extremes, varying, doubts))
     return tuple(margins)
 
 
@@ -295,7 +336,7 @@ def _chips_of(
 
 
 def _of_extremes(
-    margins: Sequence[Margin], names: Sequence[str], caveats: Sequence[Caveat]
+    margins: Sequence[Margin], names: Sequence[str], doubts: Sequence[Check]
 ) -> Margin:
     """The less favourable margin, with a verdict that holds for all of them."""
     worse = min(margins, key=lambda m: m.probability_met)
@@ -308,18 +349,14 @@ def _of_extremes(
         f"field, or independent errors, P(met) is {worse.probability_met:.3g} to "
         f"{better.probability_met:.3g}"
     )
-    texts = [*(one.text for one in caveats), reason]
+    texts = [*(one.sentence for one in doubts), reason]
     return replace(worse, verdict="undecided", reason="; ".join(texts))
 
 
-def _not_converged(solution: Solution) -> tuple[Caveat, ...]:
-    """Why draws cannot be trusted, where they cannot."""
+def _convergence(solution: Solution) -> tuple[Check, ...]:
+    """Whether the draws can be relied on, of a solution that has draws of its own."""
     convergence = getattr(solution, "convergence", None)
-    if convergence is None or convergence.converged:
-        return ()
-    reasons = "; ".join(getattr(convergence, "reasons", ()))
-    text = "the posterior is not converged" + (f": {reasons}" if reasons else "")
-    return (Caveat(text, larger=False),)
+    return () if convergence is None else (convergence_check(convergence),)
 
 
 def _margin(
@@ -329,7 +366,7 @@ def _margin(
     errors: DrawnErrors,
     factor: float,
     n_effective: float,
-    caveats: Sequence[Caveat],
+    doubts: Sequence[Check],
 ) -> Margin:
     asked = requirement.probability
     draws = np.max(by_epoch, axis=0)
@@ -338,11 +375,11 @@ def _margin(
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
     # the empirical quantile without interpolation, so that its side of the limit agrees with `met`
     reached = np.quantile(draws, asked, method="inverted_cdf")
-    verdict, reason = verdict_of(met, n_effective, asked, caveats)
+    verdict, reason = verdict_of(met, n_effective, asked, doubts)
     axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""
     place = errors.worst(worst_epoch, axis)
     remedy = None
-    if verdict == "missed" and not caveats:
+    if verdict == "missed" and not doubts:
         remedy = find_remedy(errors, requirement, worst_epoch, factor)
     return Margin(
         requirement=requirement,

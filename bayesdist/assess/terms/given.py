@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.names import require_known
 from bayesdist.assess.terms.forms import (
     GIVEN,
     PUBLISHED,
@@ -25,6 +24,7 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.names import require_known
 
 __all__ = ["CENTROID", "TERM_KINDS", "Centroids", "SmoothTerm", "UserTerm", "said_by_user"]
 

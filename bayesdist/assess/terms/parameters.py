@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.names import require_known
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorDraws, Polynomials, Row, Together
 from bayesdist.errors import InputError
+from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.model import DistortionModel
+from bayesdist.names import require_known
 
 __all__ = [
     "CATALOGUE",
@@ -22,6 +23,7 @@ __all__ = [
     "CatalogueErrors",
     "ExposureVariation",
     "ScaleError",
+    "catalogue_terms",
 ]
 
 Float = NDArray[np.float64]
@@ -78,6 +80,34 @@ class CatalogueErrors:
         theta = np.tile(mean, (n, 1))
         theta[:, :D] += rng.standard_normal((n, D)) @ root.T
         return Polynomials(self.rows[0], self.model, mean, theta)
+
+
+def catalogue_terms(
+    solution: Solution, stars: StarCovariance, catalogue: str
+) -> tuple[CatalogueErrors, ...]:
+    """What the errors of the catalogue do: of its positions, and of its motions where it has some.
+
+    Parameters
+    ----------
+    solution : Solution
+        That takes them for independent.
+    stars : StarCovariance
+    catalogue : str
+        Name of the file that states the errors.
+
+    Returns
+    -------
+    tuple of CatalogueErrors
+    """
+    source = f"{GIVEN}: errors of {{}} in {catalogue}"
+    model, mean = solution.model, np.asarray(solution.mean, float)
+    moved = 0.0 if stars.motions is None else stars.motions
+    of_positions = source.format("positions")
+    positions = CatalogueErrors(model, mean, stars.total - moved, source=of_positions)
+    if stars.motions is None:
+        return (positions,)
+    of_motions = source.format("proper motions")
+    return positions, CatalogueErrors(model, mean, stars.motions, MOTIONS, of_motions)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.spread import scale_of, sum_tails
 from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
+from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
 __all__ = ["AXIS", "AxisCoverage", "HeldTest", "all_tests", "coverage_of"]
 
@@ -29,9 +30,6 @@ AXIS = "axis"  # a part: the stars along one axis
 LEAST_STARS = 20  # of a bin that is judged by itself
 STARS_PER_PIT_BIN = 20
 SINGULAR = 0.05  # of a variance: what is left where frames have taken up nearly all
-RATIO = 1.05  # of predicted errors: less does not matter, however significant
-DEPARTURE = 0.02  # of a distribution function
-EXCESS = 1.5  # of stars in the tails
 
 
 @dataclass(frozen=True)
@@ -89,10 +87,13 @@ class HeldTest:
     def matters(self) -> bool:
         """Whether errors would be larger than predicted, if it is no chance."""
         if self.name == "spread":
-            return self.value > RATIO
+            return not HELD_OUT_RATIO.met_by(self.value)
         if self.name == "distribution":
-            return self.wider and self.value > DEPARTURE
-        return self.name in ("offset", "deviation") or self.value > EXCESS * self.expected
+            return self.wider and not HELD_OUT_DISTRIBUTION.met_by(self.value)
+        return (
+            self.name in ("offset", "deviation")
+            or self.value > HELD_OUT_TAILS.value * self.expected
+        )
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,13 @@ from bayesdist.diagnose.significance import holm, p_words
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.shards import Matches
+from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
 
-__all__ = ["DOUBTFUL", "LEAST_HELD", "UNUSUAL", "HeldOutTruth", "held_out_truth"]
+__all__ = ["HeldOutTruth", "held_out_truth"]
 
 Float = NDArray[np.float64]
 
-LEAST_HELD = 50  # stars, without which nothing can be said
 SAMPLE = 200_000  # stars that say where bins end
-UNUSUAL, DOUBTFUL = 0.01, 1e-3  # probability, over all tests together
 ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what tells most
 
 
@@ -89,18 +88,18 @@ class HeldOutTruth:
         """'pass', 'warn' or 'fail'."""
         if self.doubtful:
             return "fail"
-        return "warn" if self.p_value < UNUSUAL else "pass"
+        return "warn" if not HELD_OUT_UNUSUAL.met_by(self.p_value) else "pass"
 
     @property
     def doubtful(self) -> bool:
         """Whether errors are larger than the solution says, beyond chance."""
-        return self._telling(DOUBTFUL) is not None
+        return self._telling(HELD_OUT_DOUBTFUL.value) is not None
 
     @property
     def verdict(self) -> str:
         """One clause."""
-        found = self._telling(DOUBTFUL)
-        if found is None and self.p_value < UNUSUAL:
+        found = self._telling(HELD_OUT_DOUBTFUL.value)
+        if found is None and not HELD_OUT_UNUSUAL.met_by(self.p_value):
             found = self.tests[0]
         if found is None:
             return f"held-out stars agree with the prediction (p = {self.p_value:.2g})"
@@ -180,11 +179,11 @@ def held_out_truth(
     partitions = partitions_of(predictive.model, held, held.sample(SAMPLE), whole)
     frames = frames_for(predictive, pieces, held.exposure_names)
     sums = held_sums(predictive, pieces, partitions, frames)
-    if sums.n < LEAST_HELD:
+    if not HELD_OUT.met_by(sums.n):
         raise InputError(
             f"{sums.n} held-out stars say too little of the solution",
             where=where,
-            do=f"hold out at least {LEAST_HELD}: raise holdout.fraction",
+            do=f"hold out at least {HELD_OUT.value}: raise holdout.fraction",
         )
     tests = [*all_tests(sums, predictive, partitions), *deviation_tests(predictive, frames)]
     corrected = holm(np.array([t.p_value for t in tests]))

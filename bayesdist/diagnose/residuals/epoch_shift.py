@@ -24,6 +24,7 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
 from bayesdist.infer.transforms import Solution
+from bayesdist.limits import EPOCH_SHIFT
 from bayesdist.model.basis import polynomial_terms
 
 __all__ = ["EpochShift", "epoch_shift"]
@@ -35,7 +36,6 @@ SAMPLE = 20_000  # detections that are looked at
 FEWEST = 30  # stars with motions
 FARTHEST = 60.0  # years that are scanned
 STEPS = 481  # of the scan, a quarter of a year each
-SIGNIFICANT = 5.0  # standard errors
 ROUNDS = 30
 # error of a motion over the scatter of motions, at most: larger ones are often quoted too small
 WELL_KNOWN = 0.2
@@ -135,7 +135,7 @@ def epoch_shift(table: MatchTable, solution: Solution) -> EpochShift | None:
     score = (weight * (left * P - dt * error**2)).sum(axis=0)
     sigma = float(np.sqrt(squares_over(star.ravel(), score)[0]) / information)
     after = _scatter(left[:, known])
-    found = abs(dt) > SIGNIFICANT * sigma and after < before
+    found = abs(dt) > EPOCH_SHIFT.value * sigma and after < before
     return EpochShift(dt, sigma, before, after, sample.model.unit, bool(found))
 
 

@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
 from bayesdist.diagnose.significance import p_words
+from bayesdist.limits import STRUCTURE, STRUCTURE_SEEN
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
 
@@ -33,8 +34,6 @@ Float = NDArray[np.float64]
 
 STARS_PER_BIN = 25
 MOST_BINS = 32  # along each side
-SEEN = 0.5  # of all patterns, below which that none is found says little
-SIGNIFICANT = 1e-4  # probability of as much structure by chance, over all tests together
 
 
 @dataclass(frozen=True)
@@ -69,12 +68,12 @@ class Misfit:
     @property
     def significant(self) -> bool:
         """Whether the structure is more than chance."""
-        return self.p_value < SIGNIFICANT
+        return not STRUCTURE.met_by(self.p_value)
 
     @property
     def hidden(self) -> bool:
         """Whether most structure would not have been seen."""
-        return self.told < SEEN
+        return not STRUCTURE_SEEN.met_by(self.told)
 
     @property
     def sentence(self) -> str:

@@ -12,11 +12,11 @@ from scipy.stats import chi2
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.stars import prepare
+from bayesdist.limits import QUOTED_ERRORS
 
 __all__ = ["error_scale", "error_scale_sentence"]
 
 FEW = 0.1  # of the matches
-FAR = 20.0  # times the quoted errors, beyond which jitter would be nearly all there is
 
 
 def error_scale(fit: LinearFit, table: MatchTable) -> float:
@@ -38,7 +38,7 @@ def error_scale(fit: LinearFit, table: MatchTable) -> float:
     r = stars.residuals(np.asarray(fit.mean))
     found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, FEW)
     factor = float(np.sqrt(found / chi2.ppf(FEW, 2)))
-    return factor if factor > FAR else 1.0
+    return 1.0 if QUOTED_ERRORS.met_by(factor) else factor
 
 
 def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude: bool) -> str:

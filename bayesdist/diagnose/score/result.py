@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from scipy import special, stats
 
 from bayesdist.diagnose.significance import holm, p_words
+from bayesdist.limits import SCORE_TESTS
 
-__all__ = ["FAMILY_LEVEL", "POWER", "Outcome", "ScoreTest", "corrected", "noncentrality"]
+__all__ = ["POWER", "Outcome", "ScoreTest", "corrected", "noncentrality"]
 
-FAMILY_LEVEL = 1e-3  # probability that any of a run's tests finds something where nothing is
 POWER = 0.9  # with which the smallest effect that is told would have been found
 
 
@@ -43,7 +43,7 @@ class ScoreTest:
     finding : str
         What it means, as a sentence.
     significant : bool
-        More than chance, corrected for the number of tests (Holm 1979, at `FAMILY_LEVEL`).
+        More than chance, corrected for the number of tests (Holm 1979, at `limits.SCORE_TESTS`).
     """
 
     name: str
@@ -121,10 +121,10 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
         In the same order.
     """
     n = len(outcomes)
-    significant = holm([one.p_value for one in outcomes]) <= FAMILY_LEVEL
+    significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
     # what is alone has to pass the first step
     return tuple(
-        one.judged(bool(found), FAMILY_LEVEL / n)
+        one.judged(bool(found), SCORE_TESTS.value / n)
         for one, found in zip(outcomes, significant, strict=True)
     )
 

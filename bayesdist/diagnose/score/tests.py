@@ -14,12 +14,13 @@ from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.pattern import pattern_test
 from bayesdist.diagnose.score.projection import projection_of
 from bayesdist.diagnose.score.regressors import EDGES, EDGES_BESIDE_ORDERS, functions_for
-from bayesdist.diagnose.score.result import FAMILY_LEVEL, Outcome, ScoreTest, corrected
+from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.diagnose.score.score import regressor_tests
 from bayesdist.diagnose.score.truncation import truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.transforms import Solution
+from bayesdist.limits import SCORE_TESTS
 
 __all__ = ["score_tests"]
 
@@ -69,13 +70,13 @@ def score_tests(
     exposures = exposure_test(projection)
     found = _edges_or_orders(regressor_tests(projection))
     found += [one for one in (gap_test(projection), motion_test(projection)) if one is not None]
-    if exposures is not None and exposures.p_value < FAMILY_LEVEL:
+    if exposures is not None and exposures.p_value < SCORE_TESTS.value:
         found = [_doubtful(one) if one.name in OF_TIME else one for one in found]
     orders = [one.p_value for one in found if one.name.startswith(ORDERS)]
     truncation = truncation_test(projection, match_radius)
     others = (exposures, pattern_test(projection), truncation)
     found += noise_tests(projection)
-    if min(orders, default=1.0) < FAMILY_LEVEL:
+    if min(orders, default=1.0) < SCORE_TESTS.value:
         found = [_after_orders(one) if one.name in OF_PLACE else one for one in found]
     return corrected([*found, *(one for one in others if one is not None)])
 

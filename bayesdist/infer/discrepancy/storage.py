@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from bayesdist.infer.discrepancy.linear import KINDS, LinearDeviations
 from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
 from bayesdist.model import DistortionModel
 
-__all__ = ["discrepancy_from_arrays", "discrepancy_to_arrays"]
+__all__ = ["as_stored", "discrepancy_from_arrays", "discrepancy_to_arrays"]
 
 
 def discrepancy_to_arrays(
@@ -78,3 +79,9 @@ def discrepancy_from_arrays(
         )
     mean, formal, noise = (arrays[k] for k in ("mean", "formal", "noise"))
     return Discrepancy(model, mean, formal, noise, structure, arrays["structure_theta"], linear)
+
+
+def as_stored(found: Discrepancy) -> Discrepancy:
+    """The discrepancy in the precision of files, so that it is the same before and after."""
+    arrays, facts = discrepancy_to_arrays(found)
+    return replace(discrepancy_from_arrays(found.model, arrays), facts=facts)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.convergence import (
-    LEAST_PER_WALKER,
     Convergence,
     Limits,
     diagnose,
@@ -34,7 +33,6 @@ from bayesdist.infer.sampler.ensembles import Ensembles, Whitening
 from bayesdist.infer.sampler.lookahead import pilot_page
 from bayesdist.infer.sampler.move_schedule import (
     EFFICIENT,
-    LONGEST_TAIL,
     Plan,
     Stretch,
     boundaries,
@@ -45,6 +43,7 @@ from bayesdist.infer.sampler.move_schedule import (
     plan_moves,
     walkers_for,
 )
+from bayesdist.limits import DRAWS_PER_WALKER, PARETO_K
 
 __all__ = ["Chains", "Settings", "run_chains"]
 
@@ -199,7 +198,7 @@ def _drawn_ahead(
             return None, quality, passes, stretch.end
         dropped = min(warmup, history.rows // 2)
         made = total * (history.rows - dropped)
-        trusted = quality.efficiency > EFFICIENT and quality.k < LONGEST_TAIL
+        trusted = quality.efficiency > EFFICIENT and quality.k < PARETO_K.value
         if (made < wanted or not trusted) and not last:
             continue
         verdict = _verdict(target, history, dropped, quality, s.limits)
@@ -249,7 +248,7 @@ def _state_dependent(
         if verdict.converged or last:
             break
         ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
-        if trial and ess < LEAST_PER_WALKER * total:
+        if trial and ess < DRAWS_PER_WALKER.value * total:
             return None, passes, stretch.end
         wanted = next_check(made, verdict, s.n_stars, total)
     return history.chains(warmup, verdict, passes), passes, history.end

@@ -42,7 +42,8 @@ from bayesdist.infer.convergence import importance_efficiency
 from bayesdist.infer.convergence import pareto_k as tail_shape
 from bayesdist.infer.density.proposal import Random
 from bayesdist.infer.posterior.certificate import Certificate
-from bayesdist.infer.sampler.move_schedule import EFFICIENT, LONGEST_TAIL
+from bayesdist.infer.sampler.move_schedule import EFFICIENT
+from bayesdist.limits import PARETO_K
 
 __all__ = ["Surrogate", "certify", "draw_surrogate"]
 
@@ -279,8 +280,8 @@ def _judge(
         reasons.append(f"{n} pilots held out are fewer than {LEAST_HELD_OUT}")
     if n_outside:
         reasons.append(f"{n_outside} pilots lie where the posterior is zero")
-    if not pareto_k < LONGEST_TAIL:
-        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {LONGEST_TAIL}")
+    if not pareto_k < PARETO_K.value:
+        reasons.append(f"Pareto k {pareto_k:.3f} of the proposal is not below {PARETO_K.value}")
     if not efficiency > EFFICIENT:
         reasons.append(f"efficiency {efficiency:.3f} of the proposal is not above {EFFICIENT}")
     if not sd <= MOST_REMAINDER:

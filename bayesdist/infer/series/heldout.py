@@ -19,6 +19,7 @@ from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
 from bayesdist.infer.series.small import cholesky, solve_factor
 from bayesdist.infer.series.walk import log_mixture
+from bayesdist.limits import PARETO_K
 
 __all__ = ["LOTS", "HeldOut", "block_folds", "exposure_folds", "held_out"]
 
@@ -28,7 +29,6 @@ Int = NDArray[np.int64]
 CHAINS, WARMUP, SWEEPS = 6, 30, 60
 CHAINS_AT_ONCE = 192
 DRAWS_AT_ONCE = 1024
-WORST_PARETO_K = 0.7
 LOTS = 30
 
 
@@ -132,7 +132,7 @@ def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut
     for code in np.unique(fold):
         rows = fold == code
         weight, pareto_k = smoothed_weights(-density[:, rows].sum(axis=1), independent)
-        if pareto_k > WORST_PARETO_K:
+        if pareto_k > PARETO_K.value:
             refitted.append(code)
             continue
         top = density[:, rows].max(axis=0)

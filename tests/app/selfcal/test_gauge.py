@@ -63,13 +63,13 @@ def test_scale_and_rotation_from_offsets(truth, offsets):
 
 def test_offsets_that_contradict_the_detections_are_told(truth, offsets, tmp_path):
     session, table = offsets
-    assert not any("contradict" in text for text in session.doubts)
+    assert not any("contradict" in one.sentence for one in session.kind_checks(()))
     wrong = table.copy()
     wrong["du"][3] += 8 * SIGMA
     config = write_selfcal(tmp_path, list_table(truth), gauge={"offsets": "offsets.ecsv"})
     wrong.write(config.parent / "offsets.ecsv")
-    doubts = fitted(tmp_path / "run", config).doubts
-    assert any("commanded offsets contradict" in text for text in doubts)
+    checks = fitted(tmp_path / "run", config).kind_checks(())
+    assert any("commanded offsets contradict" in one.sentence for one in checks)
 
 
 def test_an_exposure_whose_offset_stands_twice(truth, offsets, tmp_path):

@@ -120,7 +120,7 @@ def _residuals(path: Path) -> tuple[Mapping[int, BinnedResiduals], str]:
     try:
         with closing(session_of(RunDirectory.open(home))) as session:
             chips = session.fit.model.chips
-            sums = zip(chips, session.shown_sums, strict=True)
+            sums = zip(chips, session.diagnostics.shown, strict=True)
             return {chip.number: one.residuals() for chip, one in sums}, ""
     except InputError as error:  # matches that were moved away: all else can be shown without them
         return {}, f"; no residuals: {error}"

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.assess.wise.rows import StatisticsRow
-from bayesdist.assess.wise.tables import StatisticsTable
+from bayesdist.diagnose.statistics.rows import StatisticsRow
+from bayesdist.diagnose.statistics.tables import StatisticsTable
 from bayesdist.missions.wise.assess.contradictions import (
     contradictions_across,
     contradictions_within,

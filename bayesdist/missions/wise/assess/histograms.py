@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.wise.bands import BandBins, band_bins
+from bayesdist.diagnose.statistics.bands import BandBins, band_bins
 from bayesdist.infer.linear import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.missions.wise.assess.distortion_field import DistortionField

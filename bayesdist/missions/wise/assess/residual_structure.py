@@ -17,6 +17,7 @@ from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.limits import STRUCTURE
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field, scaled
 from bayesdist.model.basis import polynomial_terms
 
@@ -26,7 +27,6 @@ Float = NDArray[np.float64]
 Base = tuple[Float, Float]
 
 PARTITIONS = tuple(range(2, 13))
-SIGNIFICANT = 1e-4  # as that of a misfit
 DRAWS = 999
 # log likelihood that blocks must gain over a polynomial of as many terms: odds of 1000 to 1
 _EDGES = float(np.log(1000.0))
@@ -67,7 +67,7 @@ class ResidualPartition:
     @property
     def significant(self) -> bool:
         """Whether there is more than chance."""
-        return self.p_value < SIGNIFICANT
+        return not STRUCTURE.met_by(self.p_value)
 
     @property
     def edges_seen(self) -> bool:

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
+from bayesdist.numbers import size_of
 from bayesdist.report.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
 from bayesdist.report.fields import Grid, scalar_map
-from bayesdist.report.numbers import size_of
 from bayesdist.report.panels import ArrayPanels
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import nice_below

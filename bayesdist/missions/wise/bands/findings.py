@@ -9,7 +9,7 @@ import numpy as np
 from bayesdist.missions.wise.assess.account import LONGEST_DIFFERENCES
 from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput
 from bayesdist.missions.wise.bands.curves import CASES, chance_of
-from bayesdist.report.numbers import MISSING, count, number, percent, probability, size_of
+from bayesdist.numbers import MISSING, count, number, percent, probability, size_of
 from bayesdist.report.texttable import TextTable, listing
 
 __all__ = [

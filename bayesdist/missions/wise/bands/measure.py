@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.assess.wise import (
+from bayesdist.diagnose.statistics import (
     BandBins,
     StatisticsTable,
     band_to_band_table,

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bayesdist.assess.wise import STATISTICS
+from bayesdist.diagnose.statistics import STATISTICS
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.published import PrintedRow
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
-from bayesdist.report.numbers import MISSING, number, rounded
+from bayesdist.numbers import MISSING, number, rounded
 from bayesdist.report.texttable import TextTable
 
 __all__ = ["account_table", "as_printed", "contradiction_table", "statistics_table", "tables_of"]

@@ -11,10 +11,10 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.patches import Rectangle
 from scipy.stats import binom
 
-from bayesdist.diagnose.holdout.validation import DOUBTFUL, HeldOutTruth
+from bayesdist.diagnose.holdout.validation import HeldOutTruth
+from bayesdist.numbers import count, number
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import Check, ReportInput
-from bayesdist.report.numbers import count, number, probability
+from bayesdist.report.context import ReportInput
 from bayesdist.report.panels import chip_axes
 from bayesdist.report.registry import Plot
 from bayesdist.report.style import CYCLE, INK, WIDTH, figure_style, new_figure
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "holdout",
-    "holdout_checks",
     "holdout_coverage",
     "holdout_table",
 ]
@@ -35,20 +34,6 @@ _LEAST_RANGE = 0.3  # of the factor on the errors, above 1: chance alone must no
 _FEWEST = 20  # stars of a region that is coloured
 _MOST_TESTS = 12
 _KEY = 3.0  # length of the arrow in the key, in sigma
-
-
-def holdout_checks(found: HeldOutTruth | None) -> tuple[Check, ...]:
-    """Status rows of the verdict of the held-out stars; none where there are none."""
-    if found is None:
-        return ()
-    return (
-        Check(
-            f"Held-out stars ({count(found.n)})",
-            f"{found.verdict}" if found.level != "pass" else f"agree, {probability(found.p_value)}",
-            f"p at least {number(DOUBTFUL, 1)}",
-            found.level,
-        ),
-    )
 
 
 def _with_coverage(r: ReportInput) -> bool:

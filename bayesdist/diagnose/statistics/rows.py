@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.wise.pairs import pair_statistics
+from bayesdist.diagnose.statistics.pairs import pair_statistics
 from bayesdist.errors import DegenerateError
 
 __all__ = ["STATISTICS", "BinValues", "StatisticsRow", "bin_row", "pair_row"]

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from bayesdist.app.campaign.inputs import known_calibration
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import MatchTable
 from bayesdist.diagnose.alignment import Alignment, alignment_residuals
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
-from bayesdist.infer.transforms import without_frames
-from bayesdist.model import corrected
-from bayesdist.report.campaign import OverlapTest
+from bayesdist.infer.transforms import Solution, without_frames
+from bayesdist.model import LookupTable, corrected
 
-__all__ = ["chosen_exposures", "overlap_test"]
+__all__ = ["OverlapTest", "chosen_exposures", "overlap_test"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -27,44 +28,103 @@ IN_CELL = 12  # stars in a cell, on average
 MOST_CELLS = 24  # along an axis
 
 
-def overlap_test(session: CampaignSession) -> OverlapTest | None:
+@dataclass(frozen=True, eq=False)
+class OverlapTest:
+    """Two exposures of the run laid on each other, through the old files and the new ones.
+
+    Parameters
+    ----------
+    names : tuple of str
+    epochs : tuple of float
+    pa_v3 : tuple of float
+        NaN where it is not known.
+    old, new : Alignment
+        Of the same stars: through the known distortion of the start, and through the solution.
+    binned_old, binned_new : BinnedResiduals
+        Over the area that both exposures see; axes (xi, eta), pixels.
+    corner : tuple of float
+        (xi, eta) of the area's corner, which the cells count from, pixels.
+    pixel_mas : float
+    with_motions : bool
+        Whether the catalogue's proper motions between the two epochs were taken out.
+    """
+
+    names: tuple[str, str]
+    epochs: tuple[float, float]
+    pa_v3: tuple[float, float]
+    old: Alignment
+    new: Alignment
+    binned_old: BinnedResiduals
+    binned_new: BinnedResiduals
+    corner: tuple[float, float]
+    pixel_mas: float
+    with_motions: bool
+
+    @property
+    def n_stars(self) -> int:
+        """Stars that both exposures have."""
+        return len(self.new.residual)
+
+
+def overlap_test(
+    pairs: MatchTable,
+    solution: Solution,
+    known: Calibration,
+    tables: Sequence[LookupTable] = (),
+    *,
+    unit_arcsec: float,
+    pixel: float,
+    rolls: Mapping[str, float | None],
+) -> OverlapTest | None:
     """Lay the two exposures that are farthest apart in time on each other.
 
     Parameters
     ----------
-    session : CampaignSession
+    pairs : MatchTable
+        Raw pixels beside positions of the catalogue.
+    solution : Solution
+    known : Calibration
+        The known distortion of the start.
+    tables : sequence of LookupTable
+        That go with the solution.
+    unit_arcsec : float
+        Size of the unit of u and v.
+    pixel : float
+        Size of a pixel, arcsec.
+    rolls : mapping of str to float
+        PA_V3 of the exposures, where it is known.
 
     Returns
     -------
     OverlapTest or None
         None where no two exposures share enough stars.
     """
-    pairs = session.pairs
     chosen = chosen_exposures(pairs)
     if chosen is None:
         return None
     shared = _shared(pairs, *chosen)
     epochs = tuple(_epoch(pairs, rows) for rows in shared)
     planes = [
-        (_known_plane(session, pairs, rows, epoch), _solved_plane(session, pairs, rows, epoch))
+        (
+            _known_plane(known, pairs, rows, epoch),
+            _solved_plane(solution, tables, pairs, rows, epoch) * unit_arcsec,
+        )
         for rows, epoch in zip(shared, epochs, strict=True)
     ]
     motion = np.column_stack(
         [column[shared[1]] - column[shared[0]] for column in (pairs.u, pairs.v)]
     )
-    pixel = session.scale_arcsec or 0.05
     old, new = (
         _aligned(a, _at_first_epoch(b, pairs, shared[1], motion), pixel)
         for a, b in zip(*planes, strict=True)
     )
     corner, binned_old, binned_new = _binned(old, new)
-    log = session.inputs.log
     names = tuple(pairs.exposure_names[code] for code in chosen)
-    rolls = tuple(np.nan if (r := log[name].pa_v3) is None else r for name in names)
+    pa_v3 = tuple(np.nan if (r := rolls[name]) is None else r for name in names)
     return OverlapTest(
         names=(names[0], names[1]),
         epochs=(epochs[0], epochs[1]),
-        pa_v3=(float(rolls[0]), float(rolls[1])),
+        pa_v3=(float(pa_v3[0]), float(pa_v3[1])),
         old=old,
         new=new,
         binned_old=binned_old,
@@ -122,9 +182,8 @@ def _numbers(pairs: MatchTable, rows: Int) -> Int:
     return np.asarray(pairs.chip_numbers)[pairs.chip[rows]]
 
 
-def _known_plane(session: CampaignSession, pairs: MatchTable, rows: Int, epoch: float) -> Float:
+def _known_plane(known: Calibration, pairs: MatchTable, rows: Int, epoch: float) -> Float:
     """Positions (N, 2) through the known distortion, its drift included; arcseconds."""
-    known = known_calibration(session.base / session.block.start, session.block.filter)
     then = None if known.no_date else epoch
     chips = _numbers(pairs, rows)
     out = np.empty((len(rows), 2))
@@ -135,17 +194,19 @@ def _known_plane(session: CampaignSession, pairs: MatchTable, rows: Int, epoch: 
     return out
 
 
-def _solved_plane(session: CampaignSession, pairs: MatchTable, rows: Int, epoch: float) -> Float:
-    """Positions (N, 2) through tables, polynomial and drift of this run; arcseconds.
+def _solved_plane(
+    solution: Solution, tables: Sequence[LookupTable], pairs: MatchTable, rows: Int, epoch: float
+) -> Float:
+    """Positions (N, 2) through tables, polynomial and drift of a solution, in its unit.
 
     Without what is fitted for the single exposure: no file holds that.
     """
     chips = _numbers(pairs, rows)
     filters = np.asarray(pairs.filter_names)[pairs.filter[rows]]
-    x, y = corrected(session.tables, pairs.x[rows], pairs.y[rows], chip=chips, filter=filters)
-    view = without_frames(session.posterior)
+    x, y = corrected(tables, pairs.x[rows], pairs.y[rows], chip=chips, filter=filters)
+    view = without_frames(solution)
     then = None if view.model.time is None else epoch
-    return view.model.predict(view.mean, x, y, chip=chips, epoch=then) * session.unit_arcsec
+    return np.asarray(view.model.predict(view.mean, x, y, chip=chips, epoch=then))
 
 
 def _at_first_epoch(plane: Float, pairs: MatchTable, rows: Int, motion: Float) -> Float:

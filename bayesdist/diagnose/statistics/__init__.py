@@ -1,15 +1,21 @@
 """Residual tables of the WISE report (WSDC D-T033, section 5 and Appendix C)."""
 
-from bayesdist.assess.wise.bands import (
+from bayesdist.diagnose.statistics.bands import (
     BAND_AXES,
     WISE_ARCSEC,
     BandBins,
     band_bins,
 )
-from bayesdist.assess.wise.changes import PatternChange, pattern_changes
-from bayesdist.assess.wise.pairs import pair_statistics
-from bayesdist.assess.wise.rows import STATISTICS, BinValues, StatisticsRow, bin_row, pair_row
-from bayesdist.assess.wise.tables import (
+from bayesdist.diagnose.statistics.changes import PatternChange, pattern_changes
+from bayesdist.diagnose.statistics.pairs import pair_statistics
+from bayesdist.diagnose.statistics.rows import (
+    STATISTICS,
+    BinValues,
+    StatisticsRow,
+    bin_row,
+    pair_row,
+)
+from bayesdist.diagnose.statistics.tables import (
     StatisticsTable,
     band_to_band_table,
     fitting_table,

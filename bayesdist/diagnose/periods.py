@@ -13,7 +13,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.wise import (
+from bayesdist.data import MatchTable
+from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
+from bayesdist.diagnose.statistics import (
     BandBins,
     PatternChange,
     StatisticsTable,
@@ -21,12 +23,10 @@ from bayesdist.assess.wise import (
     pattern_changes,
     period_table,
 )
-from bayesdist.data import MatchTable
-from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit, Matches
 from bayesdist.infer.compare.period_dates import sum_by_period
-from bayesdist.infer.compare.period_verdict import SIGNIFICANT, all_below, period_verdict
+from bayesdist.infer.compare.period_verdict import all_below, period_verdict
 from bayesdist.infer.compare.periods import (
     PeriodComparison,
     PeriodSums,
@@ -35,13 +35,46 @@ from bayesdist.infer.compare.periods import (
 )
 from bayesdist.infer.compare.positions import PositionChange
 from bayesdist.infer.stars.stars import prepare
+from bayesdist.limits import DIFFERENCE
 
-__all__ = ["PeriodPart", "TimeVariation", "bins_for", "period_part", "time_variation"]
+__all__ = [
+    "PeriodPart",
+    "PeriodSettings",
+    "TimeVariation",
+    "bins_for",
+    "period_part",
+    "time_variation",
+]
 
 Int = NDArray[np.int64]
 
 MOST_BINS = 45  # along each side, as in Appendix C
 COMBINED = "combined"
+
+
+@dataclass(frozen=True)
+class PeriodSettings:
+    """Which periods are compared, and how.
+
+    Parameters
+    ----------
+    spans : mapping of str to tuple of float
+        Begin and end of each period, decimal years, as `sum_by_period`.
+    bins : int
+        On each axis, for the residuals.
+    radial_weight : float
+        As the fit's.
+    tolerance : float or None
+        Difference of positions that does not matter, in the unit of u, v.
+    unit_arcsec : float or None
+        The unit of u, v in arcsec.
+    """
+
+    spans: Mapping[str, tuple[float, float]]
+    bins: int
+    radial_weight: float = 1.0
+    tolerance: float | None = None
+    unit_arcsec: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +149,7 @@ class TimeVariation:
     @property
     def significant(self) -> bool:
         """Whether one model of all periods is refuted."""
-        return self.comparison.homogeneity[2] < SIGNIFICANT
+        return self.comparison.homogeneity[2] < DIFFERENCE.value
 
     @property
     def matters(self) -> bool:
@@ -135,7 +168,7 @@ class TimeVariation:
         found = [one for chip in self.patterns for one in chip]
         least = min(found, key=lambda one: one.p_value)
         p = min(1.0, len(found) * least.p_value)
-        if p >= SIGNIFICANT:
+        if p >= DIFFERENCE.value:
             return (
                 "The pattern of the residuals about one model is the same in all periods "
                 f"(least of {len(found)} probabilities, times their number: {p:.2g})."
@@ -206,13 +239,9 @@ def period_part(
 def time_variation(
     fit: LinearFit,
     matches: Matches,
-    periods: Mapping[str, tuple[float, float]],
+    settings: PeriodSettings,
     *,
     rng: np.random.Generator,
-    bins: int,
-    radial_weight: float = 1.0,
-    tolerance: float | None = None,
-    unit_arcsec: float | None = None,
 ) -> TimeVariation:
     """Compare periods: one pass over the data.
 
@@ -222,17 +251,8 @@ def time_variation(
         Of all data, without frames and time dependence.
     matches : MatchTable or PartitionedMatches
         With errors and epochs.
-    periods : mapping of str to tuple of float
-        As `sum_by_period`.
+    settings : PeriodSettings
     rng : numpy.random.Generator
-    bins : int
-        On each axis, for the residuals.
-    radial_weight : float
-        As the fit's.
-    tolerance : float, optional
-        Difference of positions that does not matter, in the unit of u, v.
-    unit_arcsec : float, optional
-        The unit of u, v in arcsec.
 
     Returns
     -------
@@ -245,7 +265,8 @@ def time_variation(
     DegenerateError
         For a period with too few pairs.
     """
-    task = partial(period_part, fit=fit, bins=bins, radial_weight=radial_weight)
+    periods, unit_arcsec = settings.spans, settings.unit_arcsec
+    task = partial(period_part, fit=fit, bins=settings.bins, radial_weight=settings.radial_weight)
     parts: dict[str, PeriodPart] = sum_by_period(matches, periods, task)
     comparison = compare_periods(fit, {name: part.sums for name, part in parts.items()})
     first = min(periods, key=lambda name: periods[name])
@@ -275,7 +296,7 @@ def time_variation(
         ends=comparison.positions(last, first, rng=rng),
         residuals=residuals,
         patterns=patterns,
-        tolerance=tolerance,
+        tolerance=settings.tolerance,
         n_outside=len(matches) - sum(part.n_rows for part in parts.values()),
         n_repeated=int((seen > 1).sum()),
     )

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from bayesdist.assess.wise.bands import BAND_AXES, BandBins
-from bayesdist.assess.wise.rows import BinValues
+from bayesdist.diagnose.statistics.bands import BAND_AXES, BandBins
+from bayesdist.diagnose.statistics.rows import BinValues
 from bayesdist.errors import DegenerateError, InputError
 
 __all__ = ["PatternChange", "pattern_changes"]

@@ -12,20 +12,16 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
-from bayesdist.assess.requirements.regions import in_region
-from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.diagnose.residuals.binned import BinnedSums
+from bayesdist.limits import UNCOVERED, UNCOVERED_BY_CHANCE
 from bayesdist.model import Chip
-from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.model.grid import mesh
 
 __all__ = ["Coverage", "coverage_of"]
 
 Float = NDArray[np.float64]
 
-LEAST_GAP = 0.05  # of the area: what may be missing at the edges of any detector
-BY_CHANCE = 3.0  # times the expected gap of evenly scattered stars
 SPARSE = 0.02  # of the density where stars usually are: strays, not coverage
-NEAR = 0.03  # of the chip's longer side: a grid reaches this far beyond the outermost stars
 _FINE = (65, 65)
 
 
@@ -55,7 +51,7 @@ class Coverage:
     @property
     def significant(self) -> bool:
         """Whether so much is missing that the corners or edges are extrapolated."""
-        return self.gap > max(LEAST_GAP, BY_CHANCE * self.by_chance)
+        return self.gap > max(UNCOVERED.value, UNCOVERED_BY_CHANCE.value * self.by_chance)
 
     @property
     def sentence(self) -> str:
@@ -82,27 +78,6 @@ class Coverage:
     def beyond(self, x: Float, y: Float) -> Float:
         """Distance (N,) of pixels beyond the area; negative inside."""
         return np.asarray((self.sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0))
-
-    def misses(self, requirement: Requirement, grid: tuple[int, int]) -> bool:
-        """Whether a requirement is judged where there are no stars.
-
-        Parameters
-        ----------
-        requirement : Requirement
-        grid : tuple of int
-            Points on x and y.
-
-        Returns
-        -------
-        bool
-            Only where the gap is significant.
-        """
-        if not self.significant or requirement.chip not in (None, self.chip.number):
-            return False
-        x, y = mesh(*grid_pixels(self.chip.size, grid))
-        judged = in_region(requirement.region, self.chip.size, x, y)
-        far = self.beyond(x, y) > NEAR * max(self.chip.size)
-        return bool((judged & far).any())
 
 
 def coverage_of(sums: BinnedSums, corners: Float, chip: Chip, *, several: bool = False) -> Coverage:

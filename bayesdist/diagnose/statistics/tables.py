@@ -9,8 +9,14 @@ from itertools import combinations, product
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.assess.wise.bands import BAND_AXES, WISE_ARCSEC, BandBins
-from bayesdist.assess.wise.rows import STATISTICS, BinValues, StatisticsRow, bin_row, pair_row
+from bayesdist.diagnose.statistics.bands import BAND_AXES, WISE_ARCSEC, BandBins
+from bayesdist.diagnose.statistics.rows import (
+    STATISTICS,
+    BinValues,
+    StatisticsRow,
+    bin_row,
+    pair_row,
+)
 from bayesdist.errors import InputError
 
 __all__ = [

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.assess.names import require_known
-from bayesdist.assess.wise.rows import BinValues
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
+from bayesdist.diagnose.statistics.rows import BinValues
+from bayesdist.names import require_known
 
 __all__ = ["BAND_AXES", "WISE_ARCSEC", "BandBins", "band_bins"]
 

@@ -1,0 +1,118 @@
+"""A solution whose draws are spread by errors that its likelihood does not know of."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer import LinearFit, Posterior
+from bayesdist.infer.catalogue.star_errors import StarCovariance
+from bayesdist.infer.discrepancy import Discrepancy
+from bayesdist.infer.equations.scaled import scaled_cholesky
+from bayesdist.infer.posterior.recoloured import with_spread
+
+__all__ = ["covariance_of", "with_correlated_errors", "with_noise", "with_shared_stars"]
+
+Float = NDArray[np.float64]
+
+
+def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovariance) -> Posterior:
+    """A posterior whose draws are spread by what the errors of the catalogue add.
+
+    The linear map that turns the covariance of the fit into the larger one is applied to the
+    deviations of the draws, so that they keep their shape: no noise could be added, as errors that
+    the fit takes for independent may cancel.  Where the posterior is as much wider than the fit as
+    its jitter says, so is the covariance that the map begins with.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    fit : LinearFit
+        That `stars` was computed for.
+    stars : StarCovariance
+
+    Returns
+    -------
+    Posterior
+        With other draws of theta and the same mean; all else is as it was.
+    """
+    before = covariance_of(posterior, fit)
+    return with_spread(posterior, before, before + stars.extra)
+
+
+def covariance_of(
+    posterior: Posterior, fit: LinearFit, stars: StarCovariance | None = None
+) -> Float:
+    """Covariance of a posterior without the noise of its draws, and with a catalogue's errors.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    fit : LinearFit
+    stars : StarCovariance, optional
+
+    Returns
+    -------
+    ndarray, shape (D, D)
+    """
+    formal = np.asarray(fit.cov, float)
+    wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
+    return wider * formal if stars is None else wider * formal + stars.extra
+
+
+def with_noise(
+    posterior: Posterior, correlated: Discrepancy, before: Float | None = None
+) -> Posterior:
+    """A posterior whose draws are spread by the errors of the stars as they scatter.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    correlated : Discrepancy
+    before : ndarray, shape (D, D), optional
+        Its covariance where that is not the formal one, as in a hierarchy of exposures.
+
+    Returns
+    -------
+    Posterior
+    """
+    return _widened(posterior, correlated, correlated.noise, before)
+
+
+def with_correlated_errors(
+    posterior: Posterior, correlated: Discrepancy, before: Float | None = None
+) -> Posterior:
+    """A posterior whose draws are spread by all that is known of errors of its parameters.
+
+    Parameters
+    ----------
+    posterior, correlated, before
+        As `with_noise`.
+
+    Returns
+    -------
+    Posterior
+    """
+    return _widened(posterior, correlated, correlated.covariance, before)
+
+
+def _widened(
+    posterior: Posterior, correlated: Discrepancy, cov: Float, before: Float | None
+) -> Posterior:
+    formal = correlated.formal
+    if before is None:
+        return with_spread(posterior, formal, cov)
+    # frames follow as they are correlated with polynomials and drift
+    D = correlated.model.n_distortion
+    follow = np.linalg.solve(before[:D, :D], before[:D]).T
+    more = follow @ (cov - formal)[:D, :D] @ follow.T
+    return with_spread(posterior, before, before + _least(before, (more + more.T) / 2))
+
+
+def _least(before: Float, more: Float) -> Float:
+    """What is added to a covariance, so that no direction loses more than half its variance."""
+    root = scaled_cholesky(before)
+    white = np.linalg.solve(root, np.linalg.solve(root, more).T)
+    values, vectors = np.linalg.eigh((white + white.T) / 2)
+    turned = root @ vectors
+    return np.asarray((turned * np.maximum(values, -0.5)) @ turned.T)

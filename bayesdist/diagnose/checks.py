@@ -1,0 +1,124 @@
+"""Checks of what residuals and held-out stars say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from bayesdist.checks import LARGER, Check
+from bayesdist.diagnose.holdout.validation import HeldOutTruth
+from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
+from bayesdist.diagnose.score.result import ScoreTest
+from bayesdist.infer.discrepancy import Discrepancy
+from bayesdist.infer.discrepancy.linear import CURVATURE
+from bayesdist.limits import HELD_OUT_DOUBTFUL, STRUCTURE, STRUCTURE_IN_BUDGET
+from bayesdist.numbers import count, number, percent, probability, size_of
+
+__all__ = ["SCORE_TESTS", "holdout_checks", "score_checks", "structure_checks"]
+
+FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
+
+# tests whose findings correlated errors hold, by their kind
+OF_STRUCTURE = ("order ",)
+OF_NOISE = ("noise by ",)
+OF_EXPOSURES, OF_CURVATURE = "exposures", "curvature in time"
+
+
+def structure_checks(
+    misfits: Sequence[Misfit], correlated: Discrepancy | None = None, *, fit: str = "the fit"
+) -> Iterator[Check]:
+    """Whether a fit leaves structure in the residuals, and whether it could have been seen.
+
+    Parameters
+    ----------
+    misfits : sequence of Misfit
+        One for each chip; nothing is checked where there is none.
+    correlated : Discrepancy, optional
+        Correlated errors of the solution, which hold some of it.
+    fit : str
+        Which fit, in words.
+    """
+    if not misfits:
+        return
+    one = worst_misfit(misfits)
+    chip = "" if one.chip is None else f" of {one.chip.name}"
+    size = size_of(one.structure, one.unit, 2)
+    found = f"{size} rms in {one.partition}{chip}" if one.structure > 0 else "none"
+    if one.told < 1:
+        found += f" ({percent(one.told, 2)} of all patterns can be told from places of stars)"
+    held = None if correlated is None else correlated.structure_rms
+    sentence = doubt = ""
+    if one.significant:
+        what = "nothing" if held is None else f"{held:.2g} {one.unit} rms"
+        sentence = f"{one.finding}, and the budget holds {what} of it"
+        if correlated is None:
+            sentence = one.sentence
+        if (held or 0.0) < STRUCTURE_IN_BUDGET.value * one.structure:
+            doubt = LARGER
+    yield Check(
+        FIT,
+        f"Structure in the residuals of {fit}, beyond noise",
+        f"{found}, {probability(one.p_value)}",
+        f"p at least {number(STRUCTURE.value, 1)}",
+        "warn" if one.significant or one.hidden else "pass",
+        sentence,
+        doubt,
+    )
+    for one in misfits:
+        if one.hidden:
+            sentence = (
+                f"{100 * (1 - one.told):.0f} % of the structure that the model might leave is "
+                "hidden: places of stars take it up where dithers are small"
+            )
+            yield Check(FIT, level="warn", sentence=sentence)
+
+
+def score_checks(
+    tests: Sequence[ScoreTest], correlated: Discrepancy | None = None
+) -> Iterator[Check]:
+    """What targeted tests have found, each as a remark.
+
+    Parameters
+    ----------
+    tests : sequence of ScoreTest
+    correlated : Discrepancy, optional
+        Correlated errors: verdicts stand where these hold what a test has found.
+    """
+    for test in tests:
+        if test.significant:
+            sentence = f"{test.finding}: {test.remedy}"
+            doubt = "" if _held(correlated, test.name) else LARGER
+            yield Check(SCORE_TESTS, level="warn", sentence=sentence, doubt=doubt)
+
+
+def _held(correlated: Discrepancy | None, test: str) -> bool:
+    """Whether correlated errors hold what a test has found."""
+    if correlated is None:
+        return False
+    scatter = set() if correlated.linear is None else set(correlated.linear.scatter)
+    return (
+        test.startswith(OF_NOISE)
+        or (bool(correlated.structure) and test.startswith(OF_STRUCTURE))
+        or (test.startswith(OF_EXPOSURES) and bool(scatter - {CURVATURE}))
+        or (test.startswith(OF_CURVATURE) and CURVATURE in scatter)
+    )
+
+
+def holdout_checks(found: HeldOutTruth | None) -> Iterator[Check]:
+    """The verdict of held-out stars; nothing where there are none.
+
+    Parameters
+    ----------
+    found : HeldOutTruth or None
+    """
+    if found is None:
+        return
+    agrees = found.level == "pass"
+    yield Check(
+        HELD_OUT,
+        f"Held-out stars ({count(found.n)})",
+        f"agree, {probability(found.p_value)}" if agrees else found.verdict,
+        f"p at least {number(HELD_OUT_DOUBTFUL.value, 1)}",
+        found.level,
+        "" if agrees else found.verdict,
+        LARGER if found.doubtful else "",
+    )
