@@ -16,16 +16,14 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from bayesdist import __version__
 from bayesdist.app.campaign.files import campaign_files
-from bayesdist.app.config import Config, load_config, load_text
-from bayesdist.app.config_errors import as_config_error
+from bayesdist.app.config import Config, config_of_record, load_config, load_text
 from bayesdist.app.selfcal.files import selfcal_files
 from bayesdist.app.star_files import FOLDER, PAIRS, part_files
 from bayesdist.data import input_files
-from bayesdist.errors import InputError
+from bayesdist.errors import ConfigError, InputError
 from bayesdist.files import atomic_path, is_leftover, made_folder, remove_leftovers, sha256_of
 
 __all__ = ["RunDirectory", "as_json", "write_json"]
@@ -362,11 +360,10 @@ class RunDirectory:
     def config(self) -> Config:
         """The resolved configuration."""
         try:
-            return Config.model_validate(self.record["config"])
-        except ValidationError as error:  # made by a version that allowed other settings
-            fault = as_config_error(Config, error, str(self / "run.json"))
+            return config_of_record(self.record["config"], str(self / "run.json"))
+        except ConfigError as error:  # made by a version that allowed other settings
             raise InputError(
-                fault.cause, where=fault.where, do="start again with --force"
+                error.cause, where=error.where, do="start again with --force"
             ) from error
 
     @property

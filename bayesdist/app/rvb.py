@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bayesdist.app.config import Data
+from bayesdist.app.config.rvb import RvbBlock
 from bayesdist.app.matches import is_large
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MatchTable, open_matches, write_partitioned
 from bayesdist.data.rvb import stream_rvb

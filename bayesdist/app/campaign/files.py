@@ -15,7 +15,7 @@ def campaign_files(config: Config, base: Path) -> list[Path]:
     block, release, tdd = config.campaign, config.products.release, config.model.tdd
     assert block is not None
     lists = [block.lists] if isinstance(block.lists, str) else block.lists
-    named = [block.catalog, block.exposures, block.start, *lists]
+    named = [block.catalog, block.exposures, block.initial_distortion, *lists]
     if release is not None:
         named.append(release.reference)
     others = reference_files(config.tables, FREE if tdd is None else tdd.rates, base)

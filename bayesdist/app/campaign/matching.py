@@ -31,7 +31,7 @@ log = logging.getLogger("bayesdist")
 def run_match(session: CampaignSession) -> None:
     block, run, inputs = session.block, session.run, session.inputs
     cuts = cuts_of(block)
-    tab = read_idctab(session.base / block.start)
+    tab = read_idctab(session.base / block.initial_distortion)
     parities = parities_of(block, inputs.catalog, tab)
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)

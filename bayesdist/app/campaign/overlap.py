@@ -124,7 +124,7 @@ def _numbers(pairs: MatchTable, rows: Int) -> Int:
 
 def _known_plane(session: CampaignSession, pairs: MatchTable, rows: Int, epoch: float) -> Float:
     """Positions (N, 2) through the known distortion, its drift included; arcseconds."""
-    known = known_calibration(session.base / session.block.start, session.block.filter)
+    known = known_calibration(session.base / session.block.initial_distortion, session.block.filter)
     then = None if known.no_date else epoch
     chips = _numbers(pairs, rows)
     out = np.empty((len(rows), 2))

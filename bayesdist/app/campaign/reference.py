@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bayesdist.app.campaign.config import TablesBlock
 from bayesdist.app.campaign.gap import with_gap
 from bayesdist.app.campaign.table_file import read_tables
+from bayesdist.app.config.campaign import TablesBlock
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Posterior, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors

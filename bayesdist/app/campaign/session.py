@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.config import CampaignBlock
 from bayesdist.app.campaign.holdout import predictive_of_campaign
 from bayesdist.app.campaign.inputs import Inputs, read_inputs
 from bayesdist.app.campaign.interpolation import interpolation_term
@@ -23,6 +22,7 @@ from bayesdist.app.campaign.systematics import (
     with_kept_stars,
 )
 from bayesdist.app.campaign.table_file import KeptTables, read_tables, write_tables
+from bayesdist.app.config.campaign import CampaignBlock
 from bayesdist.app.session import Session
 from bayesdist.app.star_files import PAIRS
 from bayesdist.app.systematics import Systematics

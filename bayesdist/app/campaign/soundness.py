@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.config import ReleaseBlock
 from bayesdist.app.campaign.inputs import cuts_of
+from bayesdist.app.config.campaign import ReleaseBlock
 from bayesdist.data import StarList
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
@@ -97,7 +97,7 @@ def input_doubts(session: CampaignSession) -> list[str]:
                 f"{where} asks for {epoch:g}, and the exposures are from {epochs.min():.2f} to "
                 f"{epochs.max():.2f}: the drift is extrapolated by more than they span"
             )
-    if session.block.aberration == "earth":
+    if session.block.vafactor_source == "earth":
         out.append(
             "VAFACTOR was computed from the motion of the Earth: that of the telescope about it, "
             "up to 2.5e-5, is in the scales of the exposures"

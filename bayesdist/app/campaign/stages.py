@@ -55,7 +55,7 @@ def rehearse_campaign(session: CampaignSession) -> None:
     """
     refuse_unsound(session)
     check_named(session)
-    read_idctab(session.base / session.block.start)
+    read_idctab(session.base / session.block.initial_distortion)
     rehearse_references(session.config, session.inputs.catalog.unit, session.base)
     if session.config.products.release is not None:
         read_idctab(session.base / session.config.products.release.reference)

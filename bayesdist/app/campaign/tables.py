@@ -51,7 +51,7 @@ def fit_tables(session: CampaignSession) -> TableFit | None:
         detector=held,
         method=block.method,
         step=block.step,
-        rounds=block.rounds,
+        rounds=block.max_iterations,
         report=_say,
     )
     part = found.part()

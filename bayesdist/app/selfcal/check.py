@@ -18,7 +18,7 @@ def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
     """Stars and free directions of a self-calibration, as lines of text: nothing is sampled."""
     found = session.calibrated(lambda text: None)
     s, gauge, model = found.solution, found.gauge, found.solution.problem.model
-    matching = matching_of(found, session.inputs, session.block.least_detections)
+    matching = matching_of(found, session.inputs, session.block.min_detections)
     matching.refuse_strangers()
     summary = matching.summary
     fixed = fixed_by(gauge, s, session.known_for(model))

@@ -14,7 +14,7 @@ def selfcal_files(config: Config, base: Path) -> list[Path]:
     block, gauge = config.selfcal, config.gauge
     assert block is not None
     lists = [block.lists] if isinstance(block.lists, str) else block.lists
-    named = [*lists, block.exposures, _file_of(block.start, base), gauge.offsets]
+    named = [*lists, block.exposures, _file_of(block.initial_distortion, base), gauge.offsets]
     if gauge.reference is not None:
         named.append(gauge.reference.catalog)
     return [base / name for name in dict.fromkeys(named) if name is not None]

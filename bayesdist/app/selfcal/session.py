@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.config.selfcal import SelfcalBlock
 from bayesdist.app.discrepancy import RunDiscrepancy, kept_discrepancy
-from bayesdist.app.selfcal.config import SelfcalBlock
 from bayesdist.app.selfcal.gauge import Known, fixed_by, gauge_words
 from bayesdist.app.selfcal.inputs import (
     Commanded,
@@ -143,14 +143,14 @@ class SelfcalSession(Session):
                 knowledge=self.known_for(model),
                 match_radius=block.match_radius,
                 start_radius=block.start_radius,
-                least=block.least_detections,
+                least=block.min_detections,
                 motion=block.motion,
                 parallax_factors=self.parallax_factors,
                 dilation=self.inputs.dilation,
                 jitter=self.jitter,
                 references=self.references,
                 plane=self.tangent_plane,
-                rounds=block.rounds,
+                rounds=block.max_iterations,
                 log=log,
             )
         except (NotSettledError, DegenerateError) as error:
@@ -263,7 +263,7 @@ class SelfcalSession(Session):
             self.detections,
             theta,
             match_radius=self.block.match_radius,
-            least=self.block.least_detections,
+            least=self.block.min_detections,
             motion=self.block.motion,
             parallax_factors=self.parallax_factors,
             dilation=self.inputs.dilation,

@@ -39,14 +39,14 @@ def rehearse_selfcal(session: SelfcalSession) -> None:
     """
     model, _ = session.start
     session.known_for(model)
-    path = session.base / (session.block.start or "")
+    path = session.base / (session.block.initial_distortion or "")
     if path.suffix == ".fits":
         read_idctab(path)
 
 
 def _match(session: SelfcalSession) -> None:
     found = session.calibrated(lambda text: log.info("match: %s", text))
-    matching = matching_of(found, session.inputs, session.block.least_detections)
+    matching = matching_of(found, session.inputs, session.block.min_detections)
     matching.refuse_strangers()
     session.keep_detections(found)
     write_table(matching.table, session.run / "matching.ecsv")
