@@ -69,7 +69,7 @@ def monitor(
     """
     directory = RunDirectory(run)
     if not (directory / "run.json").exists():
-        raise directory.no_run()
+        raise directory.not_a_run_error()
     config = directory.config
     posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
     try:

@@ -18,7 +18,6 @@ from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
 from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.exposures.shared_drift import with_drift_of
@@ -117,7 +116,7 @@ def _opened(path: str | Path) -> CampaignSession:
         raise InputError(
             "is no run of a campaign", where=str(path), do="give runs that began with star lists"
         )
-    require(session, "release", ("match", "fit", "sample"))
+    session.run.require("release", ("match", "fit", "sample"))
     return session
 
 

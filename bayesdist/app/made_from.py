@@ -1,0 +1,87 @@
+"""What the stages of a run are made from: settings, inputs, and the stages before them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from bayesdist.app.config import Config
+from bayesdist.app.store import WrittenByStage, as_json, differences
+
+__all__ = ["CODECS", "LATER", "LIMITS", "NEEDS", "changes", "is_adjustable", "settings_of"]
+
+# stages in order; `revision` is raised when the numbers of a stage change
+CODECS = {
+    "match": WrittenByStage(),
+    "fit": WrittenByStage(),
+    "sample": WrittenByStage(checkpoints=("chain-*.h5",)),
+    "assess": WrittenByStage(checkpoints=("catalogue_errors.h5",)),
+    "export": WrittenByStage(),
+    "report": WrittenByStage(),
+}
+
+# stages that a stage cannot do without
+NEEDS = {
+    "match": (),
+    "fit": (),
+    "sample": ("fit",),
+    "assess": ("fit", "sample"),
+    "export": ("fit", "sample"),
+    "report": ("fit", "sample", "assess"),
+}
+
+# when to stop: the sampler goes on from its chains where these are others
+LIMITS = ("max_steps", "target_ess", "target_rhat")
+
+# sections that nothing goes by before there is a posterior
+LATER = ("assess", "budget", "requirement", "discrepancy", "periods", "products")
+
+# sections that change no number
+NOWHERE = ("compute",)
+
+
+def settings_of(config: Config) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Settings of a run by what they decide.
+
+    Parameters
+    ----------
+    config : Config
+
+    Returns
+    -------
+    solution : dict
+        What the run is: its matches, its fit and its chains.
+    limits : dict
+        How far the chains go.
+    later : dict
+        What is done with the posterior.
+    """
+    whole = as_json(config.model_dump())
+    later = {key: whole.pop(key) for key in LATER if key in whole}
+    limits = {"sampler": {key: whole["sampler"].pop(key) for key in LIMITS}}
+    for key in NOWHERE:
+        whole.pop(key, None)
+    if _is_on_the_grid(config):
+        whole["assess"] = {"grid": later["assess"]["grid"]}
+    return whole, limits, later
+
+
+def _is_on_the_grid(config: Config) -> bool:
+    """Boolean: the fit writes errors of tables on the grid of the assessment."""
+    tables = config.tables
+    return config.campaign is not None and (tables.method != "none" or tables.detector is not None)
+
+
+def changes(known: Config, now: Config) -> Iterator[tuple[str, Any, Any]]:
+    """Dotted key, old and new value of whatever differs between two configurations."""
+    yield from differences(as_json(known.model_dump()), as_json(now.model_dump()))
+
+
+def is_adjustable(key: str, config: Config) -> bool:
+    """Boolean: a run may be resumed with another value of a key."""
+    section, _, name = key.partition(".")
+    if key.startswith("assess.grid") and _is_on_the_grid(config):
+        return False
+    if section == "sampler":
+        return name in LIMITS
+    return section.partition("[")[0] in (*LATER, *NOWHERE)
