@@ -13,7 +13,7 @@ from bayesdist.app.campaign.filter_figures import draw_filters
 from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.campaign.release import write_files
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
@@ -86,7 +86,7 @@ def release_runs(
         )
         if comparison is None:
             table.meta["drift"] = {"verdict": why_not}
-        with whole_folder(Path(output)) as folder:
+        with atomic_directory(Path(output)) as folder:
             files = write_files(
                 next(iter(sessions.values())), folder, solutions, _tables(sessions), notes
             )

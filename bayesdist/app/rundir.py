@@ -106,6 +106,8 @@ class RunDirectory:
             run._refuse_another(config, inputs, base, seed)
             run._adopted = config, text, inputs
             return run
+        if run.is_initialized:
+            run.store.record  # noqa: B018 - refuse to replace what nobody can tell from other files
         foreign = run._foreign(text)
         if foreign:
             raise InputError(

@@ -136,14 +136,14 @@ class Record:
                 return cls(facts, artefacts, **rest)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(
-                "cannot be read", where=str(path), do="start again with --force"
+                "cannot be read", where=str(path), do="restore it, or choose another folder"
             ) from error
         made_by = facts.get("versions", {}).get("bayesdist", "another version")
         raise InputError(
             f"is a run of schema {schema}, which the bayesdist that made it ({made_by}) reads, and "
             f"this one reads schema {SCHEMA}",
             where=str(path),
-            do="use that version, or start again with --force",
+            do="use that version, or choose another folder",
         )
 
     def write(self, path: Path) -> None:

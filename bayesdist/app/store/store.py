@@ -68,7 +68,8 @@ class RunStore:
 
     def __init__(self, folder: Path, codecs: Mapping[str, Codec]) -> None:
         self.folder, self.codecs = folder, codecs
-        # of the stage that is under way
+        # of the stage that is being made here
+        self._making = ""
         self._sections: dict[str, Any] = {}
         self._written: set[str] = set()
 
@@ -85,13 +86,11 @@ class RunStore:
 
         A stage that is made anew sees those of the stages before it and its own.
         """
-        record = self.record
-        name = (record.under_way or {}).get("stage")
-        if name is None or not self._sections:
-            return self._merged(record)
-        return self._merged(record, before=name) | self._sections
+        if not self._making:
+            return self._merged(self.record)
+        return self._merged(self.record, before=self._making) | self._sections
 
-    def _merged(self, record: Record, before: str | None = None) -> dict[str, Any]:
+    def _merged(self, record: Record, before: str = "") -> dict[str, Any]:
         """Sections of the artefacts, later stages in place of earlier ones."""
         out: dict[str, Any] = {}
         for name in self.codecs:
@@ -192,7 +191,7 @@ class RunStore:
         fixed = tuple(one for one in made_from if not isinstance(one, Adjustable))
         self._begin(record, name, digest_of(self._parts(name, fixed)), harmed)
         started = monotonic()
-        with self._noted():
+        with self._noted(name):
             value = function(*(_value_of(one) for one in made_from))
             self._sections |= as_json(codec.save(value, self.folder))
         artefact = self._end(name, key, parts, monotonic() - started)
@@ -295,7 +294,7 @@ class RunStore:
         return (self.folder / name).is_file()
 
     @contextmanager
-    def _noted(self) -> Iterator[None]:
+    def _noted(self, stage: str) -> Iterator[None]:
         """Note in run.json whatever is written, before it takes its name."""
 
         def note(path: Path) -> None:
@@ -309,14 +308,19 @@ class RunStore:
                 record.under_way["files"] = sorted([*record.under_way["files"], name])
                 record.write(self.folder / RECORD)
 
-        with watched_writes(note):
-            yield
+        self._making = stage
+        try:
+            with watched_writes(note):
+                yield
+        finally:
+            self._making = ""
 
     def _own(self, path: Path) -> str | None:
         """Name of a file in the folder, None for one elsewhere and for the record itself."""
-        if not path.is_relative_to(self.folder):
+        path, folder = path.absolute(), self.folder.absolute()
+        if not path.is_relative_to(folder):
             return None
-        name = path.relative_to(self.folder).as_posix()
+        name = path.relative_to(folder).as_posix()
         checkpoints = (one for codec in self.codecs.values() for one in codec.checkpoints)
         return None if name in (RECORD, SUMMARY) or _is_one_of(name, (*checkpoints,)) else name
 
