@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
+from bayesdist import __version__
 from bayesdist.app.config import Config
-from bayesdist.app.store import WrittenByStage, as_json, differences
+from bayesdist.app.named_files import files_of_products
+from bayesdist.app.store import Adjustable, Made, WrittenByStage, as_json, differences
 
-__all__ = ["CODECS", "LATER", "LIMITS", "NEEDS", "changes", "is_adjustable", "settings_of"]
+__all__ = [
+    "CODECS",
+    "LATER",
+    "LIMITS",
+    "NEEDS",
+    "changes",
+    "is_adjustable",
+    "made_from_of",
+    "settings_of",
+    "with_seed",
+]
 
 # stages in order; `revision` is raised when the numbers of a stage change
 CODECS = {
@@ -66,6 +79,38 @@ def settings_of(config: Config) -> tuple[dict[str, Any], dict[str, Any], dict[st
     return whole, limits, later
 
 
+def made_from_of(
+    stage: str, before: Mapping[str, Made[None]], config: Config, facts: Mapping[str, Any]
+) -> tuple[object, ...] | None:
+    """What a stage is made from; None where a stage is missing that it needs.
+
+    Parameters
+    ----------
+    stage : str
+    before : mapping of str to Made
+        Stages before it that stand.
+    config : Config
+    facts : mapping
+        Of the record: inputs with their hashes, and requirements in place of the configured ones.
+    """
+    begins_with = () if config.data is not None or stage == "match" else ("match",)
+    if not before.keys() >= {*begins_with, *NEEDS[stage]}:
+        return None
+    solution, limits, later = settings_of(config)
+    own = [as_json(vars(one)) for one in config.requirements()]
+    later["requirement"] = facts.get("requirements", own)
+    of_products = {str(one) for one in files_of_products(config, Path(facts["base"]))}
+    inputs = {k: v for k, v in facts["inputs"].items() if k not in of_products}
+    if stage in ("match", "fit"):
+        return solution, {"inputs": inputs}, *before.values()
+    if stage == "sample":
+        return solution, *before.values(), Adjustable(limits)
+    if stage == "assess":
+        return before["fit"], before["sample"], Adjustable(later)
+    later["files"] = {k: v for k, v in facts["inputs"].items() if k in of_products}
+    return *before.values(), Adjustable(later), {"bayesdist": __version__}
+
+
 def _is_on_the_grid(config: Config) -> bool:
     """Boolean: the fit writes errors of tables on the grid of the assessment."""
     tables = config.tables
@@ -85,3 +130,11 @@ def is_adjustable(key: str, config: Config) -> bool:
     if section == "sampler":
         return name in LIMITS
     return section.partition("[")[0] in (*LATER, *NOWHERE)
+
+
+def with_seed(config: Config, seed: int | None) -> Config:
+    """A configuration with another seed; as it is where none is given."""
+    if seed is None:
+        return config
+    sampler = config.sampler.model_copy(update={"seed": seed})
+    return config.model_copy(update={"sampler": sampler})

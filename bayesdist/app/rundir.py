@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
@@ -16,24 +16,27 @@ from bayesdist.app.config import (
     Config,
     config_of_record,
     load_config,
-    load_text,
-    parse_config,
 )
-from bayesdist.app.made_from import CODECS, NEEDS, changes, is_adjustable, settings_of
+from bayesdist.app.made_from import CODECS, changes, made_from_of, with_seed
 from bayesdist.app.named_files import files_of_products, named_files
-from bayesdist.app.store import SCHEMA, Adjustable, Made, Record, RunStore, as_json, write_json
-from bayesdist.app.store.keys import shown
+from bayesdist.app.refusals import (
+    refuse_another_solution,
+    refuse_edited,
+    refuse_foreign_files,
+    refuse_inside_input,
+    refuse_other_inputs,
+)
+from bayesdist.app.star_files import PAIRS, part_files
+from bayesdist.app.store import SCHEMA, Made, Record, RunStore, as_json, write_json
+from bayesdist.app.summary import head_of
 from bayesdist.assess import Requirement
 from bayesdist.data import input_files
 from bayesdist.errors import ConfigError, InputError
-from bayesdist.files import atomic_path, is_leftover, made_folder, remove_leftovers, sha256_of
+from bayesdist.files import atomic_path, made_folder, remove_leftovers, sha256_of
 
 __all__ = ["RunDirectory", "as_json", "versions", "write_json"]
 
 PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
-PAIRS = "pairs"  # matches that were prepared before the first stage
-
-RESUME = "resume with the old value, or start again with --force"
 
 
 class RunDirectory:
@@ -46,7 +49,7 @@ class RunDirectory:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.store = RunStore(self.path, CODECS)
+        self.store = RunStore(self.path, CODECS, head_of)
         self._planned: tuple[dict[str, Any], str] | None = None
         self._adopted: tuple[Config, str, dict[str, str]] | None = None
 
@@ -94,7 +97,7 @@ class RunDirectory:
         run = cls(path)
         if run.path.exists() and not run.path.is_dir():
             raise InputError("is a file, not a folder", where=str(path), do="choose another folder")
-        run._refuse_inside_input(config, base)
+        refuse_inside_input(run.path, config, base)
         inputs = _hashes(config, base)
         if run.is_initialized and not force:
             if not resume:
@@ -103,20 +106,15 @@ class RunDirectory:
                     where=str(path),
                     do="go on with it by --resume, replace it by --force, or choose another folder",
                 )
-            run._refuse_another(config, inputs, base, seed)
+            refuse_another_solution(run.path, run.config, run.record, config, base, inputs, seed)
             run._adopted = config, text, inputs
             return run
         if run.is_initialized:
             run.store.record  # noqa: B018 - refuse to replace what nobody can tell from other files
-        foreign = run._foreign(text)
-        if foreign:
-            raise InputError(
-                f"the folder holds other files ({foreign[0]})",
-                where=str(path),
-                do="choose an empty folder",
-            )
+        else:
+            refuse_foreign_files(run.path, text)
         facts = {
-            "config": _with_seed(config, seed).model_dump(),
+            "config": with_seed(config, seed).model_dump(),
             "base": str(base.resolve()),
             "inputs": inputs,
             "seed": config.sampler.seed if seed is None else seed,
@@ -177,14 +175,14 @@ class RunDirectory:
         if self._adopted is not None:
             config, text, inputs = self._adopted
             record, known = self.store.record, self.config
-            changed = {key for key, *_ in changes(known, _with_seed(config, known.sampler.seed))}
+            changed = {key for key, *_ in changes(known, with_seed(config, known.sampler.seed))}
             if changed or inputs != record.facts["inputs"]:
-                config = _with_seed(config, known.sampler.seed)
+                config = with_seed(config, known.sampler.seed)
                 record.facts |= {"config": as_json(config.model_dump()), "inputs": inputs}
                 if any(key.startswith("requirement") for key in changed):
                     record.facts.pop("requirements", None)
-                record.write(self / "run.json")
                 self._write_text(text)
+                record.write(self / "run.json")
             self._adopted = None
         self.store.restore_summary()
 
@@ -203,8 +201,9 @@ class RunDirectory:
         """
         run = cls(path)
         if run.is_initialized:
-            run._refuse_edited()
-            run._refuse_other_inputs(_hashes(run.config, Path(run.record["base"])))
+            refuse_edited(run.path, run.config)
+            now = _hashes(run.config, Path(run.record["base"]))
+            refuse_other_inputs(run.record["inputs"], now)
             return run
         if (run / "config.toml").exists():
             config, text = load_config(run / "config.toml")
@@ -226,84 +225,6 @@ class RunDirectory:
             if (within / "run.json").exists()
             else "make one with 'bayesdist run CONFIG.toml -o RUN'",
         )
-
-    # -- refusals ---------------------------------------------------------------------------------
-
-    def _refuse_inside_input(self, config: Config, base: Path) -> None:
-        """Refuse a run whose own Parquet files would become part of its input."""
-        named = named_files(config, base)
-        for path in named if isinstance(named, list) else [named]:
-            if path.is_dir() and self.path.resolve().is_relative_to(path.resolve()):
-                raise InputError(
-                    "the run would lie inside the folder of its input",
-                    where=str(self.path),
-                    do="choose a folder outside of it",
-                )
-
-    def _foreign(self, text: str) -> list[str]:
-        """What forbids a run to begin in a folder that holds none, sorted.
-
-        A config.toml that says the same is no obstacle: a stage may be run on it.
-        """
-        if self.is_initialized or not self.path.is_dir():
-            return []
-        names = {p.name for p in self.path.iterdir() if not is_leftover(p.name)}
-        if "config.toml" in names and load_text(self / "config.toml") == text:
-            names.remove("config.toml")
-        return sorted(names)
-
-    def _refuse_another(
-        self, config: Config, inputs: dict[str, str], base: Path, seed: int | None
-    ) -> None:
-        """Refuse to resume with inputs or settings that the solution was not made from."""
-        known, path = self.config, self / "config.toml"
-        if seed is not None and seed != known.sampler.seed:
-            raise InputError(
-                f"the run began with seed {known.sampler.seed}",
-                where=str(self.path),
-                do="leave --seed out, or start again with --force",
-            )
-        if path.exists():  # the command line may have given another seed than the file
-            known = _with_seed(known, parse_config(load_text(path), str(path)).sampler.seed)
-        for key, old, new in changes(known, config):
-            if not is_adjustable(key, known):
-                raise InputError(
-                    f"the configuration has {key} = {shown(new)}, and this run began with "
-                    f"{shown(old)}",
-                    where=str(path),
-                    do=RESUME,
-                )
-        of_products = {str(f) for f in files_of_products(config, base.resolve())}
-        of_products |= {str(f) for f in files_of_products(known, Path(self.record["base"]))}
-        self._refuse_other_inputs(inputs, but=of_products)
-
-    def _refuse_edited(self) -> None:
-        """Refuse a config.toml that was edited in place: the run goes by what it was given."""
-        path, known = self / "config.toml", self.config
-        if not path.exists():
-            return
-        # the command line may have given another seed
-        now = _with_seed(load_config(path)[0], known.sampler.seed)
-        keys = [key for key, *_ in changes(known, now)]
-        if keys:
-            resumed = f"take it over by 'bayesdist run {path} -o {self.path} --resume'"
-            adjustable = all(is_adjustable(key, known) for key in keys)
-            raise InputError(
-                f"was edited since the run began ({keys[0]}), which goes by the old one",
-                where=str(path),
-                do=f"restore it, or {resumed if adjustable else 'start again with --force'}",
-            )
-
-    def _refuse_other_inputs(self, now: dict[str, str], but: Collection[str] = ()) -> None:
-        """Refuse inputs that are not those of the record, `but` some."""
-        known = self.record["inputs"]
-        for name in sorted((known.keys() | now.keys()) - set(but)):
-            if known.get(name) != now.get(name):
-                raise InputError(
-                    "this input changed since the run began",
-                    where=name,
-                    do="restore it, or start again with --force",
-                )
 
     # -- record -----------------------------------------------------------------------------------
 
@@ -374,11 +295,12 @@ class RunDirectory:
 
     def _standing(self, before: str = "") -> dict[str, Made[None]]:
         """Stages that stand, of all or of those before one, in order."""
+        config, facts = self.config, self.store.record.facts
         found: dict[str, Made[None]] = {}
         for name in CODECS:
             if name == before:
                 break
-            made_from = self._from(name, found)
+            made_from = made_from_of(name, found, config, facts)
             made = None if made_from is None else self.store.standing(name, *made_from)
             if made is not None:
                 found[name] = made
@@ -388,37 +310,10 @@ class RunDirectory:
         self, stage: str, requirements: Sequence[Requirement] | None = None
     ) -> tuple[object, ...] | None:
         """What a stage is made from now; None where a stage is missing that it needs."""
-        return self._from(stage, self._standing(stage), requirements)
-
-    def _from(
-        self,
-        stage: str,
-        before: Mapping[str, Made[None]],
-        requirements: Sequence[Requirement] | None = None,
-    ) -> tuple[object, ...] | None:
-        """What a stage is made from, given the stages before it that stand.
-
-        `requirements` are those that it is judged by, in place of the recorded ones.
-        """
-        config, facts = self.config, self.store.record.facts
-        solution, limits, later = settings_of(config)
-        judged = config.requirements() if requirements is None else requirements
-        later["requirement"] = [as_json(vars(one)) for one in judged]
-        if requirements is None and "requirements" in facts:
-            later["requirement"] = facts["requirements"]
-        of_products = {str(f) for f in files_of_products(config, Path(facts["base"]))}
-        inputs = {k: v for k, v in facts["inputs"].items() if k not in of_products}
-        begins_with = () if config.data is not None or stage == "match" else ("match",)
-        if not before.keys() >= {*begins_with, *NEEDS[stage]}:
-            return None
-        if stage in ("match", "fit"):
-            return solution, {"inputs": inputs}, *before.values()
-        if stage == "sample":
-            return solution, *before.values(), Adjustable(limits)
-        if stage == "assess":
-            return before["fit"], before["sample"], Adjustable(later)
-        later["files"] = {k: v for k, v in facts["inputs"].items() if k in of_products}
-        return *before.values(), Adjustable(later), {"bayesdist": __version__}
+        facts = self.store.record.facts
+        if requirements is not None:
+            facts = facts | {"requirements": [as_json(vars(one)) for one in requirements]}
+        return made_from_of(stage, self._standing(stage), self.config, facts)
 
     def require(self, stage: str, needs: Sequence[str], *, thorough: bool = False) -> None:
         """Refuse a stage, or another command, whose predecessors do not stand.
@@ -488,21 +383,9 @@ class RunDirectory:
 
     def clear(self) -> None:
         """Remove what a run wrote, and nothing else."""
-        self.store.clear()
-        pairs = (self / PAIRS).glob("part-" + 5 * "[0-9]" + ".parquet")
-        for path in (self / "config.toml", self / "bayesdist.log", *pairs):
-            path.unlink(missing_ok=True)
-        remove_leftovers(self / PAIRS)
-        if (self / PAIRS).is_dir() and not any((self / PAIRS).iterdir()):
-            (self / PAIRS).rmdir()
-
-
-def _with_seed(config: Config, seed: int | None) -> Config:
-    """A configuration with another seed; as it is where none is given."""
-    if seed is None:
-        return config
-    sampler = config.sampler.model_copy(update={"seed": seed})
-    return config.model_copy(update={"sampler": sampler})
+        pairs = part_files(self / PAIRS)
+        others = [path.relative_to(self.path).as_posix() for path in pairs]
+        self.store.clear("config.toml", "bayesdist.log", *others)
 
 
 def _hashes(config: Config, base: Path) -> dict[str, str]:

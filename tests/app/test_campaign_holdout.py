@@ -88,7 +88,7 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
     found, data = summary["holdout"], summary["data"]
     assert len(found["exposures"]) == 2 and data["n_exposures"] == N - LATER - 2
     pairs = read_matches(run / "pairs", unit="pix")
-    assert data["rejected"]["held out"] == found["n"] + found["n_left_out"]
+    assert data["rejected"]["held out"] == found["n"] + found["n_excluded"]
     assert summary["matching"]["n_pairs"] == len(pairs)
     session = CampaignSession(RunDirectory.open(run))
     kept, held = session.pairs, session.held_pairs

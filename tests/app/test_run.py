@@ -11,6 +11,7 @@ import shutil
 import tomllib
 import warnings
 from html.parser import HTMLParser
+from pathlib import Path
 
 import arviz
 import numpy as np
@@ -26,6 +27,7 @@ from bayesdist.app.config import load_config, parse_config
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages.report import title_of
+from bayesdist.app.summary import Summary, schema_text
 from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
@@ -173,6 +175,16 @@ def test_the_summary_has_what_the_design_lists(finished):
                 float(value)
     for key in ("fraction", "jitter"):
         assert set(summary["outliers"][key]) >= {"mean", "sd"}
+
+
+def test_the_summary_is_as_its_schema_has_it(finished):
+    """The model is that of the JSON Schema in the package, and the file fits it."""
+    there = Path(bayesdist.__file__).parent / "app" / "summary" / "schema.json"
+    assert there.read_text(encoding="utf-8") == schema_text()
+    found = Summary.model_validate(summary_of(finished.path))
+    assert (found.kind, found.detector, found.simulated) == ("data", "A", False)
+    assert found.began == json.loads((finished.path / "run.json").read_text())["created"]
+    assert found.misfit.power == 1.0 and found.budget[-1].name == "total"
 
 
 def test_the_summary_counts_what_there_is(finished, posterior, matches):

@@ -21,6 +21,7 @@ class StarListsBlock(Section):
     mag: Between | None = None
     saturation: float | None = None
     q_max: PositiveFloat | None = None
+    simulated: bool = False
 
 
 class CampaignBlock(StarListsBlock):

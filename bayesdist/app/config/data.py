@@ -30,6 +30,7 @@ class Data(Section):
     catalogue_epoch: float | None = None
     not_finite: Literal["refuse", "reject"] = "refuse"
     rvb: RvbBlock | None = None
+    simulated: bool = False
 
     @property
     def has_nominal(self) -> bool:

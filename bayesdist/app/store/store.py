@@ -16,7 +16,15 @@ from typing import Any, Generic, TypeVar
 
 from bayesdist.app.store.codec import Codec
 from bayesdist.app.store.keys import Adjustable, canonical, difference, digest_of
-from bayesdist.app.store.record import Artefact, FileMark, Record, as_json, json_text, write_json
+from bayesdist.app.store.record import (
+    SCHEMA,
+    Artefact,
+    FileMark,
+    Record,
+    as_json,
+    json_text,
+    write_json,
+)
 from bayesdist.errors import InputError
 from bayesdist.files import is_leftover, remove_leftovers, watched_writes
 
@@ -64,10 +72,17 @@ class RunStore:
         With a run.json.
     codecs : mapping of str to Codec
         Of each stage, in order.
+    head : callable, optional
+        What summary.json says of the run as a whole, from the facts of run.json.
     """
 
-    def __init__(self, folder: Path, codecs: Mapping[str, Codec]) -> None:
-        self.folder, self.codecs = folder, codecs
+    def __init__(
+        self,
+        folder: Path,
+        codecs: Mapping[str, Codec],
+        head: Callable[[Mapping[str, Any]], Mapping[str, Any]] = lambda facts: {},
+    ) -> None:
+        self.folder, self.codecs, self.head = folder, codecs, head
         # of the stage that is being made here
         self._making = ""
         self._sections: dict[str, Any] = {}
@@ -337,23 +352,26 @@ class RunStore:
     def restore_summary(self, record: Record | None = None) -> None:
         """Write summary.json as the stages that have ended have it, where it is not so."""
         record = record or self.record
-        path, content = self.folder / SUMMARY, {"schema": 2, **self._merged(record)}
-        text = json_text(content)
-        if len(content) == 1:
+        path, sections = self.folder / SUMMARY, self._merged(record)
+        if not sections:
             path.unlink(missing_ok=True)
-        elif not path.is_file() or path.read_bytes() != text.encode():
+            return
+        content = {"schema": SCHEMA, **self.head(record.facts), **sections}
+        text = json_text(content)
+        if not path.is_file() or path.read_bytes() != text.encode():
             write_json(path, content)
 
     # -- removing ---------------------------------------------------------------------------------
 
-    def clear(self) -> None:
-        """Remove what the run wrote, and nothing else."""
+    def clear(self, *others: str) -> None:
+        """Remove what the run wrote, and some other files; the record goes last."""
         record = self.record
         files = {one for artefact in record.artefacts.values() for one in artefact.files}
         files |= set((record.under_way or {}).get("files", ()))
         files |= {one for name in self.codecs for one in self._checkpoints(name)}
         record.artefacts = {}
-        self._remove({*files, SUMMARY, RECORD}, record)
+        self._remove({*files, *others, SUMMARY}, record)
+        self._remove({RECORD}, record)
 
     def _remove(self, names: Any, record: Record) -> None:
         """Remove files that belong to no other artefact, and the folders that they leave empty."""

@@ -31,6 +31,7 @@ CONFIG = """\
 catalog = "catalog.parquet"
 exposures = "exposures.ecsv"
 lists = "lists"
+simulated = true
 initial_distortion = "{start}"  # a known distortion, for the matching
 filter = "{filter}"
 mag = [-14.0, -10.0]         # instrumental; brighter ones are saturated
