@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -31,6 +30,11 @@ from bayesdist.files import is_leftover, remove_leftovers, watched_writes
 __all__ = ["Made", "RunStore"]
 
 T = TypeVar("T")
+
+try:
+    import fcntl
+except ImportError:  # systems that know no such locks
+    fcntl = None  # type: ignore[assignment]
 
 RECORD, SUMMARY = "run.json", "summary.json"
 
@@ -158,6 +162,9 @@ class RunStore:
         InputError
             Where another one has it.
         """
+        if fcntl is None:
+            yield
+            return
         held = os.open(self.folder, os.O_RDONLY)
         try:
             try:
