@@ -28,7 +28,7 @@ CODECS = {
     "match": WrittenByStage(),
     "fit": WrittenByStage(),
     "sample": WrittenByStage(checkpoints=("chain-*.h5",)),
-    "assess": WrittenByStage(checkpoints=("catalogue_errors.h5",)),
+    "assess": WrittenByStage(),
     "export": WrittenByStage(),
     "report": WrittenByStage(),
 }

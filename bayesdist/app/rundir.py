@@ -385,7 +385,8 @@ class RunDirectory:
         """Remove what a run wrote, and nothing else."""
         pairs = part_files(self / PAIRS)
         others = [path.relative_to(self.path).as_posix() for path in pairs]
-        self.store.clear("config.toml", "bayesdist.log", *others)
+        # the last one may be of a command that came before the assessment
+        self.store.clear("config.toml", "bayesdist.log", *others, "catalogue_errors.h5")
 
 
 def _hashes(config: Config, base: Path) -> dict[str, str]:

@@ -563,12 +563,8 @@ def test_figures_are_listed_once_they_are_there(copy, monkeypatch):
         raise InputError("No space left on device", where=str(folder), do="make room")
 
     monkeypatch.setattr("bayesdist.report.drawing.save_drawings", full)
-    before = summary_of(copy)["figures"]
     assert cli("stage", "report", copy).code == 1
     assert "figures" not in summary_of(copy)
-    for name in before:
-        assert (copy / "figures" / name).exists()
-    RunDirectory(copy).clear()
     assert not (copy / "figures").exists()
 
 

@@ -259,7 +259,7 @@ class RunStore:
         self._write(record)
 
     def _begin(self, record: Record, name: str, checkpoints: str, harmed: str) -> None:
-        """Note that a stage begins: what is half replaced never counts."""
+        """Note that a stage begins, and remove what it wrote before: it must not see that."""
         codec = self.codecs[name]
         before = record.under_way or {"stage": name, "files": [], "digest": ""}
         known = record.artefacts.pop(name, None)
@@ -278,15 +278,15 @@ class RunStore:
             record.checkpoints[name] = checkpoints
         record.under_way = {"stage": name, "files": sorted(files), "digest": digest}
         self._sections, self._written = {}, set()
-        self._write(record)
+        self._write(record)  # first: what is half removed never counts
+        self._remove({one for one in files if not _is_one_of(one, codec.checkpoints)}, record)
 
     def _end(self, name: str, key: str, parts: Mapping[str, Any], seconds: float) -> Artefact:
-        """Note that a stage has ended, and remove what it wrote before and not again."""
+        """Note that a stage has ended."""
         record = self.record
         assert record.under_way is not None
         written = {one for one in self._written if self._is_there(one)}
         written |= set(self._checkpoints(name))
-        self._remove(set(record.under_way["files"]) - written, record)
         marks = {one: FileMark.of(self.folder / one) for one in sorted(written)}
         artefact = Artefact(key, parts, marks, self._sections)
         if artefact.digest != record.under_way["digest"]:
