@@ -12,6 +12,7 @@ from astropy.table import Table
 
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.stages import run_stage
 from bayesdist.app.stages.assess import _assess_holdout
 from bayesdist.data import read_matches
 from bayesdist.data.tables.files import read_table
@@ -70,7 +71,7 @@ def run(folder):
     for stage in ("match", "fit", "sample"):
         good("stage", stage, run, "-q")
     session = CampaignSession(RunDirectory.open(run))
-    _assess_holdout(session)
+    run_stage(session, "assess", _assess_holdout)
     session.close()
     return run
 
@@ -128,7 +129,7 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path) -> None:
             shutil.copy(one, tmp_path / "other" / one.name)
     session = CampaignSession(RunDirectory.open(tmp_path / "other"))
     _assess_holdout(session)
-    found = summary_of(tmp_path / "other")["holdout"]
+    found = session.run.summary["holdout"]
     assert found["level"] == "fail" and f"exposure {name}, held out whole" in found["verdict"]
 
 

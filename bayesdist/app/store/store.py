@@ -103,17 +103,16 @@ class RunStore:
     def summary(self) -> dict[str, Any]:
         """Sections of summary.json: of the stages that have ended, and of the one under way.
 
-        A stage that is made anew sees those of the stages before it and its own.
+        A stage that is made anew sees those of the stages before it and its own.  Sections of a
+        function that is called by itself, outside of a stage, are here and in no file.
         """
-        if not self._making:
-            return self._merged(self.record)
         return self._merged(self.record, before=self._making) | self._sections
 
     def _merged(self, record: Record, before: str = "") -> dict[str, Any]:
         """Sections of the artefacts, later stages in place of earlier ones."""
         out: dict[str, Any] = {}
         for name in self.codecs:
-            if name == before:
+            if name == before:  # never, where that is empty
                 break
             if name in record.artefacts:
                 out |= record.artefacts[name].sections
