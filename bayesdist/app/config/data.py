@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from pydantic import PositiveFloat, field_validator, model_validator
@@ -10,7 +11,7 @@ from bayesdist.app.config.rvb import RvbBlock
 from bayesdist.app.config.section import Section
 from bayesdist.data.tables.units import length_advice
 
-__all__ = ["Data", "Unit"]
+__all__ = ["Data", "Unit", "names_nominal"]
 
 Unit = Literal["pix", "arcsec", "mas", "deg"]
 
@@ -35,7 +36,7 @@ class Data(Section):
     @property
     def has_nominal(self) -> bool:
         """Boolean: columns of nominal positions are named."""
-        return any((self.columns or {}).get(key) for key in ("u_nominal", "v_nominal"))
+        return names_nominal(self.columns)
 
     @field_validator("unit", mode="before")
     @classmethod
@@ -75,3 +76,8 @@ class Data(Section):
                 "leave u_nominal and v_nominal out"
             )
         return self
+
+
+def names_nominal(columns: Mapping[str, str] | None) -> bool:
+    """Boolean: columns of nominal positions are named."""
+    return any((columns or {}).get(key) for key in ("u_nominal", "v_nominal"))

@@ -12,7 +12,7 @@ from pydantic import Discriminator, Field, Tag, TypeAdapter, model_validator
 from bayesdist.app.config.assess import Assess, BudgetBlock, Periods, RequirementBlock
 from bayesdist.app.config.campaign import CampaignBlock, TablesBlock
 from bayesdist.app.config.common import RunConfig
-from bayesdist.app.config.data import Data
+from bayesdist.app.config.data import Data, names_nominal
 from bayesdist.app.config.detector import ChipBlock, Detector
 from bayesdist.app.config.holdout import HoldoutBlock
 from bayesdist.app.config.model import (
@@ -234,6 +234,15 @@ class SelfcalConfig(RunConfig):
     prior: list[PriorBlock] = Field(default_factory=list)
     discrepancy: DiscrepancyBlock = DiscrepancyBlock()
     products: SelfcalProducts = SelfcalProducts()
+
+    @model_validator(mode="after")
+    def _no_nominal_positions(self) -> SelfcalConfig:
+        if names_nominal(self.selfcal.columns):
+            raise ValueError(
+                "nominal positions are of matches in [data], and a [selfcal] finds its matches "
+                "itself; leave u_nominal and v_nominal out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _errors_of_frames_that_are_fitted(self) -> SelfcalConfig:
