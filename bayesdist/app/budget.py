@@ -12,7 +12,6 @@ from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.errors import InputError
@@ -58,7 +57,7 @@ def budget_at(
         `place_budget` refuses.
     """
     with closing(session_of(RunDirectory.open(run))) as session:
-        require(session, "budget", ("fit", "sample"))
+        session.run.require("budget", ("fit", "sample"))
         number_of = _chip(session, chip, str(run))
         errors = errors_of(session)
         x, y = zip(at, *to, strict=True)

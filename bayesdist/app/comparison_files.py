@@ -8,7 +8,7 @@ from typing import Any
 
 from astropy.table import Table, vstack
 
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.session import write_table
 from bayesdist.assess.comparison.compare import Comparison
@@ -43,7 +43,7 @@ def write_comparison(
     InputError
         For a folder that holds something, or cannot be made.
     """
-    with whole_folder(output) as folder:
+    with atomic_directory(output) as folder:
         write_table(joined(found, comparison_table), folder / "comparison.ecsv")
         write_table(joined(found, difference_table), folder / "difference.ecsv")
         if gaps:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from bayesdist.errors import InputError
 
-__all__ = ["whole_folder"]
+__all__ = ["atomic_directory"]
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def atomic_directory(path: Path) -> Iterator[Path]:
     """A folder that takes its name when the block succeeds, and else is removed.
 
     Parameters

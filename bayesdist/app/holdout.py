@@ -44,7 +44,7 @@ def holdout_table(found: HeldOutTruth) -> Table:
     names = (
         "name",
         "part",
-        "together",
+        "is_omnibus",
         "where",
         "n",
         "value",
@@ -53,7 +53,8 @@ def holdout_table(found: HeldOutTruth) -> Table:
         "p_corrected",
         "limit",
     )
-    table = Table({name: [getattr(t, name) for t in found.tests] for name in names})
+    columns = {name: name for name in names} | {"is_omnibus": "together"}
+    table = Table({name: [getattr(t, columns[name]) for t in found.tests] for name in names})
     table["lo95"], table["hi95"] = np.array([t.interval for t in found.tests]).T
     table["limit"].description = "of tails, in sigma; scatter of deviations"
     table["value"].description = (
@@ -63,7 +64,7 @@ def holdout_table(found: HeldOutTruth) -> Table:
     table.meta = {
         "verdict": found.verdict,
         "n": found.n,
-        "n_left_out": found.n_left_out,
+        "n_excluded": found.n_left_out,
         "exposures": list(found.exposures),
         "p_corrected": "Holm 1979, over all tests of this table",
     }
@@ -74,7 +75,7 @@ def holdout_summary(found: HeldOutTruth) -> dict[str, Any]:
     """Section 'holdout' of summary.json."""
     return {
         "n": found.n,
-        "n_left_out": found.n_left_out,
+        "n_excluded": found.n_left_out,
         "exposures": list(found.exposures),
         "p_value": found.p_value,
         "verdict": found.verdict,
@@ -94,7 +95,7 @@ def holdout_summary(found: HeldOutTruth) -> dict[str, Any]:
             {
                 "name": t.name,
                 "part": t.part,
-                "together": t.together,
+                "is_omnibus": t.together,
                 "where": t.where,
                 "n": t.n,
                 "value": t.value,

@@ -13,7 +13,7 @@ from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposur
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.rundir import RunDirectory, versions, write_json
@@ -70,7 +70,7 @@ def monitor(
     """
     directory = RunDirectory(run)
     if not (directory / "run.json").exists():
-        raise directory.no_run()
+        raise directory.not_a_run_error()
     config = directory.config
     posterior, matches, fitted, left_out = _fitted(directory, config, Path(new))
     try:
@@ -245,7 +245,7 @@ def _write(
     command: str,
 ) -> None:
     date, maps = found.date, found.maps
-    with whole_folder(output) as folder:
+    with atomic_directory(output) as folder:
         write_table(joined(maps, comparison_table), folder / "change.ecsv")
         write_table(joined(maps, difference_table), folder / "difference.ecsv")
         figures = {"change": difference_vectors(maps, names=("new", "release"))}

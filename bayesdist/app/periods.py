@@ -171,7 +171,7 @@ def periods_summary(found: TimeVariation) -> dict[str, Any]:
         "n_outside": found.n_outside,
         "n_repeated": found.n_repeated,
         "periods": rows,
-        "ends": {"period": found.last, "against": found.first, **_position(found.ends)},
+        "first_vs_last": {"period": found.last, "against": found.first, **_position(found.ends)},
         "residuals": [
             _statistics(table, chip.number)
             for table, chip in zip(found.residuals, comparison.model.chips, strict=True)

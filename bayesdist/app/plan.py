@@ -13,7 +13,6 @@ from bayesdist.app.margins import judged_requirements
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
 from bayesdist.assess.planning.exposures import Schedule, exposures_needed
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.solution import Solution
@@ -49,7 +48,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
         For a run without requirements or without that one.
     """
     with closing(session_of(RunDirectory.open(run))) as session:
-        require(session, "plan", ("fit", "sample", "assess"))
+        session.run.require("plan", ("fit", "sample", "assess"))
         if session.config.selfcal is not None:
             raise InputError(
                 "is a run of a self-calibration, where an exposure is worth what it overlaps",

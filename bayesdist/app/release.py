@@ -13,12 +13,11 @@ from bayesdist.app.campaign.filter_figures import draw_filters
 from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.campaign.release import write_files
 from bayesdist.app.campaign.session import CampaignSession
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
 from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.exposures.shared_drift import with_drift_of
@@ -87,7 +86,7 @@ def release_runs(
         )
         if comparison is None:
             table.meta["drift"] = {"verdict": why_not}
-        with whole_folder(Path(output)) as folder:
+        with atomic_directory(Path(output)) as folder:
             files = write_files(
                 next(iter(sessions.values())), folder, solutions, _tables(sessions), notes
             )
@@ -117,7 +116,7 @@ def _opened(path: str | Path) -> CampaignSession:
         raise InputError(
             "is no run of a campaign", where=str(path), do="give runs that began with star lists"
         )
-    require(session, "release", ("match", "fit", "sample"))
+    session.run.require("release", ("match", "fit", "sample"))
     return session
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 from bayesdist.app.config import load_config
+from bayesdist.app.made_from import NEEDS
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import log_file, progress_bar
 from bayesdist.app.session import STAGES, Session
 from bayesdist.app.sessions import own_stages, rehearse_run, session_of
-from bayesdist.app.stages import NEEDS, require, run_stage
+from bayesdist.app.stages import run_stage
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer.checks import convergence_check
 
@@ -39,7 +40,7 @@ def run(
     output : path
         Run directory.
     resume : bool
-        Go on with the run that is there: stages that are done are skipped, checkpoints are used.
+        Resume the run that is there: stages that stand are skipped, checkpoints are used.
     force : bool
         Replace the run that is there.
     strict : bool
@@ -69,18 +70,11 @@ def run(
         seed=seed,
         command=command,
     )
-    with closing(session_of(directory)) as session:
-        _begin(session)
-        with log_file(directory / "bayesdist.log"):
-            redo = False
-            for stage in STAGES:
-                if stage == "match" and stage not in own_stages(session):
-                    continue
-                if directory.done(stage) and not redo:
-                    log.info("%s: done before", stage)
-                    continue
-                redo = True  # what comes after a stage that is made anew is made anew
-                _run_stage(session, stage)
+    with ExitStack() as stack:
+        session = _begun(directory, stack)
+        for stage in STAGES:
+            if stage != "match" or stage in own_stages(session):
+                _run_stage(session, stage, force=False)
         _judge(session, strict)
     return directory.path
 
@@ -93,35 +87,40 @@ def continue_stage(path: str | Path, stage: str, *, strict: bool = False) -> Run
     BayesdistError
     """
     directory = RunDirectory.open(path)
-    with closing(session_of(directory)) as session:
-        listed = "match" in own_stages(session)
-        if stage == "match" and not listed:
-            raise InputError(
-                "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
-            )
-        require(session, stage, ("match",) if listed and stage == "fit" else NEEDS[stage])
-        _begin(session)
-        with log_file(directory / "bayesdist.log"):
-            _run_stage(session, stage)
+    begins_with = "fit" if directory.config.data is not None else "match"
+    if stage == "match" != begins_with:
+        raise InputError(
+            "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
+        )
+    needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stage]
+    directory.require(stage, needs, thorough=True)
+    with ExitStack() as stack:
+        session = _begun(directory, stack)
+        _run_stage(session, stage, force=True)
         if stage == "sample":
             _judge(session, strict)
     return directory
 
 
-def _begin(session: Session) -> None:
-    """Begin a planned run once it is known that it can be carried out."""
-    if session.run.begun:
-        session.run.follow()
-        return
-    rehearse_run(session)
-    session.run.begin()
-    session.begun()
+def _begun(directory: RunDirectory, stack: ExitStack) -> Session:
+    """The session of a run that has begun, once it is known that it can be carried out."""
+    session = stack.enter_context(closing(session_of(directory)))
+    begins = directory.is_planned
+    if begins:
+        rehearse_run(session)
+    stack.enter_context(directory.locked())
+    directory.begin()
+    if begins:
+        session.begun()
+    stack.enter_context(log_file(directory / "bayesdist.log"))
+    return session
 
 
-def _run_stage(session: Session, stage: str) -> None:
+def _run_stage(session: Session, stage: str, *, force: bool) -> None:
+    """Run a stage, with a progress bar where it samples."""
     with progress_bar(stage) as progress:
         session.progress = progress if stage == "sample" else None
-        run_stage(session, stage, own_stages(session).get(stage))
+        run_stage(session, stage, own_stages(session).get(stage), force=force)
 
 
 def _judge(session: Session, strict: bool) -> None:

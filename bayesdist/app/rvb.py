@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bayesdist.app.config import Data
+from bayesdist.app.config.rvb import RvbBlock
 from bayesdist.app.matches import is_large
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.rvb_config import RvbBlock
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MatchTable, open_matches, write_partitioned
 from bayesdist.data.rvb import stream_rvb
@@ -104,7 +104,7 @@ class RvbInput:
 
         write_partitioned(tables(), folder)
         self._counts = {"n_rows": selected.n_rows, "rejected": selected.rejected}
-        if self.run.begun:
+        if not self.run.is_planned:
             self.settle()
             return self._opened(self.run / PAIRS, self.run.record["pairs"])
         return self._opened(folder, self._counts)
@@ -142,7 +142,7 @@ class RvbInput:
                 where=str(target),
                 do="remove this folder, or choose another for the run",
             ) from error
-        self.run.write_record({**self.run.record, "pairs": self._counts})
+        self.run.note(pairs=self._counts)
         self.close()
         return True
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
 
 from bayesdist.app.config import load_requirements
 from bayesdist.app.dates import idle_dates
@@ -13,9 +12,7 @@ from bayesdist.app.evaluation_files import save_margins
 from bayesdist.app.judging import margins_of, validity_periods_of
 from bayesdist.app.margins import margin_rows
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.session import Session
 from bayesdist.app.sessions import session_of
-from bayesdist.app.stages import require
 from bayesdist.app.summary_text import margins_text
 from bayesdist.assess import Margin, Requirement
 from bayesdist.errors import InputError
@@ -48,14 +45,12 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
     """
     asked = load_requirements(requirements)
     with closing(session_of(RunDirectory.open(run))) as session:
-        require(session, "requirements", ("fit", "sample"))
+        session.run.require("requirements", ("fit", "sample"))
         with _named_after(requirements, asked):
             margins = margins_of(session, asked)
             horizons = validity_periods_of(session, asked)
-        before = _judgement(session)
-        save_margins(session, margins, horizons)
-        if _judgement(session) != before:
-            session.run.outdate("report")
+        with session.run.locked(), session.run.judged_by(asked):
+            save_margins(session, margins, horizons)
         report = session.run / "report.html"
         outdated = report.exists() and not session.run.done("report")
         label = session.posterior.approximation
@@ -76,11 +71,6 @@ def _named_after(path: str | Path, asked: Sequence[Requirement]) -> Iterator[Non
         if not error.where.startswith(tuple(r.where for r in asked)):
             raise
         raise type(error)(error.cause, where=f"{path}: {error.where}", do=error.do) from error
-
-
-def _judgement(session: Session) -> list[Any]:
-    """What the run says of its requirements."""
-    return [session.run.summary.get(key) for key in ("margins", "horizons")]
 
 
 def _lines(margins: Sequence[Margin]) -> Iterator[str]:

@@ -42,7 +42,7 @@ def configuration(truth: CampaignTruth, seed: int) -> dict[str, Any]:
         for k, chip in enumerate(truth.chips)
     ]
     return {
-        "campaign": files | {"start": "start_idc.fits", "mag": [BRIGHT, FAINT]},
+        "campaign": files | {"initial_distortion": "start_idc.fits", "mag": [BRIGHT, FAINT]},
         "tables": {"method": "none"},
         "detector": {"scale_mas": 1000 * ARCSEC},
         "chip": chips,

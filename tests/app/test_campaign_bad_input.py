@@ -48,8 +48,11 @@ def campaign(folder, tmp_path) -> Campaign:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda t: t.remove_column("vafactor"), ["f606w-001", "vafactor", "campaign.aberration"]),
-        (masked("vafactor", 3), ["f606w-003", "vafactor", "campaign.aberration"]),
+        (
+            lambda t: t.remove_column("vafactor"),
+            ["f606w-001", "vafactor", "campaign.vafactor_source"],
+        ),
+        (masked("vafactor", 3), ["f606w-003", "vafactor", "campaign.vafactor_source"]),
         (setting("vafactor", 3, 0.0), ["row 3", "f606w-003", "VAFACTOR is 0.0"]),
         (setting("vafactor", 3, 2.0), ["row 3", "f606w-003", "VAFACTOR is 2.0"]),
         (lambda t: t.remove_column("epoch"), ["'epoch'", "rename"]),
@@ -65,7 +68,7 @@ def test_a_log_that_lacks_something(campaign, change, words):
 
 def test_aberration_of_the_earth_needs_no_factor_but_a_target(campaign):
     campaign.log(lambda t: t.remove_column("vafactor"))
-    campaign.replaced("q_max = 0.1", 'q_max = 0.1\naberration = "earth"')
+    campaign.replaced("q_max = 0.1", 'q_max = 0.1\nvafactor_source = "earth"')
     assert "of the Earth alone" in campaign.check()
     assert any("VAFACTOR was computed" in text for text in campaign.matched()["warnings"])
     shutil.rmtree(campaign.path.parent / "run")
@@ -376,7 +379,7 @@ def test_one_exposure_in_two_lists(campaign):
     [
         (["sigma_u", "sigma_v"], ["no errors of the positions", "sigma_u"]),
         (["epoch"], ["proper motions but no epoch"]),
-        (["mag"], ["no magnitudes", "campaign.motions = 'all'"]),
+        (["mag"], ["no magnitudes", "campaign.pm_selection = 'all'"]),
     ],
     ids=["errors", "epoch", "magnitudes"],
 )

@@ -15,6 +15,7 @@ from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.config import load_config
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.app.stages import run_stage
 from bayesdist.app.stages.assess import diagnose_run
 from bayesdist.data import read_matches
 from bayesdist.data.tables.files import read_table
@@ -74,7 +75,7 @@ def run(folder):
     for stage in ("match", "fit", "sample"):
         good("stage", stage, run, "-q")
     session = CampaignSession(RunDirectory.open(run))
-    diagnose_run(session)
+    run_stage(session, "assess", diagnose_run)
     session.close()
     return run
 
@@ -92,7 +93,7 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
     found, data = summary["holdout"], summary["data"]
     assert len(found["exposures"]) == 2 and data["n_exposures"] == N - LATER - 2
     pairs = read_matches(run / "pairs", unit="pix")
-    assert data["rejected"]["held out"] == found["n"] + found["n_left_out"]
+    assert data["rejected"]["held out"] == found["n"] + found["n_excluded"]
     assert summary["matching"]["n_pairs"] == len(pairs)
     session = CampaignSession(RunDirectory.open(run))
     kept, held = session.pairs, session.held_pairs
@@ -152,7 +153,7 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path) -> None:
             shutil.copy(one, tmp_path / "other" / one.name)
     session = CampaignSession(RunDirectory.open(tmp_path / "other"))
     diagnose_run(session)
-    found = summary_of(tmp_path / "other")["holdout"]
+    found = session.run.summary["holdout"]
     assert found["level"] == "fail" and f"exposure {name}, held out whole" in found["verdict"]
 
 

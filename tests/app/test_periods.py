@@ -128,7 +128,8 @@ def test_no_change_is_said_where_there_is_none(quiet):
     rows = inside(matches, period)
     assert [row["n_pairs"] for row in found["periods"]] == [r.sum() for r in rows]
     assert sum(r.sum() for r in rows) == N - 40
-    assert found["ends"]["period"] == NAMES[2] and found["ends"]["against"] == NAMES[0]
+    ends = found["first_vs_last"]
+    assert ends["period"] == NAMES[2] and ends["against"] == NAMES[0]
     assert not any("distortion changes" in text for text in summary_of(run)["warnings"])
 
 
@@ -197,7 +198,7 @@ def test_a_change_is_found_measured_and_put_on_top(moved):
     # the tightest limit: 0.1 mas
     assert found["tolerance"] == pytest.approx(0.002)
     assert found["verdict"].endswith(f"beyond the tolerance of 0.002 pix: {', '.join(NAMES)}.")
-    ends = found["ends"]
+    ends = found["first_vs_last"]
     assert abs(ends["largest"] - CHANGE) < 4 * ends["sigma"] and ends["p_value"] < 1e-3
     # it grows towards the edges on the left and on the right
     assert ends["at"][0] in (1.0, SIZE[0])

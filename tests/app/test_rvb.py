@@ -96,7 +96,7 @@ def test_half_a_set_that_a_killed_run_left_is_not_trusted(tmp_path):
     whole = len(open_matches(run / "pairs"))
     record = json.loads((run / "run.json").read_text())
     assert record.pop("pairs")["n_rows"] == 600
-    record["stages"] = {}
+    record["artefacts"] = {}
     (run / "run.json").write_text(json.dumps(record))
     (run / "pairs" / "part-00000.parquet").write_bytes(b"half")
     good("run", config, "-o", run, "--resume")

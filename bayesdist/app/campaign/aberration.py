@@ -60,7 +60,7 @@ def aberration_term(session: CampaignSession, solution: Solution) -> ScaleError:
         Whose positions it moves.
     """
     source = PUBLISHED
-    if session.block.aberration == "earth":
+    if session.block.vafactor_source == "earth":
         sigma = scale_error(None)
         source += ", not corrected"
     else:

@@ -31,7 +31,7 @@ def campaign_lines(session: CampaignSession) -> Iterator[str]:
         yield f"             {text}"
     yield f"epochs       {epochs.min():.2f} to {epochs.max():.2f}"
     factors = log.values("vafactor")
-    how = ", of the Earth alone" if session.block.aberration == "earth" else ""
+    how = ", of the Earth alone" if session.block.vafactor_source == "earth" else ""
     yield f"VAFACTOR     {factors.min():.7f} to {factors.max():.7f}{how}"
     yield f"PA_V3        {_rolls(rolls)}"
     time = config.time()

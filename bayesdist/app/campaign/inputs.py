@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.config import CampaignBlock, StarListsBlock
 from bayesdist.app.config import Config
+from bayesdist.app.config.campaign import CampaignBlock, StarListsBlock
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import (
     ExposureLog,
@@ -129,7 +129,7 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
         )
     if block.filter is not None:
         log = log.select(filter=block.filter)
-    if block.aberration == "earth":
+    if block.vafactor_source == "earth":
         bare = tuple(replace(one, vafactor=None) for one in log)
         log = ExposureLog(bare, log.source).with_aberration()
     log.require("vafactor")
@@ -145,7 +145,7 @@ def read_inputs(block: CampaignBlock, base: Path) -> Inputs:
         )
     strangers = dict.fromkeys(one.exposure for one in lists if one.exposure not in logged)
     n = len(catalog)
-    if block.motions == "reliable" and catalog.sigma_pm_u is not None:
+    if block.pm_selection == "reliable" and catalog.sigma_pm_u is not None:
         catalog = select_motions(catalog)
     return Inputs(catalog, n, log, wanted, tuple(strangers), plane)
 

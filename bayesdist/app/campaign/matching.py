@@ -65,7 +65,7 @@ def match_lists(config: Config, base: Path, *, inputs: Inputs | None = None) -> 
     block = campaign_block(config)
     inputs = read_inputs(block, base) if inputs is None else inputs
     cuts = cuts_of(block)
-    tab = read_idctab(base / block.start)
+    tab = read_idctab(base / block.initial_distortion)
     parities = parities_of(block, inputs.catalog, tab)
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)

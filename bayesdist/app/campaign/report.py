@@ -111,7 +111,7 @@ def _catalog_stars(session: CampaignSession, matching: Table) -> CatalogStars | 
         sigma = np.hypot(catalog.sigma_u, catalog.sigma_v)[rows]
     if catalog.sigma_pm_u is not None and catalog.sigma_pm_v is not None:
         motion = np.maximum(catalog.sigma_pm_u, catalog.sigma_pm_v)[rows]
-        if session.block.motions == "reliable":
+        if session.block.pm_selection == "reliable":
             line = motion_error_line(catalog)
             limit = (line.mag - shift, line.sigma)
     return CatalogStars(

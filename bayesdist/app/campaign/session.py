@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from bayesdist.app.campaign.aberration import aberration_term
 from bayesdist.app.campaign.checks import campaign_checks, campaign_remarks
-from bayesdist.app.campaign.config import CampaignBlock
 from bayesdist.app.campaign.fit import load_fitted_campaign
 from bayesdist.app.campaign.holdout import predictive_of_campaign
 from bayesdist.app.campaign.inputs import (
@@ -27,6 +26,7 @@ from bayesdist.app.campaign.inputs import (
 from bayesdist.app.campaign.interpolation import interpolation_term
 from bayesdist.app.campaign.matched import CampaignMatched, load_matched_campaign
 from bayesdist.app.campaign.reference import free_rates
+from bayesdist.app.config.campaign import CampaignBlock
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.exposures import ExposureScatter
 from bayesdist.app.kinds.fitted import Fitted, required
@@ -231,7 +231,7 @@ class CampaignSession(Session):
         overlap = overlap_test(
             self.pairs,
             self.posterior,
-            known_calibration(self.base / self.block.start, self.block.filter),
+            known_calibration(self.base / self.block.initial_distortion, self.block.filter),
             self.tables,
             unit_arcsec=self.unit_arcsec,
             pixel=self.scale_arcsec or 0.05,

@@ -10,10 +10,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.config import ReleaseBlock
 from bayesdist.app.campaign.inputs import Inputs, campaign_block, cuts_of
 from bayesdist.app.campaign.reference import free_rates
 from bayesdist.app.config import Config
+from bayesdist.app.config.campaign import ReleaseBlock
 from bayesdist.data import StarCuts, StarList
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
@@ -99,7 +99,7 @@ def input_warnings(config: Config, inputs: Inputs) -> list[str]:
                 f"{where} asks for {epoch:g}, and the exposures are from {epochs.min():.2f} to "
                 f"{epochs.max():.2f}: the drift is extrapolated by more than they span"
             )
-    if campaign_block(config).aberration == "earth":
+    if campaign_block(config).vafactor_source == "earth":
         out.append(
             "VAFACTOR was computed from the motion of the Earth: that of the telescope about it, "
             "up to 2.5e-5, is in the scales of the exposures"

@@ -73,7 +73,7 @@ def rehearse_campaign(session: CampaignSession) -> None:
         For inputs that cannot be read or do not go together.
     """
     refuse_unsound(session.config, session.inputs)
-    read_idctab(session.base / session.block.start)
+    read_idctab(session.base / session.block.initial_distortion)
     rehearse_references(session.config, session.inputs.catalog.unit, session.base)
     if session.config.products.release is not None:
         read_idctab(session.base / session.config.products.release.reference)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.app.campaign.config import TablesBlock
 from bayesdist.app.campaign.inputs import Inputs
 from bayesdist.app.campaign.interpolation import measured_between
 from bayesdist.app.campaign.matched import CampaignMatched
 from bayesdist.app.campaign.outrun import refuse_outrun_stars
 from bayesdist.app.campaign.reference import held_tables
 from bayesdist.app.config import Config
+from bayesdist.app.config.campaign import TablesBlock
 from bayesdist.app.kinds.fitted import moved_by
 from bayesdist.app.kinds.table_file import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
@@ -90,7 +90,7 @@ def fit_tables(
         detector=held,
         method=block.method,
         step=block.step,
-        rounds=block.rounds,
+        rounds=block.max_iterations,
         report=_say,
     )
     part = found.part()

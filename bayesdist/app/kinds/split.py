@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TypeVar, cast
 
 from bayesdist.app.config import Config
-from bayesdist.app.holdout_config import HoldoutBlock
+from bayesdist.app.config.holdout import HoldoutBlock
 from bayesdist.data.holdout import SetAside, exposures_drawn, split_matches
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.shards import Matches

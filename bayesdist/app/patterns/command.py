@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
 from bayesdist.app.patterns.config import PlanConfig, load_plan
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
@@ -112,7 +112,7 @@ def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, co
     from bayesdist.report.drawing import save_figures  # figures take seconds to import
     from bayesdist.report.patterns import pattern_maps
 
-    with whole_folder(output) as folder:
+    with atomic_directory(output) as folder:
         write_table(_table(found), folder / "patterns.ecsv")
         save_figures({"patterns": pattern_maps(found)}, folder / "figures")
         record = {

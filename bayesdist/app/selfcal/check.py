@@ -19,7 +19,7 @@ def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
     given = session.given
     found = calibrated(given, lambda text: None)
     s, gauge, model = found.solution, found.gauge, found.solution.problem.model
-    matching = matching_of(found, given.inputs, given.block.least_detections)
+    matching = matching_of(found, given.inputs, given.block.min_detections)
     matching.refuse_strangers()
     summary = matching.summary
     fixed = fixed_by(gauge, s, given.known_for(model))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
-from bayesdist.app.selfcal.config import SelfcalBlock
+from bayesdist.app.config.selfcal import SelfcalBlock
 from bayesdist.app.selfcal.gauge import Known
 from bayesdist.app.selfcal.inputs import (
     Commanded,
@@ -158,7 +158,7 @@ class Given:
             detections,
             theta,
             match_radius=self.block.match_radius,
-            least=self.block.least_detections,
+            least=self.block.min_detections,
             motion=self.block.motion,
             parallax_factors=self.parallax_factors,
             dilation=self.inputs.dilation,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.app.campaign.inputs import cuts_of, lists_of
 from bayesdist.app.chips import check_chips
 from bayesdist.app.config import Config
-from bayesdist.app.selfcal.config import SelfcalBlock
+from bayesdist.app.config.selfcal import SelfcalBlock
 from bayesdist.data import ReferenceCatalog, StarList, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
 from bayesdist.data.matching.frames import refuse_duplicates

@@ -115,7 +115,7 @@ def match_dithers(config: Config, base: Path, *, given: Given | None = None) -> 
     """
     given = read_given(config, base) if given is None else given
     found = calibrated(given, lambda text: log.info("match: %s", text))
-    matching = matching_of(found, given.inputs, given.block.least_detections)
+    matching = matching_of(found, given.inputs, given.block.min_detections)
     matching.refuse_strangers()
     for text in matching.summary["warnings"]:
         log.warning("match: WARNING: %s", text)
@@ -150,14 +150,14 @@ def calibrated(given: Given, report: Callable[[str], None]) -> SelfCalibration:
             knowledge=given.known_for(model),
             match_radius=block.match_radius,
             start_radius=block.start_radius,
-            least=block.least_detections,
+            least=block.min_detections,
             motion=block.motion,
             parallax_factors=given.parallax_factors,
             dilation=given.inputs.dilation,
             jitter=given.jitter,
             references=given.references,
             plane=given.tangent_plane,
-            rounds=block.rounds,
+            rounds=block.max_iterations,
             log=report,
         )
     except (NotSettledError, DegenerateError) as error:

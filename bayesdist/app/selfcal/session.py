@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.app.config.selfcal import SelfcalBlock
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted, required
-from bayesdist.app.selfcal.config import SelfcalBlock
 from bayesdist.app.selfcal.fit import load_fitted_selfcal
 from bayesdist.app.selfcal.gauge import gauge_words
 from bayesdist.app.selfcal.given import Given, read_given

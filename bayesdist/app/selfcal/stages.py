@@ -31,7 +31,7 @@ def rehearse_selfcal(session: SelfcalSession) -> None:
     """
     model, _ = session.given.start
     session.given.known_for(model)
-    path = session.base / (session.block.start or "")
+    path = session.base / (session.block.initial_distortion or "")
     if path.suffix == ".fits":
         read_idctab(path)
 

@@ -73,7 +73,7 @@ def started(
     chips = chips_of(config, int(d.chip[0]))
     start = _first(config, base, chips, unit_arcsec)
     # each chip of each exposure by itself: without a start nobody knows how the chips lie
-    several = len(chips) > 1 and block.start is None
+    several = len(chips) > 1 and block.initial_distortion is None
     exposure, number, rows = _lists(inputs, apart=several)
     names = [d.exposure_names[e] for e in exposure]
     mags = None if d.mag is None else [d.mag[r] for r in rows]
@@ -140,9 +140,9 @@ def _first(config: Config, base: Path, chips: tuple[Chip, ...], unit_arcsec: flo
     pixel = 1.0
     if block.unit != "pix" and scale is not None and unit_arcsec is not None:
         pixel = scale / 1000 / unit_arcsec
-    if block.start is None:
+    if block.initial_distortion is None:
         return undistorted(chips, pixel)
-    path = base / block.start
+    path = base / block.initial_distortion
     if path.is_dir() or path.suffix == ".nc":
         known = load_fit(path) if path.name == "fit.nc" else load_posterior(path)
         if known.model.unit != block.unit:

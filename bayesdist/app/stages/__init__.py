@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 
 from bayesdist.app.judging import rehearse_evaluation
@@ -18,23 +17,11 @@ from bayesdist.app.stages.sample import run_sample
 from bayesdist.assess import star_sample
 from bayesdist.assess.terms.centroid import centroid_errors
 from bayesdist.diagnose.residuals.centroid import centroid_scatter
-from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit
 
-__all__ = ["NEEDS", "rehearse", "rehearse_solution", "require", "run_stage"]
-
-log = logging.getLogger("bayesdist")
+__all__ = ["rehearse", "rehearse_solution", "run_stage"]
 
 REHEARSAL_DRAWS = 100
-
-NEEDS = {
-    "match": (),
-    "fit": (),
-    "sample": ("fit",),
-    "assess": ("fit", "sample"),
-    "export": ("fit", "sample"),
-    "report": ("fit", "sample", "assess"),
-}
 
 _FUNCTIONS: dict[str, Callable[[Session], None]] = {
     "fit": run_fit,
@@ -46,12 +33,29 @@ _FUNCTIONS: dict[str, Callable[[Session], None]] = {
 
 
 def run_stage(
-    session: Session, name: str, function: Callable[[Session], None] | None = None
-) -> None:
-    """Run one stage, in the usual way or by another function, and note it as done."""
-    log.info("%s: begins", name)
-    with session.run.stage(name):
-        (function or _FUNCTIONS[name])(session)
+    session: Session,
+    name: str,
+    function: Callable[[Session], None] | None = None,
+    *,
+    force: bool = True,
+) -> bool:
+    """Run one stage, in the usual way or by another function.
+
+    Parameters
+    ----------
+    session : Session
+    name : str
+    function : callable, optional
+    force : bool
+        Also where it stands.
+
+    Returns
+    -------
+    bool
+        Whether it was run.
+    """
+    run = function or _FUNCTIONS[name]
+    return session.run.make(name, lambda: run(session), force=force)
 
 
 def rehearse(session: Session) -> None:
@@ -94,19 +98,3 @@ def _check_residuals(session: Session) -> None:
         scatter = centroid_scatter(stars, n_params=fit.model.n_params)
         if scatter is not None:
             centroid_errors(scatter, held)
-
-
-def require(session: Session, stage: str, needs: tuple[str, ...]) -> None:
-    """Refuse a stage, or another command, whose predecessors have not been run.
-
-    Raises
-    ------
-    InputError
-    """
-    for earlier in needs:
-        if not session.run.done(earlier):
-            raise InputError(
-                f"'{stage}' needs stage '{earlier}', which has not been run",
-                where=str(session.run.path),
-                do=f"run 'bayesdist stage {earlier} {session.run.path}' first",
-            )

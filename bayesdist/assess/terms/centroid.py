@@ -53,7 +53,7 @@ def centroid_errors(
                 f"errors of {known:.3g} are said to be in residuals that scatter by "
                 f"{sigma[k]:.3g} at magnitude {scatter.mag[k]:.2f}",
                 where=f"budget term {contained[0][0]!r}",
-                do="correct them, or set in_residuals = false",
+                do="correct them, or set included_in_scatter = false",
             )
         left[name] = known
     return without(scatter, left["sigma_u"], left["sigma_v"])

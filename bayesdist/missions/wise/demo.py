@@ -29,6 +29,7 @@ _CONFIG = """\
 
 [data]
 matches = "stars.ecsv"
+simulated = true
 columns = {{x="x", y="y", u="u", v="v", sigma_u="sigma_u", sigma_v="sigma_v", mag="mag"}}
 
 [detector]

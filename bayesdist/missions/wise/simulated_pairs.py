@@ -22,6 +22,7 @@ WISE_CONFIG = """\
 # {truth} holds what they were made from
 [data]
 matches = "{folder}"
+simulated = true
 format = "rvb"
 band = "{band}"
 columns = {{exposure = ""}}    # without the frames: one distortion serves all

@@ -126,7 +126,7 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     config = write_selfcal(
         tmp_path / "input",
         list_table(truth),
-        selfcal={"exposures": "log.ecsv", "motion": "proper_motion", "least_detections": 4},
+        selfcal={"exposures": "log.ecsv", "motion": "proper_motion", "min_detections": 4},
     )
     _log(truth, config.parent, np.ones(8))
     session = fitted(tmp_path / "run", config)
@@ -168,7 +168,7 @@ def test_parallaxes(tmp_path):
         selfcal={
             "exposures": "log.ecsv",
             "motion": "parallax",
-            "least_detections": 5,
+            "min_detections": 5,
             "unit": "mas",
         },
         gauge={"reference": {"catalog": "reference.ecsv", "tangent_point": [RA, DEC]}},
@@ -219,7 +219,7 @@ def test_a_start_from_an_earlier_run(three_rolls, tmp_path):
     config = write_selfcal(
         tmp_path / "input",
         list_table(three_rolls.truth),
-        selfcal={"start": str(three_rolls.path), "start_radius": 0.5},
+        selfcal={"initial_distortion": str(three_rolls.path), "start_radius": 0.5},
     )
     session = fitted(tmp_path / "run", config)
     before = load_fit(three_rolls.path / "fit.nc")

@@ -54,7 +54,7 @@ def solved(data_dir, tmp_path_factory):
             "lists": "20*.ecsv",
             "match_radius": 1.0,
             "start_radius": 3.0,
-            "least_detections": 3,
+            "min_detections": 3,
             "motion": "proper_motion",
             "unit": "arcsec",
         },

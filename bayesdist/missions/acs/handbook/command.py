@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from astropy.table import Table
 
 from bayesdist.app.calibrations import calibration_at
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
@@ -87,7 +87,7 @@ def handbook(
         detector = found.detector
     whole = WholeDetector(found.in_frame(epoch), pixel)
     title = _title(found, filter, epoch)
-    with whole_folder(Path(output)) as folder:
+    with atomic_directory(Path(output)) as folder:
         figures = {
             "non_linear": non_linear_figure(whole, title, magnification=magnification),
             "pixel_area": area_figure(whole, title),

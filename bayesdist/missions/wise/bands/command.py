@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
 from bayesdist.errors import InputError
@@ -78,7 +78,7 @@ def bands_of_runs(
         bands = open_bands(runs)
         for band in bands.values():
             stack.enter_context(closing(band.session))
-        folder = stack.enter_context(whole_folder(Path(output)))
+        folder = stack.enter_context(atomic_directory(Path(output)))
         order = {str(band.session.run.path): name for name, band in bands.items()}
         named = [order[str(Path(path))] for path in runs]
         inputs = measure_bands(

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.session import Session
-from bayesdist.app.stages import require
 from bayesdist.assess import pixel_scale_of
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import WISE_BANDS
@@ -100,7 +99,7 @@ def _opened(path: str | Path) -> BandRun:
             do="give runs of matched stars, one for each band",
         )
     session = Session(run)
-    require(session, "bands", ("fit", "sample"))
+    session.run.require("bands", ("fit", "sample"))
     chips = session.posterior.model.chips
     if len(chips) > 1:
         raise InputError(

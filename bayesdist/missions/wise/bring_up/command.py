@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.app.folder import whole_folder
+from bayesdist.app.folder import atomic_directory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
 from bayesdist.data import RadialLimit, RvbPairs
@@ -87,7 +87,7 @@ def bring_up_files(
     up = bring_up(stars, others, model, start, acceptance=RadialLimit(radius, corner_radius))
     rows = [{"round": k, **asdict(one)} for k, one in enumerate(up.rounds, 1)]
     rows = [{name: row[name] for name in ("round", *_SHOWN)} for row in rows]
-    with whole_folder(Path(output)) as folder:
+    with atomic_directory(Path(output)) as folder:
         write_rvb([_pairs(up, band)], folder / "pairs")
         write_table(Table(rows), folder / "rounds.ecsv")
     return f"{table_text(rows, 4)}\n{up.sentence}\n{output}/pairs: calibrate with format = 'rvb'"

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, PositiveInt, model_validator
 
-from bayesdist.app.section import Section
+from bayesdist.app.config.section import Section
 
 __all__ = ["HoldoutBlock"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import PositiveFloat, PositiveInt, model_validator
 
-from bayesdist.app.section import Section
+from bayesdist.app.config.section import Section
 from bayesdist.data.rvb_accept import RadialLimit
 from bayesdist.data.rvb_select import RvbSelection
 

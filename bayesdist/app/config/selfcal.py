@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from bayesdist.app.campaign.config import StarListsBlock
-from bayesdist.app.section import Section
+from bayesdist.app.config.campaign import StarListsBlock
+from bayesdist.app.config.section import Section
 
 __all__ = ["GaugeBlock", "SelfcalBlock"]
 
@@ -17,13 +17,13 @@ class SelfcalBlock(StarListsBlock):
 
     exposures: str | None = None
     sigma: Literal["measured"] | PositiveFloat = "measured"
-    start: str | None = None
+    initial_distortion: str | None = None
     unit: Literal["pix", "arcsec", "mas"] = "pix"
     frames: Literal["shift", "shift_rotation", "shift_rotation_scale"] = "shift_rotation"
     match_radius: PositiveFloat = 0.5
     start_radius: PositiveFloat | None = None
-    least_detections: Annotated[int, Field(ge=2)] = 2
-    rounds: Annotated[int, Field(ge=2)] = 12
+    min_detections: Annotated[int, Field(ge=2)] = 2
+    max_iterations: Annotated[int, Field(ge=2)] = 12
     motion: Literal["none", "proper_motion", "parallax"] = "none"
 
     @model_validator(mode="after")

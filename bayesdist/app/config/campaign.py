@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat
 
-from bayesdist.app.section import Section
+from bayesdist.app.config.section import Section
 
 __all__ = ["CampaignBlock", "ReleaseBlock", "StarListsBlock", "TablesBlock"]
 
@@ -21,6 +21,7 @@ class StarListsBlock(Section):
     mag: Between | None = None
     saturation: float | None = None
     q_max: PositiveFloat | None = None
+    simulated: bool = False
 
 
 class CampaignBlock(StarListsBlock):
@@ -28,15 +29,15 @@ class CampaignBlock(StarListsBlock):
 
     catalog: str
     exposures: str
-    start: str
+    initial_distortion: str
     catalog_columns: dict[str, str] | None = None
     unit: Literal["pix", "arcsec", "mas", "deg"] | None = None
     catalogue_epoch: float | None = None
     parity: Literal["auto", "direct", "mirrored"] = "auto"
     filter: str | None = None
     radius: PositiveFloat | None = None
-    motions: Literal["reliable", "all"] = "reliable"
-    aberration: Literal["log", "earth"] = "log"
+    pm_selection: Literal["reliable", "all"] = "reliable"
+    vafactor_source: Literal["log", "earth"] = "log"
 
 
 class TablesBlock(Section):
@@ -45,7 +46,7 @@ class TablesBlock(Section):
     detector: str | None = None
     method: Literal["field", "binned", "none"] = "field"
     step: tuple[PositiveFloat, PositiveFloat] = (64.0, 64.0)
-    rounds: Annotated[int, Field(ge=1)] = 8
+    max_iterations: Annotated[int, Field(ge=1)] = 8
 
 
 class PeriodBlock(Section):

@@ -1,0 +1,22 @@
+"""Artefacts of a run: each is made when what it was made from has changed, and else loaded."""
+
+from __future__ import annotations
+
+from bayesdist.app.store.codec import Codec, WrittenByStage
+from bayesdist.app.store.keys import Adjustable, differences
+from bayesdist.app.store.record import SCHEMA, Artefact, Record, as_json, write_json
+from bayesdist.app.store.store import Made, RunStore
+
+__all__ = [
+    "SCHEMA",
+    "Adjustable",
+    "Artefact",
+    "Codec",
+    "Made",
+    "Record",
+    "RunStore",
+    "WrittenByStage",
+    "as_json",
+    "differences",
+    "write_json",
+]
