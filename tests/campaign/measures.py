@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from bayesdist.data import MatchTable
 from bayesdist.infer import fit_by_magnitude
-from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables, pixel_jacobian
+from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
 from bayesdist.infer.series import Course, Series, fit_series
 from bayesdist.infer.transforms import Solution, View, lines, reference_gauge, without_frames
 from bayesdist.missions.acs.simulate.pointings import SPANS
@@ -119,7 +119,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
     assert isinstance(with_errors, MatchTable)
     binned = fit_with_tables(with_errors, session.plain_model, method="binned", step=(step, step))
     others = {table.chip: table for table in binned.tables}
-    for posterior in tables.part().posteriors:
+    for posterior in tables.posteriors:
         table = posterior.table
         grid = grids(step)[table.chip]
         x, y = grid.positions
@@ -153,7 +153,7 @@ def position_errors(found: Calibrated, tables: TableFit, rng: np.random.Generato
     Polynomial with its drift, errors of the catalogue, and tables.
     """
     view = reference_gauge(without_frames(found.joint), REFERENCE)
-    posteriors = {p.table.chip: p for p in tables.part().posteriors}
+    posteriors = {p.table.chip: p for p in tables.posteriors}
     truth = found.campaign.truth
     chip = rng.choice(CHIPS, POSITIONS)
     x, y = rng.uniform(0.5, 4096.5, POSITIONS), rng.uniform(0.5, 2048.5, POSITIONS)
@@ -190,7 +190,7 @@ def _position(
     """Positions (N, 2) and their covariance (N, 2, 2)."""
     px, py = corrected(found.session.tables, x, y, chip=where["chip"])
     D = view.model.jacobian(view.mean, px, py, **where)
-    J = pixel_jacobian(view.model, view.mean, px, py, **where)
+    J = view.model.slopes(view.mean, px, py, **where)
     table = posterior.position_sigma(x, y, refitted=True) ** 2
     cov = np.einsum("nap,pq,nbq->nab", D, view.cov, D, optimize=True)
     cov += np.einsum("nai,ni,nbi->nab", J, table, J)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.infer.nodes.trust import fitted_trust
+from bayesdist.infer.nodes import fit_mixture
 
 N = 20_000
 
@@ -20,7 +20,7 @@ def residuals(rng, *, false: float, width: float) -> tuple[np.ndarray, np.ndarra
 @pytest.mark.parametrize("quoted", [0.01, 0.02, 0.035, 0.06])
 def test_true_matches_are_not_false_whatever_errors_are_quoted(quoted):
     r, _ = residuals(np.random.default_rng(1), false=0.0, width=1.0)
-    found = fitted_trust(r, np.full_like(r, quoted**2))
+    found = fit_mixture(r, np.full_like(r, quoted**2))
     # of the wider kind, two fifths, those beyond twice their sigma may be doubted: a seventh
     assert found.fraction < 0.4 / 7 + 0.01
     assert np.mean(found.probability > 0.5) > 0.95
@@ -29,7 +29,7 @@ def test_true_matches_are_not_false_whatever_errors_are_quoted(quoted):
 @pytest.mark.parametrize("quoted", [0.02, 0.035])
 def test_false_matches_are_found_where_the_errors_are_too_large_or_too_small(quoted):
     r, wrong = residuals(np.random.default_rng(2), false=0.05, width=0.6)
-    found = fitted_trust(r, np.full_like(r, quoted**2))
+    found = fit_mixture(r, np.full_like(r, quoted**2))
     assert found.fraction == pytest.approx(0.05, abs=0.012)
     assert found.outlier_scale == pytest.approx(0.6, rel=0.15)
     assert np.mean(found.probability[~wrong] > 0.5) > 0.98

@@ -1,4 +1,4 @@
-"""Marginal likelihood of the field's hyperparameters: roughness and size of the pattern.
+"""Matern field of the node values: its marginal likelihood, and the most probable one.
 
 With the polynomial integrated out (REML) the stars give on each axis a rough estimate of the node
 values, d = B b, that scatters about the truth with covariance B.  The truth is a field with
@@ -18,14 +18,18 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from bayesdist.infer.nodes.grid import NodeGrid
-from bayesdist.infer.nodes.matern import NUGGET, Matern
 from bayesdist.infer.nodes.sums import NodeSums
 
-__all__ = ["Evidence", "FittedField", "fitted_field", "refined_field"]
+__all__ = ["SMOOTHNESS", "Evidence", "FittedField", "Matern", "fitted_field", "refined_field"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+SMOOTHNESS = (0.5, 1.5, 2.5)
+
+# Fraction of the variance that each node has independently: a field that is very smooth on the grid
+# has a covariance that no computer can factor. 1e-9 is 3e-5 of the amplitude.
+NUGGET = 1e-9
 # A bin without stars is given one observation of zero, 1e4 times worse than the typical bin's: it
 # does not constrain a pattern of any size and keeps B finite. (The posterior needs no such help.)
 EMPTY = 1e-8
@@ -33,6 +37,34 @@ TILE = 16  # nodes: the search starts on independent tiles of the chip
 LOG_LENGTH = (np.log(2.0), 1.0)  # prior of log(length / step): mean, standard deviation
 SETTLED = 0.02  # gain in log density at which the search stops
 RULED_OUT = 10.0  # a smoothness so much worse on the tiles is not tried again
+
+
+@dataclass(frozen=True)
+class Matern:
+    """Stationary Gaussian random field (Rasmussen and Williams 2006, Equation 4.14)."""
+
+    amplitude: float  # standard deviation, pixels
+    length: float  # correlation length, pixels
+    smoothness: float  # 1/2, 3/2 or 5/2: a rough field, one with a slope, one with a curvature
+
+    def correlation(self, distance: Float) -> Float:
+        """Correlation of two points at a distance in pixels."""
+        t = np.sqrt(2 * self.smoothness) * np.asarray(distance, float) / self.length
+        shape = {0.5: 1.0, 1.5: 1.0 + t, 2.5: 1.0 + t + t**2 / 3}[self.smoothness]
+        return shape * np.exp(-t)
+
+    def covariance(self, grid: NodeGrid) -> Float:
+        """Covariance (n_nodes, n_nodes) of free node values."""
+        by_lag = self.amplitude**2 * self.correlation(grid.lags)
+        by_lag[0] += self.amplitude**2 * NUGGET
+        return by_lag[grid.lag]
+
+    def restricted(self, grid: NodeGrid) -> Float:
+        """Covariance (n_nodes, n_nodes) of node values without their polynomial part."""
+        C, Q = self.covariance(grid), grid.polynomials
+        CQ = C @ Q
+        Z = CQ - 0.5 * Q @ (Q.T @ CQ)
+        return C - np.concatenate([Z, Q], axis=1) @ np.concatenate([Q, Z], axis=1).T
 
 
 @dataclass(frozen=True, eq=False)

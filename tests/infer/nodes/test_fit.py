@@ -12,7 +12,6 @@ from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear
 from bayesdist.infer.nodes import Matern, fit_with_tables, pixel_shifts
-from bayesdist.infer.nodes.filters import matches_of_filter
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.lookup import LookupTable, corrected
 from tests.infer.nodes.support import (
@@ -105,12 +104,12 @@ def test_it_ends_at_the_exact_joint_solution(rng, gradient):
     theta = nearly_flat(model)
     x, y = places(rng, 4000, gradient=gradient)
     matches = observed(model, theta, [table_of(rng, PATTERN)], x, y, rng)
-    fit = fit_with_tables(matches, model, tolerance=1e-5, rounds=20, **OPTIONS)
+    fit = fit_with_tables(matches, model, tolerance=1e-5, max_iterations=20, **OPTIONS)
     assert fit.converged
-    [posterior] = fit.part().posteriors
+    [posterior] = fit.posteriors
 
     # the same weights: errors with jitter, stars by their probability of being true
-    p = fit.part().trust.probability
+    p = fit.mixture.probability
     assert p.min() > 0.01
     p = np.where(p >= 0.5, p, 1e-12)
     variance = (matches.sigma_u**2 + posterior.jitter**2) / p
@@ -148,10 +147,10 @@ def test_with_drift_and_frames_the_sum_is_nearly_exact(rng):
         exposure_names=names,
         epoch=epoch,
     )
-    fit = fit_with_tables(matches, model, tolerance=1e-5, rounds=20, **OPTIONS)
-    [posterior] = fit.part().posteriors
+    fit = fit_with_tables(matches, model, tolerance=1e-5, max_iterations=20, **OPTIONS)
+    [posterior] = fit.posteriors
 
-    p = fit.part().trust.probability
+    p = fit.mixture.probability
     p = np.where(p >= 0.5, p, 1e-12)
     weight = p / (matches.sigma_u**2 + posterior.jitter**2)
     P, n, D = projector(), 320, model.n_params
@@ -188,7 +187,9 @@ def test_rounds_move_less_and_less(rng):
     x, y = places(rng, 10_000, gradient=True)
     matches = observed(model, bent(model), [table_of(rng, PATTERN)], x, y, rng)
     seen = []
-    fit = fit_with_tables(matches, model, tolerance=1e-6, rounds=8, report=seen.append, **OPTIONS)
+    fit = fit_with_tables(
+        matches, model, tolerance=1e-6, max_iterations=8, report=seen.append, **OPTIONS
+    )
     assert tuple(seen) == fit.progress
     moved = [one.moved for one in fit.progress]
     assert fit.converged and moved[-1] < 1e-6
@@ -197,7 +198,7 @@ def test_rounds_move_less_and_less(rng):
     noise = NOISE * np.sqrt(1.1**2 + 1 / 12)  # of errors between 0.6 and 1.6
     nodes = 1 - 320 / 10_000  # what they take up of it
     assert abs(fit.progress[-1].rms / (noise * np.sqrt(nodes)) - 1) < 0.03
-    short = fit_with_tables(matches, model, tolerance=1e-6, rounds=1, **OPTIONS)
+    short = fit_with_tables(matches, model, tolerance=1e-6, max_iterations=1, **OPTIONS)
     assert not short.converged
 
 
@@ -259,9 +260,9 @@ def test_false_matches_are_found_and_do_not_pull(rng, method):
     for matches in (clean, foul):
         fit = fit_with_tables(matches, model, method=method, tolerance=1e-3, **OPTIONS)
         tables.append(flat(fit.tables[0]) - flat(truth))
-    found = fit.part().trust
+    found = fit.mixture
     assert abs(found.fraction - 0.1) < 0.01
-    assert fit.part().fit.n_rows < 0.93 * len(x)
+    assert fit.solution.n_rows < 0.93 * len(x)
     rms = [np.sqrt((t**2).mean()) for t in tables]
     assert rms[1] < 1.15 * rms[0]  # a tenth of the stars is gone: 5 % by itself
 
@@ -290,21 +291,24 @@ def test_filters_have_their_own_polynomial_and_table(rng):
             exposure=exposure,
             exposure_names=model.exposures,
         )
-        fit = fit_with_tables(matches, model, **OPTIONS)
-        assert fit.base == "red" and [t.filter for t in fit.tables] == ["", "blue"]
-        assert fit.part("blue").fit.model.exposures == ("c",)
+        red, blue = (matches.select(filters == k) for k in (1, 0))
+        base = fit_with_tables(red, model, **OPTIONS)
+        assert base.solution.model.exposures == ("a", "b")
+        fit = fit_with_tables(blue, model, filter="blue", beneath=base.fitted, **OPTIONS)
+        assert [t.filter for t in fit.tables] == ["", "blue"]
+        assert fit.solution.model.exposures == ("c",)
         px, py = places(rng, 60)
         true = model.predict(
             theta, *corrected([detector, own], px, py, chip=1, filter="blue"), exposure=2
         )
-        where = {"chip": 1, "filter": "blue"}
-        errors.append(fit.predict(px, py, **where) - true)
-        sigmas.append(fit.position_sigma(px, py, **where))
-        moved = fit.corrected(matches)
-        want = np.array(corrected(fit.tables, x, y, chip=1, filter=np.array(names)[filters]))
-        np.testing.assert_array_equal([moved.x, moved.y], want[:, moved.row])
-        off = len(x) - len(moved)  # the rim: 0.05 px of 2300 px and less
-        assert moved.rejected.get("moved off the chip", 0) == off < 20
+        errors.append(fit.predict(px, py, chip=1) - true)
+        sigmas.append(fit.position_sigma(px, py, chip=1))
+        for found, stars in ((base, red), (fit, blue)):
+            moved = found.corrected(stars)
+            want = np.array(corrected(found.tables, x, y, chip=1, filter=found.filter))
+            np.testing.assert_array_equal([moved.x, moved.y], want[:, moved.row])
+            off = len(stars) - len(moved)  # the rim: 0.05 px of 2300 px and less
+            assert moved.rejected.get("moved off the chip", 0) == off < 20
     pull = np.concatenate(errors) / np.concatenate(sigmas)
     assert 0.75 < (pull**2).mean() < 1.3
     assert 0.62 < (np.abs(pull) < 1).mean() < 0.75
@@ -319,7 +323,7 @@ def test_residuals_are_clean_afterwards(rng):
     alike = []
     for solution, stars in (
         (fit_linear(matches, model), matches),
-        (fit.part().fit, fit.corrected(matches)),
+        (fit.solution, fit.corrected(matches)),
     ):
         order = np.lexsort((stars.y // 8, stars.x // 8))
         r = pixel_shifts(solution, stars).shift[order, 0]
@@ -334,17 +338,17 @@ def test_wrong_input_is_named(rng):
     matches = observed(model, bent(model), [], x, y, rng, names=("red",))
     with pytest.raises(InputError, match="no method 'spline'"):
         fit_with_tables(matches, model, method="spline", **OPTIONS)
-    with pytest.raises(InputError, match="no matches in filter 'blue'"):
-        fit_with_tables(matches, model, base="blue", **OPTIONS)
-    with pytest.raises(InputError, match="0 rounds"):
-        fit_with_tables(matches, model, rounds=0, **OPTIONS)
-    with pytest.raises(InputError, match="no model for filter 'red'"):
-        fit_with_tables(matches, {"blue": model}, **OPTIONS)
+    with pytest.raises(InputError, match="0 iterations"):
+        fit_with_tables(matches, model, max_iterations=0, **OPTIONS)
+    both = observed(model, bent(model), [], x, y, rng, filters=np.arange(500) % 2, names=("r", "b"))
+    with pytest.raises(InputError, match="of filters 'r', 'b'"):
+        fit_with_tables(both, model, **OPTIONS)
     fit = fit_with_tables(matches, model, method="binned", **OPTIONS)
     with pytest.raises(InputError, match="no covariance of their nodes"):
         fit.position_sigma(x, y, chip=1)
-    with pytest.raises(InputError, match="no tables for filter 'blue'"):
-        fit.predict(x, y, chip=1, filter="blue")
+    field = fit_with_tables(matches, model, max_iterations=1, **OPTIONS)
+    with pytest.raises(InputError, match="no table for chip 2"):
+        field.table_sigma(x, y, chip=2)
 
 
 def test_a_filter_without_the_exposure_that_holds_the_gauge_is_refused(rng):
@@ -364,10 +368,9 @@ def test_a_filter_without_the_exposure_that_holds_the_gauge_is_refused(rng):
         exposure=code,
         exposure_names=("a", "b"),
     )
-    some, one = matches_of_filter(matches, model, "red")
-    assert some.exposure_names == one.exposures == ("a",) and len(some) == 250
-    with pytest.raises(InputError, match="'a', which holds the gauge, is not in this filter"):
-        matches_of_filter(matches, model, "blue")
-    alone = DistortionModel(ORDER, (CHIP,), frames="shift", exposures=("c",))
-    with pytest.raises(InputError, match="exposure 'b' is not in the model"):
-        matches_of_filter(matches, {"blue": alone}, "blue")
+    red, blue = (matches.select(code == k) for k in (0, 1))
+    assert fit_with_tables(red, model, max_iterations=1, **OPTIONS).solution.model.exposures == (
+        "a",
+    )
+    with pytest.raises(InputError, match="no match is of exposure 'a', which holds the gauge"):
+        fit_with_tables(blue, model, **OPTIONS)

@@ -1,28 +1,37 @@
 """Look-up table after ACS ISR 2015-06: bins, iterative sigma clipping, smoothing.
 
 ACS ISR 2015-06, section 4.3.1: residuals are averaged in bins of 64 x 64 pixels with iterative
-sigma clipping, then each grid point is smoothed with a 5 x 5 quadratic kernel.
+sigma clipping, then each grid point is smoothed with a 5 x 5 quadratic kernel: the value of a node
+becomes that of the quadratic surface through the 25 values around it, all of equal weight (Anderson
+and King 2000, PASP 112, 1360).  Away from edges and empty bins this is their fixed kernel, 27/175
+in the middle.  Near an edge or an empty bin the surface is fitted to the values that exist.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.nodes.field import checked_stars
 from bayesdist.infer.nodes.grid import STEP, NodeGrid
-from bayesdist.infer.nodes.smoothing import quadratic_smoother
 from bayesdist.model import Chip
 from bayesdist.model.lookup import LookupTable
 
-__all__ = ["binned_table"]
+__all__ = ["binned_table", "quadratic_smoother"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 PASSES = 20  # of the clipping, at most
 OWN_SCATTER = 5  # stars from which on a bin's error is from its own scatter
+HALF_WIDTH = 2  # nodes: the kernel is 5 x 5
+# values for each coefficient of the surface: the 3 x 3 of a corner determine a quadratic
+ENOUGH = 1.5
 
 
 def binned_table(
@@ -81,8 +90,8 @@ def binned_table(
     j = np.clip(((py - 0.5) // step[1]).astype(np.int64), 0, ny - 1)
     bins = j * nx + i
 
-    kept = _clipped(bins, r, grid.n_nodes, clip)
-    count, mean, scatter = _moments(bins[kept], r[kept], grid.n_nodes)
+    inlier = _clipped(bins, r, grid.n_nodes, clip)
+    count, mean, scatter = _moments(bins[inlier], r[inlier], grid.n_nodes)
     several = count > 1
     if not several.any():
         raise DegenerateError(
@@ -110,35 +119,25 @@ def binned_table(
 def _clipped(bins: Int, r: Float, n: int, clip: float) -> NDArray[np.bool_]:
     """Boolean mask (N,) of the stars left when clipping changes nothing any more."""
     centre, scale = _robust(bins, r, n)
-    kept: NDArray[np.bool_] = np.ones(len(r), bool)
+    inlier: NDArray[np.bool_] = np.ones(len(r), bool)
     for _ in range(PASSES):
         within = np.asarray((np.abs(r - centre[bins]) <= clip * scale[bins]).all(axis=1))
-        if np.array_equal(within, kept):
+        if np.array_equal(within, inlier):
             break
-        kept = within
-        _, centre, scale = _moments(bins[kept], r[kept], n)
-    return kept
+        inlier = within
+        _, centre, scale = _moments(bins[inlier], r[inlier], n)
+    return inlier
 
 
 def _robust(bins: Int, r: Float, n: int) -> tuple[Float, Float]:
     """Median and scaled median absolute deviation (n, 2), from which the clipping starts."""
     centre, scale = np.zeros((n, 2)), np.zeros((n, 2))
+    filled = np.unique(bins)
     for a in (0, 1):
-        centre[:, a] = _medians(bins, r[:, a], n)
-        scale[:, a] = 1.4826 * _medians(bins, np.abs(r[:, a] - centre[bins, a]), n)
+        centre[filled, a] = ndimage.median(r[:, a], bins, filled)
+        off = np.abs(r[:, a] - centre[bins, a])
+        scale[filled, a] = 1.4826 * ndimage.median(off, bins, filled)
     return centre, scale
-
-
-def _medians(bins: Int, values: Float, n: int) -> Float:
-    ordered = values[np.lexsort((values, bins))]
-    count = np.bincount(bins, minlength=n)
-    start = np.cumsum(count) - count
-    out = np.zeros(n)
-    has = count > 0
-    low = (start + (count - 1) // 2)[has]
-    high = (start + count // 2)[has]
-    out[has] = (ordered[low] + ordered[high]) / 2
-    return out
 
 
 def _moments(bins: Int, r: Float, n: int) -> tuple[Int, Float, Float]:
@@ -149,3 +148,45 @@ def _moments(bins: Int, r: Float, n: int) -> tuple[Int, Float, Float]:
         mean[:, a] = np.bincount(bins, r[:, a], n) / np.maximum(count, 1)
         square[:, a] = np.bincount(bins, (r[:, a] - mean[bins, a]) ** 2, n)
     return count, mean, np.sqrt(square / np.maximum(count - 1, 1)[:, None])
+
+
+def quadratic_smoother(filled: NDArray[np.bool_]) -> scipy.sparse.csr_array:
+    """Sparse linear map (n_nodes, n_nodes) from node values to smooth ones.
+
+    `filled` (ny, nx) marks nodes with a value; columns of empty nodes are zero.  A node whose
+    window holds few values gets a plane or their mean; one whose window holds none gets a row of
+    zeros.
+    """
+    ny, nx = filled.shape
+    rows, columns, entries = [], [], []
+    for j in range(ny):
+        for i in range(nx):
+            low_j, low_i = max(j - HALF_WIDTH, 0), max(i - HALF_WIDTH, 0)
+            window = filled[low_j : j + HALF_WIDTH + 1, low_i : i + HALF_WIDTH + 1]
+            dj, di = np.nonzero(window)
+            if not len(dj):
+                continue
+            dj, di = dj + low_j - j, di + low_i - i
+            kernel = _kernel(tuple(di.tolist()), tuple(dj.tolist()))
+            rows.append(np.full(len(dj), j * nx + i))
+            columns.append((dj + j) * nx + di + i)
+            entries.append(kernel)
+    shape = (ny * nx, ny * nx)
+    if not rows:
+        return scipy.sparse.csr_array(shape)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.coo_array((np.concatenate(entries), where), shape).tocsr()
+
+
+@lru_cache(maxsize=4096)
+def _kernel(dx: tuple[int, ...], dy: tuple[int, ...]) -> Float:
+    """Weights of values at offsets (m,) in the surface's value at zero."""
+    x, y = np.array(dx, float), np.array(dy, float)
+    quadratic = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    for n in (6, 3, 1):
+        design = quadratic[:, :n]
+        if len(x) >= ENOUGH * n or n == 1:
+            if np.linalg.matrix_rank(design) == n:
+                break
+    weights: Float = np.linalg.pinv(design)[0]
+    return weights
