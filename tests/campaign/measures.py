@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from bayesdist.data import MatchTable
 from bayesdist.infer import fit_by_magnitude
 from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
-from bayesdist.infer.series import Course, Series, fit_series
+from bayesdist.infer.series import Series, TrendModel, fit_series
 from bayesdist.infer.transforms import Solution, View, lines, reference_gauge, without_frames
 from bayesdist.missions.acs.simulate.pointings import SPANS
 from bayesdist.missions.acs.simulate.stars import centroid_error
@@ -69,7 +69,7 @@ def line_errors(found: Calibrated, seed: int) -> Outcome:
     drift = found.bare.model.time
     assert drift is not None
     series = found.terms
-    course = Course("lines", drift.breaks, reference=drift.epoch0)
+    trend = TrendModel("lines", drift.breaks, reference=drift.epoch0)
     keep = [k for k, name in enumerate(series.coefficients) if name.split(".")[-1] in TERMS]
     some = Series(
         series.epoch,
@@ -77,7 +77,7 @@ def line_errors(found: Calibrated, seed: int) -> Outcome:
         series.cov[:, keep][:, :, keep],
         tuple(series.coefficients[k] for k in keep),
     )
-    posterior = fit_series(some, course, seed=seed, target_ess=100, target_rhat=1.05)
+    posterior = fit_series(some, trend, seed=seed, target_ess=100, target_rhat=1.05)
     names = {chip.number: chip.name for chip in found.bare.model.chips}
     draws = np.stack([posterior.alpha, posterior.beta], axis=-1)  # (n, S, k, 2)
     at = [[some.coefficients.index(f"{names[c]}.{term}") for c in CHIPS] for term in TERMS]

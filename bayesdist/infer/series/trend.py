@@ -1,6 +1,6 @@
-"""Courses of a coefficient with time: constant, lines, steps, kinks, smooth or irregular drift.
+"""Trends of a coefficient with time: constant, lines, steps, kinks, smooth or irregular drift.
 
-A course is linear in its parameters once the dates of its breaks are known; its columns are the
+A trend is linear in its parameters once the dates of its breaks are known; its columns are the
 same for every coefficient of a series.  R is the reference date of a segment, as RDATE in Equation
 3 of ACS ISR 2015-06.
 
@@ -11,7 +11,7 @@ same for every coefficient of a series.  R is the reference date of a segment, a
     piecewise   continuous, of slope b_s in segment s
     lines       a_s + b_s (t - R_s)
     spline      a line, and a smooth deviation: a Wiener process integrated once, seen at few knots
-    wander      a constant, and an irregular deviation: a Wiener process, seen at many knots
+    random_walk      a constant, and an irregular deviation: a Wiener process, seen at many knots
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ import numpy as np
 
 from bayesdist.errors import InputError
 
-__all__ = ["KINDS", "LEAST", "LEAST_FOUND", "Course"]
+__all__ = ["KINDS", "MIN_EXPOSURES", "MIN_EXPOSURES_FOUND", "TrendModel"]
 
-PLAIN = ("constant", "line", "spline", "wander")
+PLAIN = ("constant", "line", "spline", "random_walk")
 BROKEN = ("step", "line+step", "piecewise", "lines")
-KINDS = ("constant", "line", "step", "line+step", "piecewise", "lines", "spline", "wander")
+KINDS = ("constant", "line", "step", "line+step", "piecewise", "lines", "spline", "random_walk")
 SLOPED = ("line", "line+step", "piecewise", "lines", "spline")
 # fewest exposures of a segment: with given breaks, and where the breaks are to be found
-LEAST = {"step": 1, "line+step": 1, "piecewise": 2, "lines": 3}
-LEAST_FOUND = 5
+MIN_EXPOSURES = {"step": 1, "line+step": 1, "piecewise": 2, "lines": 3}
+MIN_EXPOSURES_FOUND = 5
 
 
 @dataclass(frozen=True)
-class Course:
+class TrendModel:
     """One form of dependence on time.
 
     Parameters
@@ -65,9 +65,9 @@ class Course:
     groups: str = "offsets"
 
     def __post_init__(self) -> None:
-        where = f"course {self.kind!r}"
+        where = f"trend {self.kind!r}"
         if self.kind not in KINDS:
-            raise InputError("unknown course", where=where, do=f"choose among {', '.join(KINDS)}")
+            raise InputError("unknown trend", where=where, do=f"choose among {', '.join(KINDS)}")
         if self.groups not in ("offsets", "slopes"):
             raise InputError(
                 f"groups is {self.groups!r}", where=where, do="choose offsets or slopes"
@@ -108,6 +108,13 @@ class Course:
         return self.n_breaks + 1
 
     @property
+    def n_columns(self) -> int:
+        """Number of columns, without groups and random part."""
+        s = self.n_segments
+        sizes = {"constant": 1, "line": 2, "spline": 2, "random_walk": 1, "step": s}
+        return {**sizes, "line+step": s + 1, "piecewise": s + 1, "lines": 2 * s}[self.kind]
+
+    @property
     def name(self) -> str:
         """Kind, with the breaks: 'lines, break at 2009.4'."""
         if self.breaks:
@@ -120,7 +127,7 @@ class Course:
     @property
     def drifts(self) -> bool:
         """True if it has a random part that can follow any drift."""
-        return self.kind in ("spline", "wander")
+        return self.kind in ("spline", "random_walk")
 
     @property
     def has_slope(self) -> bool:

@@ -1,4 +1,4 @@
-"""Courses: what their parameters mean, and what they refuse."""
+"""Trends: what their parameters mean, and what they refuse."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.series import KINDS, Course, Design, Series
-from bayesdist.infer.series.drift import Drift
+from bayesdist.infer.series import KINDS, Design, Series, TrendModel
+from bayesdist.infer.series.design import Drift
 
 BREAKS = (2005.3, 2011.0)
 
@@ -17,21 +17,21 @@ def series(rng, n=60, group=()):
     return Series.of(epoch, rng.standard_normal((n, 2)), coefficients=("a", "b"), group=group)
 
 
-def some_course(kind: str, **options) -> Course:
-    given = {} if kind in ("constant", "line", "spline", "wander") else {"breaks": BREAKS}
-    return Course(kind, **given, **options)
+def some_trend(kind: str, **options) -> TrendModel:
+    given = {} if kind in ("constant", "line", "spline", "random_walk") else {"breaks": BREAKS}
+    return TrendModel(kind, **given, **options)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_levels_and_slopes_are_those_of_the_columns(kind, rng):
-    """alpha and beta against values and differences of the course itself."""
-    course = some_course(kind, reference=(2004.5,))
-    design = Design(course, series(rng))
+    """alpha and beta against values and differences of the trend itself."""
+    trend = some_trend(kind, reference=(2004.5,))
+    design = Design(trend, series(rng))
     b = rng.standard_normal((3, 2, design.n_columns))
-    b[..., design.n_fixed :] = 0.0  # alpha and beta are those of the course without the drift
+    b[..., design.n_fixed :] = 0.0  # alpha and beta are those of the trend without the drift
     level, slope = design.lines(b, design.given_breaks())
-    limits = (2002.0, *course.breaks, 2014.0)
-    for s in range(course.n_segments):
+    limits = (2002.0, *trend.breaks, 2014.0)
+    for s in range(trend.n_segments):
         t = np.array([limits[s] + 0.1, limits[s] + 1.1])
         values = design.matrix(t, np.zeros(2, int))[0] @ np.swapaxes(b, 1, 2)  # (3, 2 epochs, k)
         expected = level[:, s, None] + slope[:, s, None] * (t - design.reference[s])[:, None]
@@ -41,14 +41,14 @@ def test_levels_and_slopes_are_those_of_the_columns(kind, rng):
 def test_piecewise_is_continuous_and_steps_are_not(rng):
     edges = np.array([BREAKS[0] - 1e-9, BREAKS[0]])
     for kind, continuous in (("piecewise", True), ("lines", False), ("step", False)):
-        design = Design(some_course(kind), series(rng))
+        design = Design(some_trend(kind), series(rng))
         values = design.matrix(edges, np.zeros(2, int))[0] @ rng.standard_normal(design.n_columns)
         assert (abs(values[1] - values[0]) < 1e-6) == continuous
 
 
 def test_reference_dates_are_the_mean_dates_of_the_segments(rng):
     one = series(rng)
-    design = Design(some_course("lines"), one)
+    design = Design(some_trend("lines"), one)
     segment = np.digitize(one.epoch, BREAKS)
     expected = [one.epoch[segment == s].mean() for s in range(3)]
     np.testing.assert_allclose(design.reference, expected)
@@ -58,7 +58,7 @@ def test_groups_add_an_offset_and_a_slope(rng):
     group = tuple(rng.choice(["F606W", "F814W", "F435W"], 60, p=[0.6, 0.2, 0.2]))
     one = series(rng, group=group)
     assert one.group_names[0] == "F606W"
-    plain, own = (Design(Course("line", groups=g), one) for g in ("offsets", "slopes"))
+    plain, own = (Design(TrendModel("line", groups=g), one) for g in ("offsets", "slopes"))
     assert (plain.n_columns, own.n_columns) == (4, 6)
     for code in range(3):
         t = np.array([2003.0, 2004.0])
@@ -94,34 +94,40 @@ def test_wiener_process_grows_as_time():
 @pytest.mark.parametrize(
     ("build", "error", "says"),
     [
-        (lambda: Course("cubic"), InputError, "unknown course"),
-        (lambda: Course("step"), InputError, "give one of breaks and find"),
-        (lambda: Course("step", (2009.4,), find=1), InputError, "give one of breaks and find"),
-        (lambda: Course("line", (2009.4,)), InputError, "has no breaks"),
-        (lambda: Course("lines", (2010.0, 2009.4)), InputError, "do not rise"),
-        (lambda: Course("lines", (2009.4,), reference=(1, 2, 3)), InputError, "3 reference dates"),
-        (lambda: Course("line", groups="none"), InputError, "offsets or slopes"),
-        (lambda: Course("lines", (np.nan,)), InputError, "not finite"),
+        (lambda: TrendModel("cubic"), InputError, "unknown trend"),
+        (lambda: TrendModel("step"), InputError, "give one of breaks and find"),
+        (lambda: TrendModel("step", (2009.4,), find=1), InputError, "give one of breaks and find"),
+        (lambda: TrendModel("line", (2009.4,)), InputError, "has no breaks"),
+        (lambda: TrendModel("lines", (2010.0, 2009.4)), InputError, "do not rise"),
+        (
+            lambda: TrendModel("lines", (2009.4,), reference=(1, 2, 3)),
+            InputError,
+            "3 reference dates",
+        ),
+        (lambda: TrendModel("line", groups="none"), InputError, "offsets or slopes"),
+        (lambda: TrendModel("lines", (np.nan,)), InputError, "not finite"),
     ],
 )
-def test_wrong_courses(build, error, says):
+def test_wrong_trends(build, error, says):
     with pytest.raises(error, match=says):
         build()
 
 
 def test_segments_without_exposures(rng):
     with pytest.raises(DegenerateError, match="segment from 2020 to inf has 0 exposures"):
-        Design(Course("lines", (2020.0,)), series(rng))
+        Design(TrendModel("lines", (2020.0,)), series(rng))
     with pytest.raises(DegenerateError, match="one date"):
-        Design(Course("line"), Series.of(np.full(5, 2003.0), np.arange(5.0), coefficients=("a",)))
+        Design(
+            TrendModel("line"), Series.of(np.full(5, 2003.0), np.arange(5.0), coefficients=("a",))
+        )
     with pytest.raises(DegenerateError, match="at least 15 dates"):
-        Design(Course("step", find=2), series(rng, n=12))
+        Design(TrendModel("step", find=2), series(rng, n=12))
 
 
 def test_a_filter_with_two_exposures_has_no_slope(rng):
     group = ("F606W",) * 58 + ("F814W",) * 2
     with pytest.raises(DegenerateError, match="2 exposures of group 'F814W'"):
-        Design(Course("line", groups="slopes"), series(rng, group=group))
+        Design(TrendModel("line", groups="slopes"), series(rng, group=group))
 
 
 def test_a_filter_for_each_segment_is_no_break(rng):
@@ -129,6 +135,6 @@ def test_a_filter_for_each_segment_is_no_break(rng):
     one = series(rng)
     group = tuple(np.where(one.epoch < BREAKS[0], "F606W", "F814W"))
     mixed = Series.of(one.epoch, one.values, coefficients=("a", "b"), group=group)
-    with pytest.raises(DegenerateError, match=r"F606W\) cannot be told from the course 'step"):
-        Design(Course("step", BREAKS[:1]), mixed)
-    assert Design(Course("line"), mixed).n_columns == 3
+    with pytest.raises(DegenerateError, match=r"F606W\) cannot be told from the trend 'step"):
+        Design(TrendModel("step", BREAKS[:1]), mixed)
+    assert Design(TrendModel("line"), mixed).n_columns == 3
