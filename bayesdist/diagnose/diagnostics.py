@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from bayesdist.checks import EITHER, Check
 from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
+from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
+from bayesdist.diagnose.correlated.storage import as_stored
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
 from bayesdist.diagnose.overlap import OverlapTest
@@ -34,17 +36,15 @@ from bayesdist.diagnose.residuals.sample import StarSample, star_sample
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
+from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
+from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.discrepancy import Discrepancy, DiscrepancyPriors, estimate_discrepancy
-from bayesdist.infer.discrepancy.storage import as_stored
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.selfcal import Solution as Eliminated
-from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
-from bayesdist.infer.selfcal.following import taken_by_stars
 from bayesdist.streams import restarted
 
 __all__ = [

@@ -15,25 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesdist.diagnose.correlated.deviations import deviation_columns
 from bayesdist.diagnose.score.motions import SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, noncentrality
 from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.diagnose.score.score import independent_directions
 from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
-from bayesdist.infer.discrepancy.linear import deviation_columns
-from bayesdist.infer.selfcal.discrepancy import MOST_EXPOSURES
-from bayesdist.infer.selfcal.eliminated import (
+from bayesdist.diagnose.selfcal.correlated import MOST_EXPOSURES
+from bayesdist.diagnose.selfcal.eliminated import (
     add_products,
     even_stars,
     pieces,
     star_sums,
     without_parameters,
 )
-from bayesdist.infer.selfcal.following import taken_by_stars
+from bayesdist.diagnose.selfcal.leverage import taken_by_stars
+from bayesdist.diagnose.selfcal.sandwich import star_scores
+from bayesdist.diagnose.selfcal.scores import scores_of_detections
 from bayesdist.infer.selfcal.normal import memberships
-from bayesdist.infer.selfcal.sandwich import star_scores
-from bayesdist.infer.selfcal.scores import scores_of_detections
 from bayesdist.infer.selfcal.solve import Solution
 from bayesdist.model.basis import MAX_ORDER
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.selfcal.following import MOST_TAKEN
 from bayesdist.infer.selfcal.normal import Mixture, memberships
 from bayesdist.infer.selfcal.problem import Problem
 
-__all__ = ["scatter_by_magnitude"]
+__all__ = ["MOST_TAKEN", "scatter_by_magnitude"]
 
 Float = NDArray[np.float64]
 
 LEAST = 200  # smallest number of detections in a bin
 MOST_BINS = 20
+# of a residual's variance: a star with as many parameters as detections absorbs it all
+MOST_TAKEN = 0.99
 
 
 def scatter_by_magnitude(

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.linear import LinearDeviations
-from bayesdist.model import DistortionModel
+from bayesdist.diagnose.correlated.deviations import LinearDeviations
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["ChipStructure", "Discrepancy"]
 
 Float = NDArray[np.float64]
+
+POINTS = 12  # on each axis of a chip, over which sizes are averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,30 @@ class ChipStructure:
         """Values (N, m) of all functions at scaled positions."""
         known = self.functions.evaluate(X, Y)
         return np.concatenate([known, self.functions.evaluate_finer(self.waves, X, Y)], axis=1)
+
+    def sizes(self, chip: Chip, length: float) -> list[dict[str, object]]:
+        """Rows of chip, axis, correlation length in pixels, and rms over the chip, for summaries.
+
+        The rms is that of all draws by the mean of their squares, their median, and what 95 % of
+        them do not exceed; `length` is in longer half sides.
+        """
+        line = (np.arange(POINTS) + 0.5) * 2 / POINTS - 1
+        X, Y = np.meshgrid(line, line)
+        here = self.evaluate(X.ravel(), Y.ravel())
+        rows: list[dict[str, object]] = []
+        for a, axis in enumerate("uv"):
+            by_draw = np.sqrt(np.mean((self.coefficients[:, a] @ here.T) ** 2, axis=1))
+            rows.append(
+                {
+                    "chip": chip.number,
+                    "axis": axis,
+                    "rms": float(np.sqrt(np.mean(by_draw**2))),
+                    "median": float(np.median(by_draw)),
+                    "most": float(np.quantile(by_draw, 0.95)),
+                    "length_pix": length * max(chip.size) / 2,
+                }
+            )
+        return rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.linear import deviation_columns
-from bayesdist.infer.selfcal.eliminated import Columns, eliminated, without_parameters
+from bayesdist.diagnose.correlated.deviations import deviation_columns
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.selfcal.eliminated import Columns, eliminated, without_parameters
+from bayesdist.diagnose.selfcal.sandwich import sandwich
+from bayesdist.diagnose.selfcal.scores import DetectionScores, scores_of_detections
 from bayesdist.infer.selfcal.information import Information
 from bayesdist.infer.selfcal.normal import Mixture, expand
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.selfcal.sandwich import sandwich
-from bayesdist.infer.selfcal.scores import DetectionScores, scores_of_detections
 from bayesdist.infer.selfcal.settled import gauge_of
 from bayesdist.infer.selfcal.solve import Solution, solve
 from bayesdist.model import TimeDependence

@@ -1,6 +1,6 @@
 """Discrepancy of a self-calibration, estimated from its residuals with the stars eliminated.
 
-As for matched stars (`bayesdist.infer.discrepancy`), with this difference: stars follow the common
+As for matched stars (`diagnose.correlated.estimate`), with this difference: stars follow the common
 part of their detections, which couples axes and chips.  So the structure on all of them has one
 posterior, with amplitudes and a correlation length in common.
 """
@@ -9,20 +9,24 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
-from bayesdist.infer.discrepancy.functions import LEAST_SIDE, StructureFunctions
-from bayesdist.infer.discrepancy.linear import deviation_columns, deviation_draws
-from bayesdist.infer.discrepancy.noise import not_narrower
-from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
-from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
-from bayesdist.infer.selfcal.eliminated import Columns, eliminated, even_stars, without_parameters
+from bayesdist.diagnose.correlated.coupled_structure import structure_posterior
+from bayesdist.diagnose.correlated.deviations import deviation_columns, deviation_draws
+from bayesdist.diagnose.correlated.functions import LEAST_SIDE, StructureFunctions
+from bayesdist.diagnose.correlated.noise import not_narrower
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
+from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.selfcal.eliminated import (
+    Columns,
+    eliminated,
+    even_stars,
+    without_parameters,
+)
+from bayesdist.diagnose.selfcal.sandwich import sandwich
+from bayesdist.diagnose.selfcal.scores import DetectionScores, score_excess, scores_of_detections
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.selfcal.sandwich import sandwich
-from bayesdist.infer.selfcal.scores import DetectionScores, score_excess, scores_of_detections
 from bayesdist.infer.selfcal.solve import Solution
-from bayesdist.infer.selfcal.structure import structure_posterior
-from bayesdist.infer.selfcal.structure_sizes import chip_structure
 
 __all__ = ["MOST_EXPOSURES", "selfcal_discrepancy"]
 
@@ -35,8 +39,7 @@ MOST_EXPOSURES = 150  # whose single deviations are estimated
 MOST_SINES = 700  # of all axes and chips: their information is decomposed
 
 
-# a second BLAS thread gains little here and loses much on a machine that has other work
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def selfcal_discrepancy(
     solution: Solution,
     *,
@@ -145,12 +148,12 @@ def _structure(
         structure=priors.structure * pixel,
     )
     drawn = posterior.draws(n, rng)
-    out, rows, known = {}, list[dict[str, object]](), []
+    out, rows, known = dict[int, ChipStructure](), list[dict[str, object]](), []
     for k, (code, one) in enumerate(functions.items()):
         chip, pair = model.chips[code], drawn[2 * k : 2 * k + 2]
-        waves = one.finer_waves(rng)
-        out[chip.number], sizes = chip_structure(chip, one, waves, pair, [posterior] * 2)
-        rows += sizes
+        found = ChipStructure(one, one.finer_waves(rng), np.stack(pair, axis=1))
+        rows += found.sizes(chip, posterior.length)
+        out[chip.number] = found
         known += [axis[:, : one.n_known] for axis in pair]
     # the fit absorbs structure into polynomials; the truth lies on the other side
     return out, -np.concatenate(known, axis=1) @ taken.T, rows

@@ -10,10 +10,10 @@ import pytest
 from numpy.polynomial.legendre import legvander2d
 from scipy.stats import kurtosis
 
-from bayesdist.infer.discrepancy import DiscrepancyPriors
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.linear import DeviationColumns, deviation_draws
-from bayesdist.infer.discrepancy.structure import LENGTHS, chip_structure
+from bayesdist.diagnose.correlated import DiscrepancyPriors
+from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_draws
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.structure import LENGTHS, chip_structure
 from tests.infer.by_nuts import nuts_draws
 
 pytestmark = pytest.mark.slow

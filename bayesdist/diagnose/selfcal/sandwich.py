@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.selfcal.eliminated import Columns, Piece, pieces, star_sums
-from bayesdist.infer.selfcal.scores import DetectionScores
+from bayesdist.diagnose.selfcal.eliminated import Columns, Piece, pieces, star_sums
+from bayesdist.diagnose.selfcal.scores import DetectionScores
 from bayesdist.infer.selfcal.solve import Solution
 
 __all__ = ["sandwich", "star_scores"]

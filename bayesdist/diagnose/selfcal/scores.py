@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.discrepancy.noise import MOST_BLOCKS, STARS_PER_BLOCK, shrunk_ratios
-from bayesdist.infer.selfcal.following import taken_by_stars
+from bayesdist.diagnose.correlated.noise import MOST_BLOCKS, STARS_PER_BLOCK, shrunk_ratios
+from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.infer.selfcal.normal import memberships
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.solve import Solution

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayesdist.diagnose.correlated import estimate_discrepancy
 from bayesdist.infer import Rejection, build_model, fit_linear
-from bayesdist.infer.discrepancy import estimate_discrepancy
-from tests.infer.discrepancy.skies import SIZE, matched
+from tests.diagnose.correlated.skies import SIZE, matched
 
 EXPOSURES, SCATTER = 8, 3e-5
 

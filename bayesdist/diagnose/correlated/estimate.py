@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.infer.discrepancy.cells import CellSums, cell_sums, cells_per_side
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.information import Information
-from bayesdist.infer.discrepancy.linear import MOST_EXPOSURES, linear_deviations
-from bayesdist.infer.discrepancy.neighbours import SharedVariance, shared_variances
-from bayesdist.infer.discrepancy.noise import not_narrower, score_excess
-from bayesdist.infer.discrepancy.priors import DiscrepancyPriors
-from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
-from bayesdist.infer.discrepancy.shared_stars import shared_stars
-from bayesdist.infer.discrepancy.structure import chip_structure
+from bayesdist.diagnose.correlated.cells import CellSums, cell_sums, cells_per_side
+from bayesdist.diagnose.correlated.deviations import MOST_EXPOSURES, linear_deviations
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.information import Information
+from bayesdist.diagnose.correlated.neighbours import SharedVariance, shared_variances
+from bayesdist.diagnose.correlated.noise import not_narrower, score_excess
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
+from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.correlated.shared_stars import shared_stars
+from bayesdist.diagnose.correlated.structure import chip_structure
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
@@ -35,7 +35,6 @@ __all__ = ["estimate_discrepancy"]
 Float = NDArray[np.float64]
 
 DRAWS = 2000
-POINTS = 12  # on each axis
 
 
 @one_thread
@@ -166,7 +165,6 @@ def _structures(
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
         chip_waves = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
         S, crossed, taken, score = _along_axes(information, working, chip_waves, code)
-        here = chip_waves.evaluate(*_even_points())
         left = [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)]
         pull = [score[a] - crossed[a].T @ shift for a in (0, 1)]
         posterior = chip_structure(
@@ -178,30 +176,13 @@ def _structures(
             structure=priors.structure * pixel,
             pairs=neighbours.get(code, (None, None)),
         )
-        drawn = posterior.draws(n, rng)
+        found = replace(chip_waves, coefficients=posterior.draws(n, rng))
         for a in (0, 1):
             # the fit absorbs structure into polynomials; the truth lies on the other side
-            theta -= drawn[:, a] @ (working.covariance @ taken[a]).T
-            by_draw = np.sqrt(np.mean((drawn[:, a] @ here.T) ** 2, axis=1))
-            rows.append(
-                {
-                    "chip": chip.number,
-                    "axis": "uv"[a],
-                    "rms": float(np.sqrt(np.mean(by_draw**2))),
-                    "median": float(np.median(by_draw)),
-                    "most": float(np.quantile(by_draw, 0.95)),
-                    "length_pix": posterior.length * max(chip.size) / 2,
-                }
-            )
-        out[chip.number] = replace(chip_waves, coefficients=drawn)
+            theta -= found.coefficients[:, a] @ (working.covariance @ taken[a]).T
+        rows += found.sizes(chip, posterior.length)
+        out[chip.number] = found
     return out, theta, {"structure": rows}
-
-
-def _even_points() -> tuple[Float, Float]:
-    """Scaled positions over which sizes are averaged."""
-    line = (np.arange(POINTS) + 0.5) * 2 / POINTS - 1
-    X, Y = np.meshgrid(line, line)
-    return X.ravel(), Y.ravel()
 
 
 def _star_error(information: Information, chip: int) -> float:

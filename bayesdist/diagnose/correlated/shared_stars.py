@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
+from bayesdist.diagnose.correlated.priors import log_half_cauchy
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
-from bayesdist.infer.discrepancy.priors import log_half_cauchy
 from bayesdist.infer.posterior.likelihood import Scores
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel

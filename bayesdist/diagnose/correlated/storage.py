@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.linear import KINDS, LinearDeviations
-from bayesdist.infer.discrepancy.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.correlated.deviations import KINDS, LinearDeviations
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
 from bayesdist.model import DistortionModel
 
 __all__ = ["as_stored", "discrepancy_from_arrays", "discrepancy_to_arrays"]

@@ -9,10 +9,10 @@ import pytest
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.correlated import StructureErrors
+from bayesdist.diagnose.correlated import DiscrepancyPriors, estimate_discrepancy
 from bayesdist.errors import InputError
-from bayesdist.infer.discrepancy import DiscrepancyPriors, estimate_discrepancy
 from bayesdist.model.grid import grid_pixels, mesh
-from tests.infer.discrepancy.skies import SIZE, matched, smooth
+from tests.diagnose.correlated.skies import SIZE, matched, smooth
 
 FULL = "BAYESDIST_FULL" in os.environ
 GRID = (9, 9)

@@ -8,22 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.infer.selfcal.errors import MOST_TAKEN
 from bayesdist.infer.selfcal.normal import STARS, memberships
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.solve import Solution
 
-__all__ = ["MOST_TAKEN", "Following", "following", "places_by_star", "taken_by_stars"]
+__all__ = ["StarBlock", "places_by_star", "star_blocks", "taken_by_stars"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-# of a residual's variance: a star with as many parameters as detections absorbs it all
-MOST_TAKEN = 0.99
 LOOSE = 1e-9  # relative curvature below which a combination of a star's parameters is undetermined
 
 
 @dataclass(frozen=True, eq=False)
-class Following:
+class StarBlock:
     """Some stars with their n detections, in pixels of the detector."""
 
     rows: slice  # detections, in the order of the problem
@@ -36,8 +35,8 @@ class Following:
     ties: Float
 
 
-def following(solution: Solution) -> Iterator[Following]:
-    """Iterator over the stars of a solution, some at a time."""
+def star_blocks(solution: Solution) -> Iterator[StarBlock]:
+    """Iterator over the stars of a solution, some at a time, with their detections."""
     p, theta, mixture = solution.problem, solution.theta, solution.mixture
     members = memberships(p, theta, mixture, solution.stars)
     weights = members / (p.var + mixture.jitter**2)
@@ -53,13 +52,13 @@ def following(solution: Solution) -> Iterator[Following]:
         roots = _inverse_roots(own)
         residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
         ties = w[:, None, None] * (roots[star] @ by_star)
-        yield Following(rows, star, members[rows], w, residual, ties)
+        yield StarBlock(rows, star, members[rows], w, residual, ties)
 
 
 def taken_by_stars(solution: Solution) -> Float:
     """Fraction (N,) of each detection's variance that its star absorbs, at most `MOST_TAKEN`."""
     out = np.empty(len(solution.problem))
-    for some in following(solution):
+    for some in star_blocks(solution):
         square = np.sum(some.ties**2, axis=(1, 2))
         out[some.rows] = square / (2 * np.maximum(some.weight, np.finfo(float).tiny))
     return np.minimum(out, MOST_TAKEN)

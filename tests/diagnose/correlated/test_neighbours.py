@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from bayesdist.diagnose.correlated import estimate_discrepancy
+from bayesdist.diagnose.correlated.neighbours import EDGES, shared_variances
 from bayesdist.infer import fit_linear
-from bayesdist.infer.discrepancy import estimate_discrepancy
-from bayesdist.infer.discrepancy.neighbours import EDGES, shared_variances
 from bayesdist.infer.posterior.likelihood import scores_of
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches

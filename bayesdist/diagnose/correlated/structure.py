@@ -21,9 +21,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from bayesdist.infer.discrepancy.functions import FINE, StructureFunctions
-from bayesdist.infer.discrepancy.neighbours import SharedVariance
-from bayesdist.infer.discrepancy.priors import log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
+from bayesdist.diagnose.correlated.neighbours import SharedVariance
+from bayesdist.diagnose.correlated.priors import log_half_cauchy, log_widths
 
 __all__ = ["Structure", "chip_structure"]
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
-from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
 from bayesdist.infer.selfcal.information import Information
 from bayesdist.infer.selfcal.problem import prepared
 from bayesdist.infer.selfcal.settled import gauge_of

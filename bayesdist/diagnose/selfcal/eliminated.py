@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.linear import DeviationColumns
-from bayesdist.infer.selfcal.following import places_by_star
+from bayesdist.diagnose.correlated.deviations import DeviationColumns
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.selfcal.leverage import places_by_star
+from bayesdist.diagnose.selfcal.scores import DetectionScores
 from bayesdist.infer.selfcal.normal import Structure
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.selfcal.scores import DetectionScores
 from bayesdist.infer.selfcal.solve import Solution
 
 __all__ = [

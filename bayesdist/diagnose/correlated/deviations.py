@@ -16,9 +16,10 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from bayesdist.infer.discrepancy.information import GroupCells, Information
-from bayesdist.infer.discrepancy.priors import DiscrepancyPriors, log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.information import GroupCells, Information
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cauchy, log_widths
 from bayesdist.model import DistortionModel, Groups
+from bayesdist.model.frames import LINEAR_MATRICES
 
 __all__ = [
     "DeviationColumns",
@@ -37,6 +38,12 @@ KINDS = {
     "rotation": ("shift_rotation", "shift_rotation_scale", "affine"),
     "scale": ("shift_rotation_scale", "affine"),
     "shear": ("affine",),
+}
+# and their parameters, but for shifts
+LINEAR = {
+    "rotation": ("rotation",),
+    "scale": ("scale",),
+    "shear": ("shear_plus", "shear_cross"),
 }
 SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
 CURVATURE = "curvature"
@@ -86,17 +93,12 @@ class LinearDeviations:
         P[:, 0] = 0.0
         along = np.zeros((2, *P.shape))
         along[0, 0, 0] = along[1, 1, 0] = self.size
-        fields = {
-            "shift": [*along],
-            "rotation": [np.stack([-P[1], P[0]])],
-            "scale": [P],
-            "shear": [np.stack([P[0], -P[1]]), P[::-1]],
-        }
         out = np.zeros((n, *P.shape))
         for kind in self.kinds:
-            scatter = self.scatter[SCATTERS[kind]]
-            for field in fields[kind]:
-                out += (scatter * rng.standard_normal(n))[:, None, None] * field
+            fields = along if kind == "shift" else [LINEAR_MATRICES[k] @ P for k in LINEAR[kind]]
+            for field in fields:
+                size = self.scatter[SCATTERS[kind]] * rng.standard_normal(n)
+                out += size[:, None, None] * field
         return out
 
 
@@ -165,7 +167,7 @@ def deviation_columns(
     kinds = tuple(k for k, fitted in KINDS.items() if model.frames not in fitted)
     if n_exposures < 2 or n_exposures > most or not exposures:
         kinds = ()
-    per_exposure = [SCATTERS[k] for k in kinds for _ in range({"shift": 2, "shear": 2}.get(k, 1))]
+    per_exposure = [SCATTERS[k] for k in kinds for _ in LINEAR.get(k, "uv")]
     terms = _bending(model)
     scatter = np.array([*per_exposure * n_exposures, *[CURVATURE] * len(terms)])
     if not len(scatter):
@@ -337,15 +339,11 @@ def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:
 
 def _deviations(position: Float, kinds: Sequence[str], size: float) -> Float:
     """Displacements (C, 2, q) by unit deviations of each kind; shifts in half sizes."""
-    p, q = position.T
-    zero, one = np.zeros_like(p), np.full_like(p, size)
-    fields = {
-        "shift": [(one, zero), (zero, one)],
-        "rotation": [(-q, p)],
-        "scale": [(p, q)],
-        "shear": [(p, -q), (q, p)],
-    }
-    chosen = [np.stack(field, axis=1) for kind in kinds for field in fields[kind]]
-    if not chosen:
-        return np.zeros((len(p), 2, 0))
-    return np.stack(chosen, axis=2)
+    chosen = [np.zeros((len(position), 0, 2))]
+    for kind in kinds:
+        if kind == "shift":
+            chosen.append(np.broadcast_to(size * np.eye(2), (len(position), 2, 2)))
+        else:
+            matrices = np.stack([LINEAR_MATRICES[name] for name in LINEAR[kind]])
+            chosen.append(np.einsum("kab,cb->cka", matrices, position))
+    return np.swapaxes(np.concatenate(chosen, axis=1), 1, 2)

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.discrepancy.functions import FINE, StructureFunctions
-from bayesdist.infer.discrepancy.priors import log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
+from bayesdist.diagnose.correlated.priors import log_half_cauchy, log_widths
 
 __all__ = ["StructurePosterior", "structure_posterior"]
 
@@ -107,12 +107,6 @@ class StructurePosterior:
             strict=True,
         )
         return [np.concatenate(parts, axis=1) for parts in split]
-
-    @property
-    def field_rms(self) -> float:
-        """Root of the mean posterior square of the field's amplitude."""
-        by_point = self.weight.sum(axis=1)
-        return float(np.sqrt(by_point @ [p.amplitude**2 for p in self.points]))
 
     @property
     def length(self) -> float:

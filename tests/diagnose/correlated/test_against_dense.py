@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bayesdist.diagnose.correlated.cells import cell_sums
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.information import Information
+from bayesdist.diagnose.correlated.structure import chip_structure
 from bayesdist.infer import GaussianPriors
-from bayesdist.infer.discrepancy.cells import cell_sums
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.information import Information
-from bayesdist.infer.discrepancy.structure import chip_structure
 from bayesdist.infer.posterior.likelihood import scores_of
 from bayesdist.infer.stars.stars import prepare
-from tests.infer.discrepancy.skies import SIGMA, matched
+from tests.diagnose.correlated.skies import SIGMA, matched
 
 SIDE = 64
 
