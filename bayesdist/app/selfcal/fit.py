@@ -18,10 +18,10 @@ from bayesdist.app.selfcal.matched import SelfcalMatched
 from bayesdist.app.selfcal.matches import fit_of, magnitude_errors_of, matches_of
 from bayesdist.app.selfcal.solved import SelfCalibrated, arrays_of, read_solution
 from bayesdist.infer import GaussianPriors, Posterior, load_fit
-from bayesdist.infer.selfcal import Solution, sample_selfcal
+from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
+from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import Decision
-from bayesdist.infer.selfcal.normal import Mixture, expand
-from bayesdist.infer.selfcal.settled import gauge_of, solved_in_gauge
+from bayesdist.infer.selfcal.mode import gauge_of, solve_in_gauge
 from bayesdist.model import DistortionModel
 
 __all__ = ["fit_selfcal", "load_fitted_selfcal", "sample_detections"]
@@ -43,10 +43,10 @@ def fit_selfcal(matched: SelfcalMatched) -> Fitted:
     Raises
     ------
     DegenerateError, NotSettledError
-        As `solved_in_gauge`.
+        As `solve_in_gauge`.
     """
     given, model = matched.given, matched.problem.model
-    mode = solved_in_gauge(
+    mode = solve_in_gauge(
         matched.problem,
         matched.theta,
         given.known_for(model),
@@ -150,7 +150,7 @@ def _solved(
     for _ in range(RELINEARISED):
         problem = problem.at(theta, stars)
     found = expand(problem, theta, mixture, stars)
-    solution = Solution(
+    solution = SelfCalibrationMode(
         problem,
         theta,
         problem.found_again(theta, found.stars),

@@ -15,9 +15,9 @@ from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.data.detections import Detections
 from bayesdist.infer.linear import Clip, LinearFit
-from bayesdist.infer.selfcal import Solution
-from bayesdist.infer.selfcal.errors import scatter_by_magnitude
-from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal import SelfCalibrationMode
+from bayesdist.infer.selfcal.calibrate import scatter_by_magnitude
+from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = ["fit_of", "magnitude_errors_of", "matches_of"]
@@ -86,7 +86,7 @@ def _axes(W: Float) -> Float:
     return np.sqrt(np.stack([W[:, 2], W[:, 0]], axis=1) / det[:, None])
 
 
-def fit_of(solution: Solution) -> LinearFit:
+def fit_of(solution: SelfCalibrationMode) -> LinearFit:
     """The solution as a fit, with the statistics of its residuals.
 
     The covariance is that of the curvature at the mode, with the stars eliminated; zero for what
@@ -122,7 +122,9 @@ def fit_of(solution: Solution) -> LinearFit:
     )
 
 
-def magnitude_errors_of(solution: Solution, matches: MatchTable) -> MagnitudeErrors | None:
+def magnitude_errors_of(
+    solution: SelfCalibrationMode, matches: MatchTable
+) -> MagnitudeErrors | None:
     """Errors of centroids by magnitude, in the unit of u, v; None without magnitudes."""
     if matches.mag is None:
         return None

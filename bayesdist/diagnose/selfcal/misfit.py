@@ -23,7 +23,7 @@ from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
 from bayesdist.diagnose.selfcal.leverage import StarBlock, star_blocks
-from bayesdist.infer.selfcal import Solution
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
@@ -38,12 +38,12 @@ MOST_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
 TOLD = 0.05  # of what detections would say of a cell if stars were known: less is not told
 
 
-def dithered_misfit(solution: Solution) -> Misfit:
+def dithered_misfit(solution: SelfCalibrationMode) -> Misfit:
     """Test the detections of a self-calibration for structure over the detector.
 
     Parameters
     ----------
-    solution : Solution
+    solution : SelfCalibrationMode
 
     Returns
     -------
@@ -97,7 +97,7 @@ class _Shifts:
     dof: float = 1.0
 
 
-def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
+def _shifts(solution: SelfCalibrationMode, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
     """What detections say of shifts of the cells of each partition, in one pass over them."""
     p, expansion = solution.problem, solution.expansion
     out = []

@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.moves import (
+from bayesdist.infer.selfcal.prior import Prior
+from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.selfcal.sky_moves import (
     GENERATORS,
     PARALLAX,
     POINTS,
     functionals,
+    largest_roll_difference,
     moves,
     parameter_scale,
     rates,
-    roll_spread,
 )
-from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
 __all__ = ["FAR", "SAME_ROLL", "Decision", "Gauge", "NamedDirection", "find_gauge"]
@@ -204,7 +204,7 @@ def find_gauge(
     problem: Problem,
     theta: Float,
     curvature: Float,
-    information: Information,
+    prior: Prior,
     *,
     known: Float | None = None,
     decision: Decision | None = None,
@@ -218,7 +218,7 @@ def find_gauge(
     model = problem.model
     years = float(np.ptp(problem.groups.epoch)) or 1.0
     scale = parameter_scale(model, theta, years)
-    both = (curvature if known is None else known) + information.precision
+    both = (curvature if known is None else known) + prior.precision
     alone, fixed = (
         _Spectrum.of(H * np.outer(scale, scale), n)
         for H, n in (
@@ -247,7 +247,7 @@ def find_gauge(
         directions=directions,
         unnamed=_unnamed(model, null, known_moves),
         weakest=weakest,
-        spread=roll_spread(model, theta),
+        spread=largest_roll_difference(model, theta),
         whole=tuple(name for name in GENERATORS if _within(named[name] / scale, null)),
         rates=tuple(name for name, row in moving.items() if _within(row / scale, loose)),
     )

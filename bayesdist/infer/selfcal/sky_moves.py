@@ -7,7 +7,6 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.selfcal.information import linear_part
 from bayesdist.model import DistortionModel
 
 __all__ = [
@@ -15,10 +14,10 @@ __all__ = [
     "PARALLAX",
     "POINTS",
     "functionals",
+    "largest_roll_difference",
     "moves",
     "parameter_scale",
     "rates",
-    "roll_spread",
 ]
 
 Float = NDArray[np.float64]
@@ -129,9 +128,19 @@ def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
     return out
 
 
+def _linear_part(model: DistortionModel, chip: int | None = None) -> Float:
+    """Rows (2, 2, D): derivatives of u and v by x and y at a chip's reference pixel."""
+    basis = model.basis(chip)
+    by = basis.monomial_matrix[1:3]
+    out = np.zeros((2, 2, model.n_params))
+    for axis in range(2):
+        out[axis, :, model.coefficient_slice(chip, axis)] = by
+    return out
+
+
 def _sky_map(model: DistortionModel, theta: Float, chip: int) -> Float:
     """Rows (2, 2, D) of the linear map of the sky that a change of the chip's linear part makes."""
-    G = linear_part(model, chip)
+    G = _linear_part(model, chip)
     now = G @ theta
     return np.asarray(np.einsum("abd,bc->acd", G, np.linalg.inv(now)))
 
@@ -154,7 +163,7 @@ def _parts(L: Float) -> dict[str, Float]:
     }
 
 
-def roll_spread(model: DistortionModel, theta: Float) -> float:
+def largest_roll_difference(model: DistortionModel, theta: Float) -> float:
     """Largest difference of two roll angles, radians; a half turn counts as none."""
     angles = []
     for e in range(len(model.exposures)):

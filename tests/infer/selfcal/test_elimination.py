@@ -9,7 +9,7 @@ import pytest
 from scipy.special import logsumexp
 
 from bayesdist.infer import kernel
-from bayesdist.infer.selfcal.normal import Anchor, Mixture, expand, log_marginal
+from bayesdist.infer.selfcal.elimination import Mixture, StarModes, expand, log_marginal
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
 from bayesdist.simulate.dithers import pixels_of
@@ -66,7 +66,10 @@ def test_elimination_is_the_schur_complement(kind, motion):
         simulated = replace(simulated, model=model, theta=theta)
     factors = np.random.default_rng(0).normal(size=(9, 2))
     problem, stars = problem_of(
-        simulated, motion=motion, parallax_factors=factors, least=5 if motion != "none" else 2
+        simulated,
+        motion=motion,
+        parallax_factors=factors,
+        min_detections=5 if motion != "none" else 2,
     )
     found = expand(problem, theta, NO_FALSE, stars)
     dense = _dense(problem, theta)
@@ -79,7 +82,7 @@ def test_gradient_is_that_of_the_density():
     theta = simulated.theta
     found = expand(problem, theta, NO_FALSE, stars)
     rng, scale = np.random.default_rng(0), 1 / np.sqrt(np.diag(found.curvature))
-    anchor = Anchor.at(problem, theta, NO_FALSE, found.stars)
+    anchor = StarModes.at(problem, theta, NO_FALSE, found.stars)
     for _ in range(4):
         step = scale * rng.normal(size=len(theta))
         near = theta + np.outer([0.03, -0.03], step)
@@ -95,7 +98,7 @@ def test_expansion_and_density_agree():
     problem, stars = problem_of(simulated)
     theta, mixture = simulated.theta, Mixture(0.01, 0.03)
     found = expand(problem, theta, mixture, stars)
-    anchor = Anchor.at(problem, theta, mixture, found.stars)
+    anchor = StarModes.at(problem, theta, mixture, found.stars)
     # where it is doubtful who is a member the expansion knows one choice, the density all of them
     assert (anchor.state == kernel.DOUBTFUL).any()
     anchor = replace(anchor, state=np.full(len(problem), kernel.MEMBER, np.int8))
@@ -137,7 +140,7 @@ def _quadrature(one, theta, mixture, low, high, n=401):
 def test_star_integral():
     """The mixture integrated over the place of one star, against quadrature."""
     simulated = field(4, 6, 60, disturbed=0.1)
-    problem, _ = problem_of(simulated, least=4)
+    problem, _ = problem_of(simulated, min_detections=4)
     theta, mixture = simulated.theta, Mixture(0.005, 0.05)
     checked, rough, exact = 0, [], []
     for s in range(0, problem.n_stars, 3):
@@ -146,7 +149,7 @@ def test_star_integral():
         found = expand(one, theta, mixture, simulated.sky[true][None])
         width = 8 * np.sqrt(one.var.max() + mixture.jitter**2)
         want = _quadrature(one, theta, mixture, found.stars[0] - width, found.stars[0] + width)
-        anchor = Anchor.at(one, theta, mixture, found.stars)
+        anchor = StarModes.at(one, theta, mixture, found.stars)
         [value] = log_marginal(
             one, theta[None], np.array([[mixture.jitter, mixture.fraction]]), anchor
         )
@@ -166,7 +169,7 @@ def test_a_detection_that_goes_away_from_its_star(n):
     What is doubtful is told at one solution, at 8: no draw carries a detection as far from there.
     """
     simulated = field(4, n, 60)
-    problem, _ = problem_of(simulated, least=n)
+    problem, _ = problem_of(simulated, min_detections=n)
     one, theta, mixture = _alone(problem, 0), simulated.theta, Mixture(0.0, 0.02)
     place = simulated.sky[simulated.detections.star[one.rows[0]]][None]
     sigma = np.sqrt(one.var[0])
@@ -182,7 +185,7 @@ def test_a_detection_that_goes_away_from_its_star(n):
     none = len(one) * mixture.constants(one.log_outlier)[2]
     room = 2 * np.pi / one.least_root**2 - 4 * reach.prod()
     at = moved(8.0)
-    anchor = Anchor.at(at, theta, mixture, expand(at, theta, mixture, place).stars)
+    anchor = StarModes.at(at, theta, mixture, expand(at, theta, mixture, place).stars)
     for away in np.linspace(5.0, 11.0, 25):
         here = moved(away)
         value = log_marginal(here, theta[None], given, anchor)[0] + np.log(2 * np.pi)
@@ -212,7 +215,7 @@ def test_a_larger_sky_is_no_better_than_a_smaller_one():
         problem,
         np.stack([theta, grown]),
         np.tile([0.0, 0.01], (2, 1)),
-        Anchor.at(problem, theta, Mixture(0.0, 0.01), found.stars),
+        StarModes.at(problem, theta, Mixture(0.0, 0.01), found.stars),
     )
     # of 2 n squared residuals a thousandth would be 2; what is left is of second order
     assert len(problem) > 500

@@ -1,22 +1,30 @@
-"""The mode of distortion, frames, stars and memberships together."""
+"""The mode of distortion, frames, stars and memberships, with the parameters fixed by convention.
+
+Free directions are found at a solution, and a solution needs the fixed parameters.  With the errors
+of a start more seems free than at the mode; where rolls hardly differ the two answers differ.  So
+the question is asked again at the mode, and the answer is stored with the solution for all later
+uses.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, NotSettledError
-from bayesdist.infer.selfcal.gauge import Decision
-from bayesdist.infer.selfcal.information import Information
-from bayesdist.infer.selfcal.normal import Expansion, Mixture, expand
-from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.selfcal.elimination import Expansion, Mixture, expand
+from bayesdist.infer.selfcal.gauge import Decision, Gauge, find_gauge
+from bayesdist.infer.selfcal.prior import Prior
+from bayesdist.infer.selfcal.problem import Problem, StarPriors
 
-__all__ = ["Solution", "newton_step", "solve", "wide_mixture"]
+__all__ = ["PriorAt", "SelfCalibrationMode", "curvatures", "gauge_of", "solve", "solve_in_gauge"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+PriorAt = Callable[[Float], Prior]  # linearised at parameters (D,)
 
 MOST_PASSES = 80
 CLOSE = 1e-5  # decrement (expected gain in log density) at which the mode is found
@@ -27,7 +35,7 @@ START = 3.0  # times the robust scatter: errors begin as large as this, so that 
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class SelfCalibrationMode:
     """Mode of a self-calibration.
 
     Parameters
@@ -41,7 +49,7 @@ class Solution:
     free : ndarray of int, shape (F,)
         Parameters that were fitted; the others are fixed by the gauge.
     expansion : Expansion
-    information : Information
+    prior : Prior
     decision : Decision, optional
         Directions taken as free; None where only `free` was given.
     """
@@ -52,13 +60,13 @@ class Solution:
     mixture: Mixture
     free: Int
     expansion: Expansion
-    information: Information
+    prior: Prior
     decision: Decision | None = None
 
     @property
     def precision(self) -> Float:
         """Curvature (F, F) of the free parameters, with information from other sources."""
-        total = self.expansion.curvature + self.information.precision
+        total = self.expansion.curvature + self.prior.precision
         return np.asarray(total[np.ix_(self.free, self.free)])
 
     @property
@@ -78,12 +86,12 @@ def solve(
     problem: Problem,
     theta: Float,
     free: Int,
-    information: Information,
+    prior: Prior,
     *,
     stars: Float | None = None,
     mixture: Mixture | None = None,
     jitter: float | None = None,
-) -> Solution:
+) -> SelfCalibrationMode:
     """Mode by Newton's method with the stars eliminated in each pass.
 
     Errors begin as large as the scatter of the start and shrink with it, so that a start that is
@@ -98,8 +106,8 @@ def solve(
     for _ in range(MOST_PASSES):
         found = expand(problem, theta, mixture, stars, observed=near)
         stars = problem.found_again(theta, found.stars)
-        gradient = found.gradient + information.pull(theta)
-        step = newton_step(found.curvature + information.precision, gradient, free)
+        gradient = found.gradient + prior.pull(theta)
+        step = newton_step(found.curvature + prior.precision, gradient, free)
         if step is None and near:
             near = False
             continue
@@ -122,7 +130,7 @@ def solve(
         if near and decrement < CLOSE and change < SETTLED:
             found = expand(problem, theta, mixture, stars)
             stars = problem.found_again(theta, found.stars)
-            return Solution(problem, theta, stars, mixture, free, found, information)
+            return SelfCalibrationMode(problem, theta, stars, mixture, free, found, prior)
         near = decrement < NEAR and change < 0.1
         mixture = after
     raise NotSettledError(
@@ -171,3 +179,86 @@ def _mixture(
     new = min(max(new, mixture.jitter**2 / 4), 4 * mixture.jitter**2 + float(np.median(s2)))
     floor = (1e-2 * problem.sigma) ** 2
     return Mixture(float(np.sqrt(max(new, floor))), share)
+
+
+def solve_in_gauge(
+    problem: Problem,
+    theta: Float,
+    prior_at: PriorAt,
+    *,
+    stars: Float | None = None,
+    mixture: Mixture | None = None,
+    jitter: float | None = None,
+) -> SelfCalibrationMode:
+    """Mode of a problem, with the parameters fixed by convention as decided there.
+
+    The search starts at theta (D,); `prior_at` gives information from other sources than the
+    detections, linearised at parameters (D,).  Where the detections determine more at the mode than
+    at the start, that is fitted; where it then turns out to be free after all, it stays fixed.
+    DegenerateError and NotSettledError as `solve`.
+    """
+    prior = prior_at(theta)
+
+    def solved(gauge: Gauge, begin: SelfCalibrationMode | None) -> SelfCalibrationMode:
+        free = np.setdiff1d(np.arange(problem.model.n_params), gauge.held)
+        found = solve(
+            problem,
+            theta if begin is None else begin.theta,
+            free,
+            prior,
+            stars=stars if begin is None else begin.stars,
+            mixture=mixture if begin is None else begin.mixture,
+            jitter=jitter,
+        )
+        return replace(found, decision=gauge.decision)
+
+    def asked_at(solution: SelfCalibrationMode) -> Gauge:
+        bare = replace(solution, decision=None)
+        return gauge_of(bare.problem, bare.theta, prior_at(bare.theta), bare)
+
+    gauge = gauge_of(problem, theta, prior)
+    solution = solved(gauge, None)
+    at_mode = asked_at(solution)
+    if at_mode.held.size > gauge.held.size:
+        return solved(at_mode, solution)
+    while at_mode.held.size < gauge.held.size:
+        try:
+            freer = solved(at_mode, solution)
+        except (DegenerateError, NotSettledError):
+            return solution
+        gauge, at_mode = at_mode, asked_at(freer)
+        if at_mode.held.size > gauge.held.size:
+            return solution
+        solution = freer
+    # as many are fixed: the choice of the parameters is arbitrary
+    return replace(solution, decision=replace(at_mode.decision, held=gauge.held))
+
+
+def gauge_of(
+    problem: Problem, theta: Float, prior: Prior, solution: SelfCalibrationMode | None = None
+) -> Gauge:
+    """Free directions of a problem, and what fixes them.
+
+    Before there is a solution, stars lie at the means of their detections.  The solution's decision
+    on the free directions is used.
+    """
+    decision = None if solution is None else solution.decision
+    if solution is None:
+        stars = problem.mean_places(theta)
+        problem = problem.at(theta, stars)
+        mixture = wide_mixture(problem, theta, stars)
+    else:
+        stars, mixture = solution.stars, solution.mixture
+    alone, known = curvatures(problem, theta, mixture, stars)
+    return find_gauge(problem, theta, alone, prior, known=known, decision=decision)
+
+
+def curvatures(
+    problem: Problem, theta: Float, mixture: Mixture, stars: Float
+) -> tuple[Float, Float]:
+    """Curvature (D, D) by the detections alone, and with the priors of the stars."""
+    known = expand(problem, theta, mixture, stars, observed=False).curvature
+    if not problem.priors.informed.any():
+        return known, known
+    bare = replace(problem, priors=StarPriors.none(problem.n_stars, problem.n_star))
+    return expand(bare, theta, mixture, stars, observed=False).curvature, known

@@ -21,10 +21,10 @@ from bayesdist.infer import kernel
 from bayesdist.infer.selfcal.problem import Problem
 
 __all__ = [
-    "Anchor",
     "Expansion",
     "Mixture",
-    "Structure",
+    "PlaceDerivatives",
+    "StarModes",
     "eliminated_rows",
     "expand",
     "log_marginal",
@@ -54,7 +54,7 @@ class Mixture:
 
 
 @dataclass(frozen=True, eq=False)
-class Structure:
+class PlaceDerivatives:
     """Dependence of sky positions on the parameters, linearised at a solution.
 
     By the coefficients of a chip's polynomials, M (kron) phi; by everything else, `extra` phi.
@@ -67,8 +67,8 @@ class Structure:
     columns: Int  # indices (G, m) of these parameters; -1 for none
 
     @classmethod
-    def at(cls, problem: Problem, theta: Float) -> Structure:
-        """Structure of a problem at theta (D,)."""
+    def at(cls, problem: Problem, theta: Float) -> PlaceDerivatives:
+        """PlaceDerivatives of a problem at theta (D,)."""
         groups, K = problem.groups, problem.model.n_terms
         found = problem.effective_jacobian(theta)
         m = max(len(columns) for columns, _ in found) - 2 * K
@@ -103,7 +103,7 @@ def expand(
     The search for the stars' modes starts at `stars` (S, q).  If `observed` the curvature is that
     of the mixture itself; otherwise that with EM weights, which is never indefinite.
     """
-    structure, D = Structure.at(problem, theta), problem.model.n_params
+    structure, D = PlaceDerivatives.at(problem, theta), problem.model.n_params
     curvature, gradient = np.zeros((D, D)), np.zeros(D)
     found, scalars = stars.copy(), np.zeros(4)
     chips = problem.groups.chip
@@ -129,7 +129,7 @@ def eliminated_rows(
 
     Yields the stars, L^-1 B (n, q, D) of each, A = L L^T, and L (n, q, q).
     """
-    structure, D, q = Structure.at(problem, theta), problem.model.n_params, problem.n_star
+    structure, D, q = PlaceDerivatives.at(problem, theta), problem.model.n_params, problem.n_star
     first = 0
     for *_, rows, factors in _passes(problem, structure, mixture, stars.copy(), True):
         n = len(factors)
@@ -138,7 +138,7 @@ def eliminated_rows(
 
 
 def _passes(
-    problem: Problem, structure: Structure, mixture: Mixture, stars: Float, observed: bool
+    problem: Problem, structure: PlaceDerivatives, mixture: Mixture, stars: Float, observed: bool
 ) -> Iterator[tuple[Float, ...]]:
     p = problem
     j2, log_core, log_out = mixture.constants(p.log_outlier)
@@ -164,7 +164,7 @@ def _passes(
 
 
 def _assemble(
-    N: Float, structure: Structure, chips: Int, direct: Float, edge: Float, own: Float
+    N: Float, structure: PlaceDerivatives, chips: Int, direct: Float, edge: Float, own: Float
 ) -> None:
     """Add the sums of J^T H J to N (D, D)."""
     K = structure.coef.shape[2]
@@ -206,7 +206,7 @@ def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) 
 
 
 @dataclass(frozen=True, eq=False)
-class Anchor:
+class StarModes:
     """Modes of the stars at a solution, and their response to their detections from there."""
 
     stars: Float
@@ -215,8 +215,8 @@ class Anchor:
     state: NDArray[np.int8]  # of each detection (N,): `kernel.MEMBER`, `DOUBTFUL` or `FALSE`
 
     @classmethod
-    def at(cls, problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Anchor:
-        """Anchor of a problem at theta (D,), where `stars` are the modes."""
+    def at(cls, problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> StarModes:
+        """StarModes of a problem at theta (D,), where `stars` are the modes."""
         p, z = problem, problem.places(theta)
         member = memberships(problem, theta, mixture, stars)
         weight = member / (p.var + mixture.jitter**2) * (p.W[:, 0] + p.W[:, 2])
@@ -249,7 +249,7 @@ def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
     return out
 
 
-def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: Anchor) -> Float:
+def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: StarModes) -> Float:
     """Log densities (n,) of theta (n, D), the stars integrated out (Laplace), up to a constant.
 
     `mixtures` (n, 2) are jitter in pixels and fraction of false detections; the search for the
