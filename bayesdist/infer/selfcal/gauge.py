@@ -40,7 +40,7 @@ WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as
 FAR = 3.0  # times the final error: information no better than this does not fix a direction
 EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
-LEAST_PIVOT = 0.02
+MIN_PIVOT = 0.02
 HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is free
 
 
@@ -337,7 +337,7 @@ def _pivots(model: DistortionModel, null: Float) -> Int:
             break
         _, R, order = qr(left[rows].T, pivoting=True, mode="economic")
         size = np.abs(np.diag(R))
-        take = rows[order[: int((size > LEAST_PIVOT).sum())]]
+        take = rows[order[: int((size > MIN_PIVOT).sum())]]
         held += list(take)
         # still free once these are fixed
         _, s, Vt = np.linalg.svd(null[held])

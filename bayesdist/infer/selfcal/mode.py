@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import DegenerateError, NotSettledError
+from bayesdist.infer.linear import Clip, LinearFit
 from bayesdist.infer.selfcal.elimination import Expansion, Mixture, expand
 from bayesdist.infer.selfcal.gauge import Decision, Gauge, find_gauge
 from bayesdist.infer.selfcal.prior import Prior
@@ -26,12 +28,14 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 PriorAt = Callable[[Float], Prior]  # linearised at parameters (D,)
 
-MOST_PASSES = 80
-CLOSE = 1e-5  # decrement (expected gain in log density) at which the mode is found
+MAX_PASSES = 80
+MAX_DECREMENT = 1e-5  # decrement (expected gain in log density) at which the mode is found
 NEAR = 1.0  # decrement below which the curvature of the mixture is used
-SETTLED = 1e-4  # relative change of errors and of the fraction of false detections
-LEAST_SHARE = 1e-5
-START = 3.0  # times the robust scatter: errors begin as large as this, so that no star is lost
+MAX_CHANGE = 1e-4  # relative change of errors and of the fraction of false detections
+MIN_FRACTION = 1e-5
+# times the robust scatter: errors begin as large as this, so that no star is lost
+START_SCALE = 3.0
+REJECTED = 25.0  # chi-square of both axes beyond which a detection counts as rejected
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +85,43 @@ class SelfCalibrationMode:
         out[np.ix_(self.free, self.free)] = root @ root.T
         return out
 
+    @cached_property
+    def solution(self) -> LinearFit:
+        """Solution of distortion and frames, with the statistics of the detections' residuals.
+
+        The covariance is that of the curvature, with the stars eliminated.
+        """
+        p, theta = self.problem, self.theta
+        wider = 1.0 + self.mixture.jitter**2 / p.sigma**2
+        clip = Clip(theta, REJECTED * wider, p.match_radius * p.model.pixel_size(theta))
+        square = p.squares(theta, self.stars) / p.var
+        residual = p.places(theta) - p.star_places(self.stars)
+        far = np.hypot(*residual.T) > clip.abs_limit
+        used = (square <= clip.chi2_limit) & ~far
+        n, n_used = len(p), int(used.sum())
+        precision = self.precision
+        scale = np.sqrt(np.diag(precision))
+        uu, vv = (residual[used] ** 2).mean(axis=0)
+        lost = p.n_star * p.n_stars + len(self.free)
+        return LinearFit(
+            model=p.model,
+            mean=theta,
+            cov=self.cov,
+            clip=clip,
+            n_rows=n,
+            n_used=n_used,
+            rms_u=float(np.sqrt(uu)),
+            rms_v=float(np.sqrt(vv)),
+            rms_rejected=float(np.sqrt((residual[~used] ** 2).mean())) if n > n_used else 0.0,
+            rejected={
+                "chi-square": int((~used & ~far).sum()),
+                "absolute residual": int(far.sum()),
+            },
+            chi2=float(square[used].sum()),
+            dof=max(2 * n_used - lost, 1),
+            condition=float(np.linalg.cond(precision / np.outer(scale, scale))),
+        )
+
 
 def solve(
     problem: Problem,
@@ -103,7 +144,7 @@ def solve(
     problem = problem.at(theta, stars)
     mixture = mixture or wide_mixture(problem, theta, stars)
     near = False
-    for _ in range(MOST_PASSES):
+    for _ in range(MAX_PASSES):
         found = expand(problem, theta, mixture, stars, observed=near)
         stars = problem.found_again(theta, found.stars)
         gradient = found.gradient + prior.pull(theta)
@@ -127,14 +168,14 @@ def solve(
         change = abs(after.fraction / mixture.fraction - 1.0) + abs(
             (problem.var + after.jitter**2).mean() / (problem.var + mixture.jitter**2).mean() - 1.0
         )
-        if near and decrement < CLOSE and change < SETTLED:
+        if near and decrement < MAX_DECREMENT and change < MAX_CHANGE:
             found = expand(problem, theta, mixture, stars)
             stars = problem.found_again(theta, found.stars)
             return SelfCalibrationMode(problem, theta, stars, mixture, free, found, prior)
         near = decrement < NEAR and change < 0.1
         mixture = after
     raise NotSettledError(
-        f"the solution still moves after {MOST_PASSES} passes",
+        f"the solution still moves after {MAX_PASSES} passes",
         where="self-calibration",
         do="give a better start, or lower the order",
     )
@@ -160,7 +201,7 @@ def wide_mixture(problem: Problem, theta: Float, stars: Float) -> Mixture:
     """Mixture with errors as large as those of a start."""
     square = problem.squares(theta, stars)
     # the median of r^2 is 1.386 sigma^2
-    return Mixture(START * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)
+    return Mixture(START_SCALE * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)
 
 
 def _mixture(
@@ -168,7 +209,7 @@ def _mixture(
 ) -> Mixture:
     """Mixture with the fraction of false detections by EM, and the jitter by chi-square."""
     n = len(problem)
-    share = float(np.clip((n - found.n_members) / n, LEAST_SHARE, 0.9))
+    share = float(np.clip((n - found.n_members) / n, MIN_FRACTION, 0.9))
     if jitter is not None:
         return replace(mixture, fraction=share, jitter=jitter)
     lost = (problem.n_star * problem.n_stars + n_free) / n  # of each detection's two numbers

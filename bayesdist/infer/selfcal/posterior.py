@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -43,14 +43,14 @@ __all__ = ["SelfTarget", "propose", "sample_selfcal"]
 Float = NDArray[np.float64]
 
 DROP = 18.0  # distance (in log density) below the top to which the nodes extend
-MOST_NODES, FEWEST_NODES = 25, 9
-CLOSE = 1e-4  # decrement at which a node is found
-MOST_STEPS = 12
-MOST_TURNS = 10  # in each of which the mesh of log j is narrowed by seven: to 1e-8
-FLAT = 0.02  # change of the log density beyond which the jitter has an effect
-LEAST = 1e-3  # of the median error: no jitter
+MAX_NODES, MIN_NODES = 25, 9
+MAX_DECREMENT = 1e-4  # decrement at which a node is found
+MAX_STEPS = 12
+MAX_ITERATIONS = 10  # in each of which the mesh of log j is narrowed by seven: to 1e-8
+MIN_EFFECT = 0.02  # change of the log density beyond which the jitter has an effect
+MIN_JITTER = 1e-3  # of the median error: no jitter
 # cost of a detection in a pass, in matched stars: its star's mode is found anew each time
-DEARER = 60
+RELATIVE_COST = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,8 +161,8 @@ def sample_selfcal(
     Returns
     -------
     Posterior
-        Parameters that the gauge fixes have one value in all draws and are not judged.  The
-        jitter is in pixels.
+        With errors in the unit of u, v.  Parameters that the gauge fixes have one value in all
+        draws and are not judged.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def sample_selfcal(
     seeds = np.random.SeedSequence(seed).generate_state(ensembles + 1)
     settings = Settings(
         seeds=tuple(int(s) for s in seeds[:-1]),
-        n_stars=DEARER * len(solution.problem),
+        n_stars=RELATIVE_COST * len(solution.problem),
         limits=Limits(target_ess, target_rhat),
         max_steps=max_steps,
         checkpoint_every=checkpoint_every,
@@ -200,7 +200,7 @@ def sample_selfcal(
     draws = np.swapaxes(chains.psi, 1, 2).reshape(E, W * T, D)
     n, expansion = target.n_theta, solution.expansion
     member = memberships(solution.problem, solution.theta, solution.mixture, solution.stars)
-    return Posterior(
+    posterior = Posterior(
         model=solution.problem.model,
         mixture=target.mixture,
         theta=target.theta(draws[..., :n]),
@@ -224,6 +224,26 @@ def sample_selfcal(
         ),
         own_places=True,
     )
+    return _in_unit(posterior, solution.problem.model.pixel_size(solution.theta))
+
+
+def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
+    """Posterior whose errors are pixels, with errors in the unit of u, v like all others."""
+    m, hyper = posterior.mixture, dict(posterior.hyper)
+    if "j" in hyper:
+        hyper["j"] = pixel * hyper["j"]
+
+    def scaled(length: float | None) -> float | None:
+        return None if length is None else pixel * length
+
+    mixture = replace(
+        m,
+        match_radius=scaled(m.match_radius),
+        jitter=scaled(m.jitter),
+        jitter_scale=scaled(m.jitter_scale),
+    )
+    sigma = pixel * posterior.reference_sigma
+    return replace(posterior, mixture=mixture, hyper=hyper, reference_sigma=sigma)
 
 
 def _fingerprint(solution: SelfCalibrationMode, *settings: object) -> str:
@@ -244,14 +264,14 @@ def propose(target: SelfTarget) -> GridProposal:
         target.n_theta, target.mixture.hyper, tuple(k for k in target.mixture.hyper if k == "j")
     )
     if not split.held:
-        z, bend = _share(target, split, np.zeros(0))
+        z, bend = _fraction(target, split, np.zeros(0))
         return GridProposal(split, (_node(target, split, np.zeros(0), z, bend),))
     at, top = _nodes_at(target)
-    z, bend = _share(target, split, np.array([top]))
+    z, bend = _fraction(target, split, np.array([top]))
     return GridProposal(split, tuple(_node(target, split, np.array([x]), z, bend) for x in at))
 
 
-def _share(target: SelfTarget, split: Split, at: Float) -> tuple[float, float]:
+def _fraction(target: SelfTarget, split: Split, at: Float) -> tuple[float, float]:
     """Cube root of the most probable fraction of false detections, and its curvature.
 
     From the density with the stars integrated out: at their modes the fraction would be biased low,
@@ -289,14 +309,14 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
         return target.log_density(psi)
 
     sigma = target.problem.sigma
-    low, high = np.log(LEAST * sigma), np.log(30 * max(sigma, solution.mixture.jitter))
+    low, high = np.log(MIN_JITTER * sigma), np.log(30 * max(sigma, solution.mixture.jitter))
     mesh = np.linspace(low, high, 16)
-    for turn in range(MOST_TURNS):
+    for turn in range(MAX_ITERATIONS):
         value = along(mesh)
         top = int(np.argmax(value))
         inside = np.flatnonzero(value > value[top] - DROP)
         begin, end = max(inside[0] - 1, 0), min(inside[-1] + 1, len(mesh) - 1)
-        if inside[-1] - inside[0] > 6 or turn == MOST_TURNS - 1:
+        if inside[-1] - inside[0] > 6 or turn == MAX_ITERATIONS - 1:
             break
         mesh = np.linspace(mesh[begin], mesh[end], 16)
     fine = np.linspace(mesh[begin], mesh[end], 400)
@@ -304,11 +324,11 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
     if open_end:
         # at the left end is only the prior's tail: one node in it is enough
         likelihood = value - value[0] - (mesh - mesh[0])
-        felt = np.flatnonzero(np.abs(likelihood) > FLAT)
+        felt = np.flatnonzero(np.abs(likelihood) > MIN_EFFECT)
         if len(felt):
             fine = fine[fine >= mesh[max(felt[0] - 2, 0)]]
     # a peak is nearly Gaussian; a shoulder that falls off from a plateau is not
-    count = MOST_NODES if open_end else FEWEST_NODES
+    count = MAX_NODES if open_end else MIN_NODES
     return np.linspace(fine[0], fine[-1], count), float(mesh[np.argmax(value)])
 
 
@@ -319,7 +339,7 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
     held = float(np.exp(at[0])) if len(at) else float(target.jitter or 0.0)
     middles = problem.middles(theta)
     observed = True
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         found = expand(problem, theta, Mixture(held, z**3), stars, observed=observed)
         gradient = (found.gradient + target.prior.pull(theta))[free]
         H = np.zeros((len(free) + 1,) * 2)
@@ -337,7 +357,7 @@ def _node(target: SelfTarget, split: Split, at: Float, z: float, bend: float) ->
                 do="look at the gauge: dither more, add roll angles, or give priors",
             ) from error
         step = factor.solve(np.append(gradient, 0.0))[:-1]
-        if gradient @ step < CLOSE:
+        if gradient @ step < MAX_DECREMENT:
             break
         theta[free] += step
         after = problem.middles(theta)
