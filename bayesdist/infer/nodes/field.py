@@ -26,7 +26,7 @@ __all__ = ["checked_stars", "field_table"]
 Float = NDArray[np.float64]
 
 STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
-ROUNDS = 6
+MAX_ITERATIONS = 6
 
 
 # a factorisation of this size is no faster on two threads, and far slower where they are shared
@@ -76,7 +76,7 @@ def field_table(
     smoothness : sequence of float
         Matern smoothness to choose from.
     earlier : TablePosterior, optional
-        Table of nearly the same stars from an earlier round, at which the search starts.
+        Table of nearly the same stars from an earlier iteration, at which the search starts.
     hold : bool
         True to take the hyperparameters of the earlier table unchanged.
 
@@ -126,7 +126,7 @@ def field_table(
             fields = [
                 refined_field(Evidence(grid, s), f) for s, f in zip(sums, fields, strict=True)
             ]
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         axes = (axis_posterior(grid, sums[0], fields[0]), axis_posterior(grid, sums[1], fields[1]))
         n = sum(axis.n_effective for axis in axes)
         new, error = jitter_at(sums, [axis.mean for axis in axes], n)

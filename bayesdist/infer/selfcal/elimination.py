@@ -49,8 +49,8 @@ class Mixture:
     def constants(self, log_outlier: float) -> tuple[float, float, float]:
         """Squared jitter, log of the core's fraction, log density of false detections."""
         with np.errstate(divide="ignore"):
-            shares = np.log([1.0 - self.fraction, self.fraction])
-        return self.jitter**2, float(shares[0]), float(max(shares[1] + log_outlier, -1e300))
+            core, false = np.log([1.0 - self.fraction, self.fraction])
+        return self.jitter**2, float(core), float(max(false + log_outlier, -1e300))
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,21 +210,21 @@ class StarModes:
     """Modes of the stars at a solution, and their response to their detections from there."""
 
     stars: Float
-    share: Float  # weight (N,) of each detection in the position of its star; they add to 1
+    weight: Float  # (N,) of each detection in the position of its star; they add to 1
     middles: Float  # weighted mean positions (S, 2) of the detections at the solution
     state: NDArray[np.int8]  # of each detection (N,): `kernel.MEMBER`, `DOUBTFUL` or `FALSE`
 
     @classmethod
     def at(cls, problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> StarModes:
-        """StarModes of a problem at theta (D,), where `stars` are the modes."""
+        """Modes of a problem at theta (D,), where `stars` are the modes."""
         p, z = problem, problem.places(theta)
         member = memberships(problem, theta, mixture, stars)
         weight = member / (p.var + mixture.jitter**2) * (p.W[:, 0] + p.W[:, 2])
         total = np.bincount(p.star, weight)
         lost = total[p.star] <= 0  # a star without members stays in the middle
-        share = np.where(lost, 1.0 / p.counts[p.star], weight / np.where(lost, 1.0, total[p.star]))
-        middles = [np.bincount(p.star, share * z[:, axis]) for axis in (0, 1)]
-        return cls(stars, share, np.stack(middles, axis=1), _states(p, member))
+        weight = np.where(lost, 1.0 / p.counts[p.star], weight / np.where(lost, 1.0, total[p.star]))
+        middles = [np.bincount(p.star, weight * z[:, axis]) for axis in (0, 1)]
+        return cls(stars, weight, np.stack(middles, axis=1), _states(p, member))
 
 
 def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
@@ -249,11 +249,11 @@ def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
     return out
 
 
-def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: StarModes) -> Float:
+def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarModes) -> Float:
     """Log densities (n,) of theta (n, D), the stars integrated out (Laplace), up to a constant.
 
     `mixtures` (n, 2) are jitter in pixels and fraction of false detections; the search for the
-    stars' modes starts from the anchor, of a solution near by.
+    stars' modes starts from `modes`, of a solution near by.
     """
     p = problem
     rows = np.array([Mixture(j, f).constants(p.log_outlier) for j, f in mixtures])
@@ -266,10 +266,10 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, anchor: StarMo
             0,
             p.n_stars,
             *p.columns,
-            anchor.stars,
-            anchor.middles,
-            anchor.share,
-            anchor.state,
+            modes.stars,
+            modes.middles,
+            modes.weight,
+            modes.state,
             np.ascontiguousarray(np.moveaxis(p.effective(theta[some]), 0, -1)),
             p.model.order,
             rows[some],

@@ -151,20 +151,20 @@ class Gauge:
         out, free = list[str](), set(self.free_names)
         # the degeneracy with a skew of the sky is reported at once
         skew = {"skew_plus", "skew_cross"}
-        told = set(POINTS) | (skew if skew & set(self.whole) else set())
-        if skew <= told and skew <= free and self.spread < SAME_ROLL:
+        named = set(POINTS) | (skew if skew & set(self.whole) else set())
+        if skew <= named and skew <= free and self.spread < SAME_ROLL:
             out.append(
                 f"one roll angle (they differ by {np.degrees(self.spread):.2g} deg at most, half "
                 "turns apart): a linear skew of the distortion cannot be told from one of the sky"
             )
-        elif skew <= told:
+        elif skew <= named:
             out.append("a linear skew of the distortion cannot be told from one of the sky")
         for one in self.directions:
             if one.free and one.name == "scale":
                 out.append(f"scale: the detections say nothing of it; {_fixed(one)}")
             elif one.free and one.name == "rotation":
                 out.append(f"rotation on the sky: free; {_fixed(one)}")
-            elif one.free and one.name not in told:
+            elif one.free and one.name not in named:
                 out.append(f"{one.name}: the detections say nothing of it; {_fixed(one)}")
             elif one.weak and not one.free:
                 out.append(

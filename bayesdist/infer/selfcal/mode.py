@@ -209,9 +209,9 @@ def _mixture(
 ) -> Mixture:
     """Mixture with the fraction of false detections by EM, and the jitter by chi-square."""
     n = len(problem)
-    share = float(np.clip((n - found.n_members) / n, MIN_FRACTION, 0.9))
+    fraction = float(np.clip((n - found.n_members) / n, MIN_FRACTION, 0.9))
     if jitter is not None:
-        return replace(mixture, fraction=share, jitter=jitter)
+        return replace(mixture, fraction=fraction, jitter=jitter)
     lost = (problem.n_star * problem.n_stars + n_free) / n  # of each detection's two numbers
     dof = max((2.0 - lost) * found.n_members, 1.0)
     s2 = problem.var + mixture.jitter**2
@@ -219,7 +219,7 @@ def _mixture(
     new = mixture.jitter**2 + (found.chi2 / dof - 1.0) / float(np.mean(1.0 / s2))
     new = min(max(new, mixture.jitter**2 / 4), 4 * mixture.jitter**2 + float(np.median(s2)))
     floor = (1e-2 * problem.sigma) ** 2
-    return Mixture(float(np.sqrt(max(new, floor))), share)
+    return Mixture(float(np.sqrt(max(new, floor))), fraction)
 
 
 def solve_in_gauge(

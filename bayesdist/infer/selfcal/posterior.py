@@ -99,7 +99,7 @@ class SelfTarget:
         return (*(all_names[k] for k in self.solution.free), *self.hyper.names)
 
     @cached_property
-    def _anchor(self) -> StarModes:
+    def _modes(self) -> StarModes:
         s = self.solution
         return StarModes.at(s.problem, s.theta, s.mixture, s.stars)
 
@@ -123,7 +123,7 @@ class SelfTarget:
             return out
         theta, h = self.theta(psi[ok, : self.n_theta]), psi[ok, self.n_theta :]
         value = self.prior.log_density(theta) + self.hyper.log_prior(h)
-        value += log_marginal(self.problem, theta, self.mixtures(h), self._anchor)
+        value += log_marginal(self.problem, theta, self.mixtures(h), self._modes)
         out[ok] = np.where(np.isnan(value), -np.inf, value)
         return out
 

@@ -143,8 +143,8 @@ def frame_prior(
 ) -> Prior:
     """Prior on one property of the exposures' frames ('rotation', 'scale').
 
-    Commanded rolls, each with its error, or scales that scatter about one; the zero point that all
-    share stays free.  `values` (E,) are NaN where there is none; the first exposure's is that of
+    Commanded rolls, each with its error, or scales that scatter about one; their common zero point
+    stays free.  `values` (E,) are NaN where there is none; the first exposure's is that of
     the polynomials.
     """
     known = np.flatnonzero(np.isfinite(values))

@@ -303,8 +303,8 @@ def prepare(
     """
     q = MOTIONS[motion]
     counts = np.bincount(detections.star[detections.star >= 0], minlength=1)
-    kept = (detections.star >= 0) & (counts[detections.star] >= max(min_detections, MIN_DETECTIONS))
-    if not kept.any():
+    used = (detections.star >= 0) & (counts[detections.star] >= max(min_detections, MIN_DETECTIONS))
+    if not used.any():
         raise InputError(
             f"no star is seen {max(min_detections, MIN_DETECTIONS)} times",
             where=detections.source,
@@ -314,7 +314,7 @@ def prepare(
         raise InputError(
             "the detections carry no errors", where=detections.source, do="give sigma in pixels"
         )
-    rows = np.flatnonzero(kept)
+    rows = np.flatnonzero(used)
     rows = rows[np.argsort(detections.star[rows], kind="stable")]
     star = np.unique(detections.star[rows], return_inverse=True)[1]
     starts = np.concatenate([[0], np.cumsum(np.bincount(star))]).astype(np.int64)

@@ -74,8 +74,8 @@ class BreakMoves:
             weight = np.where(self.possible(trial), likelihood(trial), -np.inf)
             weight = weight + np.log(self.prior)
             weight -= weight.max(axis=1, keepdims=True)
-            share = np.exp(weight) / np.exp(weight).sum(axis=1, keepdims=True)
-            self._seen[b] += share.mean(axis=0)
+            probability = np.exp(weight) / np.exp(weight).sum(axis=1, keepdims=True)
+            self._seen[b] += probability.mean(axis=0)
             breaks = _pick(trial, weight, rng)
         return breaks
 

@@ -116,14 +116,14 @@ def _draw_memberships(
     count = (off * included).sum(axis=1)
     a, b = FRACTION_PRIOR
     of_good = b + included.sum(axis=1) - count
-    share = np.maximum(betainc(a + count, of_good, MAX_FRACTION), 1e-290)
-    fraction = betaincinv(a + count, of_good, share * rng.uniform(1e-12, 1.0, len(share)))
+    below = np.maximum(betainc(a + count, of_good, MAX_FRACTION), 1e-290)
+    fraction = betaincinv(a + count, of_good, below * rng.uniform(1e-12, 1.0, len(below)))
     fraction = np.clip(fraction, 1e-12, MAX_FRACTION)
     shape = KAPPA_SHAPE + k * count / 2
     rate = KAPPA_RATE + (off * included * distance).sum(axis=1) / 2
     # 1 / kappa^2 is gamma, cut off where kappa would be less than its smallest value
-    share = np.maximum(gammainc(shape, rate / MIN_KAPPA**2), 1e-290)
-    inverse = gammaincinv(shape, share * rng.uniform(1e-12, 1.0, len(share))) / rate
+    below = np.maximum(gammainc(shape, rate / MIN_KAPPA**2), 1e-290)
+    inverse = gammaincinv(shape, below * rng.uniform(1e-12, 1.0, len(below))) / rate
     kappa2_new = np.maximum(1 / np.maximum(inverse, 1e-300), MIN_KAPPA**2)
     return replace(state, off=off, probability=probability, fraction=fraction, kappa2=kappa2_new)
 
