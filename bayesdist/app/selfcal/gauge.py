@@ -13,11 +13,10 @@ from scipy.stats import chi2
 from bayesdist.app.config import Config
 from bayesdist.app.selfcal.inputs import Commanded
 from bayesdist.errors import InputError
-from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.infer.equations.priors import GaussianPriors, Prior
 from bayesdist.infer.selfcal.gauge import FAR, Gauge, NamedDirection, find_gauge
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode, curvatures
 from bayesdist.infer.selfcal.prior import (
-    Prior,
     frame_prior,
     pointing_prior,
     tie,
@@ -111,9 +110,7 @@ class Known:
         if config.prior:
             named = {p.parameter: (p.mean, p.sigma) for p in config.prior}
             priors = GaussianPriors.of(model, named)
-            pieces["priors"] = lambda theta: Prior(
-                theta, np.diag(priors.precision), priors.pull(theta)
-            )
+            pieces["priors"] = priors.about
         return cls(pieces)
 
 

@@ -17,9 +17,9 @@ from scipy.sparse.csgraph import connected_components
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.expected import ExpectedSolution, expected_solution
 from bayesdist.infer.selfcal.prior import (
-    Prior,
     frame_prior,
     pointing_prior,
     tie,

@@ -18,12 +18,13 @@ is left are the parameters of a `DistortionModel`.
     expected    covariance before any exposure is taken
 """
 
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.calibrate import SelfCalibration, self_calibrate
 from bayesdist.infer.selfcal.catalogue import StarCatalogue, star_catalogue
 from bayesdist.infer.selfcal.gauge import Gauge, NamedDirection
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.posterior import sample_selfcal
-from bayesdist.infer.selfcal.prior import Prior, ReferenceStars, pointing_prior, tie
+from bayesdist.infer.selfcal.prior import ReferenceStars, pointing_prior, tie
 from bayesdist.infer.selfcal.relative import gauge_free
 from bayesdist.infer.selfcal.tangent import TangentPlane
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from bayesdist.data.detections import Detections
 from bayesdist.data.matching.friends import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, memberships
 from bayesdist.infer.selfcal.gauge import Gauge
 from bayesdist.infer.selfcal.mode import PriorAt, SelfCalibrationMode, gauge_of, solve_in_gauge
-from bayesdist.infer.selfcal.prior import Prior
 from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane, places_of
 from bayesdist.model import DistortionModel

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.detections import Detections
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import Gauge, find_gauge
-from bayesdist.infer.selfcal.prior import Prior
 from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.relative import gauge_free_matrix
 from bayesdist.model import DistortionModel

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from bayesdist.infer.selfcal.prior import Prior
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.sky_moves import (
     GENERATORS,

@@ -24,6 +24,7 @@ from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.sampler.chains import Settings, run_chains
 from bayesdist.infer.selfcal.elimination import (
@@ -34,7 +35,6 @@ from bayesdist.infer.selfcal.elimination import (
     memberships,
 )
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
-from bayesdist.infer.selfcal.prior import Prior
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 

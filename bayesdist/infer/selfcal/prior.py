@@ -17,59 +17,17 @@ from scipy.spatial import cKDTree
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.errors import InputError
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.model import DistortionModel
 
-__all__ = ["Prior", "ReferenceStars", "frame_prior", "pointing_prior", "tie"]
+__all__ = ["ReferenceStars", "frame_prior", "pointing_prior", "tie"]
 
 Float = NDArray[np.float64]
 
 MIN_REFERENCE_STARS = 2  # reference stars that fix position, rotation and scale
 MAX_DISTANCE = 5.0  # times the median from the map: not the reference star, but a neighbour
 MIN_MEDIAN = 0.01  # pixels: smallest median distance in this limit
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """log p = -d^T P d / 2 + r^T d with d = theta - reference.
-
-    Parameters
-    ----------
-    reference : ndarray, shape (D,)
-        Near the solution, so that no digits are lost.
-    precision : ndarray, shape (D, D)
-        P.
-    right : ndarray, shape (D,)
-        r.
-    """
-
-    reference: Float
-    precision: Float
-    right: Float
-
-    @classmethod
-    def none(cls, reference: Float) -> Prior:
-        """Flat prior."""
-        D = len(reference)
-        return cls(reference, np.zeros((D, D)), np.zeros(D))
-
-    def __add__(self, other: Prior) -> Prior:
-        """Sum of two independent pieces."""
-        shift = self.reference - other.reference
-        return Prior(
-            self.reference,
-            self.precision + other.precision,
-            self.right + other.right - other.precision @ shift,
-        )
-
-    def pull(self, theta: Float) -> Float:
-        """Gradient (D,)."""
-        return np.asarray(self.right - self.precision @ (theta - self.reference))
-
-    def log_density(self, theta: Float) -> Float:
-        """Log density of parameter vectors (..., D), up to a constant."""
-        d = theta - self.reference
-        return np.asarray(d @ self.right - 0.5 * np.einsum("...d,...d->...", d @ self.precision, d))
 
 
 def tie(reference: Float, row: Float, value: float, sigma: float) -> Prior:

@@ -12,9 +12,9 @@ from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.selfcal.eliminated import Columns, eliminated, without_parameters
 from bayesdist.diagnose.selfcal.sandwich import sandwich
 from bayesdist.diagnose.selfcal.scores import DetectionScores, scores_of_detections
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode, gauge_of, solve
-from bayesdist.infer.selfcal.prior import Prior
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
 from tests.infer.selfcal.fields import field, problem_of

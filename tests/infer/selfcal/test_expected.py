@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from bayesdist.data.detections import Detections
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.expected import expected_solution
-from bayesdist.infer.selfcal.prior import Prior, frame_prior
+from bayesdist.infer.selfcal.prior import frame_prior
 from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
 from bayesdist.simulate.patterns import flat_coefficients
 from tests.infer.selfcal.fields import SIZE, chips

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import pointing_prior, tie
 from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import find_gauge
-from bayesdist.infer.selfcal.prior import Prior
 from bayesdist.infer.selfcal.sky_moves import POINTS, functionals, moves
 from tests.infer.selfcal.fields import field, problem_of
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legder, legval, legvander
 
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import sample_selfcal
 from bayesdist.infer.selfcal.mode import solve
-from bayesdist.infer.selfcal.prior import Prior
 from tests.infer.selfcal.fields import SIZE, field, problem_of
 
 pytestmark = pytest.mark.slow

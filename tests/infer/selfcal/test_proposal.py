@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError
+from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import posterior
 from bayesdist.infer.selfcal.mode import solve
 from bayesdist.infer.selfcal.posterior import SelfTarget
-from bayesdist.infer.selfcal.prior import Prior
 
 from .fields import field, problem_of
 
