@@ -132,7 +132,7 @@ def self_calibrate(
     pixel = model.pixel_size(theta)
     errors: tuple[Float, Float] | None = None
     before: Friends | None = None
-    solution: SelfCalibrationMode | None = None
+    mode: SelfCalibrationMode | None = None
     for turn in range(max_iterations):
         flat = detections if plane is None else plane.onto_it(model, detections, theta)
         friends = friends_of_friends(
@@ -140,37 +140,46 @@ def self_calibrate(
         )
         found = replace(flat, star=friends.star)
         problem = prepare(
-            model, found, theta, match_radius=radius, min_detections=min_detections, motion=motion,
-            parallax_factors=parallax_factors, dilation=dilation,
-        )  # fmt: skip
+            model,
+            found,
+            theta,
+            match_radius=radius,
+            min_detections=min_detections,
+            motion=motion,
+            parallax_factors=parallax_factors,
+            dilation=dilation,
+        )
         if references is not None:
             problem = replace(problem, priors=references(problem, theta))
-        known = None if solution is None else _still(problem, solution)
-        solution = solve_in_gauge(problem, theta, prior_at, jitter=jitter, mixture=known)
-        theta = solution.theta
+        known = None if mode is None else _still(problem, mode)
+        mode = solve_in_gauge(problem, theta, prior_at, jitter=jitter, mixture=known)
+        theta = mode.theta
         log(
             f"iteration {turn + 1}: linking length {radius:.3g} pix, {friends.n_stars} stars, "
-            f"{len(problem)} detections, error "
-            f"{np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2):.3g} pix"
+            f"{len(problem)} detections, error {mode.error:.3g} pix"
         )
         last = radius <= match_radius
         if measured:
-            detections, errors = _with_errors(detections, solution)
+            detections, errors = _with_errors(detections, mode)
         few = max(MAX_CHANGED * len(detections), MIN_CHANGED)
         if last and before is not None and _changed(before, friends) <= few:
             if measured:  # with the errors of this iteration
                 sigma = detections.sigma
                 assert sigma is not None
-                problem = solution.problem.with_sigma(sigma[solution.problem.rows])
-                solution = solve_in_gauge(
-                    problem, theta, prior_at, stars=solution.stars, jitter=jitter,
-                    mixture=solution.mixture,
-                )  # fmt: skip
-            gauge = gauge_of(solution.problem, solution.theta, prior_at(solution.theta), solution)
+                problem = mode.problem.with_sigma(sigma[mode.problem.rows])
+                mode = solve_in_gauge(
+                    problem,
+                    theta,
+                    prior_at,
+                    stars=mode.stars,
+                    jitter=jitter,
+                    mixture=mode.mixture,
+                )
+            gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
             found = replace(found, sigma=detections.sigma)
-            return SelfCalibration(solution, gauge, friends, found, errors, turn + 1)
+            return SelfCalibration(mode, gauge, friends, found, errors, turn + 1)
         before = friends
-        scatter = float(np.sqrt(np.median(solution.problem.var) + solution.mixture.jitter**2))
+        scatter = mode.error
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
     if last:
         raise NotSettledError(
@@ -186,24 +195,24 @@ def self_calibrate(
     )
 
 
-def _still(problem: Problem, solution: SelfCalibrationMode) -> Mixture | None:
+def _still(problem: Problem, mode: SelfCalibrationMode) -> Mixture | None:
     """Mixture of the last iteration, if this one starts with nearly the same detections.
 
     New ones may lie far from their positions by the solution, and so do stars with motions, which
     start at rest: then the first errors have to be large.
     """
-    same = abs(len(problem) / len(solution.problem) - 1.0) < ALIKE
-    return solution.mixture if same and problem.n_star == 2 else None
+    same = abs(len(problem) / len(mode.problem) - 1.0) < ALIKE
+    return mode.mixture if same and problem.n_star == 2 else None
 
 
 def _with_errors(
-    detections: Detections, solution: SelfCalibrationMode
+    detections: Detections, mode: SelfCalibrationMode
 ) -> tuple[Detections, tuple[Float, Float]]:
     """Detections with errors by magnitude, or one for all."""
-    problem = solution.problem
+    problem = mode.problem
     mag = np.zeros(len(detections)) if detections.mag is None else detections.mag
     middles, sigma = scatter_by_magnitude(
-        problem, solution.theta, solution.mixture, solution.stars, mag[problem.rows]
+        problem, mode.theta, mode.mixture, mode.stars, mag[problem.rows]
     )
     of_each = np.exp(np.interp(mag, middles, np.log(sigma)))
     return replace(detections, sigma=of_each), (middles, sigma)

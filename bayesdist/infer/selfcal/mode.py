@@ -85,6 +85,11 @@ class SelfCalibrationMode:
         out[np.ix_(self.free, self.free)] = root @ root.T
         return out
 
+    @property
+    def error(self) -> float:
+        """Typical error of a detection on one axis, pixels."""
+        return float(np.sqrt(np.median(self.problem.var) + self.mixture.jitter**2))
+
     @cached_property
     def solution(self) -> LinearFit:
         """Solution of distortion and frames, with the statistics of the detections' residuals.
