@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import InputError
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.nodes.grid import STEP, NodeGrid
 from bayesdist.infer.nodes.hyperparameters import (
     SMOOTHNESS,
@@ -30,7 +30,7 @@ MAX_ITERATIONS = 6
 
 
 # a factorisation of this size is no faster on two threads, and far slower where they are shared
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def field_table(
     x: ArrayLike,
     y: ArrayLike,

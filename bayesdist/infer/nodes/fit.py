@@ -16,10 +16,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.data.matches import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.nodes.binned import binned_table
 from bayesdist.infer.nodes.corrected import corrected_matches, on_the_chips, with_columns
@@ -43,7 +43,7 @@ SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in lat
 
 
 # all large matrices are factored here, one at a time: see `field_table`
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_with_tables(
     matches: MatchTable,
     model: DistortionModel,

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.convergence import Limits
@@ -25,6 +24,7 @@ from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.equations.priors import Prior
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.sampler.chains import Settings, run_chains
 from bayesdist.infer.selfcal.elimination import (
@@ -128,7 +128,7 @@ class SelfTarget:
         return out
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def sample_selfcal(
     solution: SelfCalibrationMode,
     *,

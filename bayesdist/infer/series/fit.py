@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from threadpoolctl import threadpool_limits
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.convergence import Limits
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.series.chains import run
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.posterior import SeriesPosterior
@@ -20,7 +20,7 @@ __all__ = ["fit_series"]
 CHAINS, WARMUP, SWEEPS = 32, 100, 100
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def fit_series(
     series: Series,
     trend: TrendModel,

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
-from threadpoolctl import threadpool_limits
 
 from bayesdist.infer.convergence import smoothed_weights
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
 from bayesdist.infer.series.scatter import log_mixture
@@ -103,7 +103,7 @@ def block_folds(epoch: Float, breaks: tuple[float, ...], length: int) -> Int:
     return out
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")
+@one_thread
 def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut:
     """Predict each fold from the rest.
 
