@@ -100,12 +100,12 @@ def _binned(projection: Projection) -> dict[int, tuple[list[Float], Float]]:
     for block in sample.blocks:
         scores = block.frame.T @ projection.whole_score[:, block.rows]
         found.setdefault(block.chip, []).append((code[block.rows], scores))
-    out = {}
+    out: dict[int, tuple[list[Float], Float]] = {}
     for chip, parts in found.items():
         cells = np.concatenate([one for one, _ in parts])
         whole = np.concatenate([one for _, one in parts], axis=1)
-        binned = [np.bincount(cells, one, minlength=BINS * BINS) for one in whole]
-        out[chip] = list(whole), np.reshape(binned, (2, BINS, BINS))
+        binned = np.array([np.bincount(cells, one, minlength=BINS * BINS) for one in whole])
+        out[chip] = list(whole), binned.astype(float).reshape(2, BINS, BINS)
     return out
 
 
