@@ -10,13 +10,13 @@ import numpy as np
 
 from bayesdist.app.fingerprint import fingerprint_of
 from bayesdist.app.rundir import RunDirectory
+from bayesdist.diagnose.correlated.storage import discrepancy_from_arrays, discrepancy_to_arrays
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
-from bayesdist.infer.discrepancy.storage import discrepancy_from_arrays, discrepancy_to_arrays
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.records import record_from_arrays, record_to_arrays
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
-from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.infer.equations.scaled import scaled_cholesky
 from bayesdist.infer.posterior.recoloured import with_spread
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from bayesdist.checks import LARGER, Check
+from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.diagnose.correlated.deviations import CURVATURE
 from bayesdist.diagnose.holdout.validation import HeldOutTruth
 from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
 from bayesdist.diagnose.score.result import ScoreTest
-from bayesdist.infer.discrepancy import Discrepancy
-from bayesdist.infer.discrepancy.linear import CURVATURE
 from bayesdist.limits import HELD_OUT_DOUBTFUL, STRUCTURE, STRUCTURE_IN_BUDGET
 from bayesdist.numbers import count, number, percent, probability, size_of
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from bayesdist.checks import EITHER, Check
 from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.diagnose.checks import holdout_checks, score_checks, structure_checks
+from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
+from bayesdist.diagnose.correlated.storage import as_stored
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.validation import HeldOutTruth, held_out_truth
 from bayesdist.diagnose.overlap import OverlapTest
@@ -34,17 +36,15 @@ from bayesdist.diagnose.residuals.sample import StarSample, star_sample
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
+from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
+from bayesdist.diagnose.selfcal.leverage import taken_by_stars
 from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from bayesdist.infer import GaussianPriors, LinearFit, Matches, Posterior, Shards
 from bayesdist.infer.catalogue.star_errors import StarCovariance, star_covariance
 from bayesdist.infer.catalogue.star_influence import StarErrors
-from bayesdist.infer.discrepancy import Discrepancy, DiscrepancyPriors, estimate_discrepancy
-from bayesdist.infer.discrepancy.storage import as_stored
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.selfcal import Solution as Eliminated
-from bayesdist.infer.selfcal.discrepancy import selfcal_discrepancy
-from bayesdist.infer.selfcal.following import taken_by_stars
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.streams import restarted
 
 __all__ = [
@@ -155,7 +155,7 @@ def diagnose_fit(
     shards: Shards,
     table: MatchTable,
     *,
-    eliminated: Eliminated | None = None,
+    eliminated: SelfCalibrationMode | None = None,
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
     things: str = "pairs",
 ) -> Diagnostics:
@@ -171,7 +171,7 @@ def diagnose_fit(
         The same, as passes go over them.
     table : MatchTable
         Evenly spread ones of them, or all.
-    eliminated : infer.selfcal.Solution, optional
+    eliminated : infer.selfcal.SelfCalibrationMode, optional
         The solution with its stars, where places of stars were fitted too.
     centroid : MagnitudeErrors, 'residuals' or None
         Errors of the centroids where the fit has found them; else they are the scatter of the
@@ -251,7 +251,7 @@ def misfits_of(
     return tuple(out)
 
 
-def _taken(eliminated: Eliminated, rows: Int) -> NDArray[np.float64]:
+def _taken(eliminated: SelfCalibrationMode, rows: Int) -> NDArray[np.float64]:
     """Fraction (N,) of the variance that places of stars take out of detections."""
     own = eliminated.problem.rows
     taken = np.zeros(max(int(own.max(initial=-1)), int(rows.max(initial=-1))) + 1)
@@ -275,7 +275,7 @@ def diagnose(
     exposures: bool = True,
     settling: Settling | None = None,
     catalogue: StarErrors | None = None,
-    eliminated: Eliminated | None = None,
+    eliminated: SelfCalibrationMode | None = None,
     centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals",
     periods: PeriodSettings | None = None,
     things: str = "pairs",

@@ -13,8 +13,8 @@ from astropy.table import Table
 
 from bayesdist.app.session import Session
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
-from bayesdist.infer.discrepancy.cells import cell_sums
-from bayesdist.infer.discrepancy.information import Information
+from bayesdist.diagnose.correlated.cells import cell_sums
+from bayesdist.diagnose.correlated.information import Information
 from bayesdist.infer.posterior.likelihood import scores_of
 from tests.adversarial import KINDS
 from tests.adversarial.campaign_measure import actual_error, assessed, stated_sigma

@@ -28,9 +28,9 @@ from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.terms.parameters import CatalogueErrors, ExposureVariation, ScaleError
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.data import MagnitudeErrors
+from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.diagnose.correlated.deviations import LinearDeviations
 from bayesdist.diagnose.tables.mean_square import MeanSquare
-from bayesdist.infer.discrepancy import Discrepancy
-from bayesdist.infer.discrepancy.linear import LinearDeviations
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 from .conftest import StandIn

@@ -12,8 +12,8 @@ from scipy.stats import chi2
 
 from bayesdist.data import MatchTable
 from bayesdist.infer import fit_by_magnitude
-from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables, pixel_jacobian
-from bayesdist.infer.series import Course, Series, fit_series
+from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
+from bayesdist.infer.series import Series, TrendModel, fit_series
 from bayesdist.infer.transforms import Solution, View, lines, reference_gauge, without_frames
 from bayesdist.missions.acs.simulate.pointings import SPANS
 from bayesdist.missions.acs.simulate.stars import centroid_error
@@ -69,7 +69,7 @@ def line_errors(found: Calibrated, seed: int) -> Outcome:
     drift = found.bare.model.time
     assert drift is not None
     series = found.terms
-    course = Course("lines", drift.breaks, reference=drift.epoch0)
+    trend = TrendModel("lines", drift.breaks, reference=drift.epoch0)
     keep = [k for k, name in enumerate(series.coefficients) if name.split(".")[-1] in TERMS]
     some = Series(
         series.epoch,
@@ -77,7 +77,7 @@ def line_errors(found: Calibrated, seed: int) -> Outcome:
         series.cov[:, keep][:, :, keep],
         tuple(series.coefficients[k] for k in keep),
     )
-    posterior = fit_series(some, course, seed=seed, target_ess=100, target_rhat=1.05)
+    posterior = fit_series(some, trend, seed=seed, target_ess=100, target_rhat=1.05)
     names = {chip.number: chip.name for chip in found.bare.model.chips}
     draws = np.stack([posterior.alpha, posterior.beta], axis=-1)  # (n, S, k, 2)
     at = [[some.coefficients.index(f"{names[c]}.{term}") for c in CHIPS] for term in TERMS]
@@ -119,7 +119,7 @@ def node_errors(found: Calibrated, tables: TableFit, step: float) -> Outcome:
     assert isinstance(with_errors, MatchTable)
     binned = fit_with_tables(with_errors, session.plain_model, method="binned", step=(step, step))
     others = {table.chip: table for table in binned.tables}
-    for posterior in tables.part().posteriors:
+    for posterior in tables.posteriors:
         table = posterior.table
         grid = grids(step)[table.chip]
         x, y = grid.positions
@@ -153,7 +153,7 @@ def position_errors(found: Calibrated, tables: TableFit, rng: np.random.Generato
     Polynomial with its drift, errors of the catalogue, and tables.
     """
     view = reference_gauge(without_frames(found.joint), REFERENCE)
-    posteriors = {p.table.chip: p for p in tables.part().posteriors}
+    posteriors = {p.table.chip: p for p in tables.posteriors}
     truth = found.campaign.truth
     chip = rng.choice(CHIPS, POSITIONS)
     x, y = rng.uniform(0.5, 4096.5, POSITIONS), rng.uniform(0.5, 2048.5, POSITIONS)
@@ -190,7 +190,7 @@ def _position(
     """Positions (N, 2) and their covariance (N, 2, 2)."""
     px, py = corrected(found.session.tables, x, y, chip=where["chip"])
     D = view.model.jacobian(view.mean, px, py, **where)
-    J = pixel_jacobian(view.model, view.mean, px, py, **where)
+    J = view.model.slopes(view.mean, px, py, **where)
     table = posterior.position_sigma(x, y, refitted=True) ** 2
     cov = np.einsum("nap,pq,nbq->nab", D, view.cov, D, optimize=True)
     cov += np.einsum("nai,ni,nbi->nab", J, table, J)

@@ -20,7 +20,7 @@ from bayesdist.assess.terms.correlated import STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PolynomialField
 from bayesdist.assess.terms.given import CENTROID
 from bayesdist.assess.terms.solution import COEFFICIENTS, TIME_DEPENDENCE
-from bayesdist.infer.discrepancy import Discrepancy
+from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.model import DistortionModel
 
 from .campaigns import (

@@ -17,10 +17,10 @@ from bayesdist.app.judging import errors_of, margins_of
 from bayesdist.assess import Requirement
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic
+from bayesdist.diagnose.correlated import DiscrepancyPriors
+from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.structure import LENGTHS, UNLIKE
 from bayesdist.infer import OutlierMixture
-from bayesdist.infer.discrepancy import DiscrepancyPriors
-from bayesdist.infer.discrepancy.functions import StructureFunctions
-from bayesdist.infer.discrepancy.structure import LENGTHS, UNLIKE
 from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial import fields
 from tests.adversarial.measure import GRID, assessed

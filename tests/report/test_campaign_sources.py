@@ -10,7 +10,7 @@ import pytest
 from bayesdist.app.campaign.report import _residuals
 from bayesdist.data import MatchTable
 from bayesdist.diagnose.overlap import _aligned, _at_first_epoch, chosen_exposures
-from bayesdist.infer.nodes.alternation import inside_chips, with_columns
+from bayesdist.infer.nodes.corrected import inside_chips, with_columns
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 
 SIZE = (1024.0, 512.0)

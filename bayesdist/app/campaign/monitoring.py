@@ -18,7 +18,7 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_influence import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes.alternation import on_the_chips, with_columns
+from bayesdist.infer.nodes.corrected import on_the_chips, with_columns
 from bayesdist.model import corrected
 
 __all__ = ["NewExposures", "fit_exposures_of", "read_new_exposures"]

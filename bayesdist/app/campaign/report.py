@@ -15,9 +15,7 @@ from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residual
 from bayesdist.infer import GaussianPriors, LinearFit, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import Rejection
-from bayesdist.infer.nodes import pixel_shifts
-from bayesdist.infer.nodes.alternation import inside_chips, with_columns
-from bayesdist.model import corrected
+from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
 from bayesdist.model.grid import outline_pixels
 from bayesdist.report.campaign import (
     CampaignResults,
@@ -173,8 +171,7 @@ def _residuals(session: CampaignSession) -> tuple[ChipResiduals, ...]:
     plain = pairs if errors is None else with_centroid_errors(pairs, errors)
     if any(table.filter for table in session.tables):  # those of the detector are not of this run
         detector = [table for table in session.tables if not table.filter]
-        x, y = corrected(detector, pairs.x, pairs.y, chip=pairs.chip_number)
-        plain = with_columns(plain, x=x, y=y)
+        plain = corrected_matches(detector, plain)
     # the stars that neither has moved off their chip
     kept = session.inside_with_tables
     both = kept & inside_chips(plain, model)

@@ -11,7 +11,7 @@ from astropy.table import Table
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.session import write_table
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.series import Course, Series, SeriesPosterior, describe, fit_series
+from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe, fit_series
 
 __all__ = ["run_series"]
 
@@ -28,9 +28,9 @@ def run_series(session: CampaignSession) -> None:
     if time is None or len(series.names) < FEWEST:
         return
     seed = session.config.sampler.seed
-    course = Course("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
+    trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
     try:
-        posterior = fit_series(series, course, seed=seed, max_sweeps=MOST_SWEEPS)
+        posterior = fit_series(series, trend, seed=seed, max_sweeps=MOST_SWEEPS)
     except DegenerateError as error:
         if session.free_rates:
             raise
@@ -70,12 +70,12 @@ def _doubts(session: CampaignSession, outlying: list[str]) -> Iterator[str]:
     if missed:
         yield (
             f"{', '.join(missed)}, each fitted alone, {'lie' if len(missed) > 1 else 'lies'} off "
-            "the course of the others, and the joint fit counts them as scatter"
+            "the trend of the others, and the joint fit counts them as scatter"
         )
 
 
 def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
-    """Which course one term takes, by held-out exposures."""
+    """Which trend one term takes, by held-out exposures."""
     verdict = describe(series.only(series.coefficients[k]), breaks=breaks, seed=seed)
     return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
 
@@ -99,12 +99,12 @@ def _lines(posterior: SeriesPosterior) -> list[dict[str, object]]:
 
 def _changes(posterior: SeriesPosterior) -> list[dict[str, object]]:
     out: list[dict[str, object]] = []
-    for number in range(posterior.course.n_breaks):
+    for number in range(posterior.trend.n_breaks):
         level, slope = posterior.change(number)
         for k, name in enumerate(posterior.series.coefficients):
             out.append(
                 {
-                    "break": posterior.course.breaks[number],
+                    "break": posterior.trend.breaks[number],
                     "term": name,
                     "step": float(level.value[k]),
                     "sigma_step": float(level.sigma[k]),

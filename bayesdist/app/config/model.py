@@ -11,8 +11,8 @@ from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from bayesdist.app.config.detector import Pair
 from bayesdist.app.config.section import Section
+from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.infer import Compute, OutlierMixture
-from bayesdist.infer.discrepancy import DiscrepancyPriors
 from bayesdist.model import FRAME_KINDS, TimeDependence
 
 __all__ = [

@@ -18,7 +18,7 @@ def selfcal_lines(session: SelfcalSession) -> Iterator[str]:
     """Stars and free directions of a self-calibration, as lines of text: nothing is sampled."""
     given = session.given
     found = calibrated(given, lambda text: None)
-    s, gauge, model = found.solution, found.gauge, found.solution.problem.model
+    s, gauge, model = found.mode, found.gauge, found.mode.problem.model
     matching = matching_of(found, given.inputs, given.block.min_detections)
     matching.refuse_strangers()
     summary = matching.summary

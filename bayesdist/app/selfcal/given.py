@@ -26,7 +26,7 @@ from bayesdist.data.detections import Detections
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import ReferenceStars
-from bayesdist.infer.selfcal.problem import Problem, prepared
+from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import DistortionModel
 
@@ -153,12 +153,12 @@ class Given:
         first : ndarray, shape (D,)
             By which reference stars are found among the detected ones.
         """
-        problem = prepared(
+        problem = prepare(
             model,
             detections,
             theta,
             match_radius=self.block.match_radius,
-            least=self.block.min_detections,
+            min_detections=self.block.min_detections,
             motion=self.block.motion,
             parallax_factors=self.parallax_factors,
             dilation=self.inputs.dilation,

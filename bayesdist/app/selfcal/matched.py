@@ -19,7 +19,7 @@ from bayesdist.data.detections import Detections
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import SelfCalibration
-from bayesdist.infer.selfcal.normal import Mixture
+from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
 
@@ -84,7 +84,7 @@ def matched_of(
     found: SelfCalibration, given: Given, facts: Mapping[str, Any], table: Table
 ) -> SelfcalMatched:
     """What a self-calibration made of its detections, as later stages take it."""
-    solution = found.solution
+    solution = found.mode
     return _matched(
         given,
         found.detections,

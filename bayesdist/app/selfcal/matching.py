@@ -21,7 +21,7 @@ from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.calibrate import self_calibrate
-from bayesdist.infer.selfcal.normal import memberships
+from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
 
@@ -147,17 +147,17 @@ def calibrated(given: Given, report: Callable[[str], None]) -> SelfCalibration:
             model,
             given.inputs.detections,
             theta,
-            knowledge=given.known_for(model),
+            prior_at=given.known_for(model),
             match_radius=block.match_radius,
             start_radius=block.start_radius,
-            least=block.min_detections,
+            min_detections=block.min_detections,
             motion=block.motion,
             parallax_factors=given.parallax_factors,
             dilation=given.inputs.dilation,
             jitter=given.jitter,
             references=given.references,
             plane=given.tangent_plane,
-            rounds=block.max_iterations,
+            max_iterations=block.max_iterations,
             log=report,
         )
     except (NotSettledError, DegenerateError) as error:
@@ -192,7 +192,7 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
     least : int
         Fewest detections of a star.
     """
-    s, d, friends = found.solution, found.detections, found.friends
+    s, d, friends = found.mode, found.detections, found.friends
     p, model = s.problem, s.problem.model
     E = len(d.exposure_names)
     used = np.zeros(len(d), bool)
@@ -247,7 +247,7 @@ def matching_of(found: SelfCalibration, inputs: Inputs, least: int) -> Matching:
         "n_ambiguous": friends.n_ambiguous,
         "n_doubled": friends.n_doubled,
         "n_chains": friends.n_chains,
-        "rounds": found.rounds,
+        "rounds": found.iterations,
         "match_radius": p.match_radius,
         "tangent_planes_pix": _moved(d, inputs),
         "detections": {

@@ -23,7 +23,7 @@ from bayesdist.checks import Check
 from bayesdist.data import MatchTable, ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.infer import Matches
-from bayesdist.infer.selfcal import Gauge, Solution
+from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
 
 Float = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class SelfcalSession(Session):
         return required(self.fitted.solved, "solution of detections")
 
     @property
-    def solved(self) -> Solution:
+    def solved(self) -> SelfCalibrationMode:
         """The solution with its stars."""
         return self._solved.solution
 

@@ -14,7 +14,7 @@ from bayesdist.app.output import write_table
 from bayesdist.app.selfcal.gauge import gauge_table
 from bayesdist.data.matches import MatchTable
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.selfcal import Gauge, Solution
+from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
 
 __all__ = ["SelfCalibrated", "arrays_of", "read_solution"]
 
@@ -30,7 +30,7 @@ class SelfCalibrated:
 
     Parameters
     ----------
-    solution : Solution
+    solution : SelfCalibrationMode
     gauge : Gauge
         What the detections leave free, and what fixes it.
     fixed : mapping of str to str
@@ -41,7 +41,7 @@ class SelfCalibrated:
         From which the solution is made again.
     """
 
-    solution: Solution
+    solution: SelfCalibrationMode
     gauge: Gauge
     fixed: Mapping[str, str]
     matches: MatchTable
@@ -54,7 +54,7 @@ class SelfCalibrated:
         write_table(table, folder / GAUGE)
 
 
-def arrays_of(solution: Solution, reference: Float) -> dict[str, NDArray[Any]]:
+def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDArray[Any]]:
     """A solution as arrays; `reference` is where what is known beside it was linearised."""
     mixture, decision = solution.mixture, solution.decision
     counts = (0, 0) if decision is None else (decision.n_null, decision.n_open)

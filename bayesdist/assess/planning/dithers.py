@@ -18,13 +18,13 @@ from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal.expected import ExpectedSolution, expected_solution
-from bayesdist.infer.selfcal.information import (
-    Information,
-    frame_information,
-    pointing_information,
+from bayesdist.infer.selfcal.prior import (
+    Prior,
+    frame_prior,
+    pointing_prior,
     tie,
 )
-from bayesdist.infer.selfcal.moves import POINTS, functionals, moves
+from bayesdist.infer.selfcal.sky_moves import POINTS, functionals, moves
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import outline_pixels
 from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
@@ -125,22 +125,20 @@ class Beforehand:
     exposure_scale_sigma: float | None = None
     scale_sigma: float | None = None
 
-    def information(
-        self, model: DistortionModel, theta: Float, pattern: DitherPattern
-    ) -> Information:
+    def prior(self, model: DistortionModel, theta: Float, pattern: DitherPattern) -> Prior:
         """All of it, at a truth."""
-        out, n = Information.none(theta), len(pattern)
+        out, n = Prior.none(theta), len(pattern)
         if self.offset_sigma is not None:
             # rolls are about the middle of all chips: a pixel elsewhere moves with the roll
             middles = [(c.number, (c.size[0] + 1) / 2, (c.size[1] + 1) / 2) for c in model.chips]
             sigma = np.full(n, self.offset_sigma)
-            out = out + pointing_information(model, theta, pattern.offsets, sigma, pixels=middles)
+            out = out + pointing_prior(model, theta, pattern.offsets, sigma, pixels=middles)
         if self.roll_sigma is not None:
             rolls = pattern.rolls
-            out = out + frame_information(model, theta, "rotation", rolls, self.roll_sigma)
+            out = out + frame_prior(model, theta, "rotation", rolls, self.roll_sigma)
         if self.exposure_scale_sigma is not None:
             scatter = self.exposure_scale_sigma
-            out = out + frame_information(model, theta, "scale", np.zeros(n), scatter)
+            out = out + frame_prior(model, theta, "scale", np.zeros(n), scatter)
         if self.scale_sigma is not None:
             out = out + tie(theta, functionals(model, theta)["scale"], 0.0, self.scale_sigma)
         return out
@@ -300,8 +298,8 @@ def _planned(
     detections = Detections(
         x, y, exposure, model.exposures, chip, sigma=sigma, star=star, source=pattern.name
     )
-    information = known.information(model, truth, pattern)
-    solution = expected_solution(model, truth, detections, information, least=stars.least)
+    prior = known.prior(model, truth, pattern)
+    solution = expected_solution(model, truth, detections, prior, min_detections=stars.least)
     move = moves(model, truth)
     without = {
         "gauge-free": solution.gauge.null,

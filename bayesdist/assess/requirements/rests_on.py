@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.checks import visits_of
+from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.infer.discrepancy import Discrepancy
 from bayesdist.model import DistortionModel
 
 __all__ = ["rests_on"]

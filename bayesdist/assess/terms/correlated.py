@@ -19,8 +19,8 @@ from bayesdist.assess.terms.forms import (
     Row,
     Together,
 )
-from bayesdist.infer.discrepancy import Discrepancy
-from bayesdist.infer.discrepancy.linear import LinearDeviations
+from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.diagnose.correlated.deviations import LinearDeviations
 
 __all__ = ["DEVIATIONS", "STRUCTURE", "STRUCTURE_IN_FIT", "Deviations", "StructureErrors"]
 

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.discrepancy.functions import legendre_products
-from bayesdist.infer.selfcal.eliminated import Columns
+from bayesdist.diagnose.correlated.functions import legendre_products
+from bayesdist.diagnose.selfcal.eliminated import Columns
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 

@@ -22,8 +22,8 @@ from scipy.sparse import csr_array
 from scipy.stats import f as f_distribution
 
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
-from bayesdist.infer.selfcal import Solution
-from bayesdist.infer.selfcal.following import Following, following
+from bayesdist.diagnose.selfcal.leverage import StarBlock, star_blocks
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
@@ -38,12 +38,12 @@ MOST_CELLS = 512  # of all chips: the matrix of all shifts is decomposed
 TOLD = 0.05  # of what detections would say of a cell if stars were known: less is not told
 
 
-def dithered_misfit(solution: Solution) -> Misfit:
+def dithered_misfit(solution: SelfCalibrationMode) -> Misfit:
     """Test the detections of a self-calibration for structure over the detector.
 
     Parameters
     ----------
-    solution : Solution
+    solution : SelfCalibrationMode
 
     Returns
     -------
@@ -97,7 +97,7 @@ class _Shifts:
     dof: float = 1.0
 
 
-def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
+def _shifts(solution: SelfCalibrationMode, partitions: Sequence[tuple[int, int]]) -> list[_Shifts]:
     """What detections say of shifts of the cells of each partition, in one pass over them."""
     p, expansion = solution.problem, solution.expansion
     out = []
@@ -105,7 +105,7 @@ def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_
         n = 2 * len(p.model.chips) * nx * ny
         out.append(_Shifts(np.zeros(n), np.zeros((n, n)), np.zeros(n)))
     taken = float(len(solution.free))  # of the detections' numbers by distortion and stars
-    for some in following(solution):
+    for some in star_blocks(solution):
         taken += np.minimum(p.n_star, 2 * np.bincount(some.star, some.member)).sum()
         for sums, bins in zip(out, partitions, strict=True):
             _add(sums, some, _cells(p, some.rows, bins))
@@ -115,7 +115,7 @@ def _shifts(solution: Solution, partitions: Sequence[tuple[int, int]]) -> list[_
     return [replace(sums, chi2=expansion.chi2, dof=dof) for sums in out]
 
 
-def _add(sums: _Shifts, some: Following, cell: Int) -> None:
+def _add(sums: _Shifts, some: StarBlock, cell: Int) -> None:
     """Add some stars; of the curvature what they take of it."""
     w, ties, n = some.weight, some.ties, len(sums.weight)
     index = np.stack([cell, cell + n // 2], axis=1)

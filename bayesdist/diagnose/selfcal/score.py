@@ -15,26 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from bayesdist.diagnose.correlated.deviations import deviation_columns
 from bayesdist.diagnose.score.motions import SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.result import Outcome, ScoreTest, corrected, noncentrality
 from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.diagnose.score.score import independent_directions
 from bayesdist.diagnose.selfcal.columns import AddedColumns, pointing_terms
-from bayesdist.infer.discrepancy.linear import deviation_columns
-from bayesdist.infer.selfcal.discrepancy import MOST_EXPOSURES
-from bayesdist.infer.selfcal.eliminated import (
+from bayesdist.diagnose.selfcal.correlated import MOST_EXPOSURES
+from bayesdist.diagnose.selfcal.eliminated import (
     add_products,
     even_stars,
     pieces,
     star_sums,
     without_parameters,
 )
-from bayesdist.infer.selfcal.following import taken_by_stars
-from bayesdist.infer.selfcal.normal import memberships
-from bayesdist.infer.selfcal.sandwich import star_scores
-from bayesdist.infer.selfcal.scores import scores_of_detections
-from bayesdist.infer.selfcal.solve import Solution
+from bayesdist.diagnose.selfcal.leverage import taken_by_stars
+from bayesdist.diagnose.selfcal.sandwich import star_scores
+from bayesdist.diagnose.selfcal.scores import scores_of_detections
+from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.model.basis import MAX_ORDER
 
 __all__ = ["selfcal_score_tests"]
@@ -76,7 +76,7 @@ class _Sums:
 
 
 def selfcal_score_tests(
-    solution: Solution, *, mag: Float | None = None, epoch: Float | None = None
+    solution: SelfCalibrationMode, *, mag: Float | None = None, epoch: Float | None = None
 ) -> tuple[ScoreTest, ...]:
     """Targeted tests of a self-calibration for what its model lacks, and for its noise.
 
@@ -84,7 +84,7 @@ def selfcal_score_tests(
 
     Parameters
     ----------
-    solution : Solution
+    solution : SelfCalibrationMode
     mag, epoch : ndarray, shape (N,), optional
         Of each detection of its problem; decimal years.
 
@@ -116,7 +116,7 @@ def selfcal_score_tests(
 
 
 def _summed(
-    solution: Solution, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
+    solution: SelfCalibrationMode, columns: AddedColumns, rows: NDArray[np.bool_], stars: Float
 ) -> _Sums:
     """Sums over some of the detections of a solution."""
     p, scores = columns.problem, scores_of_detections(solution).at(rows)
@@ -141,7 +141,7 @@ def _summed(
     # given back what the parameters have taken: a little, and much the same everywhere
     numbers = 2 * float((scores.curvature[:, 0, 0] > 0).sum()) - p.n_star * p.n_stars
     free = max(1 - len(solution.free) / max(numbers, 1.0), 0.1)
-    covariance = own.T @ own / free + left.gain.T @ solution.information.precision @ left.gain
+    covariance = own.T @ own / free + left.gain.T @ solution.prior.precision @ left.gain
     further = np.ix_(columns.order[D:], columns.order[D:])
     return _Sums(
         known[further],
@@ -214,7 +214,7 @@ def _words(name: str, order: int) -> tuple[str, str, str]:
     )
 
 
-def _motions(solution: Solution, epoch: Float) -> Outcome | None:
+def _motions(solution: SelfCalibrationMode, epoch: Float) -> Outcome | None:
     """Test for stars that move."""
     p, scores = solution.problem, scores_of_detections(solution)
     return motion_outcome(
@@ -235,7 +235,7 @@ class _Scored:
 
 
 def _noise_sample(
-    solution: Solution, some: Int, rows: NDArray[np.bool_], mag: Float | None
+    solution: SelfCalibrationMode, some: Int, rows: NDArray[np.bool_], mag: Float | None
 ) -> _Scored:
     """Some detections along the axes of the detector, in the unit of u and v.
 

@@ -16,7 +16,7 @@ from bayesdist.app.session import write_table
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.infer import load_fit
 from bayesdist.infer.selfcal import star_catalogue
-from bayesdist.infer.selfcal.moves import functionals
+from bayesdist.infer.selfcal.sky_moves import functionals
 from bayesdist.simulate.dithers import pixels_of
 from tests.app.selfcal.support import (
     SCALE_MAS,
