@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from bayesdist.app.folder import atomic_directory
 from bayesdist.app.screen import table_text
 from bayesdist.app.session import write_table
-from bayesdist.data import RadialLimit, RvbPairs
 from bayesdist.data.frame_stars import FrameStars
-from bayesdist.data.rvb_files import ARRAY_SIZE, RVB_ALIASES, band_name
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
-from bayesdist.missions.wise.rvb.write import write_rvb
+from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, RVB_ALIASES, band_name
+from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
+from bayesdist.missions.wise.pairs.write import write_rvb
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = ["bring_up_files"]

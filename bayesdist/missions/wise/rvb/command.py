@@ -9,14 +9,15 @@ from math import radians
 from operator import add
 from pathlib import Path
 
-from bayesdist.data import MatchTable, RvbPairs, stream_rvb
-from bayesdist.data.rvb import chosen_band
-from bayesdist.data.rvb_files import ARRAY_SIZE, open_rvb_files
+from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, open_rvb_files
+from bayesdist.missions.wise.pairs.read import chosen_band, stream_rvb
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
+from bayesdist.missions.wise.pairs.write import write_rvb
 from bayesdist.missions.wise.rvb.linear import fit_transform, linear_moments
 from bayesdist.missions.wise.rvb.solutions import read_solutions
 from bayesdist.missions.wise.rvb.transform import RvbTransform, rereference, transformed
-from bayesdist.missions.wise.rvb.write import write_rvb
 
 __all__ = ["rereference_files", "transform_files"]
 

@@ -13,9 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.rvb_accept import CHI2, OFFSET, RadialLimit, radial_rows
-from bayesdist.data.rvb_pairs import COLOUR, NO_COLOUR, RvbPairs, bluest_rows, colours_of
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.radial_limit import CHI2, OFFSET, RadialLimit, radial_rows
+from bayesdist.missions.wise.pairs.rvb_pairs import (
+    COLOUR,
+    NO_COLOUR,
+    RvbPairs,
+    bluest_rows,
+    colours_of,
+)
 
 __all__ = ["RvbSelection", "SelectedPairs"]
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.data.rvb_pairs import RvbPairs
 from bayesdist.data.write import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
 
 __all__ = ["write_rvb"]
 

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
-from bayesdist.data.rvb import chosen_band
-from bayesdist.data.rvb_array import ArrayCheck
-from bayesdist.data.rvb_files import MAGNITUDES, RvbFile, open_rvb_files
 from bayesdist.data.tables.column import Place
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.data.tables.parquet import ParquetPart
+from bayesdist.missions.wise.pairs.array_check import ArrayCheck
+from bayesdist.missions.wise.pairs.files import MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.missions.wise.pairs.read import chosen_band
 
 __all__ = ["open_rvb"]
 
