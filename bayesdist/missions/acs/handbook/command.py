@@ -18,6 +18,7 @@ from bayesdist.app.sessions import session_of
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.published import acs_detector, handbook_rows
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 
 if TYPE_CHECKING:
@@ -69,12 +70,10 @@ def handbook(
         non_linear_figure,
         residual_figure,
     )
-    from bayesdist.missions.acs.handbook.published import handbook_rows
-    from bayesdist.products.detectors import acs_detector
     from bayesdist.report.drawing import save_figures
 
     if detector is not None:
-        detector = acs_detector(detector).name
+        detector = acs_detector(detector)
     if magnification is not None and not magnification > 0:
         raise InputError(
             f"the magnification is {magnification}",

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import DetectorNumbers
 
-__all__ = ["handbook_rows"]
+__all__ = ["acs_detector", "handbook_rows"]
 
 # detector: quantity: as printed
 _PUBLISHED: dict[str, dict[str, str]] = {
@@ -43,6 +44,18 @@ _PUBLISHED: dict[str, dict[str, str]] = {
 
 # what is printed in arcseconds
 _ANGLES = ("non-linear arcsec", "size x", "size y", "output scale")
+
+
+def acs_detector(name: str) -> str:
+    """Name of a detector of ACS in capitals; any other is refused."""
+    found = name.strip().upper()
+    if found not in _PUBLISHED:
+        raise InputError(
+            f"ACS has no detector {name!r}",
+            where="detector",
+            do=f"choose one of {', '.join(_PUBLISHED)}",
+        )
+    return found
 
 
 def handbook_rows(

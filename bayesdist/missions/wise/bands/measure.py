@@ -164,9 +164,7 @@ def _printed(band: str, field: DistortionField) -> Printed:
         LONGEST_VECTORS[band],
         longest,
         FORMAL_RADII[band],
-        implied_sigma(
-            FORMAL_RADII[band], SAMPLE_SIZES[band], order=field.basis.order, size=field.basis.size
-        ),
+        implied_sigma(FORMAL_RADII[band], SAMPLE_SIZES[band], order=field.basis.order),
     )
 
 
