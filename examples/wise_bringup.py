@@ -8,7 +8,8 @@ import numpy as np
 
 from bayesdist.missions.wise.bring_up.iterate import bring_up
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
-from bayesdist.missions.wise.simulate.bringup import optical_model, simulate_unpaired
+from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
+from bayesdist.missions.wise.simulate.optical import optical_model
 
 STARTS = {
     "from nothing": None,

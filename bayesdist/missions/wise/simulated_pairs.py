@@ -13,7 +13,7 @@ from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
 from bayesdist.missions.wise.demo import simulation_config, write_simulation
 from bayesdist.missions.wise.simulate import WiseSet, simulate_wise, wise_set, write_wise_set
-from bayesdist.missions.wise.simulate.stand_in import STAND_IN_TURN, write_stand_in
+from bayesdist.missions.wise.simulate.optical import DELIVERED_TURN, write_optical_model
 
 __all__ = ["simulate_sets", "simulate_table"]
 
@@ -184,11 +184,11 @@ def simulate_sets(
             }
         )
         lines.append(f"bayesdist run {folder / f'{name}.toml'} -o {folder / f'run_{name}'}")
-    write_stand_in(folder / "optical_w2.hdr")
+    write_optical_model(folder / "optical_w2.hdr")
     runs = " ".join(str(folder / f"run_{name}") for name in names)
     compare = (
         f"compare them:\n  bayesdist wise bands {runs} -o {folder / 'bands'} "
-        f"--optical {folder / 'optical_w2.hdr'} --rotation {STAND_IN_TURN}"
+        f"--optical {folder / 'optical_w2.hdr'} --rotation {DELIVERED_TURN}"
     )
     return f"{table_text(rows)}\n\ncalibrate them:\n  " + "\n  ".join([*lines, compare])
 
