@@ -78,15 +78,7 @@ class UncertaintyMap:
 def with_local(found: UncertaintyMap, sigma: Float | None) -> UncertaintyMap:
     """A map with what the model leaves out at each position; itself where that is not known.
 
-    Parameters
-    ----------
-    found : UncertaintyMap
-    sigma : ndarray, shape (ny nx, 2), or None
-        Of u and v at the points of the map.
-
-    Returns
-    -------
-    UncertaintyMap
+    `sigma`: (ny nx, 2), of u and v at the points of the map.
     """
     if sigma is None:
         return found

@@ -39,30 +39,10 @@ def handbook(
 ) -> str:
     """Write the figures and the numbers of a calibration.
 
-    Parameters
-    ----------
-    path : path
-        As of `calibration_at`.
-    output : path
-        New or empty folder.
-    filter, scale
-        As of `calibration_at`.
-    epoch : float, optional
-        Decimal years, for what depends on time.
-    detector : str, optional
-        WFC, HRC or SBC, whose printed numbers stand beside; that of an IDCTAB of ACS by default.
-    magnification : float, optional
-        Of the vectors.
-
-    Returns
-    -------
-    str
-        The numbers.
-
-    Raises
-    ------
-    InputError
-        For what cannot be read or written.
+    `path`: as of `calibration_at`. `output`: new or empty folder. `filter`, `scale`: as of
+    `calibration_at`. `epoch`: decimal years, for what depends on time. `detector`: WFC, HRC or SBC,
+    whose printed numbers stand beside; that of an IDCTAB of ACS by default. `magnification`: of the
+    vectors. Returns the numbers. InputError for what cannot be read or written.
     """
     # figures take seconds to import
     from bayesdist.missions.acs.handbook.figures import (

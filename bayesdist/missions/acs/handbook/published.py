@@ -1,4 +1,4 @@
-"""What section 4.1 of the ACS handbook prints of each detector, beside what a calibration gives.
+"""Numbers of section 4.1 of the ACS handbook for each detector, beside those of a calibration.
 
 Its Table 4.1 is not here: only what its text says.
 """
@@ -63,20 +63,9 @@ def handbook_rows(
 ) -> list[dict[str, Any]]:
     """Rows of the table: quantity, unit, published, ours.
 
-    Parameters
-    ----------
-    numbers : DetectorNumbers
-    scale : float
-        Size of an output pixel, in `unit`.
-    unit : str
-        Of the undistorted plane.
-    detector : str
-        WFC, HRC or SBC of ACS; of others nothing is printed.
-
-    Returns
-    -------
-    list of dict
-        Keys quantity, unit, published (text, empty where the handbook has nothing), value.
+    `scale`: size of an output pixel, in `unit`. `unit`: of the undistorted plane. `detector`: WFC,
+    HRC or SBC of ACS; of others nothing is printed. Returns keys quantity, unit, published (text,
+    empty where the handbook has nothing), value.
     """
     n = numbers
     angle = unit if unit != "pix" else "pix of u, v"

@@ -20,24 +20,9 @@ __all__ = ["implied_sigma"]
 def implied_sigma(radius_max: float, n_pairs: int, *, order: int = 4) -> float:
     """Error of a pair, equal on both axes, that a largest radius implies.
 
-    Parameters
-    ----------
-    radius_max : float
-        Largest hypot(sigma_x, sigma_y) of a polynomial's position over the array.
-    n_pairs : int
-        Pairs that determine the polynomial, evenly over the array.
-    order : int
-        Of the polynomial.
-
-    Returns
-    -------
-    float
-        In the unit of the radius.
-
-    Raises
-    ------
-    InputError
-        For no pairs.
+    `radius_max`: largest hypot(sigma_x, sigma_y) of a polynomial's position over the array.
+    `n_pairs`: pairs that determine the polynomial, evenly over the array. `order`: of the
+    polynomial. The result is in the unit of the radius. InputError for no pairs.
     """
     if n_pairs < 1:
         raise InputError(f"{n_pairs} pairs are given", do="give one pair or more")

@@ -42,22 +42,10 @@ PathLike = str | os.PathLike[str]
 def rvb_bands(
     path: PathLike | Sequence[PathLike], *, columns: Mapping[str, str] | None = None
 ) -> dict[str, int]:
-    """How many pairs of each band some files hold.
+    """Number of pairs of each band in some files.
 
-    Parameters
-    ----------
-    path, columns
-        As `stream_rvb`.
-
-    Returns
-    -------
-    dict of str to int
-        Bands in the order of their wavelength.
-
-    Raises
-    ------
-    InputError
-        Without a column of bands, and for what is no band.
+    `path`, `columns`: as `stream_rvb`. Returns bands in the order of their wavelength. InputError
+    without a column of bands, and for what is no band.
     """
     return _bands_of(open_rvb_files(path, columns))
 

@@ -33,10 +33,6 @@ class RvbInput:
     What is too large for memory and has to be selected or converted is written once, as a table of
     matches: beside the run's folder as long as nothing may be written into it, then moved there
     whole.  The record of the run says that it is there.
-
-    Parameters
-    ----------
-    run : RunDirectory
     """
 
     run: RunDirectory
@@ -46,10 +42,8 @@ class RvbInput:
     def load(self) -> Matches:
         """The selected pairs.
 
-        Raises
-        ------
-        InputError
-            For all that is wrong with files and selection, and a detector that is not the band's.
+        InputError for all that is wrong with files and selection, and a detector that is not the
+        band's.
         """
         data, size, path = *self._settings, self.run.matches
         options = _options(data, size)
@@ -116,15 +110,8 @@ class RvbInput:
     def settle(self) -> bool:
         """Move what was written into the folder of the run, which has begun.
 
-        Returns
-        -------
-        bool
-            True for pairs that were moved, and have to be opened anew.
-
-        Raises
-        ------
-        InputError
-            When the system refuses.
+        Returns True for pairs that were moved, and have to be opened anew. InputError when the
+        system refuses.
         """
         if self._scratch is None or self._counts is None:
             return False
@@ -155,21 +142,8 @@ def load_rvb(
 ) -> MatchTable:
     """RvB pairs in memory, as a configuration reads and selects them.
 
-    Parameters
-    ----------
-    path : path or sequence of path
-    data : RvbData
-    size : tuple of float
-        Columns and rows of the detector.
-
-    Returns
-    -------
-    MatchTable
-
-    Raises
-    ------
-    InputError
-        For all that is wrong with files and selection, and a detector that is not the band's.
+    `size`: columns and rows of the detector. InputError for all that is wrong with files and
+    selection, and a detector that is not the band's.
     """
     assert isinstance(data, RvbData)
     if data.band is not None:

@@ -51,10 +51,7 @@ scale_mas = {scale:.0f}
 def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]] | None:
     """Number of pairs, and what they put into the template of `init`; None for other matches.
 
-    Raises
-    ------
-    InputError
-        As `stream_rvb`.
+    InputError as `stream_rvb`.
     """
     if not _is_rvb(matches):
         return None

@@ -37,35 +37,11 @@ def transform_files(
 ) -> str:
     """Pairs with all reference positions moved by one linear transformation.
 
-    Parameters
-    ----------
-    files : sequence of path
-    output : path
-        New folder.
-    band : str, optional
-        Needed where the files hold several.
-    columns : mapping of str to str, optional
-        As `stream_rvb`.
-    dx, dy : float
-        Pixels.
-    rotation : float
-        Degrees, from x towards y.
-    scale_x, scale_y : float
-        Relative to one.
-    fit : bool
-        The five parameters are those that bring reference positions to the detections, by least
-        squares.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For no transformation, one that is both given and to be fitted, and as `stream_rvb`,
-        `transformed` and `write_rvb`.
+    `output`: new folder. `band`: needed where the files hold several. `columns`: as `stream_rvb`.
+    `dx`, `dy`: pixels. `rotation`: degrees, from x towards y. `scale_x`, `scale_y`: relative to
+    one. `fit`: the five parameters are those that bring reference positions to the detections, by
+    least squares. Returns the text to print. InputError for no transformation, one that is both
+    given and to be fitted, and as `stream_rvb`, `transformed` and `write_rvb`.
     """
     transform = RvbTransform(dx, dy, radians(rotation), scale_x, scale_y)
     if (transform == RvbTransform()) != fit:
@@ -104,25 +80,9 @@ def rereference_files(
 ) -> str:
     """Pairs brought from the frame solutions that they were made with to others.
 
-    Parameters
-    ----------
-    files : sequence of path
-    output : path
-        New folder.
-    free, fixed : path
-        Tables of solutions: those of the pairs, and those that they are brought to.
-    band, columns
-        As of `transform_files`.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        As `stream_rvb`, `read_solutions`, `rereference` and `write_rvb`.
+    `output`: new folder. `free`, `fixed`: Tables of solutions: those of the pairs, and those that
+    they are brought to. `band`, `columns`: as of `transform_files`. Returns the text to print.
+    InputError as `stream_rvb`, `read_solutions`, `rereference` and `write_rvb`.
     """
     columns = columns or {}
     band = _band(files, band, columns)
