@@ -15,9 +15,8 @@ from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.folder import atomic_directory
 from bayesdist.app.kinds.errors import read_magnitude_errors
-from bayesdist.app.matches import load_matches, reading_options
+from bayesdist.app.match_sources import read_configured
 from bayesdist.app.rundir import RunDirectory, versions, write_json
-from bayesdist.app.rvb import load_rvb
 from bayesdist.app.session import Session, write_table
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
@@ -155,10 +154,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
             )
     assert data is not None
     _refuse_the_same(run, path)
-    if data.format == "rvb" and size is not None:
-        matches: Matches = load_rvb(path, data, size)
-    else:
-        matches = load_matches(path, **reading_options(data, config.chip))
+    matches = read_configured(path, data, size=size, chips=config.chip)
     if data.sigma != "by_magnitude":
         return matches
     errors = read_magnitude_errors(run.path)

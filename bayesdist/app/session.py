@@ -21,10 +21,10 @@ from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched, Prepared
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.stars import load_fitted_stars, match_stars
+from bayesdist.app.match_sources import RunInput, input_of_run
 from bayesdist.app.output import write_table
 from bayesdist.app.periods import period_settings
 from bayesdist.app.rundir import RunDirectory
-from bayesdist.app.rvb import RvbInput
 from bayesdist.assess import SAMPLE, pixel_scale_of
 from bayesdist.assess.error_model import ErrorModel, error_model, solution_with_errors
 from bayesdist.assess.evaluation import EvaluationSettings
@@ -68,7 +68,7 @@ class Session:
     _values: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
     _made: set[str] = field(default_factory=set, init=False, repr=False)
     _reader: StarReader | None = field(default=None, init=False, repr=False)
-    _rvb: RvbInput | None = field(default=None, init=False, repr=False)
+    _input: RunInput | None = field(default=None, init=False, repr=False)
     _derived: Derived = field(default_factory=Derived, init=False, repr=False)
 
     things = "stars"  # what a row of the data is, in words
@@ -110,10 +110,8 @@ class Session:
         return self._value("matched", self._load_matched)
 
     def _load_matched(self) -> Matched:
-        stars, data = None, self.config.data
-        if data is not None and data.format == "rvb":
-            self._rvb = self._rvb or RvbInput(self.run)
-            stars = self._rvb.load()
+        self._input = self._input or input_of_run(self.run)
+        stars = None if self._input is None else self._input.load()
         return match_stars(self.config, self.base, stars=stars)
 
     @property
@@ -136,7 +134,7 @@ class Session:
 
     def begun(self) -> None:
         """Move into the run's folder what was prepared beside it: the run has begun."""
-        if self._rvb is not None and self._rvb.settle():
+        if self._input is not None and self._input.settle():
             fitted = self.fitted
             self.renew("matched", self._load_matched())
             self.renew("fitted", fitted)
@@ -144,7 +142,7 @@ class Session:
 
     def close(self) -> None:
         """Let go of the data, and of whoever holds them."""
-        for one in (self._reader, self._rvb):
+        for one in (self._reader, self._input):
             if one is not None:
                 one.close()
 

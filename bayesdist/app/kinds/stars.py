@@ -17,8 +17,7 @@ from bayesdist.app.kinds.fitted import FIT, Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.reader import StarReader
 from bayesdist.app.kinds.split import set_aside
-from bayesdist.app.matches import load_matches, reading_options
-from bayesdist.app.rvb import load_rvb
+from bayesdist.app.match_sources import read_configured
 from bayesdist.assess import SAMPLE
 from bayesdist.diagnose.residuals.quoted import error_scale
 from bayesdist.errors import ConfigError, DegenerateError, InputError, NotSettledError
@@ -93,14 +92,12 @@ def read_stars(config: Config, base: Path) -> Matches:
     InputError
         For a configuration that names none, and for files that cannot be read.
     """
-    data, size = config.data, config.detector.size
+    data = config.data
     if data is None:
         raise InputError("names no matched stars", where="data", do="give data.matches")
     names = data.matches
     path = base / names if isinstance(names, str) else [base / name for name in names]
-    if data.format == "rvb" and size is not None:
-        return load_rvb(path, data, size)
-    return load_matches(path, **reading_options(data, config.chip))
+    return read_configured(path, data, size=config.detector.size, chips=config.chip)
 
 
 def model_of(stars: Matches, config: Config) -> DistortionModel:

@@ -106,34 +106,11 @@ def simulate_campaign(
 ) -> str:
     """Simulate, and write into a folder.
 
-    Parameters
-    ----------
-    output : path
-        Folder.
-    seed : int
-    force : bool
-        Replace a campaign that is there.
-    exposures, stars : int
-        In the first filter, and of the catalogue.
-    filters : sequence of str
-    secondary_exposures : int
-        Of each further filter.
-    false, outlying : float
-        Fractions of detections that are none, and of outlying exposures.
-    cte : bool
-        Trailed charge moves the stars.
-    no_tables : bool
-        A distortion without look-up tables.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For options that cannot be used, and a folder in use.
+    `output`: folder. `force`: replace a campaign that is there. `exposures`, `stars`: in the first
+    filter, and of the catalogue. `secondary_exposures`: of each further filter. `false`,
+    `outlying`: fractions of detections that are none, and of outlying exposures. `cte`: trailed
+    charge moves the stars. `no_tables`: a distortion without look-up tables. Returns the text to
+    print. InputError for options that cannot be used, and a folder in use.
     """
     folder = Path(output)
     if (folder / "lists").exists() and not force:
@@ -197,7 +174,7 @@ def _config(filter: str, reference: str) -> str:
 
 
 def _stale() -> IdcTab:
-    """What an observer has before the calibration: the distortion of 2004.5, without drift."""
+    """IDCTAB that an observer has before: the distortion of 2004.5, without drift."""
     model, theta = acs_solution()
     known = replace(model, time=None)
     return idctab_from_solution(

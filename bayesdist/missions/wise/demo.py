@@ -81,10 +81,7 @@ def simulation_config(band: str) -> str:
 def write_simulation(folder: Path, matches: MatchTable, truth: Truth, config: str) -> None:
     """Write stars.ecsv, truth.ecsv and config.toml of a simulation.
 
-    Raises
-    ------
-    InputError
-        When the folder cannot be made or written.
+    InputError when the folder cannot be made or written.
     """
     made_folder(folder)
     stars = QTable()
@@ -114,19 +111,8 @@ def write_simulation(folder: Path, matches: MatchTable, truth: Truth, config: st
 def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
     """Simulate, calibrate, and compare with the truth.
 
-    Parameters
-    ----------
-    folder : path
-        Holds ``input/`` and ``run/`` afterwards.
-    force : bool
-        Replace an earlier demo.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    str
-        What to print.
+    `folder`: holds ``input/`` and ``run/`` afterwards. `force`: replace an earlier demo. `command`:
+    for the record. Returns the text to print.
     """
     folder = Path(folder)
     known = {"input", "run"}

@@ -101,7 +101,7 @@ class FunctionField(ErrorField):
 
     @property
     def uniform(self) -> bool:  # type: ignore[override]
-        """Whether the error is the same at all positions."""
+        """True if the error is the same at all positions."""
         return self.of.uniform
 
     @cached_property

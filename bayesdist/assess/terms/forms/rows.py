@@ -1,4 +1,4 @@
-"""What an error term has to give: rows of a budget, draws, and fields of these at positions.
+"""The protocol of error terms: rows of a budget, draws, and fields of these at positions.
 
 A term draws its chance once, for all chips, epochs and questions; its draws are evaluated at the
 positions of a domain wherever they are asked for.  Terms are independent of each other: what is
@@ -149,15 +149,15 @@ class ErrorField(ABC):
         return self.by_draws(slice(0, self.n_different))
 
     def noise(self, scale: Scale) -> Iterator[Noise]:
-        """What is independent from position to position, rows multiplied by factors."""
+        """Parts that are independent from position to position, rows multiplied by factors."""
         yield from ()
 
     def relative_error(self, name: str, chip: int, monte_carlo: float) -> float | None:
-        """How well the size of a row is known on a chip, relative to it; None where it is not."""
+        """Relative error of the size of a row on a chip; None where it is not known."""
         return monte_carlo
 
     def of_parameters(self, name: str) -> bool:
-        """Whether a row is an error of parameters."""
+        """True if a row is an error of parameters."""
         return False
 
     def by_draws(self, draws: slice) -> Float:

@@ -18,6 +18,7 @@ from bayesdist.app.sessions import session_of
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
+from bayesdist.missions.acs.handbook.published import acs_detector, handbook_rows
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 
 if TYPE_CHECKING:
@@ -38,30 +39,10 @@ def handbook(
 ) -> str:
     """Write the figures and the numbers of a calibration.
 
-    Parameters
-    ----------
-    path : path
-        As of `calibration_at`.
-    output : path
-        New or empty folder.
-    filter, scale
-        As of `calibration_at`.
-    epoch : float, optional
-        Decimal years, for what depends on time.
-    detector : str, optional
-        WFC, HRC or SBC, whose printed numbers stand beside; that of an IDCTAB of ACS by default.
-    magnification : float, optional
-        Of the vectors.
-
-    Returns
-    -------
-    str
-        The numbers.
-
-    Raises
-    ------
-    InputError
-        For what cannot be read or written.
+    `path`: as of `calibration_at`. `output`: new or empty folder. `filter`, `scale`: as of
+    `calibration_at`. `epoch`: decimal years, for what depends on time. `detector`: WFC, HRC or SBC,
+    whose printed numbers stand beside; that of an IDCTAB of ACS by default. `magnification`: of the
+    vectors. Returns the numbers. InputError for what cannot be read or written.
     """
     # figures take seconds to import
     from bayesdist.missions.acs.handbook.figures import (
@@ -69,12 +50,10 @@ def handbook(
         non_linear_figure,
         residual_figure,
     )
-    from bayesdist.missions.acs.handbook.published import handbook_rows
-    from bayesdist.products.detectors import acs_detector
     from bayesdist.report.drawing import save_figures
 
     if detector is not None:
-        detector = acs_detector(detector).name
+        detector = acs_detector(detector)
     if magnification is not None and not magnification > 0:
         raise InputError(
             f"the magnification is {magnification}",

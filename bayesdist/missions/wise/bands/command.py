@@ -42,33 +42,13 @@ def bands_of_runs(
 ) -> str:
     """Compare bands and write everything into a new folder.
 
-    Parameters
-    ----------
-    runs : sequence of path
-        Finished runs, one for each band.
-    output : path
-        New or empty folder.  It appears with all files in it, or not at all.
-    bins : int
-        Of residuals, on each axis.
-    optical : sequence of path
-        SIP headers or WISE meta-data of an optical model: one, or one for each run.
-    rotation : float
-        Degrees by which that is turned, from x towards y.
-    published : bool
-        Whether WISE's bands have the values of WSDC D-T033 beside them.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    str
-        What to print.
-
-    Raises
-    ------
-    InputError
-        For runs that are not finished or do not go together, an optical model that cannot be used,
-        and a folder that is in use.
+    `runs`: finished runs, one for each band. `output`: new or empty folder.  It appears with all
+    files in it, or not at all. `bins`: of residuals, on each axis. `optical`: SIP headers or WISE
+    meta-data of an optical model: one, or one for each run. `rotation`: degrees by which that is
+    turned, from x towards y. `published`: True if WISE's bands have the values of WSDC D-T033
+    beside them. `command`: for the record. Returns the text to print. InputError for runs that are
+    not finished or do not go together, an optical model that cannot be used, and a folder that is
+    in use.
     """
     if bins < FEWEST_BINS:
         raise InputError(

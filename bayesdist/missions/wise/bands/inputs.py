@@ -20,20 +20,11 @@ SAME_FIELD = 0.01  # by so much the fields of two bands may differ in size
 
 @dataclass(frozen=True, eq=False)
 class BandRun:
-    """A finished run of a band.
+    """A finished run of a band."""
 
-    Parameters
-    ----------
-    name : str
-        Of its detector.
-    session : Session
-    arcsec : float
-        Per pixel.
-    """
-
-    name: str
+    name: str  # of its detector
     session: Session
-    arcsec: float
+    arcsec: float  # per pixel
 
     @property
     def path(self) -> str:
@@ -55,20 +46,9 @@ class BandRun:
 def open_bands(paths: Sequence[str | Path]) -> dict[str, BandRun]:
     """Open the runs of several bands.
 
-    Parameters
-    ----------
-    paths : sequence of path
-
-    Returns
-    -------
-    dict of str to BandRun
-        In the order given; those of WISE in their own.
-
-    Raises
-    ------
-    InputError
-        For a run that is not finished, has several chips or no scale, for two runs of one band, and
-        for bands that do not see one field.
+    The result is in the order given; those of WISE in their own. InputError for a run that is not
+    finished, has several chips or no scale, for two runs of one band, and for bands that do not see
+    one field.
     """
     out: dict[str, BandRun] = {}
     for path in paths:

@@ -1,4 +1,4 @@
-"""What is measured on each band, and on several together."""
+"""Measurements on each band, and on several together."""
 
 from __future__ import annotations
 
@@ -43,27 +43,9 @@ def measure_bands(
 ) -> BandsInput:
     """Everything that tables and diagrams show.
 
-    Parameters
-    ----------
-    runs : mapping of str to BandRun
-        Their stars are read once and let go of, band by band.
-    bins : int
-        On each axis.
-    optical : mapping of str to OpticalModel, optional
-    published : bool
-        Whether values of WSDC D-T033 stand beside those of WISE's bands.
-    provenance : mapping, optional
-
-    Returns
-    -------
-    BandsInput
-
-    Raises
-    ------
-    InputError
-        For an optical model of another shape.
-    DegenerateError
-        When too few bins hold stars.
+    `runs`: their stars are read once and let go of, band by band. `bins`: on each axis.
+    `published`: True if values of WSDC D-T033 stand beside those of WISE's bands. InputError for an
+    optical model of another shape. DegenerateError when too few bins hold stars.
     """
     wise = published and set(runs) <= set(WISE_BANDS)
     fields = {
@@ -164,9 +146,7 @@ def _printed(band: str, field: DistortionField) -> Printed:
         LONGEST_VECTORS[band],
         longest,
         FORMAL_RADII[band],
-        implied_sigma(
-            FORMAL_RADII[band], SAMPLE_SIZES[band], order=field.basis.order, size=field.basis.size
-        ),
+        implied_sigma(FORMAL_RADII[band], SAMPLE_SIZES[band], order=field.basis.order),
     )
 
 

@@ -1,4 +1,4 @@
-"""RvB pairs of a run: in memory, left on disk where they are, or selected into the run's folder."""
+"""RvB pairs of a run: in memory, left on disk where they are, or selected into its folder."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from bayesdist.app.config import Data
-from bayesdist.app.config.rvb import RvbBlock
 from bayesdist.app.matches import is_large
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.star_files import PAIRS, part_files
 from bayesdist.data import MatchTable, open_matches, write_partitioned
-from bayesdist.data.rvb import stream_rvb
-from bayesdist.data.rvb_files import ARRAY_SIZE, band_name
-from bayesdist.data.rvb_open import open_rvb
-from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
 from bayesdist.infer import Matches
+from bayesdist.missions.wise.pairs.files import ARRAY_SIZE, band_name
+from bayesdist.missions.wise.pairs.read import stream_rvb
+from bayesdist.missions.wise.pairs.section import RvbData
+from bayesdist.missions.wise.pairs.selection import SelectedPairs
+from bayesdist.missions.wise.pairs.stored import open_rvb
 
 __all__ = ["RvbInput", "load_rvb"]
 
@@ -33,10 +33,6 @@ class RvbInput:
     What is too large for memory and has to be selected or converted is written once, as a table of
     matches: beside the run's folder as long as nothing may be written into it, then moved there
     whole.  The record of the run says that it is there.
-
-    Parameters
-    ----------
-    run : RunDirectory
     """
 
     run: RunDirectory
@@ -46,37 +42,32 @@ class RvbInput:
     def load(self) -> Matches:
         """The selected pairs.
 
-        Raises
-        ------
-        InputError
-            For all that is wrong with files and selection, and a detector that is not the band's.
+        InputError for all that is wrong with files and selection, and a detector that is not the
+        band's.
         """
-        config, path = self.run.config, self.run.matches
-        data, options = config.data, self._options
-        assert data is not None and config.detector.size is not None
+        data, size, path = *self._settings, self.run.matches
+        options = _options(data, size)
         if not is_large(path):
-            return load_rvb(path, data, config.detector.size)
+            return load_rvb(path, data, size)
         if data.band is not None:
-            _refuse_other_array(band_name(data.band), config.detector.size)
+            _require_array(data.band, size)
         if "pairs" in self.run.record and part_files(self.run / PAIRS):
             return self._opened(self.run / PAIRS, self.run.record["pairs"])
-        if _selection(data).takes_all:
+        selection = data.rvb.selection()
+        if selection.takes_all:
             opened = open_rvb(path, **options)
             if opened is not None:
                 for band in opened.filter_names:
-                    _refuse_other_array(band_name(band or data.band), options["size"])
+                    _require_array(band or data.band, size)
                 return opened
-        selected = SelectedPairs(
-            lambda: stream_rvb(path, **options), _selection(data), options["size"]
-        )
-        return self._written(selected)
+        return self._written(SelectedPairs(lambda: stream_rvb(path, **options), selection, size))
 
     @property
-    def _options(self) -> dict[str, Any]:
-        """Of `stream_rvb`."""
+    def _settings(self) -> tuple[RvbData, tuple[float, float]]:
+        """Section [data], and columns and rows of the detector."""
         config = self.run.config
-        assert config.data is not None and config.detector.size is not None
-        return _options(config.data, config.detector.size)
+        assert isinstance(config.data, RvbData) and config.detector.size is not None
+        return config.data, config.detector.size
 
     def _written(self, selected: SelectedPairs) -> Matches:
         """The pairs as a table of matches, in the run's folder if it may be."""
@@ -95,11 +86,11 @@ class RvbInput:
                 do="choose a folder that you may write to",
             ) from error
         folder = Path(self._scratch.name) / PAIRS
-        size = self._options["size"]
+        _, size = self._settings
 
         def tables() -> Iterator[MatchTable]:
             for pairs in selected:
-                _refuse_other_array(pairs.band, size)
+                _require_array(pairs.band, size)
                 yield pairs.matches
 
         write_partitioned(tables(), folder)
@@ -110,7 +101,7 @@ class RvbInput:
         return self._opened(folder, self._counts)
 
     def _opened(self, folder: Path, counts: Mapping[str, Any]) -> Matches:
-        options = self._options
+        options = _options(*self._settings)
         # a number has been written into the columns
         sigma = options["sigma"] if options["sigma"] == "by_magnitude" else "columns"
         opened = open_matches(folder, unit=options["unit"], sigma=sigma)
@@ -119,15 +110,8 @@ class RvbInput:
     def settle(self) -> bool:
         """Move what was written into the folder of the run, which has begun.
 
-        Returns
-        -------
-        bool
-            Whether there was anything: it has to be opened anew.
-
-        Raises
-        ------
-        InputError
-            When the system refuses.
+        Returns True for pairs that were moved, and have to be opened anew. InputError when the
+        system refuses.
         """
         if self._scratch is None or self._counts is None:
             return False
@@ -158,35 +142,19 @@ def load_rvb(
 ) -> MatchTable:
     """RvB pairs in memory, as a configuration reads and selects them.
 
-    Parameters
-    ----------
-    path : path or sequence of path
-    data : Data
-        With the format 'rvb'.
-    size : tuple of float
-        Columns and rows of the detector.
-
-    Returns
-    -------
-    MatchTable
-
-    Raises
-    ------
-    InputError
-        For all that is wrong with files and selection, and a detector that is not the band's.
+    `size`: columns and rows of the detector. InputError for all that is wrong with files and
+    selection, and a detector that is not the band's.
     """
+    assert isinstance(data, RvbData)
     if data.band is not None:
-        _refuse_other_array(band_name(data.band), size)
+        _require_array(data.band, size)
     pieces = list(stream_rvb(path, **_options(data, size)))
-    _refuse_other_array(pieces[0].band, size)
-    return SelectedPairs(lambda: pieces, _selection(data), size).table()
+    _require_array(pieces[0].band, size)
+    return SelectedPairs(lambda: pieces, data.rvb.selection(), size).table()
 
 
-def _selection(data: Data) -> RvbSelection:
-    return (data.rvb or RvbBlock()).selection()
-
-
-def _options(data: Data, size: tuple[float, float]) -> dict[str, Any]:
+def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:
+    """Options of `stream_rvb` and `open_rvb`."""
     return {
         "band": data.band,
         "columns": data.columns,
@@ -197,7 +165,9 @@ def _options(data: Data, size: tuple[float, float]) -> dict[str, Any]:
     }
 
 
-def _refuse_other_array(band: str, size: tuple[float, float]) -> None:
+def _require_array(label: str | None, size: tuple[float, float]) -> None:
+    """Refuse a detector that has not the size of the band's array."""
+    band = band_name(label)
     if tuple(size) != ARRAY_SIZE[band]:
         columns, rows = ARRAY_SIZE[band]
         raise InputError(

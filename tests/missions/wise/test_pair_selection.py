@@ -6,21 +6,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from bayesdist.data import (
-    MatchTable,
-    RadialLimit,
-    RvbPairs,
-    RvbSelection,
-    SelectedPairs,
-    read_rvb,
-    rvb_files,
-    rvb_open,
-    stream_rvb,
-)
-from bayesdist.data.rvb_open import open_rvb
+from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
-from bayesdist.missions.wise.rvb.write import write_rvb
-from tests.data.test_rvb import assert_same, rvb_table, write
+from bayesdist.missions.wise.pairs import files as rvb_files
+from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
+from bayesdist.missions.wise.pairs.read import read_rvb, stream_rvb
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
+from bayesdist.missions.wise.pairs.selection import RvbSelection, SelectedPairs
+from bayesdist.missions.wise.pairs.stored import open_rvb
+from bayesdist.missions.wise.pairs.write import write_rvb
+from tests.missions.wise.test_pairs import assert_same, rvb_table, write
 
 SIZE = (1016.0, 1016.0)
 ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag")
@@ -147,7 +142,6 @@ def test_what_has_to_be_converted_is_not_opened_in_place(rng, tmp_path):
     assert open_rvb(dates, band="W1", **OPTIONS) is None
     text = write(rvb_table(rng, bands=("W1",)), tmp_path / "a.tbl")
     assert open_rvb(text, band="W1", **OPTIONS) is None
-    assert rvb_open.open_rvb is open_rvb
 
 
 def test_pairs_in_place_are_checked_against_the_array(rng, tmp_path):

@@ -19,8 +19,11 @@ from numpy.typing import NDArray
 from bayesdist.data.matches import MatchTable
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
-from bayesdist.data.rvb_array import ArrayCheck
-from bayesdist.data.rvb_files import (
+from bayesdist.data.tables.column import Place, SourceColumn
+from bayesdist.data.tables.quantities import Columns, Quantities
+from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.array_check import ArrayCheck
+from bayesdist.missions.wise.pairs.files import (
     ARRAY_SIZE,
     MAGNITUDES,
     RVB_ALIASES,
@@ -28,10 +31,7 @@ from bayesdist.data.rvb_files import (
     band_name,
     open_rvb_files,
 )
-from bayesdist.data.rvb_pairs import RvbPairs, colour_of
-from bayesdist.data.tables.column import Place, SourceColumn
-from bayesdist.data.tables.quantities import Columns, Quantities
-from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
 
 __all__ = ["chosen_band", "read_rvb", "rvb_bands", "stream_rvb"]
 
@@ -42,22 +42,10 @@ PathLike = str | os.PathLike[str]
 def rvb_bands(
     path: PathLike | Sequence[PathLike], *, columns: Mapping[str, str] | None = None
 ) -> dict[str, int]:
-    """How many pairs of each band some files hold.
+    """Number of pairs of each band in some files.
 
-    Parameters
-    ----------
-    path, columns
-        As `stream_rvb`.
-
-    Returns
-    -------
-    dict of str to int
-        Bands in the order of their wavelength.
-
-    Raises
-    ------
-    InputError
-        Without a column of bands, and for what is no band.
+    `path`, `columns`: as `stream_rvb`. Returns bands in the order of their wavelength. InputError
+    without a column of bands, and for what is no band.
     """
     return _bands_of(open_rvb_files(path, columns))
 

@@ -27,22 +27,12 @@ CHI2 = "chi-square beyond the radial limit"
 class RadialLimit:
     """A limit that goes from one value at the array's centre to another in its corners.
 
-    Parameters
-    ----------
-    centre, corner : float
-        Positive; equal for a limit without dependence on the radius.
-    power : float
-        How it goes there: limit = centre + (corner - centre) (r / r_corner)^power.
-
-    Raises
-    ------
-    InputError
-        For values that are not positive.
+    InputError for values that are not positive.
     """
 
-    centre: float
+    centre: float  # positive; equal for a limit without dependence on the radius
     corner: float
-    power: float = 2.0
+    power: float = 2.0  # how it goes there: limit = centre + (corner - centre) (r / r_corner)^power
 
     def __post_init__(self) -> None:
         for name in ("centre", "corner", "power"):
@@ -55,16 +45,7 @@ class RadialLimit:
     def at(self, x: ArrayLike, y: ArrayLike, size: tuple[float, float]) -> Float:
         """The limit at detector positions.
 
-        Parameters
-        ----------
-        x, y : array_like, shape (N,)
-            FITS 1-based pixels.
-        size : tuple of float
-            Columns and rows of the array.
-
-        Returns
-        -------
-        ndarray, shape (N,)
+        `x`, `y`: (N,), FITS 1-based pixels. `size`: columns and rows of the array. Returns (N,).
         """
         dx = np.asarray(x, float) - (size[0] + 1) / 2
         dy = np.asarray(y, float) - (size[1] + 1) / 2
@@ -82,30 +63,13 @@ def radial_rows(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Boolean masks of the pairs whose reference position lies near enough to the expected one.
 
-    Parameters
-    ----------
-    matches : MatchTable
-        With u, v in pixels of the array.
-    size : tuple of float
-        Columns and rows of the array.
-    offset : RadialLimit, optional
-        On the distance from the expected position, in pixels.
-    chi2 : RadialLimit, optional
-        On the chi-square of both axes, with the quoted errors.
-    expected : array_like, shape (N, 2), optional
-        Where the reference stars should be, such as `DistortionModel.predict` of the previous
-        iteration; by default where the detections are, which assumes no distortion.
-
-    Returns
-    -------
-    near, likely : ndarray of bool, shape (N,)
-        Within the limit on the offset, and within that on chi-square.
-
-    Raises
-    ------
-    InputError
-        For u, v in another unit, a chi-square limit without errors, and expected positions of
-        another length.
+    `matches`: with u, v in pixels of the array. `size`: columns and rows of the array. `offset`: on
+    the distance from the expected position, in pixels. `chi2`: on the chi-square of both axes, with
+    the quoted errors. `expected`: (N, 2), where the reference stars should be, such as
+    `DistortionModel.predict` of the previous iteration; by default where the detections are, which
+    assumes no distortion. Returns `near`, `likely`: (N,), within the limit on the offset, and
+    within that on chi-square. InputError for u, v in another unit, a chi-square limit without
+    errors, and expected positions of another length.
     """
     where = ", ".join(matches.sources)
     if matches.unit != "pix":

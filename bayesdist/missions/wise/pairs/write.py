@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.data.rvb_pairs import RvbPairs
 from bayesdist.data.write import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files import made_folder
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs
 
 __all__ = ["write_rvb"]
 
@@ -25,22 +25,9 @@ def write_rvb(pieces: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> int
 
     Reading them as RvB pairs gives the same numbers bit for bit, with bands, frames and colours.
 
-    Parameters
-    ----------
-    pieces : iterable of RvbPairs
-        Only one need be in memory at a time.
-    folder : path-like
-        A new one.  When a piece cannot be had or written, the folder is removed.
-
-    Returns
-    -------
-    int
-        Pairs written.
-
-    Raises
-    ------
-    InputError
-        For no pieces, a folder that holds something, and when the system refuses to write.
+    `pieces`: only one need be in memory at a time. `folder`: a new one.  When a piece cannot be had
+    or written, the folder is removed. Returns pairs written. InputError for no pieces, a folder
+    that holds something, and when the system refuses to write.
     """
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and next(folder.iterdir(), None) is None):

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from bayesdist.data.partitioned import PartitionedMatches, open_matches
-from bayesdist.data.rvb import chosen_band
-from bayesdist.data.rvb_array import ArrayCheck
-from bayesdist.data.rvb_files import MAGNITUDES, RvbFile, open_rvb_files
 from bayesdist.data.tables.column import Place
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.data.tables.parquet import ParquetPart
+from bayesdist.missions.wise.pairs.array_check import ArrayCheck
+from bayesdist.missions.wise.pairs.files import MAGNITUDES, RvbFile, open_rvb_files
+from bayesdist.missions.wise.pairs.read import chosen_band
 
 __all__ = ["open_rvb"]
 
@@ -31,21 +31,10 @@ def open_rvb(
 ) -> PartitionedMatches | None:
     """RvB pairs of one band, left on disk.
 
-    Parameters
-    ----------
-    path, band, columns, unit, sigma, pixel_origin, size
-        As `stream_rvb`.
-
-    Returns
-    -------
-    PartitionedMatches or None
-        The pairs that `stream_rvb` gives.  None where the files are no Parquet, hold other bands
-        beside this one, or have to be converted: dates in MJD, magnitudes by band.
-
-    Raises
-    ------
-    InputError
-        As `stream_rvb` and `open_matches`.
+    `path`, `band`, `columns`, `unit`, `sigma`, `pixel_origin`, `size`: as `stream_rvb`. Returns the
+    pairs that `stream_rvb` gives.  None where the files are no Parquet, hold other bands beside
+    this one, or have to be converted: dates in MJD, magnitudes by band. InputError as `stream_rvb`
+    and `open_matches`.
     """
     files = open_rvb_files(path, columns)
     band = chosen_band(files, band)
@@ -74,7 +63,7 @@ def _row_name(file: RvbFile, place: Place, k: int) -> str:
 
 
 def _fit(files: Sequence[RvbFile]) -> bool:
-    """Whether the files read as one table of matches."""
+    """True if the files read as one table of matches."""
     found = files[0].found
     return (
         all(isinstance(file.contents, ParquetPart) and file.found == found for file in files)
@@ -84,7 +73,7 @@ def _fit(files: Sequence[RvbFile]) -> bool:
 
 
 def _only(file: RvbFile, band: str) -> bool:
-    """Whether a file holds no other band."""
+    """True if a file holds no other band."""
     if "band" not in file.found:
         return True
     return all(file.bands(table, place)[1] == (band,) for table, _, place in file.blocks(["band"]))

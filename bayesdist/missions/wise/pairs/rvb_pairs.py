@@ -26,18 +26,13 @@ COLOUR = "colour"
 
 @dataclass(frozen=True, eq=False)
 class RvbPairs:
-    """Pairs of one band.
+    """Pairs of one band."""
 
-    Parameters
-    ----------
-    matches : MatchTable
-        x, y the detection, u, v the reference star as a detector without distortion would see it;
-        the band is the filter, the frame the exposure.
-    colour : ndarray, shape (N,), or None
-        Magnitudes; NaN where fewer than two bands have one.  None where the file has no magnitudes.
-    """
-
+    # x, y the detection, u, v the reference star as a detector without distortion would see it; the
+    # band is the filter, the frame the exposure
     matches: MatchTable
+    # (N,), magnitudes; NaN where fewer than two bands have one.  None where the file has no
+    # magnitudes
     colour: Float | None = None
 
     def __post_init__(self) -> None:
@@ -66,11 +61,8 @@ class RvbPairs:
     def concatenate(several: Sequence[RvbPairs]) -> RvbPairs:
         """All pairs of several sets, in their order.
 
-        Raises
-        ------
-        InputError
-            For sets of different bands, sets of which only some have colours, and as
-            `MatchTable.concatenate`.
+        InputError for sets of different bands, sets of which only some have colours, and as
+        `MatchTable.concatenate`.
         """
         bands = list(dict.fromkeys(one.band for one in several))
         if len(bands) > 1:
@@ -91,16 +83,9 @@ class RvbPairs:
 def colour_of(magnitudes: ArrayLike) -> Float:
     """Magnitude of the shortest wavelength detected minus that of the longest.
 
-    Parameters
-    ----------
-    magnitudes : array_like, shape (B, N)
-        By rising wavelength; NaN where a source is not detected.
-
-    Returns
-    -------
-    ndarray, shape (N,)
-        NaN where fewer than two bands have a magnitude.  Colours of sources that are detected in
-        different bands are different colours: W1 - W2 of one stands beside W1 - W4 of another.
+    `magnitudes`: (B, N), by rising wavelength; NaN where a source is not detected. Returns (N,),
+    NaN where fewer than two bands have a magnitude.  Colours of sources that are detected in
+    different bands are different colours: W1 - W2 of one stands beside W1 - W4 of another.
     """
     magnitudes = np.asarray(magnitudes, float)
     detected = np.isfinite(magnitudes)
@@ -112,7 +97,7 @@ def colour_of(magnitudes: ArrayLike) -> Float:
 
 
 def bluest_rows(colour: Float, frame: NDArray[np.int64], n: int) -> NDArray[np.bool_]:
-    """Which rows (N,) are among the n of smallest colour of their frame; never one without."""
+    """Boolean mask (N,) of the n rows of smallest colour of each frame; never one without."""
     order = np.lexsort((colour, frame))  # stable, NaN last within a frame
     first = np.searchsorted(frame[order], frame[order])
     rank = np.empty(len(colour), np.int64)

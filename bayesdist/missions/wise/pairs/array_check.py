@@ -24,17 +24,10 @@ _NEAR = 0.05
 
 @dataclass
 class ArrayCheck:
-    """Positions piece by piece against the array of a band.
-
-    Parameters
-    ----------
-    band : str
-    size : tuple of float
-        Columns and rows of the array.
-    """
+    """Positions piece by piece against the array of a band."""
 
     band: str
-    size: tuple[float, float]
+    size: tuple[float, float]  # columns and rows of the array
     n: int = 0
     n_far: int = 0
     reach: Float = field(default_factory=lambda: np.zeros(2))
@@ -49,18 +42,8 @@ class ArrayCheck:
     ) -> None:
         """Refuse detections that the array cannot have made.
 
-        Parameters
-        ----------
-        x, y : ndarray, shape (N,)
-            FITS 1-based pixels.
-        where : callable
-            Names file and row of a position.
-        reference : tuple of ndarray, shape (N,), optional
-            u and v, where these are said to be pixels of the array.
-
-        Raises
-        ------
-        InputError
+        `x`, `y`: (N,), FITS 1-based pixels. `where`: names file and row of a position. `reference`:
+        (N,), u and v, where these are said to be pixels of the array.
         """
         for name, values, extent in (("x", x, self.size[0]), ("y", y, self.size[1])):
             # half a pixel beyond the edge of the outermost: centroids may fall a little outside
@@ -83,10 +66,6 @@ class ArrayCheck:
         """Refuse positions that all lie in the first quarter, and references far from detections.
 
         The first are those of another array, the second those of no array, or in swapped columns.
-
-        Raises
-        ------
-        InputError
         """
         if self.n >= _ENOUGH and (self.reach <= np.array(self.size) / 2 + 0.5).all():
             raise InputError(

@@ -1,4 +1,4 @@
-"""What `bayesdist init` says of RvB pairs."""
+"""The template of `bayesdist init` for RvB pairs."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ from pathlib import Path
 
 from bayesdist.app.init_columns import column_lines
 from bayesdist.data import input_files
-from bayesdist.data.rvb import rvb_bands, stream_rvb
-from bayesdist.data.rvb_files import ARRAY_SIZE, IPAC, MAGNITUDES, RvbFile, open_rvb_files
 from bayesdist.data.tables.files import read_table
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.files import (
+    ARRAY_SIZE,
+    IPAC,
+    MAGNITUDES,
+    RvbFile,
+    open_rvb_files,
+)
+from bayesdist.missions.wise.pairs.read import rvb_bands, stream_rvb
 
-__all__ = ["is_rvb", "rvb_template"]
+__all__ = ["rvb_template"]
 
 SIGMA = 0.1  # pixels, for pairs that say nothing about their errors
 MAS = 2750.0  # of a pixel of W1 to W3
@@ -42,36 +48,13 @@ scale_mas = {scale:.0f}
 """
 
 
-def is_rvb(matches: str | Path) -> bool:
-    """Whether these are RvB pairs: IPAC tables with u, v, or Parquet with WISE's bands.
+def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]] | None:
+    """Number of pairs, and what they put into the template of `init`; None for other matches.
 
-    Raises
-    ------
-    InputError
-        For files that cannot be read.
+    InputError as `stream_rvb`.
     """
-    files = input_files(matches)
-    if all(file.name.lower().endswith(IPAC) for file in files):
-        return {"u", "v"} <= {name.lower() for name in read_table(files[0]).colnames}
-    if any(file.suffix.lower() != ".parquet" for file in files):
-        return False
-    part = describe_part(files[0])
-    if not {"band", "x", "y", "u", "v"} <= set(part.colnames) or "band" not in part.texts:
-        return False
-    try:
-        return bool(rvb_bands(files[0]))
-    except InputError:  # bands of another instrument
-        return False
-
-
-def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]]:
-    """How many pairs the configuration reads, and what they put into the template of `init`.
-
-    Raises
-    ------
-    InputError
-        As `stream_rvb`.
-    """
+    if not _is_rvb(matches):
+        return None
     files = open_rvb_files(matches, None)
     found = set(files[0].found)
     if "band" in found:
@@ -107,6 +90,22 @@ def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]]:
         "grid_y": 33,
         "unit": "pix",
     }
+
+
+def _is_rvb(matches: str | Path) -> bool:
+    """Truth of RvB pairs: IPAC tables with u, v, or Parquet with WISE's bands."""
+    files = input_files(matches)
+    if all(file.name.lower().endswith(IPAC) for file in files):
+        return {"u", "v"} <= {name.lower() for name in read_table(files[0]).colnames}
+    if any(file.suffix.lower() != ".parquet" for file in files):
+        return False
+    part = describe_part(files[0])
+    if not {"band", "x", "y", "u", "v"} <= set(part.colnames) or "band" not in part.texts:
+        return False
+    try:
+        return bool(rvb_bands(files[0]))
+    except InputError:  # bands of another instrument
+        return False
 
 
 def _guessed_band(files: list[RvbFile]) -> str:

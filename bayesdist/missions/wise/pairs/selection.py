@@ -1,4 +1,4 @@
-"""Which RvB pairs are taken, piece by piece: what the selection drops is counted by reason.
+"""Selection of RvB pairs, piece by piece; those that it drops are counted by reason.
 
 In memory or streamed, the same pairs pass: by the range of colours, then the bluest of each frame,
 then the radial limits.
@@ -13,9 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.matches import MatchTable
-from bayesdist.data.rvb_accept import CHI2, OFFSET, RadialLimit, radial_rows
-from bayesdist.data.rvb_pairs import COLOUR, NO_COLOUR, RvbPairs, bluest_rows, colours_of
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs.radial_limit import CHI2, OFFSET, RadialLimit, radial_rows
+from bayesdist.missions.wise.pairs.rvb_pairs import (
+    COLOUR,
+    NO_COLOUR,
+    RvbPairs,
+    bluest_rows,
+    colours_of,
+)
 
 __all__ = ["RvbSelection", "SelectedPairs"]
 
@@ -28,26 +34,15 @@ MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1
 
 @dataclass(frozen=True)
 class RvbSelection:
-    """Which pairs are taken: all limits that are given.
+    """Limits that pairs have to meet, all of those that are given.
 
-    Parameters
-    ----------
-    colour : tuple of float, optional
-        Lowest and highest colour, both included.
-    bluest : int, optional
-        Of each frame at most so many, those of the smallest colour.
-    offset, chi2 : RadialLimit, optional
-        On the distance of the reference position from the detection, in pixels, and on its
-        chi-square with the quoted errors; a pair beyond both counts under the first.
-
-    Raises
-    ------
-    InputError
-        For colours that are no range, and less than one pair.
+    InputError for colours that are no range, and less than one pair.
     """
 
-    colour: tuple[float, float] | None = None
-    bluest: int | None = None
+    colour: tuple[float, float] | None = None  # lowest and highest colour, both included
+    bluest: int | None = None  # of each frame at most so many, those of the smallest colour
+    # on the distance of the reference position from the detection, in pixels, and on its chi-square
+    # with the quoted errors; a pair beyond both counts under the first
     offset: RadialLimit | None = None
     chi2: RadialLimit | None = None
 
@@ -62,16 +57,16 @@ class RvbSelection:
 
     @property
     def takes_all(self) -> bool:
-        """Whether no limit is given."""
+        """True if no limit is given."""
         return self == RvbSelection()
 
     @property
     def by_colour(self) -> bool:
-        """Whether a pair needs a colour."""
+        """True if a pair needs a colour."""
         return self.colour is not None or self.bluest is not None
 
     def right_colour(self, pairs: RvbPairs) -> Rows:
-        """Which pairs (N,) have a colour within the limits."""
+        """Boolean mask (N,) of the pairs with a colour within the limits."""
         colour = colours_of(pairs)
         low, high = self.colour or (-np.inf, np.inf)
         return np.asarray((colour >= low) & (colour <= high))
@@ -79,39 +74,22 @@ class RvbSelection:
 
 @dataclass
 class SelectedPairs:
-    """The pairs that a selection takes, to be gone through once.
+    """The pairs that a selection takes, to be gone through once."""
 
-    Parameters
-    ----------
-    pieces : callable
-        Gives the pairs of one band piece by piece: once more where the bluest of each frame are
-        asked for, which takes the colours of all.
-    selection : RvbSelection
-    size : tuple of float
-        Columns and rows of the array.
-
-    Attributes
-    ----------
-    n_rows : int
-        Pairs so far.
-    rejected : dict of str to int
-        Those of them that were dropped, by reason.
-    """
-
+    # gives the pairs of one band piece by piece: once more where the bluest of each frame are asked
+    # for, which takes the colours of all
     pieces: Callable[[], Iterable[RvbPairs]]
     selection: RvbSelection
-    size: tuple[float, float]
-    n_rows: int = 0
+    size: tuple[float, float]  # columns and rows of the array
+    n_rows: int = 0  # pairs so far
+    # those of them that were dropped, by reason
     rejected: dict[str, int] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[RvbPairs]:
         """Pieces of which something is left.
 
-        Raises
-        ------
-        InputError
-            Without colours where they are needed, for u, v in another unit where offsets are
-            judged, and when no pair at all is left.
+        InputError without colours where they are needed, for u, v in another unit where offsets are
+        judged, and when no pair at all is left.
         """
         bluest = self._bluest()
         sources: dict[str, None] = {}
@@ -137,10 +115,7 @@ class SelectedPairs:
     def table(self) -> MatchTable:
         """All of them in memory, with the counts.
 
-        Raises
-        ------
-        InputError
-            As going through them, and as `MatchTable.concatenate`.
+        InputError as going through them, and as `MatchTable.concatenate`.
         """
         found = MatchTable.concatenate([pairs.matches for pairs in self])
         columns = {one.name: getattr(found, one.name) for one in fields(found)}
@@ -148,7 +123,7 @@ class SelectedPairs:
         return MatchTable.of_distinct_rows(**columns)
 
     def _rules(self, pairs: RvbPairs, bluest: Rows | None) -> Mapping[str, Rows]:
-        """Which pairs are good by each reason to drop one."""
+        """Boolean masks of the pairs that pass, by the reason to drop the others."""
         rules = {}
         if self.selection.by_colour:
             right = self.selection.right_colour(pairs)
@@ -162,7 +137,7 @@ class SelectedPairs:
         return rules
 
     def _bluest(self) -> Rows | None:
-        """Which of all rows are among the bluest of their frames."""
+        """Boolean mask of the rows among the bluest of their frames; None without that rule."""
         if self.selection.bluest is None:
             return None
         colours: list[Float] = []

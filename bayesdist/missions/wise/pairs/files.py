@@ -61,10 +61,7 @@ IPAC = (".tbl", ".ipac")
 def band_name(label: object) -> str:
     """'W1' to 'W4' of what a file or a user calls a band: W1, w1, 1.
 
-    Raises
-    ------
-    InputError
-        For anything else.
+    InputError for anything else.
     """
     text = str(label).strip().upper()
     name = text if text.startswith("W") else f"W{text.removesuffix('.0')}"
@@ -75,14 +72,7 @@ def band_name(label: object) -> str:
 
 @dataclass(frozen=True, eq=False)
 class RvbFile:
-    """A file and which of its columns is what.
-
-    Parameters
-    ----------
-    source : str
-    contents : Table or ParquetPart
-    found : mapping of str to str
-    """
+    """A file and which of its columns is what."""
 
     source: str
     contents: Table | ParquetPart

@@ -11,12 +11,13 @@ import pytest
 from astropy.table import MaskedColumn, Table
 from astropy.time import Time
 
-from bayesdist.data import MatchTable, open_matches, rvb_files, write_partitioned
-from bayesdist.data.rvb import read_rvb, rvb_bands, stream_rvb
-from bayesdist.data.rvb_accept import RadialLimit, radial_rows
-from bayesdist.data.rvb_pairs import RvbPairs, colour_of
-from bayesdist.data.rvb_select import RvbSelection, SelectedPairs
+from bayesdist.data import MatchTable, open_matches, write_partitioned
 from bayesdist.errors import InputError
+from bayesdist.missions.wise.pairs import files as rvb_files
+from bayesdist.missions.wise.pairs.radial_limit import RadialLimit, radial_rows
+from bayesdist.missions.wise.pairs.read import read_rvb, rvb_bands, stream_rvb
+from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
+from bayesdist.missions.wise.pairs.selection import RvbSelection, SelectedPairs
 
 SIZE = (1016.0, 1016.0)
 BANDS = ("W1", "W2", "W4")
