@@ -120,7 +120,7 @@ def convergence_check(c: Convergence) -> Check:
     """Whether draws can be relied on at all."""
     sentence = ""
     if not c.converged:
-        why = "; ".join(getattr(c, "reasons", ()))
+        why = "; ".join(c.reasons)
         sentence = "the posterior is not converged" + (f": {why}" if why else "")
     good = "yes" if c.converged else "NO"
     return Check(

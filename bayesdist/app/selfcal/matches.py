@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from bayesdist.app.selfcal.inputs import Inputs
 from bayesdist.data import MagnitudeErrors, MatchTable
 from bayesdist.data.detections import Detections
-from bayesdist.infer.linear import Clip, LinearFit
+from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.selfcal import Solution
 from bayesdist.infer.selfcal.errors import scatter_by_magnitude
 from bayesdist.infer.selfcal.normal import memberships
 from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.stars.likelihood import Clip
 
 __all__ = ["fit_of", "magnitude_errors_of", "matches_of"]
 

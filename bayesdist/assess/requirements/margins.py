@@ -355,7 +355,7 @@ def _of_extremes(
 
 def _convergence(solution: Solution) -> tuple[Check, ...]:
     """Whether the draws can be relied on, of a solution that has draws of its own."""
-    convergence = getattr(solution, "convergence", None)
+    convergence = solution.convergence
     return () if convergence is None else (convergence_check(convergence),)
 
 

@@ -27,9 +27,12 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Matches, load
-from bayesdist.infer.transforms import Solution, View, without_frames
+from bayesdist.infer.transforms import (
+    without_frames,
+)
 from bayesdist.model import DistortionModel
 
 __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
@@ -46,7 +49,7 @@ class NewFit:
 
     Parameters
     ----------
-    released : View
+    released : TransformedSolution
         The released polynomials and their drift, without frames.
     fit : LinearFit
         Least squares of the new matches, which starts the mixture.
@@ -69,7 +72,7 @@ class NewFit:
         Covariance of the release with these polynomials, by stars in both.
     """
 
-    released: View
+    released: TransformedSolution
     fit: LinearFit
     theta: Float
     cov: Float
@@ -183,7 +186,7 @@ def fit_new(
         names = model.free_frame_names(1)
         scattering = np.array([scatter[k] ** -2.0 if k in scatter else 0.0 for k in names])
     shards = load(model, matches, compute)
-    mixture = mixture or getattr(released, "mixture", None) or OutlierMixture()
+    mixture = mixture or released.mixture or OutlierMixture()
     priors = _with_scatter(_held_drift(bare, model), model, scatter or {})
     fit = fit_linear(shards, model, rejection=rejection, priors=priors)
     target = Target(shards, mixture, priors)
@@ -295,7 +298,7 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     )
 
 
-def _held_drift(released: View, model: DistortionModel) -> GaussianPriors:
+def _held_drift(released: TransformedSolution, model: DistortionModel) -> GaussianPriors:
     """Priors that fix the drift at its released values."""
     priors = GaussianPriors.none(model)
     rows = slice(released.model.n_polynomial, released.model.n_distortion)

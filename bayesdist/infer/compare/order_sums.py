@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
-from bayesdist.infer.linear import Clip
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars, cell_of
 
 __all__ = ["LotSums", "bin_sums", "departures", "held_out_gain", "share_sums", "truncated"]

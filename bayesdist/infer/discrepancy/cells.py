@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.posterior.likelihood import Scores
+from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars, cell_of
 from bayesdist.model import Groups, merge_groups
 
@@ -59,9 +59,9 @@ def cells_per_side(n_groups: int) -> int:
     return next(side for most, side in SIDES if n_groups <= most)
 
 
-def cell_sums(stars: Stars, scores: Scores, side: int) -> CellSums:
+def cell_sums(stars: Stars, likelihood: Likelihood, side: int) -> CellSums:
     """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`."""
-    g_u, g_v, h_uu, h_uv, h_vv = scores.of(stars)
+    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
     # Where a star may or may not be a false match its curvature is negative.  Such stars are left
     # out, so that every sum of curvatures is that of a possible likelihood.
     good = (h_uu > 0) & (h_vv > 0)

@@ -33,7 +33,9 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.exposures.scatter import Scatter
-from bayesdist.infer.linear import DEFAULT_REJECTION, Clip, LinearFit, Rejection, fit_linear
+from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.stars.likelihood import ClippedGaussian
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
 from bayesdist.infer.transforms import reference_gauge
 from bayesdist.model import DistortionModel
@@ -53,7 +55,7 @@ LEAST_DETERMINED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class HierarchicalFit:
+class HierarchicalFit(Solution):
     """A joint solution of all exposures in which scale and shear of each may deviate.
 
     Draws and mean are over the posterior of tau.  So is the covariance, but for one simplification:
@@ -90,20 +92,15 @@ class HierarchicalFit:
         """Indices in theta of the deviations."""
         return self.scatter.index
 
-    @property
+    @cached_property
     def model(self) -> DistortionModel:
         """The distortion model."""
         return self.fit.model
 
     @property
-    def unit(self) -> str:
-        """Unit of u and v."""
-        return self.model.unit
-
-    @property
-    def clip(self) -> Clip:
-        """Rule by which stars were left out of the second pass."""
-        return self.fit.clip
+    def likelihood(self) -> ClippedGaussian:
+        """Normal errors of the stars in the second pass, at the mean."""
+        return ClippedGaussian(self.mean, self.fit.clip)
 
     def uses(self, matches: MatchTable) -> NDArray[np.bool_]:
         """Boolean mask (N,) of a table's stars that were used."""
@@ -145,11 +142,6 @@ class HierarchicalFit:
         """Posterior covariance of theta, shape (D, D)."""
         spread = self._means - self.mean
         return np.asarray(self.fit.cov + spread.T @ spread / len(spread))
-
-    @property
-    def sigma(self) -> Float:
-        """Posterior standard deviation of theta, shape (D,)."""
-        return np.asarray(np.sqrt(np.diag(self.cov)))
 
     @one_thread
     def draws(self, n: int, rng: np.random.Generator) -> Float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.posterior.certificate import Certificate
-from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.stars.likelihood import MixtureAt
+from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.model import DistortionModel
 
 __all__ = ["Posterior", "SamplerInfo"]
@@ -54,7 +56,7 @@ class SamplerInfo:
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(Solution):
     """Posterior draws of the distortion and of the outlier mixture.
 
     Parameters
@@ -84,7 +86,7 @@ class Posterior:
     """
 
     model: DistortionModel
-    mixture: OutlierMixture
+    mixture: OutlierMixture = field()
     theta: Float
     hyper: dict[str, Float]
     log_prob: Float
@@ -92,7 +94,7 @@ class Posterior:
     n_flagged: int
     n_false: float
     reference_sigma: float
-    convergence: Convergence
+    convergence: Convergence = field()
     sampler: SamplerInfo
     certificate: Certificate | None = None
     own_places: bool = False
@@ -133,11 +135,6 @@ class Posterior:
         """Posterior standard deviation of theta, shape (D,)."""
         return self.flat.std(axis=0, ddof=1)
 
-    @property
-    def unit(self) -> str:
-        """Unit of u and v."""
-        return self.model.unit
-
     def interval(self, probability: float) -> Float:
         """Central interval of every entry of theta, shape (D, 2)."""
         tail = (1 - probability) / 2
@@ -157,3 +154,27 @@ class Posterior:
         """
         total = len(self.flat)
         return self.flat[rng.choice(total, size=n, replace=n > total)]
+
+    @property
+    def sampled_points(self) -> tuple[Float, Float]:
+        """All draws as theta (n, D) and hyperparameters (n, h) in sampled coordinates."""
+        h = self.bound_mixture.point({k: self.hyper[k].ravel() for k in self.mixture.hyper})
+        return self.flat, h.reshape(len(self.flat), len(self.mixture.hyper))
+
+    @property
+    def bound_mixture(self) -> Hyper:
+        """Mixture with its priors in the unit of the data."""
+        return self.mixture.bind(self.reference_sigma)
+
+    @property
+    def likelihood(self) -> MixtureAt:
+        """Mixture at the mean of theta and of the sampled coordinates of the hyperparameters.
+
+        Location and scale of a symmetric density are nearly independent.
+        """
+        _, h = self.sampled_points
+        return MixtureAt(self.mean, self.bound_mixture.constants(h.mean(axis=0)[None]))
+
+    def mapped(self, matrix: Float) -> Posterior:
+        """Posterior whose deviations from the mean are mapped by a matrix (D, D)."""
+        return replace(self, theta=self.mean + (self.theta - self.mean) @ matrix.T)
