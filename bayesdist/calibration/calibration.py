@@ -18,9 +18,7 @@ from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import (
-    without_frames,
-)
+from bayesdist.infer.transforms import without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 
 __all__ = ["Calibration", "GaussianSolution", "calibration_of", "calibration_of_maps"]

@@ -13,12 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import (
-    ReferenceGauge,
-    Solution,
-    TransformedSolution,
-    root_of_diagonal,
-)
+from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution, root_of_diagonal
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.similarity import turned, turned_model
 

@@ -10,13 +10,7 @@ from scipy import stats
 
 from bayesdist.errors import InputError
 from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import (
-    linear_terms,
-    lines,
-    reference_gauge,
-    segment,
-    without_frames,
-)
+from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, segment, without_frames
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
 from .small_campaign import seen_by

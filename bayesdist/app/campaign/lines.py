@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution
-from bayesdist.infer.transforms import (
-    LinearTerms,
-    lines,
-    reference_gauge,
-    without_frames,
-)
+from bayesdist.infer.transforms import LinearTerms, lines, reference_gauge, without_frames
 
 __all__ = ["FIXED", "line_sections"]
 

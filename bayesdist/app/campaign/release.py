@@ -11,10 +11,7 @@ from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.orientation import lay_on
 from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import (
-    reference_gauge,
-    without_frames,
-)
+from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
 from bayesdist.products import (
     Period,

@@ -30,9 +30,7 @@ from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_
 from bayesdist.infer.solution import Solution, TransformedSolution
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Matches, load
-from bayesdist.infer.transforms import (
-    without_frames,
-)
+from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
 
 __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]

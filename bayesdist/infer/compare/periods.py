@@ -33,6 +33,7 @@ from bayesdist.infer.equations.rank import require_full_rank
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, scaled_inverse
 from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import Chip, DistortionModel
 
 __all__ = [
@@ -47,8 +48,8 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class PeriodSums:
-    """Sums over the matches of one period, which add over chunks of the data.
+class PeriodSums(Sums):
+    """Sums over the matches of one period.
 
     Parameters
     ----------
@@ -63,12 +64,6 @@ class PeriodSums:
     equations: NormalEquations
     squares: NormalEquations | None
     n: int
-
-    def __add__(self, other: PeriodSums) -> PeriodSums:
-        squares = None
-        if self.squares is not None and other.squares is not None:
-            squares = self.squares + other.squares
-        return PeriodSums(self.equations + other.equations, squares, self.n + other.n)
 
 
 def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:

@@ -19,12 +19,7 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution
-from bayesdist.infer.transforms import (
-    LinearTerms,
-    linear_terms,
-    reference_gauge,
-    without_frames,
-)
+from bayesdist.infer.transforms import LinearTerms, linear_terms, reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 
 __all__ = ["ExposureSolutions", "fit_exposures"]

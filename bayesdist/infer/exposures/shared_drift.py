@@ -15,10 +15,7 @@ from numpy.typing import NDArray
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.scaled import scaled_inverse, unit_diagonal
 from bayesdist.infer.solution import DerivedSolution, Solution
-from bayesdist.infer.transforms import (
-    reference_gauge,
-    without_frames,
-)
+from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.similarity import turned, turned_model
 

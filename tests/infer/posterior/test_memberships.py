@@ -9,11 +9,7 @@ from bayesdist.data import matches as tables
 from bayesdist.infer import GaussianPriors, OutlierMixture, load, memberships
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.posterior import memberships as membership
-from bayesdist.infer.posterior.memberships import (
-    count_outliers,
-    some_draws,
-    star_log_likelihood,
-)
+from bayesdist.infer.posterior.memberships import count_outliers, some_draws, star_log_likelihood
 
 from ..oracle import star_terms
 from ..support import MIXTURES, TWO_CHIPS, posterior_at, residual_of, simulated, table, target_of

@@ -15,11 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.calibration.calibration import (
-    Calibration,
-    GaussianSolution,
-    calibration_of_maps,
-)
+from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
