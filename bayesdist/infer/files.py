@@ -23,8 +23,7 @@ from bayesdist.errors import FormatError
 from bayesdist.files import atomic_path
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.posterior.certificate import Certificate
+from bayesdist.infer.posterior import Certificate, Posterior, SamplerInfo
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.mixture import OutlierMixture

@@ -259,7 +259,7 @@ def _fitted(
 ) -> LinearFit:
     radial_weight = rejection.radial_weight
     check_coverage(model, shards.survey, priors.n_informative)
-    first = shards.sum(least_squares, None, None, np.inf, np.inf, radial_weight)
+    first = shards.sum(least_squares, None, None, radial_weight)
     theta = starting_point(first, model, priors)
     refuse_absorbed_drift(first, theta, model, priors)
     theta = gauss_newton(first, theta, model, priors)
@@ -273,8 +273,7 @@ def _fitted(
         if rejection.clip_abs is None
         else rejection.clip_abs * model.pixel_size(theta),
     )
-    rule = (clip.theta, clip.chi2_limit, clip.abs_limit, radial_weight)
-    second = shards.sum(least_squares, clip.theta, *rule)
+    second = shards.sum(least_squares, clip.theta, clip, radial_weight)
     n_used, n_far = int(second.scalars[0]), int(second.scalars[1])
     n_rejected = len(shards) - n_used
     if n_used * 2 + priors.n_informative < model.n_params or n_used < 0.05 * len(shards):
@@ -292,7 +291,7 @@ def _fitted(
     factor = matrix.factor()
     cov = factor.covariance()
     # at the solution: the statistics, and the squared weights that a sandwich needs
-    final = shards.sum(least_squares, theta, *rule, 2)
+    final = shards.sum(least_squares, theta, clip, radial_weight, 2)
     if radial_weight != 1.0:
         meat, _ = final.assemble(model, theta)
         cov = cov @ (meat + priors.matrix(model)).dense() @ cov

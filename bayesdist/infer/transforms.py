@@ -20,6 +20,7 @@ from bayesdist.model.similarity import turned, turned_model
 __all__ = [
     "LINEAR_TERMS",
     "LinearTerms",
+    "bare_model",
     "linear_terms",
     "lines",
     "reference_gauge",
@@ -74,7 +75,7 @@ class LinearTerms:
         return LinearTerms(labels, self.values[index], self.cov[np.ix_(index, index)])
 
 
-def _bare(model: DistortionModel) -> DistortionModel:
+def bare_model(model: DistortionModel) -> DistortionModel:
     """Model of the polynomials alone, whose parameters are the first ones of the full model."""
     return replace(
         model,
@@ -111,7 +112,7 @@ def without_frames(solution: Solution) -> TransformedSolution:
         'first', those from which all exposures deviate in gauge 'held'.
     """
     n = solution.model.n_distortion
-    return _viewed(solution, _bare(solution.model), lambda theta: theta[..., :n], np.eye(n))
+    return _viewed(solution, bare_model(solution.model), lambda theta: theta[..., :n], np.eye(n))
 
 
 def segment(solution: Solution, s: int) -> TransformedSolution:
@@ -143,7 +144,7 @@ def segment(solution: Solution, s: int) -> TransformedSolution:
             if time is None
             else f"choose one of 0 to {time.n_segments - 1}",
         )
-    new = replace(_bare(model), time=TimeDependence(time.terms, (time.epoch0[s],)))
+    new = replace(bare_model(model), time=TimeDependence(time.terms, (time.epoch0[s],)))
     jacobian = np.zeros((new.n_params, model.n_distortion))
     jacobian[: model.n_polynomial, : model.n_polynomial] = np.eye(model.n_polynomial)
     for chip in model.chips:
@@ -187,7 +188,7 @@ def reference_gauge(
     InputError
         For an unknown chip.
     """
-    model = _bare(solution.model)
+    model = bare_model(solution.model)
     time = model.time
     if time is not None and epoch is None:
         epoch = time.epoch0[0]
@@ -301,7 +302,7 @@ def _linear_jacobian(
     model: DistortionModel, chip: int | None, epoch: float | None
 ) -> tuple[tuple[str, ...], Float]:
     """Labels (k,) and the matrix (k, n) that maps the parameters to the linear terms."""
-    bare = _bare(model)
+    bare = bare_model(model)
     labels: list[str] = []
     rows = []
     for one in bare.chips:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bayesdist.infer import kernel
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.kernel import Constants
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import DistortionModel, Groups
@@ -97,26 +98,23 @@ class NormalEquations(Sums):
 def least_squares(
     stars: Stars,
     about: Float | None,
-    test: Float | None = None,
-    chi2_limit: float = np.inf,
-    abs_limit: float = np.inf,
+    clip: Clip | None = None,
     corner: float = 1.0,
     power: int = 1,
 ) -> NormalEquations:
     """Normal equations of weighted least squares with rejection: one pass over the stars.
 
-    Residuals are taken at `about` (n_params,), or None for the data themselves; those at `test`
-    decide on rejection.  The limits, `corner`, `power` and the `scalars` are those of
-    `kernel.least_squares_moments`.
+    Residuals are taken at `about` (n_params,), or None for the data themselves; `clip` decides on
+    rejection.  `corner`, `power` and the `scalars` are those of `kernel.least_squares_moments`.
     """
     moments = kernel.least_squares_moments(
         stars.pieces,
         stars.columns,
         stars.powers(about),
-        stars.powers(test),
+        stars.powers(None if clip is None else clip.theta),
         stars.model.order,
-        chi2_limit=chi2_limit,
-        abs_limit=abs_limit,
+        chi2_limit=np.inf if clip is None else clip.chi2_limit,
+        abs_limit=np.inf if clip is None else clip.abs_limit,
         corner=corner,
         power=power,
     )

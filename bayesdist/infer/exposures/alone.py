@@ -19,7 +19,13 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution import ReferenceGauge, Solution, TransformedSolution
-from bayesdist.infer.transforms import LinearTerms, linear_terms, reference_gauge, without_frames
+from bayesdist.infer.transforms import (
+    LinearTerms,
+    bare_model,
+    linear_terms,
+    reference_gauge,
+    without_frames,
+)
 from bayesdist.model import DistortionModel
 
 __all__ = ["ExposureSolutions", "fit_exposures"]
@@ -154,15 +160,7 @@ def fit_exposures(
             where="data.columns",
             do="map column 'epoch'",
         )
-    alone = replace(
-        model,
-        frames="none",
-        time=None,
-        exposures=("1",),
-        origin=(0.0, 0.0),
-        gauge="first",
-        held=(0.0, 0.0, 0.0),
-    )
+    alone = replace(bare_model(model), time=None)
     base = priors or GaussianPriors.none(alone)
     joint = None if high_order is None else reference_gauge(without_frames(high_order), chip)
     if joint is not None and (joint.model.order, joint.model.chips) != (alone.order, alone.chips):

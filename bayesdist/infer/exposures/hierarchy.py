@@ -37,7 +37,7 @@ from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_
 from bayesdist.infer.solution import Solution
 from bayesdist.infer.stars.likelihood import ClippedGaussian
 from bayesdist.infer.stars.shards import Compute, Matches, Shards, opened
-from bayesdist.infer.transforms import reference_gauge
+from bayesdist.infer.transforms import bare_model, reference_gauge
 from bayesdist.model import DistortionModel
 
 __all__ = ["HierarchicalFit", "fit_hierarchical", "held_in_reference"]
@@ -223,15 +223,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
             where=f"chip {model.chips[model.chip_code(chip)].name}",
             do="put another exposure first",
         )
-    alone = replace(
-        model,
-        chips=(model.chips[model.chip_code(chip)],),
-        time=None,
-        frames="none",
-        exposures=("1",),
-        gauge="first",
-        held=(0.0, 0.0, 0.0),
-    )
+    alone = replace(bare_model(model), chips=(model.chips[model.chip_code(chip)],), time=None)
     table = MatchTable.concatenate(parts)
     gauge = reference_gauge(fit_linear(table, alone), chip).gauge
     assert gauge is not None
@@ -305,8 +297,7 @@ def fit_hierarchical(
     with opened(model, matches, compute) as shards:
         wide = _with_deviations(others, index, scales[kind] ** -2)
         first = fit_linear(shards, model, rejection=rejection, priors=wide)
-        limits = (first.clip.theta, first.clip.chi2_limit, first.clip.abs_limit)
-        equations = shards.sum(least_squares, first.mean, *limits)
+        equations = shards.sum(least_squares, first.mean, first.clip)
         matrix, right = equations.assemble(model, first.mean)
         scatter = Scatter(
             kinds,
