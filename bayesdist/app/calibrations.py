@@ -15,7 +15,7 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.registry import read_calibration
 

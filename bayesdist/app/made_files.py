@@ -7,7 +7,7 @@ from dataclasses import replace
 from bayesdist.app.session import Session
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import Plane
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.products.formats.common.document import BuildOptions, Built
 from bayesdist.products.registry import build
 

@@ -9,7 +9,7 @@ from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.equations.scaled import scaled_cholesky
-from bayesdist.infer.posterior.recoloured import with_spread
+from bayesdist.infer.posterior.covariance import recolouring
 
 __all__ = ["covariance_of", "with_correlated_errors", "with_noise", "with_shared_stars"]
 
@@ -28,7 +28,7 @@ def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovarianc
     mean; all else is as it was.
     """
     before = covariance_of(posterior, fit)
-    return with_spread(posterior, before, before + stars.extra)
+    return posterior.mapped(recolouring(before, before + stars.extra))
 
 
 def covariance_of(
@@ -69,12 +69,13 @@ def _widened(
 ) -> Posterior:
     formal = correlated.formal
     if before is None:
-        return with_spread(posterior, formal, cov)
+        return posterior.mapped(recolouring(formal, cov))
     # frames follow as they are correlated with polynomials and drift
     D = correlated.model.n_distortion
     follow = np.linalg.solve(before[:D, :D], before[:D]).T
     more = follow @ (cov - formal)[:D, :D] @ follow.T
-    return with_spread(posterior, before, before + _least(before, (more + more.T) / 2))
+    after = before + _least(before, (more + more.T) / 2)
+    return posterior.mapped(recolouring(before, after))
 
 
 def _least(before: Float, more: Float) -> Float:

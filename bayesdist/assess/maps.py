@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.assess.solution import Solution, kind_of, place_of
+from bayesdist.assess.solution import Solution, place_of
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 
@@ -139,5 +139,5 @@ def uncertainty_map(
         unit=solution.model.unit,
         chip=place.chip.number,
         epoch=place.epoch,
-        kind=kind_of(solution),
+        kind=solution.kind,
     )

@@ -13,17 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
 
-__all__ = ["Place", "Solution", "kind_of", "place_of"]
+__all__ = ["Place", "Solution", "place_of"]
 
 Float = NDArray[np.float64]
-
-
-def kind_of(solution: Solution) -> str:
-    """'posterior' for a solution whose convergence was judged, else 'least squares'."""
-    return "posterior" if hasattr(solution, "convergence") else "least squares"
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
 from bayesdist.calibration.similarity import correlations
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.frame_fields import term_squares
-from bayesdist.infer.transforms import Derived, Solution
+from bayesdist.infer.solution import DerivedSolution, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.similarity import turned, turned_model
 
@@ -171,7 +171,7 @@ def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
 
 
 @dataclass(frozen=True, eq=False)
-class _Oriented(Derived):
+class _Oriented(DerivedSolution):
     """Solution in the plane of an aperture: each draw turned by a draw of the orientation."""
 
     model: DistortionModel

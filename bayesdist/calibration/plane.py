@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.transforms import Solution
+from bayesdist.infer.solution import Solution
 
 __all__ = ["ARCSEC", "Agreement", "Orientation", "Plane"]
 

@@ -15,7 +15,7 @@ from bayesdist.app.session import Session
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.diagnose.correlated.cells import cell_sums
 from bayesdist.diagnose.correlated.information import Information
-from bayesdist.infer.posterior.likelihood import scores_of
+from bayesdist.infer.solution import likelihood_of
 from tests.adversarial import KINDS
 from tests.adversarial.campaign_measure import actual_error, assessed, stated_sigma
 from tests.adversarial.campaign_truth import CampaignTruth
@@ -94,11 +94,11 @@ def test_where_nothing_is_left_out_errors_are_hardly_wider(plain):
 def test_at_the_mode_the_priors_pull_as_hard_as_the_stars(plain):
     """Or the structure would be that of deviations which their priors have shrunk."""
     session = plain.session
-    scores = scores_of(session.posterior)
-    sums = session.shards.sum(cell_sums, scores, 32)
-    information = Information(session.model, scores.theta, sums, session.priors)
+    likelihood = likelihood_of(session.posterior)
+    sums = session.shards.sum(cell_sums, likelihood, 32)
+    information = Information(session.model, likelihood.theta, sums, session.priors)
     of_stars = Information(
-        session.model, scores.theta, sums, type(session.priors).none(session.model)
+        session.model, likelihood.theta, sums, type(session.priors).none(session.model)
     )
     D = session.model.n_distortion
 

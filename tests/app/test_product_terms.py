@@ -15,6 +15,7 @@ from bayesdist.app.file_positions import sip_positions
 from bayesdist.app.product_terms import _Laid, product_terms
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.sessions import session_of
+from bayesdist.calibration.calibration import GaussianSolution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from tests.app.support import good, summary_of
@@ -189,7 +190,7 @@ def test_digits_of_wise_entries_are_what_is_left(tmp_path):
     monomial[:, 3:] = 1e-6 * rng.standard_normal((2, 3))
     monomial[:, 0] = 0.3, -0.2
     mean = basis.from_monomials(monomial).ravel()
-    solution = SimpleNamespace(model=model, mean=mean, cov=1e-12 * np.eye(len(mean)))
+    solution = GaussianSolution(model, mean, 1e-12 * np.eye(len(mean)))
     header = sip_from_solution(solution, linear="sip", inverse_order=2)
     write_wise_meta(tmp_path / "w1.meta", {1: header})
     [band] = read_wise_meta(tmp_path / "w1.meta")

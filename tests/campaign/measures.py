@@ -14,7 +14,8 @@ from bayesdist.data import MatchTable
 from bayesdist.infer import fit_by_magnitude
 from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
 from bayesdist.infer.series import Series, TrendModel, fit_series
-from bayesdist.infer.transforms import Solution, View, lines, reference_gauge, without_frames
+from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.transforms import lines, reference_gauge, without_frames
 from bayesdist.missions.acs.simulate.pointings import SPANS
 from bayesdist.missions.acs.simulate.stars import centroid_error
 from bayesdist.model import corrected
@@ -180,7 +181,7 @@ def position_errors(found: Calibrated, tables: TableFit, rng: np.random.Generato
 
 
 def _position(
-    view: View,
+    view: TransformedSolution,
     found: Calibrated,
     posterior: TablePosterior,
     x: np.ndarray,

@@ -21,8 +21,8 @@ from bayesdist.data import MatchTable
 from bayesdist.infer.catalogue.star_errors import star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
-from bayesdist.infer.posterior.recoloured import Recoloured
 from bayesdist.infer.series import Series
+from bayesdist.infer.solution import TransformedSolution
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_model, read_acs
 from bayesdist.missions.acs.simulate.pointings import OWN
 from bayesdist.model import LookupTable
@@ -104,7 +104,7 @@ class Calibrated:
         What it was made from.
     session : CampaignSession
     tables : TableFit or None
-    bare, joint : HierarchicalFit and Recoloured
+    bare, joint : HierarchicalFit and TransformedSolution
         All exposures jointly; without and with the correlated errors of the catalogue.
     terms : Series
         Linear terms of every exposure alone.
@@ -114,7 +114,7 @@ class Calibrated:
     session: CampaignSession
     tables: TableFit | None
     bare: HierarchicalFit
-    joint: Recoloured
+    joint: TransformedSolution
     terms: Series
 
 
@@ -201,7 +201,7 @@ def _results_of(*names: str) -> Iterator[dict[str, Any]]:
         yield made
 
 
-def _with_catalogue(bare: HierarchicalFit, session: CampaignSession) -> Recoloured:
+def _with_catalogue(bare: HierarchicalFit, session: CampaignSession) -> TransformedSolution:
     """The joint fit with the errors that a star of the catalogue has in all exposures."""
     catalog, matches = session.inputs.catalog, session.matches
     assert isinstance(matches, MatchTable)

@@ -10,7 +10,8 @@ from typing import Any
 from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.orientation import lay_on
-from bayesdist.infer.transforms import Solution, reference_gauge, without_frames
+from bayesdist.infer.solution import Solution
+from bayesdist.infer.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
 from bayesdist.products import (
     Period,

@@ -13,11 +13,7 @@ from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.error_model import error_model
 from bayesdist.assess.requirements.remedy import Remedy, find_remedy
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.verdict import (
-    counting_error,
-    effective_draws,
-    verdict_of,
-)
+from bayesdist.assess.requirements.verdict import counting_error, effective_draws, verdict_of
 from bayesdist.assess.solution import Solution, place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
@@ -326,7 +322,7 @@ def _of_extremes(
 
 def _convergence(solution: Solution) -> tuple[Check, ...]:
     """Check that draws can be relied on, of a solution that has draws of its own."""
-    convergence = getattr(solution, "convergence", None)
+    convergence = solution.convergence
     return () if convergence is None else (convergence_check(convergence),)
 
 

@@ -32,10 +32,10 @@ def effective_draws(solution: Solution, n_draws: int) -> float:
     tail effective sample sizes (a probability far from a half is a matter of the tails). The result
     is at least 1.
     """
-    convergence = getattr(solution, "convergence", None)
+    convergence = solution.convergence
     if convergence is None:
         return float(n_draws)
-    sizes = [float(convergence.ess_bulk_min), float(getattr(convergence, "ess_tail_min", math.inf))]
+    sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
     ess = 1.0 if any(math.isnan(s) for s in sizes) else max(min(sizes), 1.0)
     return max(1.0 / (1.0 / n_draws + 1.0 / ess), 1.0)
 

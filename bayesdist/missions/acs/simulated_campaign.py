@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from bayesdist.app.screen import progress_bar, table_text
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path
+from bayesdist.infer.solution import Solution
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_solution, simulate_acs, write_acs
 from bayesdist.model import DistortionModel
 from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
@@ -189,13 +191,13 @@ def _stale() -> IdcTab:
 
 
 @dataclass(frozen=True, eq=False)
-class _Exact:
+class _Exact(Solution):
     """Given parameters as a solution without errors."""
 
     model: DistortionModel
     mean: Float
 
-    @property
+    @cached_property
     def cov(self) -> Float:
         return np.zeros((len(self.mean), len(self.mean)))
 

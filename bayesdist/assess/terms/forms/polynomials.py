@@ -129,7 +129,7 @@ class PolynomialField(ErrorField):
         return cls(rows, domain, without_rigid(every, positions, model))
 
     @property
-    def n_draws(self) -> int:  # type: ignore[override]
+    def n_draws(self) -> int:
         """Number of draws."""
         return len(next(iter(self.coefficients.values())))
 

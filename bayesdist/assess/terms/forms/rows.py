@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,10 +125,19 @@ class ErrorField(ABC):
     """Errors of a term at the N positions of a domain."""
 
     domain: EvaluationDomain
-    rows: tuple[Row, ...]
-    n_draws: int
 
-    uniform = False  # the same at all positions
+    if TYPE_CHECKING:  # read-only: fields of some subclasses, computed by others
+
+        @property
+        def rows(self) -> tuple[Row, ...]: ...
+
+        @property
+        def n_draws(self) -> int: ...
+
+    @property
+    def uniform(self) -> bool:
+        """True if the error is the same at all positions."""
+        return False
 
     @property
     def n_different(self) -> int:

@@ -51,12 +51,12 @@ class TogetherField(ErrorField):
     remainder: bool = False  # as of `Together`
 
     @property
-    def rows(self) -> tuple[Row, ...]:  # type: ignore[override]
+    def rows(self) -> tuple[Row, ...]:
         """Rows of all parts."""
         return tuple(row for part in self.parts for row in part.rows)
 
     @property
-    def n_draws(self) -> int:  # type: ignore[override]
+    def n_draws(self) -> int:
         """Number of draws."""
         return self.parts[0].n_draws
 

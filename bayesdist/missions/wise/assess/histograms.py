@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.statistics.bands import BandBins, band_bins
-from bayesdist.infer.linear import Clip
+from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 

@@ -18,8 +18,8 @@ from bayesdist.infer.sampler import lookahead
 from bayesdist.infer.sampler.chains import Settings, run_chains
 from bayesdist.infer.sampler.checkpoints import Walkers
 from bayesdist.infer.sampler.ensembles import replay
-from bayesdist.infer.sampler.lookahead import Page, draw_page
 from bayesdist.infer.sampler.move_schedule import expected_passes
+from bayesdist.infer.sampler.proposal_batch import ProposalBatch, draw_batch
 
 from ..fakes import FakeTarget, gaussian_proposal
 from ..support import simulated, target_of
@@ -53,7 +53,7 @@ def test_replay_is_metropolis_hastings_over_the_given_proposals():
     log_q[np.isnan(log_prob)] = np.nan
     at_start = rng.normal(size=(2, W))
     random = np.random.RandomState(8).get_state()
-    block = replay(Walkers(start, *at_start, random), Page(psi, log_prob, log_q), 0)
+    block = replay(Walkers(start, *at_start, random), ProposalBatch(psi, log_prob, log_q), 0)
 
     stream = np.random.RandomState(8)
     here = [(start[w], *at_start[:, w]) for w in range(W)]
@@ -77,18 +77,18 @@ def test_how_many_are_evaluated_at_a_time_does_not_matter(rows, monkeypatch):
     model, matches, _ = simulated(81, 400, n_exposures=3, frames="shift", fraction=0.05)
     target, fit = target_of(model, matches, OutlierMixture())
     proposal = build_proposal(target, fit)
-    expected = draw_page(target, proposal, (1, 2), (5,), 60)
+    expected = draw_batch(target, proposal, (1, 2), (5,), 60)
     monkeypatch.setattr(lookahead, "ROWS", rows)
-    page = draw_page(target, proposal, (1, 2), (5,), 60)
+    batch = draw_batch(target, proposal, (1, 2), (5,), 60)
     for name in ("psi", "log_prob", "log_q"):
         np.testing.assert_allclose(
-            getattr(page, name), getattr(expected, name), rtol=1e-12, atol=1e-9
+            getattr(batch, name), getattr(expected, name), rtol=1e-12, atol=1e-9
         )
-    part = draw_page(target, proposal, (1, 2), (5,), 60, 20)
+    part = draw_batch(target, proposal, (1, 2), (5,), 60, 20)
     np.testing.assert_array_equal(part.psi, expected.psi[:, :20])
-    one = draw_page(target, proposal, (2,), (5,), 60)  # each ensemble has its own numbers
+    one = draw_batch(target, proposal, (2,), (5,), 60)  # each ensemble has its own numbers
     np.testing.assert_array_equal(one.psi[0], expected.psi[1])
-    other = draw_page(target, proposal, (1, 2), (6,), 60)
+    other = draw_batch(target, proposal, (1, 2), (6,), 60)
     assert not np.isin(other.psi[..., 0], expected.psi[..., 0]).any()
 
 
@@ -305,7 +305,7 @@ def test_weakly_identified_jitter():
     target, fit = target_of(model, matches, OutlierMixture())
     proposal = build_proposal(target, fit)
     seeds = (1, 2)
-    grid = quality_of(draw_page(target, proposal, seeds, (0,), 1000).log_weights)
+    grid = quality_of(draw_batch(target, proposal, seeds, (0,), 1000).log_weights)
     assert grid.efficiency > 0.9 and grid.k < 0.7
 
     # plain Laplace: mode and curvature in all sampled coordinates, by differences

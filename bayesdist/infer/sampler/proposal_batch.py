@@ -1,7 +1,7 @@
 """Independence proposals, drawn and evaluated many at a time.
 
 They do not depend on the walkers, so that one pass over the data serves many steps of all
-ensembles.  Each ensemble has its own stream of random numbers for each page of proposals, which
+ensembles.  Each ensemble has its own stream of random numbers for each batch of proposals, which
 makes the draws independent of how they are evaluated.
 """
 
@@ -18,7 +18,7 @@ from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
-__all__ = ["Page", "draw_page", "pilot_page"]
+__all__ = ["ProposalBatch", "draw_batch", "pilot_batch"]
 
 Float = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ ROWS = 8192  # proposals evaluated at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Page:
+class ProposalBatch:
     """Proposals of all ensembles with their densities."""
 
     psi: Float  # (ensembles, n, D)
@@ -44,28 +44,30 @@ class Page:
         """Number of proposals that lie in the support."""
         return int((~np.isnan(self.log_prob)).sum())
 
-    def __getitem__(self, rows: slice) -> Page:
-        """Page with some of the proposals of each ensemble."""
-        return Page(self.psi[:, rows], self.log_prob[:, rows], self.log_q[:, rows])
+    def __getitem__(self, rows: slice) -> ProposalBatch:
+        """Batch with some of the proposals of each ensemble."""
+        return ProposalBatch(self.psi[:, rows], self.log_prob[:, rows], self.log_q[:, rows])
 
-    def without(self, taken: NDArray[np.bool_], n: int) -> Page:
-        """Page of the first n proposals of each ensemble that are not among those taken."""
+    def without(self, taken: NDArray[np.bool_], n: int) -> ProposalBatch:
+        """Batch of the first n proposals of each ensemble that are not among those taken."""
         rows = np.array([np.flatnonzero(~t)[:n] for t in taken])
         each = np.arange(len(rows))[:, None]
-        return Page(self.psi[each, rows], self.log_prob[each, rows], self.log_q[each, rows])
+        return ProposalBatch(
+            self.psi[each, rows], self.log_prob[each, rows], self.log_q[each, rows]
+        )
 
 
-def draw_page(
+def draw_batch(
     target: Target,
     proposal: Proposal,
     seeds: Sequence[int],
     key: tuple[int, ...],
     n: int,
     n_used: int | None = None,
-) -> Page:
-    """Page of n proposals of each ensemble, drawn and evaluated.
+) -> ProposalBatch:
+    """Batch of n proposals of each ensemble, drawn and evaluated.
 
-    `key` of the page and the ensemble's seed fix the random numbers.  Only the first `n_used` are
+    `key` of the batch and the ensemble's seed fix the random numbers.  Only the first `n_used` are
     returned; they do not depend on this number.
     """
     psi = _drawn(proposal, seeds, key, n)[:, :n_used]
@@ -76,7 +78,7 @@ def draw_page(
         rows = inside[a : a + ROWS]
         log_prob[rows] = target.log_density(flat[rows])
         log_q[rows] = proposal.log_density(flat[rows])
-    return Page(psi, log_prob.reshape(psi.shape[:2]), log_q.reshape(psi.shape[:2]))
+    return ProposalBatch(psi, log_prob.reshape(psi.shape[:2]), log_q.reshape(psi.shape[:2]))
 
 
 def _drawn(proposal: Proposal, seeds: Sequence[int], key: tuple[int, ...], n: int) -> Float:
@@ -84,7 +86,7 @@ def _drawn(proposal: Proposal, seeds: Sequence[int], key: tuple[int, ...], n: in
     return np.array([proposal.draw(n, rng) for rng in streams])
 
 
-def pilot_page(
+def pilot_batch(
     target: Target,
     proposal: Proposal,
     seeds: Sequence[int],
@@ -93,8 +95,8 @@ def pilot_page(
     fingerprint: str = "",
     name: str = "pilot",
     key: tuple[int, ...] = (0,),
-) -> Page:
-    """First page, which judges the proposal and then starts the chains.
+) -> ProposalBatch:
+    """First batch, which judges the proposal and then starts the chains.
 
     A file stores the result of its evaluation; the proposals themselves are drawn again.
     InputError when the file cannot be read or written, or belongs to other data or settings.
@@ -103,8 +105,8 @@ def pilot_page(
     if path is not None and path.exists():
         do = "delete it and resume: its proposals are evaluated again"
         known = read_arrays(path, fingerprint, ("log_prob", "log_q"), do=do)
-        return Page(_drawn(proposal, seeds, key, n), **known)
-    page = draw_page(target, proposal, seeds, key, n)
+        return ProposalBatch(_drawn(proposal, seeds, key, n), **known)
+    batch = draw_batch(target, proposal, seeds, key, n)
     if path is not None:
-        write_arrays(path, fingerprint, {"log_prob": page.log_prob, "log_q": page.log_q})
-    return page
+        write_arrays(path, fingerprint, {"log_prob": batch.log_prob, "log_q": batch.log_q})
+    return batch
