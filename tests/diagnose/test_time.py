@@ -42,7 +42,7 @@ def test_a_gap_that_opens_is_found(frames):
     assert np.median([one.size for one in gap]) == pytest.approx(OPENING, rel=0.15)
     assert all(one.unit == "pix/yr" for one in gap)
     assert "chip B drifts along y against chip A" in gap[0].finding and "pix/yr" in gap[0].finding
-    assert "model.tdd.terms" in gap[0].family.remedy
+    assert "model.tdd.terms" in gap[0].remedy
     assert not any(one["motions"].significant for one in found)
 
 
@@ -76,7 +76,7 @@ def test_stars_that_move_are_found():
     motions = [one["motions"] for one in found]
     assert all(one.significant for one in motions)
     assert "the catalogue does not have" in motions[0].finding
-    assert "proper motions" in motions[0].family.remedy
+    assert "proper motions" in motions[0].remedy
     assert not any(one["gap"].significant for one in found)
 
 
