@@ -63,7 +63,8 @@ class GroupedScores:
     @classmethod
     def empty(cls, n: int, n_params: int, n_free: int) -> GroupedScores:
         """Sums over nothing."""
-        return cls(*(np.zeros((n, *shape)) for shape in ((), (n_params,), (n_params,), (n_free,))))
+        by = (n, n_params)
+        return cls(np.zeros(n), np.zeros(by), np.zeros(by), np.zeros((n, n_free)))
 
     def add(self, terms: csr_matrix, scores: StarScores) -> None:
         """Add terms (S, n) of some stars."""
@@ -79,8 +80,13 @@ class GroupedScores:
 
     def mapped(self, matrix: Float) -> GroupedScores:
         """Sums of linear combinations (T, S) of the statistics."""
-        parts = (matrix @ part for part in (self.sums, self.by, self.common, self.free))
-        return GroupedScores(*parts, {name: matrix @ part for name, part in self.lost.items()})
+        return GroupedScores(
+            matrix @ self.sums,
+            matrix @ self.by,
+            matrix @ self.common,
+            matrix @ self.free,
+            {name: matrix @ part for name, part in self.lost.items()},
+        )
 
     def covariance(
         self, predictive: Predictive, frames: Mapping[str, Frame], *, mixture: bool

@@ -102,7 +102,7 @@ class SharedErrors:
         return [code[inside], *(self._all[name][inside] for name in names)]
 
     def place_covariance(self, kind: str, n: int) -> tuple[Float, Float]:
-        """Covariances (2 n, 2 n) of scores of the position in n bins: by stars, and by cells too."""
+        """Covariances (2 n, 2 n) of scores of positions in n bins: by stars, and by cells too."""
         at, star, place = self._inside(kind, "star", "place")
         by_star = products_over(at, star, place, n)
         if self._step is None:
@@ -164,7 +164,7 @@ class SharedErrors:
         return np.asarray(out)
 
     def overdispersion(self, limit: float) -> float:
-        """Variance of the number of stars beyond a limit, in sigma, over that of independent ones."""
+        """Variance of the number of stars beyond a limit over that of independent ones."""
         far = (self._all["size"] > limit).astype(float)
         rest = far - far.mean()
         single = float((rest**2).sum())
