@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.diagnose.statistics.bands import BandBins, band_bins
+from bayesdist.diagnose.residuals.binned import BinnedSums, band_bins
 from bayesdist.infer.linear import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
@@ -107,13 +107,13 @@ class BandSums:
 
     Parameters
     ----------
-    bins : BandBins
+    bins : BinnedSums
         Of the stars that the fit used, pixels.
     histograms : mapping of str to ResidualHistogram
         Of all stars; that of the calibration under `CALIBRATED`.
     """
 
-    bins: BandBins
+    bins: BinnedSums
     histograms: Mapping[str, ResidualHistogram]
 
     def __add__(self, other: BandSums) -> BandSums:
