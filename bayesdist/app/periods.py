@@ -15,7 +15,7 @@ from bayesdist.errors import InputError
 
 if TYPE_CHECKING:
     from bayesdist.app.session import Session
-    from bayesdist.diagnose.statistics import PatternChange, StatisticsTable
+    from bayesdist.diagnose.residuals import PatternChange, StatisticsTable
     from bayesdist.infer.compare.positions import PositionChange
 
 __all__ = ["check_pairs", "period_settings", "periods_summary", "periods_table"]

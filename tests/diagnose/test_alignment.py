@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from bayesdist.assess import residual_statistics
-from bayesdist.diagnose.statistics import (
+from bayesdist.diagnose.residuals import (
     STATISTICS,
     BinValues,
     band_bins,

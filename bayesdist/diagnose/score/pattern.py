@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import i0e, i1e
 
-from bayesdist.diagnose.score.projection import Projection
-from bayesdist.diagnose.score.result import Outcome
+from bayesdist.diagnose.score.families import FAMILIES
+from bayesdist.diagnose.score.result import Outcome, outcome
+from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.grid import cell_index
 
 __all__ = ["pattern_test"]
@@ -20,7 +23,7 @@ SLOWEST = 1.5  # periods beyond the polynomial's own, below which it takes waves
 FEWEST_STARS = 100
 
 
-def pattern_test(projection: Projection) -> Outcome | None:
+def pattern_test(sample: ScoredSample) -> Outcome | None:
     """Test for a wave of any period and direction on a chip.
 
     At each frequency k the length of sum g exp(i k x), over the scores g of one axis, is that of a
@@ -30,20 +33,20 @@ def pattern_test(projection: Projection) -> Outcome | None:
 
     Parameters
     ----------
-    projection : Projection
+    sample : ScoredSample
+        With its leverage.
 
     Returns
     -------
     Outcome or None
         None for less than `FEWEST_STARS` detections.
     """
-    sample = projection.sample
     if len(sample) < FEWEST_STARS:
         return None
     model = sample.model
     allowed = _frequencies(model.order)
     log_tail, power, trials, at = 0.0, 0.0, 0, (0, 0, 0, 0)
-    for chip, (scores, binned) in _binned(projection).items():
+    for chip, (scores, binned) in _binned(sample).items():
         for axis in (0, 1):
             if not scores[axis].any():
                 continue
@@ -69,36 +72,37 @@ def pattern_test(projection: Projection) -> Outcome | None:
         # a noncentral exponential exceeds it with probability 0.9
         return float(unit * (np.sqrt(needed) + 1.0))
 
-    return Outcome(
-        name="repeating pattern",
-        statistic=2 * power,
-        dof=2,
-        dof_residual=None,
-        p_value=p_value,
-        size=float(unit * np.sqrt(max(power - 1, 0.0))),
-        smallest=smallest,
+    present = (
+        f"the residuals along {'uv'[axis]} repeat over the detector with a period of {period:.0f} "
+        "pixels"
+    )
+    return outcome(
+        replace(FAMILIES["repeating pattern"], present=present),
+        2 * power,
+        2,
+        None,
+        p_value,
+        square=float(unit**2 * power),
+        noise=float(unit**2),
         unit=model.unit,
-        remedy="fit a look-up table with nodes closer than half the period",
-        present=f"the residuals along {'uv'[axis]} repeat over the detector with a period of "
-        f"{period:.0f} pixels",
-        absent="no pattern repeats over the detector",
+        smallest=smallest,
     )
 
 
 def _frequencies(order: int) -> NDArray[np.bool_]:
-    """Which frequencies of `rfft2` are tested: those that the polynomial does not take up."""
+    """Boolean mask of the frequencies of `rfft2` that the polynomial does not take up."""
     n = PADDED * BINS
     j, i = np.fft.fftfreq(n, 1 / n)[:, None], np.arange(n // 2 + 1)[None]
     waves = np.hypot(i, j) / PADDED  # over the chip
     return (waves > SLOWEST * (order + 1) / 2) & (waves < BINS / 2.5)
 
 
-def _binned(projection: Projection) -> dict[int, tuple[list[Float], Float]]:
+def _binned(sample: ScoredSample) -> dict[int, tuple[list[Float], Float]]:
     """Scores (N,) along each axis of the polynomials on each chip, and binned (2, BINS, BINS)."""
-    sample, found = projection.sample, dict[int, list[tuple[NDArray[np.int64], Float]]]()
+    found = dict[int, list[tuple[NDArray[np.int64], Float]]]()
     code = cell_index(sample.X, sample.Y, (BINS, BINS))
     for block in sample.blocks:
-        scores = block.frame.T @ projection.whole_score[:, block.rows]
+        scores = block.frame.T @ sample.whole_score[:, block.rows]
         found.setdefault(block.chip, []).append((code[block.rows], scores))
     out: dict[int, tuple[list[Float], Float]] = {}
     for chip, parts in found.items():

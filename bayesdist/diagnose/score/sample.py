@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +82,9 @@ class ScoredSample:
         Proper motions along u and v, in the unit of u, v per year.
     motion_sigma : ndarray, shape (2, N), or None
         Their standard errors, where the table has them.
+    leverage : ndarray, shape (2, N), or float
+        Fraction of the noise of each detection that the fit follows, along u and v; 0 where it is
+        not known.
     """
 
     model: DistortionModel
@@ -98,6 +102,7 @@ class ScoredSample:
     blocks: tuple[Block, ...]
     motion: Float | None = None
     motion_sigma: Float | None = None
+    leverage: Float | float = 0.0
 
     def __len__(self) -> int:
         return len(self.X)
@@ -106,6 +111,25 @@ class ScoredSample:
     def used(self) -> NDArray[np.bool_]:
         """Detections that say anything: all but those that a fit rejects."""
         return np.any(self.curvature != 0, axis=0)
+
+    @cached_property
+    def whole_score(self) -> Float:
+        """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
+        return np.asarray(self.score / np.sqrt(1.0 - self.leverage))
+
+    def codes(self, name: str) -> Int:
+        """Codes (N,) of what the detections of a block have in common: 'chip', 'exposure'."""
+        out = np.empty(len(self), np.int64)
+        for block in self.blocks:
+            out[block.rows] = getattr(block, name)
+        return out
+
+    def blocks_by(self, name: str) -> list[list[Block]]:
+        """Blocks that have a code in common: 'exposure', 'frame_exposure'."""
+        found: dict[int, list[Block]] = {}
+        for block in self.blocks:
+            found.setdefault(getattr(block, name), []).append(block)
+        return list(found.values())
 
     def with_positive_curvature(self) -> ScoredSample:
         """The sample with what is concave in the likelihood alone.

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -23,13 +22,15 @@ from scipy import stats
 from scipy.linalg import block_diag
 
 from bayesdist.diagnose.clusters import add_over
+from bayesdist.diagnose.score.directions import independent_directions, squares_of
+from bayesdist.diagnose.score.families import Family
 from bayesdist.diagnose.score.projection import LARGEST_LEVERAGE, Projection
 from bayesdist.diagnose.score.regressors import Regressors
-from bayesdist.diagnose.score.result import Outcome, noncentrality
+from bayesdist.diagnose.score.result import Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
-from bayesdist.diagnose.significance import LEAST_P
+from bayesdist.diagnose.significance import chi_square_of
 
-__all__ = ["independent_directions", "regressor_tests", "smallest_pattern"]
+__all__ = ["regressor_tests"]
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -41,7 +42,6 @@ MOST_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothin
 GIVEN_BACK = 0.75
 LEAST_DOF = 3  # of the noise: below, its covariance says nothing
 MOST_CHIPS = 4  # that are tested together, with the covariance of all their scores
-SQUARES = ("size2", "noise2")
 
 
 def regressor_tests(projection: Projection) -> list[Outcome]:
@@ -59,7 +59,7 @@ def regressor_tests(projection: Projection) -> list[Outcome]:
     for chips in _chips_together(projection):
         for name, part in _parts_of(projection, chips):
             found.setdefault(name, []).append(part)
-    families = {one.name: one for one in projection.functions.regressors}
+    families = {one.family.name: one.family for one in projection.functions.regressors}
     return [_outcome(projection, families[name], parts) for name, parts in found.items()]
 
 
@@ -71,7 +71,7 @@ class _Part:
     ----------
     statistic, p_value : float
     dof, dof_residual : float
-    size2, noise2 : float
+    square, noise : float
         Mean square of the pattern over these chips, noise included, and of the noise.
     """
 
@@ -79,8 +79,8 @@ class _Part:
     p_value: float
     dof: float
     dof_residual: float
-    size2: float
-    noise2: float
+    square: float
+    noise: float
 
 
 def _chips_together(projection: Projection) -> list[list[int]]:
@@ -89,37 +89,33 @@ def _chips_together(projection: Projection) -> list[list[int]]:
     return [chips] if len(chips) <= MOST_CHIPS else [[one] for one in chips]
 
 
-def _outcome(projection: Projection, family: Regressors, parts: Sequence[_Part]) -> Outcome:
+def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> Outcome:
     """Outcome of one family, from its parts."""
-    T, dof = (float(sum(getattr(one, name) for one in parts)) for name in ("statistic", "dof"))
-    size2, noise2 = (float(np.mean([getattr(p, name) for p in parts])) for name in SQUARES)
+    T, dof = parts[0].statistic, float(sum(one.dof for one in parts))
     residual: float | None = parts[0].dof_residual
     p = parts[0].p_value
-    if len(parts) > 1:  # chi-square of the same probabilities, which can be added up
-        T = float(sum(stats.chi2.isf(max(one.p_value, LEAST_P), one.dof) for one in parts))
+    if len(parts) > 1:
+        T = sum(chi_square_of(one.p_value, one.dof) for one in parts)
         residual, p = None, float(stats.chi2.sf(T, dof))
-    return Outcome(
-        name=family.name,
-        statistic=T,
-        dof=dof,
-        dof_residual=residual,
-        p_value=p,
-        size=float(np.sqrt(max(size2 - noise2, 0.0))),
-        smallest=partial(smallest_pattern, float(np.sqrt(noise2)), dof, residual),
+    return outcome(
+        family,
+        T,
+        dof,
+        residual,
+        p,
+        square=float(np.mean([one.square for one in parts])),
+        noise=float(np.mean([one.noise for one in parts])),
         unit=projection.sample.model.unit,
-        remedy=family.remedy,
-        present=family.present,
-        absent=family.absent,
     )
 
 
 def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _Part]]:
     """Tests of all families on some chips, with the names of the families."""
     tried = []
-    for family in projection.functions.regressors:
-        columns = np.concatenate([projection.columns(family.every, chip) for chip in chips])
-        own = np.tile(np.repeat(family.own, 2), len(chips))
-        one = _Directions.of(projection, family, columns, own)
+    for several in projection.functions.regressors:
+        columns = np.concatenate([projection.columns(several.every, chip) for chip in chips])
+        own = np.tile(np.repeat(several.own, 2), len(chips))
+        one = _Directions.of(projection, several, columns, own)
         if one.q:
             tried.append(one)
     sums = _star_sums(projection, chips, tried)
@@ -133,10 +129,10 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[str, _
             continue
         T = dof_residual / dof * float(one.score @ np.linalg.solve(V, one.score))
         p = float(stats.f.sf(T / one.q, one.q, dof_residual))
-        square = np.repeat(projection.functions.mean_square[one.family.every], 2)
+        square = np.repeat(projection.functions.mean_square[one.regressors.every], 2)
         Q = (one.basis.T * np.tile(square, len(chips)) / len(chips)) @ one.basis
-        size2, noise2 = float(one.score @ Q @ one.score), float(np.trace(Q @ V))
-        yield one.family.name, _Part(T, p, one.q, dof_residual, size2, noise2)
+        squares = squares_of(one.score, np.eye(one.q), V, Q)
+        yield one.regressors.family.name, _Part(T, p, one.q, dof_residual, *squares)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +141,7 @@ class _Directions:
 
     Parameters
     ----------
-    family : Regressors
+    regressors : Regressors
     columns : ndarray of int, shape (n,)
     basis : ndarray, shape (n, q)
         With unit information beside all parameters.
@@ -153,31 +149,31 @@ class _Directions:
         Also the step by which the fit would move.
     """
 
-    family: Regressors
+    regressors: Regressors
     columns: Int
     basis: Float
     score: Float
 
     @property
     def q(self) -> int:
-        """How many."""
+        """Number of directions."""
         return self.basis.shape[1]
 
     @classmethod
     def of(
-        cls, projection: Projection, family: Regressors, columns: Int, own: NDArray[np.bool_]
+        cls, projection: Projection, several: Regressors, columns: Int, own: NDArray[np.bool_]
     ) -> _Directions:
-        """Those of a family, of which some columns are tested beside the others."""
+        """Directions of regressors of which the `own` columns are tested beside the others."""
         S = projection.efficient_information(columns)
         # each of the tested ones without what the others say of it
         A = np.zeros((len(columns), own.sum()))
         A[own] = np.eye(own.sum())
         A[~own] = -np.linalg.lstsq(S[np.ix_(~own, ~own)], S[np.ix_(~own, own)])[0]
         S = A.T @ S @ A
-        N = independent_directions(projection.whole_information(columns[own]), S, family.least)
+        N = independent_directions(projection.whole_information(columns[own]), S, several.least)
         # eigenvectors: their information is diagonal
         basis = A @ (N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True)))
-        return cls(family, columns, basis, basis.T @ projection.efficient_score[columns])
+        return cls(several, columns, basis, basis.T @ projection.efficient_score[columns])
 
 
 def _star_sums(
@@ -271,7 +267,7 @@ class _Together:
 
     @classmethod
     def of(cls, tried: Sequence[_Directions]) -> _Together:
-        """Those of some families."""
+        """Directions of these families."""
         return cls(
             np.concatenate([one.columns for one in tried]),
             np.asarray(block_diag(*(one.basis for one in tried))),
@@ -308,47 +304,3 @@ class _Together:
         psi = g[0][:, family] * x[0] + g[1][:, family] * x[1]
         lost = (leverage[0] * G_uu + leverage[1] * G_vv).sum(axis=0)
         return psi, np.stack([G_uu + G_vv, np.sqrt(G_uu**2 + 2 * G_uv**2 + G_vv**2)]), lost
-
-
-def independent_directions(whole: Float, left: Float, least: float) -> Float:
-    """Directions of regressors that the parameters have left, (n, q).
-
-    Parameters
-    ----------
-    whole, left : ndarray, shape (n, n)
-        Information of the regressors before and after the parameters are projected out.
-    least : float
-        Fraction of it that a direction must have kept.
-
-    Returns
-    -------
-    ndarray, shape (n, q)
-        In units in which `whole` is the unit matrix.
-    """
-    diagonal = np.diag(whole)
-    scale = np.zeros(len(diagonal))
-    scale[diagonal > 0] = diagonal[diagonal > 0] ** -0.5
-    values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
-    good = values > 1e-8 * values.max(initial=1e-300)
-    basis = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
-    kept, turn = np.linalg.eigh(basis.T @ left @ basis)
-    return np.asarray(basis @ turn[:, kept > least])
-
-
-def smallest_pattern(noise: float, dof: float, dof_residual: float | None, level: float) -> float:
-    """Rms of a pattern that is found with the power `POWER`.
-
-    Parameters
-    ----------
-    noise : float
-        Rms of the pattern that noise makes.
-    dof, dof_residual : float
-        Of the test.
-    level : float
-
-    Returns
-    -------
-    float
-        Of a pattern that lies in any direction as noise does.
-    """
-    return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bayesdist.diagnose.statistics.bands import WISE_ARCSEC
+from bayesdist.diagnose.residuals.tables import WISE_ARCSEC
 from bayesdist.missions.wise.assess.published import PrintedRow
 
 __all__ = ["contradictions_across", "contradictions_within"]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.diagnose.statistics.bands import BandBins, band_bins
+from bayesdist.diagnose.residuals.binned import BinnedSums, band_bins
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
@@ -87,7 +87,7 @@ def histogram(residual: Float, reach: float, bins: int = HISTOGRAM_BINS) -> Resi
 class BandSums:
     """Bins and histograms of one pass over the stars of a band; parts add."""
 
-    bins: BandBins  # of the stars that the fit used, pixels
+    bins: BinnedSums  # of the stars that the fit used, pixels
     # of all stars; that of the calibration under `CALIBRATED`
     histograms: Mapping[str, ResidualHistogram]
 

@@ -8,7 +8,7 @@ from decimal import Decimal
 
 import numpy as np
 
-from bayesdist.diagnose.statistics.rows import STATISTICS
+from bayesdist.diagnose.residuals.rows import STATISTICS
 from bayesdist.errors import InputError
 
 __all__ = [

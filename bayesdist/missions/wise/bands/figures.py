@@ -263,7 +263,7 @@ def coverage(inputs: BandsInput) -> Plot:
     """Pairs used in each bin over the mean of all bins."""
     images, titles = {}, []
     for b in inputs.bands:
-        count = b.sums.bins.axes.count
+        count = b.sums.bins.count
         expected = float(count.mean())
         images[b.name] = count / expected
         titles.append(

@@ -200,7 +200,7 @@ def coverage_table(inputs: BandsInput) -> TextTable:
     """Pairs in bins against even coverage."""
     rows = []
     for b in inputs.bands:
-        n = b.sums.bins.axes.count
+        n = b.sums.bins.count
         mean = float(n.mean())
         chi2 = float(((n - mean) ** 2).sum() / mean)
         rows.append(

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayesdist.assess import uncertainty_map
-from bayesdist.diagnose.statistics import (
-    BandBins,
+from bayesdist.diagnose.residuals import (
+    BinnedSums,
     StatisticsTable,
     band_to_band_table,
     fitting_table,
@@ -111,7 +111,7 @@ def _measured(
     )
     session.close()
     order = session.posterior.model.order
-    binned, rng = sums.bins.axes.residuals(), np.random.default_rng(SEED)
+    binned, rng = sums.bins.residuals(), np.random.default_rng(SEED)
     where = {"grid": GRID, "epoch": session.epoch}
     convergence = session.posterior.convergence
     return BandResult(
@@ -157,7 +157,7 @@ def _tables(bands: tuple[BandResult, ...]) -> dict[str, StatisticsTable]:
     terms = {b.name: len(polynomial_terms(b.order)) for b in bands}
 
     def rows(function: object, *several: BandResult, **options: object) -> StatisticsTable:
-        sums: dict[str, BandBins] = {b.name: b.sums.bins for b in several}
+        sums: dict[str, BinnedSums] = {b.name: b.sums.bins for b in several}
         absorbed = max(terms[b.name] for b in several)
         return function(sums, rng=rng, absorbed=absorbed, **options)  # type: ignore[operator]
 

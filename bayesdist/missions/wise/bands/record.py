@@ -46,7 +46,7 @@ def record_of(inputs: BandsInput) -> dict[str, Any]:
 
 def _band(b: BandResult) -> dict[str, Any]:
     c, p = b.correlation, b.partition
-    count = b.sums.bins.axes.count
+    count = b.sums.bins.count
     out: dict[str, Any] = {
         "name": b.name,
         "run": b.path,

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.diagnose.statistics.pairs import pair_statistics
+from bayesdist.diagnose.residuals.binned import BinValues
+from bayesdist.diagnose.residuals.pairs import pair_statistics
 from bayesdist.errors import DegenerateError
 
-__all__ = ["STATISTICS", "BinValues", "StatisticsRow", "bin_row", "pair_row"]
+__all__ = ["STATISTICS", "StatisticsRow", "bin_row", "pair_row"]
 
 Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 STATISTICS = ("mean", "sigma", "min", "max", "median", "p01", "p99")
 
@@ -27,41 +27,6 @@ DRAWS = 300  # of bins with fresh noise: errors to 4 %
 _FEWEST_BINS = 3
 # percentiles of pairs in the draws need not be finer than this part of their spread
 _COARSE = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class BinValues:
-    """Means of one quantity in bins.
-
-    Parameters
-    ----------
-    mean, sem : ndarray, shape (ny, nx)
-        Means and their standard errors; NaN where there are too few stars.
-    dof : ndarray, shape (ny, nx)
-        Degrees of freedom of the standard errors: stars less one.
-    """
-
-    mean: Float
-    sem: Float
-    dof: Float
-
-    @property
-    def good(self) -> NDArray[np.bool_]:
-        """Bins whose mean has a standard error."""
-        return np.isfinite(self.mean) & np.isfinite(self.sem)
-
-    def scaled(self, factor: float) -> BinValues:
-        """The same in another unit."""
-        return BinValues(self.mean * factor, self.sem * abs(factor), self.dof)
-
-    def minus(self, other: BinValues) -> BinValues:
-        """Differences bin by bin; errors of the two count as independent."""
-        var = self.sem**2, other.sem**2
-        total = var[0] + var[1]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            # Satterthwaite's degrees of freedom of a sum of variances
-            dof = total**2 / (var[0] ** 2 / self.dof + var[1] ** 2 / other.dof)
-        return BinValues(self.mean - other.mean, np.sqrt(total), dof)
 
 
 @dataclass(frozen=True, eq=False)

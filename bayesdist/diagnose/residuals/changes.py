@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from bayesdist.diagnose.statistics.bands import BAND_AXES, BandBins
-from bayesdist.diagnose.statistics.rows import BinValues
+from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
 from bayesdist.errors import DegenerateError, InputError
 
 __all__ = ["PatternChange", "pattern_changes"]
@@ -47,7 +46,7 @@ class PatternChange:
     n_bins: int
 
 
-def pattern_changes(periods: Mapping[str, BandBins]) -> tuple[PatternChange, ...]:
+def pattern_changes(periods: Mapping[str, BinnedSums]) -> tuple[PatternChange, ...]:
     """Every period against the rest.
 
     A single period shares its stars with the combined set, the rest does not: differences from the
@@ -56,7 +55,7 @@ def pattern_changes(periods: Mapping[str, BandBins]) -> tuple[PatternChange, ...
 
     Parameters
     ----------
-    periods : mapping of str to BandBins
+    periods : mapping of str to BinnedSums
         Disjoint in their stars, all against one model, in pixels; two or more.
 
     Returns

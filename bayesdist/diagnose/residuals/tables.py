@@ -9,10 +9,9 @@ from itertools import combinations, product
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.diagnose.statistics.bands import BAND_AXES, WISE_ARCSEC, BandBins
-from bayesdist.diagnose.statistics.rows import (
+from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues
+from bayesdist.diagnose.residuals.rows import (
     STATISTICS,
-    BinValues,
     StatisticsRow,
     bin_row,
     pair_row,
@@ -20,6 +19,7 @@ from bayesdist.diagnose.statistics.rows import (
 from bayesdist.errors import InputError
 
 __all__ = [
+    "WISE_ARCSEC",
     "StatisticsTable",
     "band_to_band_table",
     "fitting_table",
@@ -31,6 +31,7 @@ _HEADS = dict(
     zip(STATISTICS, ("Mean", "Sigma", "Min", "Max", "Median", "1%-tile", "99%-tile"), strict=True)
 )
 _AXES = BAND_AXES[:2]
+WISE_ARCSEC = {"W1": 2.75, "W2": 2.75, "W3": 2.75, "W4": 5.5}  # per pixel; W4 is binned 2 x 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +94,13 @@ class StatisticsTable:
 
 
 def fitting_table(
-    bands: Mapping[str, BandBins], *, rng: np.random.Generator, absorbed: int = 1
+    bands: Mapping[str, BinnedSums], *, rng: np.random.Generator, absorbed: int = 1
 ) -> StatisticsTable:
     """Table 5-1: residuals of the fit in bins, in pixels.
 
     Parameters
     ----------
-    bands : mapping of str to BandBins
+    bands : mapping of str to BinnedSums
         By the name of the band, in the order of the table.
     rng : numpy.random.Generator
         For the errors.
@@ -131,7 +132,7 @@ def fitting_table(
 
 
 def band_to_band_table(
-    bands: Mapping[str, BandBins],
+    bands: Mapping[str, BinnedSums],
     *,
     rng: np.random.Generator,
     absorbed: int = 1,
@@ -165,7 +166,7 @@ def band_to_band_table(
     names = list(bands)
     if len(names) < 2:
         raise InputError("one band has no other to be compared with", do="give two bands or more")
-    shapes = {name: band.axes.count.shape for name, band in bands.items()}
+    shapes = {name: band.count.shape for name, band in bands.items()}
     for name in names[1:]:
         if shapes[name] != shapes[names[0]]:
             raise InputError(
@@ -187,7 +188,7 @@ def band_to_band_table(
 
 
 def multiframe_table(
-    bands: Mapping[str, BandBins],
+    bands: Mapping[str, BinnedSums],
     *,
     rng: np.random.Generator,
     absorbed: int = 1,
@@ -221,7 +222,7 @@ def multiframe_table(
 
 
 def period_table(
-    periods: Mapping[str, BandBins],
+    periods: Mapping[str, BinnedSums],
     *,
     rng: np.random.Generator,
     arcsec_per_pixel: float,
@@ -231,7 +232,7 @@ def period_table(
 
     Parameters
     ----------
-    periods : mapping of str to BandBins
+    periods : mapping of str to BinnedSums
         By the name of the period, in the order of the table: the combined one and single ones, all
         against the combined model.
     rng, absorbed
@@ -267,7 +268,7 @@ def _two_bands(bands: Iterable[str]) -> Iterator[tuple[str, str, str]]:
 
 
 def _in_arcsec(
-    bands: Mapping[str, BandBins], arcsec: Mapping[str, float]
+    bands: Mapping[str, BinnedSums], arcsec: Mapping[str, float]
 ) -> dict[tuple[str, str], BinValues]:
     missing: Sequence[str] = [name for name in bands if name not in arcsec]
     if missing:
