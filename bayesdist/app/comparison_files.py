@@ -9,8 +9,8 @@ from typing import Any
 from astropy.table import Table, vstack
 
 from bayesdist.app.folder import atomic_directory
+from bayesdist.app.output import write_table
 from bayesdist.app.rundir import versions, write_json
-from bayesdist.app.session import write_table
 from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.comparison.gap import GapDifference
 from bayesdist.assess.comparison.sentences import gap_verdict, verdict

@@ -10,15 +10,15 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
-from bayesdist.app.campaign.session import CampaignSession
 from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.folder import atomic_directory
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.matches import load_matches, reading_options
+from bayesdist.app.output import write_table
+from bayesdist.app.results import results_of
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.rvb import load_rvb
-from bayesdist.app.session import Session, write_table
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
 from bayesdist.assess.units import convert, pixel_scale_of
@@ -107,9 +107,9 @@ def _fitted(
 ) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
     """Release, new matches and their fit, and the exposures that the release has seen."""
     if config.campaign is not None:
-        session = CampaignSession(run)
-        exposures = read_new_exposures(session, new)
-        found = fit_exposures_of(session, exposures)
+        release = results_of(run)
+        exposures = read_new_exposures(release, new)
+        found = fit_exposures_of(release, exposures)
         return exposures.released, exposures.matches, found, exposures.left_out
     if config.selfcal is not None:
         raise InputError(
@@ -117,7 +117,7 @@ def _fitted(
             where=str(run.path),
             do="calibrate the new exposures by themselves, and use 'bayesdist compare'",
         )
-    posterior = Session(run).solution
+    posterior = results_of(run).solution
     matches = _new_matches(run, config, new)
     found = fit_new(
         posterior,

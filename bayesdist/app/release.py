@@ -12,12 +12,13 @@ import numpy as np
 from bayesdist.app.campaign.filter_figures import draw_filters
 from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.campaign.release import write_files
-from bayesdist.app.campaign.session import CampaignSession
+from bayesdist.app.error_terms import published_tables
 from bayesdist.app.folder import atomic_directory
+from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.output import write_table
+from bayesdist.app.results import Results, results_of
 from bayesdist.app.rundir import RunDirectory, versions, write_json
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
-from bayesdist.app.sessions import session_of
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
 from bayesdist.infer.exposures.shared_drift import with_drift_of
@@ -63,42 +64,39 @@ def release_runs(
         allowed, and a folder that is in use.
     """
     with ExitStack() as stack:
-        sessions: dict[str, CampaignSession] = {}
+        every: dict[str, Results] = {}
         for path in runs:
-            session = stack.enter_context(closing(_opened(path)))
-            filter = session.inputs.filter
-            if filter in sessions:
+            results = stack.enter_context(closing(_opened(path)))
+            filter = results.inputs.filter
+            if filter in every:
                 raise InputError(
-                    f"is of filter {filter}, as {sessions[filter].run.path} is",
+                    f"is of filter {filter}, as {every[filter].run.path} is",
                     where=str(path),
                     do="give one run for each filter",
                 )
-            sessions[filter] = session
-        _require_alike(sessions)
-        doubts = _doubts(sessions, allowed=allow_unconverged)
-        solutions = _solutions(sessions)
-        comparison, why_not = _compared(sessions)
-        notes = [*doubts, *_notes(sessions, comparison)]
-        table = comparison_table(
-            solutions,
-            comparison,
-            chip=next(iter(sessions.values())).reference_chip,
-        )
+            every[filter] = results
+        _require_alike(every)
+        doubts = _doubts(every, allowed=allow_unconverged)
+        solutions = _solutions(every)
+        comparison, why_not = _compared(every)
+        notes = [*doubts, *_notes(every, comparison)]
+        first = next(iter(every.values()))
+        chip = first.config.chips()[0].number
+        table = comparison_table(solutions, comparison, chip=chip)
         if comparison is None:
             table.meta["drift"] = {"verdict": why_not}
         with atomic_directory(Path(output)) as folder:
-            files = write_files(
-                next(iter(sessions.values())), folder, solutions, _tables(sessions), notes
-            )
+            tables = _tables(every)
+            files = write_files(first.config, first.base, folder, solutions, tables, notes)
             write_table(table, folder / "filters.ecsv")
-            figures = draw_filters(folder, sessions, solutions)
+            figures = draw_filters(folder, {k: one.fitted for k, one in every.items()}, solutions)
             write_json(
                 folder / "release.json",
                 {
                     "schema": SCHEMA,
                     "command": command,
                     "versions": versions(),
-                    "runs": {name: str(one.run.path) for name, one in sessions.items()},
+                    "runs": {name: str(one.run.path) for name, one in every.items()},
                     "converged": not doubts,
                     "drift": table.meta["drift"],
                     "products": files,
@@ -109,22 +107,22 @@ def release_runs(
     return _text(Path(output), files, rows, str(table["at_edge"].unit), why_not or None, comparison)
 
 
-def _opened(path: str | Path) -> CampaignSession:
-    """The session of a finished run of a campaign."""
-    session = session_of(RunDirectory.open(path))
-    if not isinstance(session, CampaignSession):
+def _opened(path: str | Path) -> Results:
+    """The results of a finished run of a campaign."""
+    run = RunDirectory.open(path)
+    if run.config.campaign is None:
         raise InputError(
             "is no run of a campaign", where=str(path), do="give runs that began with star lists"
         )
-    session.run.require("release", ("match", "fit", "sample"))
-    return session
+    run.require("release", ("match", "fit", "sample"))
+    return results_of(run)
 
 
 # -- whether the runs go together -----------------------------------------------------------------
 
 
-def _require_alike(sessions: Mapping[str, CampaignSession]) -> None:
-    first, *others = sessions.values()
+def _require_alike(every: Mapping[str, Results]) -> None:
+    first, *others = every.values()
     if first.config.products.release is None:
         raise InputError(
             "has no [products.release], and the first run says what is released",
@@ -132,41 +130,45 @@ def _require_alike(sessions: Mapping[str, CampaignSession]) -> None:
             do="put the run of the reference filter first",
         )
     mine = _structure(first)
-    for session in others:
-        for what, theirs in _structure(session).items():
+    for results in others:
+        for what, theirs in _structure(results).items():
             if theirs != mine[what]:
                 raise InputError(
                     f"the {what} are not those of {first.run.path}"
                     + (f": {theirs} and {mine[what]}" if what != "chips" else ""),
-                    where=str(session.run.path),
+                    where=str(results.run.path),
                     do="run both filters with one structure",
                 )
-        if not _same_detector(first, session):
+        if not _same_detector(first.fitted, results.fitted):
             raise InputError(
                 f"the detector's tables are not those of {first.run.path}",
-                where=str(session.run.path),
+                where=str(results.run.path),
                 do="name that run in tables.detector and run this filter again",
             )
 
 
-def _structure(session: CampaignSession) -> dict[str, Any]:
+def _structure(results: Results) -> dict[str, Any]:
     """What files of several filters must have in common, in words that take a plural."""
-    model, time = session.posterior.model, session.posterior.model.time
+    model, time = results.posterior.model, results.posterior.model.time
     return {
         "chips": model.chips,
         "orders": model.order,
         "units": model.unit,
-        "pixel scales": session.config.detector.scale_mas,
+        "pixel scales": results.config.detector.scale_mas,
         "drifting terms": None if time is None else time.terms,
         "reference dates (RDATE)": None if time is None else time.epoch0,
         "breaks": None if time is None else time.breaks,
     }
 
 
-def _same_detector(a: CampaignSession, b: CampaignSession) -> bool:
+def _same_detector(a: Fitted, b: Fitted) -> bool:
     """Whether two runs corrected the pixels alike, as far as a D2IMFILE holds it."""
     mine, theirs = (
-        {t.chip: (t.first, t.step, t.values.astype(np.float32)) for t in one.tables if not t.filter}
+        {
+            t.chip: (t.first, t.step, t.values.astype(np.float32))
+            for t in one.tables.tables
+            if not t.filter
+        }
         for one in (a, b)
     )
     return mine.keys() == theirs.keys() and all(
@@ -174,17 +176,17 @@ def _same_detector(a: CampaignSession, b: CampaignSession) -> bool:
     )
 
 
-def _doubts(sessions: Mapping[str, CampaignSession], *, allowed: bool) -> list[str]:
+def _doubts(every: Mapping[str, Results], *, allowed: bool) -> list[str]:
     """What has not converged, as sentences."""
     out = []
-    for name, session in sessions.items():
-        convergence = session.posterior.convergence
+    for name, results in every.items():
+        convergence = results.posterior.convergence
         if not convergence.converged:
             why = "; ".join(convergence.reasons)
             if not allowed:
                 raise InputError(
                     f"the run of {name} has not converged ({why})",
-                    where=str(session.run.path),
+                    where=str(results.run.path),
                     do="resume it with more steps, or release it with --allow-unconverged",
                 )
             out.append(f"NOT CONVERGED: the run of {name} ({why}).")
@@ -194,35 +196,44 @@ def _doubts(sessions: Mapping[str, CampaignSession], *, allowed: bool) -> list[s
 # -- what is released -----------------------------------------------------------------------------
 
 
-def _solutions(sessions: Mapping[str, CampaignSession]) -> dict[str, Solution]:
+def _solutions(every: Mapping[str, Results]) -> dict[str, Solution]:
     """The reference filter's solution, and the others with its drift."""
-    (first, reference), *others = sessions.items()
+    (first, reference), *others = every.items()
     out: dict[str, Solution] = {first: reference.solution}
-    for name, session in others:
-        solution: Solution = session.solution
+    for name, results in others:
+        solution: Solution = results.solution
         if solution.model.time is not None:
             solution = with_drift_of(
-                solution, reference.solution, chip=reference.reference_chip, formal=session.fit
+                solution,
+                reference.solution,
+                chip=reference.config.chips()[0].number,
+                formal=results.fit,
             )
         out[name] = solution
     return out
 
 
-def _tables(sessions: Mapping[str, CampaignSession]) -> list[LookupTable]:
+def _tables(every: Mapping[str, Results]) -> list[LookupTable]:
     """The detector's tables, once, and those of the filters."""
-    first = next(iter(sessions.values()))
-    out = [table for table in first.published_tables if not table.filter]
-    return out + [t for one in sessions.values() for t in one.published_tables if t.filter]
+    published = [
+        published_tables(one.fitted.tables, held=one.config.tables.detector is not None)
+        for one in every.values()
+    ]
+    out = [table for table in published[0] if not table.filter]
+    return out + [table for tables in published for table in tables if table.filter]
 
 
-def _compared(sessions: Mapping[str, CampaignSession]) -> tuple[FilterComparison | None, str]:
+def _compared(every: Mapping[str, Results]) -> tuple[FilterComparison | None, str]:
     """The comparison of the filters, or why there is none."""
-    if len(sessions) < 2:
+    if len(every) < 2:
         return None, "not compared: there is one filter"
-    first = next(iter(sessions.values()))
+    first = next(iter(every.values()))
     try:
         found = compare_filters(
-            {name: one.terms for name, one in sessions.items()},
+            {
+                name: required(one.fitted.alone, "fits of single exposures")
+                for name, one in every.items()
+            },
             first.posterior.model.time,
             seed=first.config.sampler.seed,
         )
@@ -231,14 +242,12 @@ def _compared(sessions: Mapping[str, CampaignSession]) -> tuple[FilterComparison
     return found, ""
 
 
-def _notes(
-    sessions: Mapping[str, CampaignSession], comparison: FilterComparison | None
-) -> list[str]:
+def _notes(every: Mapping[str, Results], comparison: FilterComparison | None) -> list[str]:
     """Lines for HISTORY."""
-    if len(sessions) < 2:
+    if len(every) < 2:
         return []
-    first = next(iter(sessions))
-    out = [f"Filters {', '.join(sessions)}; the drift is that of {first}."]
+    first = next(iter(every))
+    out = [f"Filters {', '.join(every)}; the drift is that of {first}."]
     if comparison is not None:
         said = comparison.sentence
         out.append(f"Tested on the exposures: {said}.")

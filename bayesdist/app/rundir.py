@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bayesdist.app.config import (
     Config,
@@ -35,6 +35,8 @@ from bayesdist.files import atomic_path, made_folder, remove_leftovers, sha256_o
 from bayesdist.version import __version__
 
 __all__ = ["RunDirectory", "as_json", "versions", "write_json"]
+
+T = TypeVar("T")
 
 PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 
@@ -258,8 +260,8 @@ class RunDirectory:
 
     # -- stages -----------------------------------------------------------------------------------
 
-    def make(self, stage: str, function: Callable[[], None], *, force: bool = False) -> bool:
-        """Make a stage where what it was made from or what it wrote is not as it was.
+    def make(self, stage: str, function: Callable[[], T], *, force: bool = False) -> Made[T]:
+        """The artefact of a stage: made where it or what it was made from is not as it was.
 
         Parameters
         ----------
@@ -268,11 +270,6 @@ class RunDirectory:
             Writes its files into the folder and its sections by `summarise`.
         force : bool
             Make it also where it stands.
-
-        Returns
-        -------
-        bool
-            Whether it was made.
         """
         made_from = self._made_from(stage)
         if made_from is None:
@@ -281,7 +278,7 @@ class RunDirectory:
                 where=str(self.path),
                 do="run them first",
             )
-        return self.store.stage(stage, lambda *_: function(), *made_from, force=force).was_made
+        return self.store.stage(stage, lambda *_: function(), *made_from, force=force)
 
     def made(self, stage: str) -> Made[None] | None:
         """A stage that stands; None for one that was not run, or on something else."""

@@ -10,10 +10,10 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.folder import atomic_directory
+from bayesdist.app.output import write_table
 from bayesdist.app.patterns.config import PlanConfig, load_plan
 from bayesdist.app.rundir import versions, write_json
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
 from bayesdist.assess.planning.dithers import KINDS, PlannedPattern, compare_patterns
 from bayesdist.assess.planning.words import lacking, nearly_free
 

@@ -168,6 +168,7 @@ def _solved(
         fixed_by(gauge, solution, known),
         matches_of(problem, places, matched.detections, given.inputs, matched.unused),
         arrays,
+        tuple(known.contradictions(theta)),
     )
 
 

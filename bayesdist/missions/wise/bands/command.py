@@ -77,9 +77,9 @@ def bands_of_runs(
     with ExitStack() as stack:
         bands = open_bands(runs)
         for band in bands.values():
-            stack.enter_context(closing(band.session))
+            stack.enter_context(closing(band.results))
         folder = stack.enter_context(atomic_directory(Path(output)))
-        order = {str(band.session.run.path): name for name, band in bands.items()}
+        order = {str(band.results.run.path): name for name, band in bands.items()}
         named = [order[str(Path(path))] for path in runs]
         inputs = measure_bands(
             bands,
@@ -100,13 +100,13 @@ def bands_of_runs(
 
 def _meta(bands: Mapping[str, BandRun], folder: Path) -> list[str]:
     """WISE meta-data, where all bands are WISE's and in pixels."""
-    models = [band.session.posterior.model for band in bands.values()]
+    models = [band.results.posterior.model for band in bands.values()]
     if not set(bands) <= set(WISE_BANDS) or any(model.unit != "pix" for model in models):
         return []
     headers = {
         int(name[1:]): sip_from_solution(
-            band.session.solution,
-            epoch=band.session.epoch,
+            band.results.solution,
+            epoch=band.results.epoch,
             linear="sip",
             inverse_order=META_ORDER,
             scale_arcsec=band.arcsec,

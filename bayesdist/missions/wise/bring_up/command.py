@@ -10,8 +10,8 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.folder import atomic_directory
+from bayesdist.app.output import write_table
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
 from bayesdist.data import RadialLimit, RvbPairs
 from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.rvb_files import ARRAY_SIZE, RVB_ALIASES, band_name
