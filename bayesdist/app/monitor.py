@@ -12,12 +12,12 @@ from astropy.table import Table
 from bayesdist.app.campaign.monitoring import fit_exposures_of, read_new_exposures
 from bayesdist.app.comparison_files import joined
 from bayesdist.app.config import Config, load_config
-from bayesdist.app.folder import atomic_directory
+from bayesdist.app.folder import record_folder
 from bayesdist.app.kinds.errors import read_magnitude_errors
 from bayesdist.app.matches import load_matches, reading_options
 from bayesdist.app.output import write_table
 from bayesdist.app.results import results_of
-from bayesdist.app.rundir import RunDirectory, versions, write_json
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.rvb import load_rvb
 from bayesdist.assess.comparison.change_maps import Monitored, change_maps, is_late
 from bayesdist.assess.comparison.tables import comparison_table, difference_table
@@ -37,7 +37,7 @@ from bayesdist.report.drawing import save_figures
 
 __all__ = ["monitor"]
 
-SCHEMA = 1
+CHANGE_MAPS = 1  # of the random streams that follow from the one seed
 
 
 def monitor(
@@ -86,7 +86,7 @@ def monitor(
             change=change,
             maps=change_maps(
                 date.change if late and date is not None else change,
-                rng=np.random.default_rng([config.sampler.seed, SCHEMA]),
+                rng=np.random.default_rng([config.sampler.seed, CHANGE_MAPS]),
                 names=(str(new), str(run)),
                 grid=(nx, ny),
             ),
@@ -245,7 +245,7 @@ def _write(
     command: str,
 ) -> None:
     date, maps = found.date, found.maps
-    with atomic_directory(output) as folder:
+    with record_folder(output, "monitor.json", command) as (folder, record):
         write_table(joined(maps, comparison_table), folder / "change.ecsv")
         write_table(joined(maps, difference_table), folder / "difference.ecsv")
         figures = {"change": difference_vectors(maps, names=("new", "release"))}
@@ -264,10 +264,10 @@ def _write(
                     table["first"], date.gain, date.dof, found.p_since
                 )
         save_figures(figures, folder / "figures")
-        write_json(folder / "monitor.json", _summary(found, facts, command))
+        record |= _summary(found, facts)
 
 
-def _summary(found: Monitored, facts: dict[str, Any], command: str) -> dict[str, Any]:
+def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
     test, date, worst = found.change.test, found.date, found.worst
     since = None
     if date is not None:
@@ -282,9 +282,6 @@ def _summary(found: Monitored, facts: dict[str, Any], command: str) -> dict[str,
         }
     scale = found.pixel_mas
     return {
-        "schema": SCHEMA,
-        "command": command,
-        "versions": versions(),
         "verdict": found.verdict,
         "changed": found.changed,
         "p_value": found.p_either,

@@ -13,11 +13,11 @@ from bayesdist.app.campaign.filter_figures import draw_filters
 from bayesdist.app.campaign.filters import FilterComparison, compare_filters, comparison_table
 from bayesdist.app.campaign.release import write_files
 from bayesdist.app.error_terms import published_tables
-from bayesdist.app.folder import atomic_directory
+from bayesdist.app.folder import record_folder
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.output import write_table
 from bayesdist.app.results import Results, results_of
-from bayesdist.app.rundir import RunDirectory, versions, write_json
+from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
 from bayesdist.assess.solution import Solution
 from bayesdist.errors import InputError
@@ -26,7 +26,6 @@ from bayesdist.model import LookupTable
 
 __all__ = ["release_runs"]
 
-SCHEMA = 1
 PRINTED = ("filter", "chip", "term", "at_edge", "sigma_at_edge")
 
 
@@ -64,45 +63,41 @@ def release_runs(
         allowed, and a folder that is in use.
     """
     with ExitStack() as stack:
-        every: dict[str, Results] = {}
+        by_filter: dict[str, Results] = {}
         for path in runs:
             results = stack.enter_context(closing(_opened(path)))
             filter = results.inputs.filter
-            if filter in every:
+            if filter in by_filter:
                 raise InputError(
-                    f"is of filter {filter}, as {every[filter].run.path} is",
+                    f"is of filter {filter}, as {by_filter[filter].run.path} is",
                     where=str(path),
                     do="give one run for each filter",
                 )
-            every[filter] = results
-        _require_alike(every)
-        doubts = _doubts(every, allowed=allow_unconverged)
-        solutions = _solutions(every)
-        comparison, why_not = _compared(every)
-        notes = [*doubts, *_notes(every, comparison)]
-        first = next(iter(every.values()))
+            by_filter[filter] = results
+        _require_alike(by_filter)
+        doubts = _doubts(by_filter, allowed=allow_unconverged)
+        solutions = _solutions(by_filter)
+        comparison, why_not = _compared(by_filter)
+        notes = [*doubts, *_notes(by_filter, comparison)]
+        first = next(iter(by_filter.values()))
         chip = first.config.chips()[0].number
         table = comparison_table(solutions, comparison, chip=chip)
         if comparison is None:
             table.meta["drift"] = {"verdict": why_not}
-        with atomic_directory(Path(output)) as folder:
-            tables = _tables(every)
+        with record_folder(Path(output), "release.json", command) as (folder, record):
+            tables = _tables(by_filter)
             files = write_files(first.config, first.base, folder, solutions, tables, notes)
             write_table(table, folder / "filters.ecsv")
-            figures = draw_filters(folder, {k: one.fitted for k, one in every.items()}, solutions)
-            write_json(
-                folder / "release.json",
-                {
-                    "schema": SCHEMA,
-                    "command": command,
-                    "versions": versions(),
-                    "runs": {name: str(one.run.path) for name, one in every.items()},
-                    "converged": not doubts,
-                    "drift": table.meta["drift"],
-                    "products": files,
-                    "figures": list(figures),
-                },
+            figures = draw_filters(
+                folder, {k: one.fitted for k, one in by_filter.items()}, solutions
             )
+            record |= {
+                "runs": {name: str(one.run.path) for name, one in by_filter.items()},
+                "converged": not doubts,
+                "drift": table.meta["drift"],
+                "products": files,
+                "figures": list(figures),
+            }
     rows = [dict(zip(table.colnames, row, strict=True)) for row in table]
     return _text(Path(output), files, rows, str(table["at_edge"].unit), why_not or None, comparison)
 
@@ -121,8 +116,8 @@ def _opened(path: str | Path) -> Results:
 # -- whether the runs go together -----------------------------------------------------------------
 
 
-def _require_alike(every: Mapping[str, Results]) -> None:
-    first, *others = every.values()
+def _require_alike(by_filter: Mapping[str, Results]) -> None:
+    first, *others = by_filter.values()
     if first.config.products.release is None:
         raise InputError(
             "has no [products.release], and the first run says what is released",
@@ -176,10 +171,10 @@ def _same_detector(a: Fitted, b: Fitted) -> bool:
     )
 
 
-def _doubts(every: Mapping[str, Results], *, allowed: bool) -> list[str]:
+def _doubts(by_filter: Mapping[str, Results], *, allowed: bool) -> list[str]:
     """What has not converged, as sentences."""
     out = []
-    for name, results in every.items():
+    for name, results in by_filter.items():
         convergence = results.posterior.convergence
         if not convergence.converged:
             why = "; ".join(convergence.reasons)
@@ -196,9 +191,9 @@ def _doubts(every: Mapping[str, Results], *, allowed: bool) -> list[str]:
 # -- what is released -----------------------------------------------------------------------------
 
 
-def _solutions(every: Mapping[str, Results]) -> dict[str, Solution]:
+def _solutions(by_filter: Mapping[str, Results]) -> dict[str, Solution]:
     """The reference filter's solution, and the others with its drift."""
-    (first, reference), *others = every.items()
+    (first, reference), *others = by_filter.items()
     out: dict[str, Solution] = {first: reference.solution}
     for name, results in others:
         solution: Solution = results.solution
@@ -213,26 +208,26 @@ def _solutions(every: Mapping[str, Results]) -> dict[str, Solution]:
     return out
 
 
-def _tables(every: Mapping[str, Results]) -> list[LookupTable]:
+def _tables(by_filter: Mapping[str, Results]) -> list[LookupTable]:
     """The detector's tables, once, and those of the filters."""
     published = [
         published_tables(one.fitted.tables, held=one.config.tables.detector is not None)
-        for one in every.values()
+        for one in by_filter.values()
     ]
     out = [table for table in published[0] if not table.filter]
     return out + [table for tables in published for table in tables if table.filter]
 
 
-def _compared(every: Mapping[str, Results]) -> tuple[FilterComparison | None, str]:
+def _compared(by_filter: Mapping[str, Results]) -> tuple[FilterComparison | None, str]:
     """The comparison of the filters, or why there is none."""
-    if len(every) < 2:
+    if len(by_filter) < 2:
         return None, "not compared: there is one filter"
-    first = next(iter(every.values()))
+    first = next(iter(by_filter.values()))
     try:
         found = compare_filters(
             {
                 name: required(one.fitted.alone, "fits of single exposures")
-                for name, one in every.items()
+                for name, one in by_filter.items()
             },
             first.posterior.model.time,
             seed=first.config.sampler.seed,
@@ -242,12 +237,12 @@ def _compared(every: Mapping[str, Results]) -> tuple[FilterComparison | None, st
     return found, ""
 
 
-def _notes(every: Mapping[str, Results], comparison: FilterComparison | None) -> list[str]:
+def _notes(by_filter: Mapping[str, Results], comparison: FilterComparison | None) -> list[str]:
     """Lines for HISTORY."""
-    if len(every) < 2:
+    if len(by_filter) < 2:
         return []
-    first = next(iter(every))
-    out = [f"Filters {', '.join(every)}; the drift is that of {first}."]
+    first = next(iter(by_filter))
+    out = [f"Filters {', '.join(by_filter)}; the drift is that of {first}."]
     if comparison is not None:
         said = comparison.sentence
         out.append(f"Tested on the exposures: {said}.")

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import platform
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +13,7 @@ from bayesdist.app.config import (
     config_of_record,
     load_config,
 )
+from bayesdist.app.folder import versions
 from bayesdist.app.made_from import CODECS, changes, made_from_of, with_seed
 from bayesdist.app.named_files import files_of_products, named_files
 from bayesdist.app.refusals import (
@@ -26,19 +24,16 @@ from bayesdist.app.refusals import (
     refuse_other_inputs,
 )
 from bayesdist.app.star_files import PAIRS, part_files
-from bayesdist.app.store import SCHEMA, Made, Record, RunStore, as_json, write_json
+from bayesdist.app.store import SCHEMA, Made, Record, RunStore, as_json
 from bayesdist.app.summary import head_of
 from bayesdist.assess import Requirement
 from bayesdist.data import input_files
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.files import atomic_path, made_folder, remove_leftovers, sha256_of
-from bayesdist.version import __version__
 
-__all__ = ["RunDirectory", "as_json", "versions", "write_json"]
+__all__ = ["RunDirectory"]
 
 T = TypeVar("T")
-
-PACKAGES = ("arviz", "astropy", "emcee", "numba", "numpy", "scipy", "xarray")
 
 
 class RunDirectory:
@@ -390,11 +385,3 @@ def _hashes(config: Config, base: Path) -> dict[str, str]:
     """SHA-256 of every file that the configuration names, by its absolute path."""
     named, others = named_files(config, base.resolve()), files_of_products(config, base.resolve())
     return {str(f): sha256_of(f) for f in [*input_files(named), *others]}
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the platform, and the packages that matter."""
-    out = {"python": sys.version.split()[0], "platform": platform.platform()}
-    out["bayesdist"] = __version__  # also where it runs from a source tree
-    out |= {name: metadata.version(name) for name in PACKAGES}
-    return out

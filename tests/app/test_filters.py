@@ -88,7 +88,7 @@ def runs(folder):
 
 
 @pytest.fixture(scope="module")
-def every(runs):
+def by_filter(runs):
     return {name: results_of(RunDirectory.open(run)) for name, run in runs.items()}
 
 
@@ -102,8 +102,8 @@ def release(runs, folder):
 # -- what one run takes from the other ------------------------------------------------------------
 
 
-def test_the_detectors_tables_are_held_and_the_filters_are_fitted(every):
-    reference, other = (every[name] for name in FILTERS)
+def test_the_detectors_tables_are_held_and_the_filters_are_fitted(by_filter):
+    reference, other = (by_filter[name] for name in FILTERS)
     assert [(t.chip, t.filter) for t in reference.fitted.tables.tables] == [(1, ""), (2, "")]
     assert [(t.chip, t.filter) for t in other.fitted.tables.tables] == [
         *((1, ""), (2, "")),
@@ -118,8 +118,8 @@ def test_the_detectors_tables_are_held_and_the_filters_are_fitted(every):
     assert len(x) == len(both) and np.array_equal(x, both)
 
 
-def test_the_error_of_the_held_tables_stays_in_the_budget(every):
-    other = every["F814W"]
+def test_the_error_of_the_held_tables_stays_in_the_budget(by_filter):
+    other = by_filter["F814W"]
     [term] = [one for one in other.errors.terms if one.name == "look-up tables"]
     for chip in other.fit.model.chips:
         x, y = np.meshgrid(
@@ -134,23 +134,23 @@ def test_the_error_of_the_held_tables_stays_in_the_budget(every):
         assert (sigma > 0.9 * held).all() and (held > 0).all()
 
 
-def test_a_d2imfile_serves_as_well(every, release, runs):
-    block = every["F814W"].config.tables
-    chips = every["F814W"].config.chips()
+def test_a_d2imfile_serves_as_well(by_filter, release, runs):
+    block = by_filter["F814W"].config.tables
+    chips = by_filter["F814W"].config.chips()
     of_run = held_tables(block, chips, runs["F814W"])
     file = block.model_copy(update={"detector": str(release.path / "acs_wfc_d2i.fits")})
     for a, b in zip(of_run, held_tables(file, chips, runs["F814W"]), strict=True):
         np.testing.assert_array_equal(a.values.astype(np.float32), b.values.astype(np.float32))
 
 
-def test_drift_of_few_exposures_is_that_of_the_reference(every):
+def test_drift_of_few_exposures_is_that_of_the_reference(by_filter):
     """Eight exposures know the drift as well as 22 do, and it is the true one."""
     model, theta = acs_solution("F814W")
     true = [lines(Truth(model, theta), s) for s in (0, 1)]
     pulls = []
     for s in (0, 1):
-        found = lines(reference_gauge(every["F814W"].posterior, 2), s)
-        first = lines(reference_gauge(every["F606W"].posterior, 2), s)
+        found = lines(reference_gauge(by_filter["F814W"].posterior, 2), s)
+        first = lines(reference_gauge(by_filter["F606W"].posterior, 2), s)
         for chip in ("WFC1", "WFC2"):
             for term in ("A_2", "B_2", "B_3"):
                 label = f"{chip}.{term}.beta"
@@ -221,10 +221,10 @@ def test_offsets_between_filters_are_the_true_ones(release):
 
 
 @pytest.fixture(scope="module")
-def plane(every, folder):
+def plane(by_filter, folder):
     """Both solutions as they are released, turned into the plane of the IDCTAB."""
-    first, other = (every[name].solution for name in FILTERS)
-    formal = every["F814W"].fit
+    first, other = (by_filter[name].solution for name in FILTERS)
+    formal = by_filter["F814W"].fit
     released = {"F606W": first, "F814W": with_drift_of(other, first, formal=formal)}
     views = {name: reference_gauge(without_frames(one), 2) for name, one in released.items()}
     orientation = laid_on(
@@ -241,7 +241,7 @@ def plane(every, folder):
 @pytest.mark.parametrize("filter", FILTERS)
 @pytest.mark.parametrize(("period", "date"), [("pre", "2005-03-01"), ("post", "2013-01-01")])
 def test_stwcs_sees_our_model_and_the_true_sky(
-    filter, period, date, release, every, folder, plane, tmp_path
+    filter, period, date, release, by_filter, folder, plane, tmp_path
 ):
     """All files together: 0.1 mas from the model, and as far from the truth as is stated."""
     pytest.importorskip("stwcs")
@@ -262,10 +262,10 @@ def test_stwcs_sees_our_model_and_the_true_sky(
     [true_centre] = truth.model.predict(truth.theta[filter], 2048.0, 1024.0, **middle)
     rng = np.random.default_rng(1)
     x, y = rng.uniform(1, 4096, 600), rng.uniform(1, 2048, 600)
-    [term] = [one for one in every[filter].errors.terms if one.name == "look-up tables"]
+    [term] = [one for one in by_filter[filter].errors.terms if one.name == "look-up tables"]
     for chip in (1, 2):
         theirs = wcs[chip].all_pix2world(np.stack([x, y], axis=1), 1)
-        px, py = corrected(every[filter].fitted.tables.tables, x, y, chip=chip, filter=filter)
+        px, py = corrected(by_filter[filter].fitted.tables.tables, x, y, chip=chip, filter=filter)
         ours = model.predict(turned.mean, px, py, epoch=epoch, chip=chip)
         assert separation_mas(to_sky(ours - centre, pointing, v2v3), theirs).max() < 0.1
 
