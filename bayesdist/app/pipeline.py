@@ -84,7 +84,7 @@ def fit(matched: Matched, config: Config, base: Path) -> FitData:
         For parameters that the stars do not determine.
     """
     reader = StarReader(config.resources())
-    fitted = kind_of(config).fit(matched, config, base, reader=reader)
+    fitted = kind_of(config).fit(matched, config, base, reader)
     return FitData(matched, fitted, reader)
 
 

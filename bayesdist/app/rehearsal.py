@@ -36,7 +36,7 @@ def rehearse(results: Results) -> Results:
         return results
     matched = results.matched
     check_pairs(matched.stars, config)
-    fitted = kind.fit(matched, config, base, reader=results.reader)
+    fitted = kind.fit(matched, config, base, results.reader)
     results = results.having(fitted=fitted)
     _check_residuals(results.data, config)
     rehearse_solution(results)

@@ -110,7 +110,7 @@ class Results:
         if found is not None:
             return found
         summary = self.run.summary
-        return self.kind.load_matched(self.run.path, self.config, self.base, self.inputs, summary)
+        return self.kind.load_matched(self.run.path, self.inputs, self.config, self.base, summary)
 
     @cached_property
     def fitted(self) -> Fitted:
@@ -119,7 +119,7 @@ class Results:
         if found is not None:
             return found
         summary = self.run.summary
-        return self.kind.load_fitted(self.run.path, self.config, lambda: self.matched, summary)
+        return self.kind.load_fitted(self.run.path, lambda: self.matched, self.config, summary)
 
     @cached_property
     def data(self) -> FitData:

@@ -11,6 +11,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.app.campaign.fit import fit_campaign
+from bayesdist.app.campaign.inputs import read_campaign
 from bayesdist.app.campaign.matching import match_lists
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fit_data import FitData
@@ -108,7 +109,7 @@ def test_what_is_held_out_is_no_part_of_the_fit(run) -> None:
 def test_functions_find_what_the_run_has_found(run) -> None:
     """Lists are matched and fitted without a run's folder, and are prepared as those of the run."""
     config, _ = load_config(run / "config.toml")
-    matched = match_lists(config, run)
+    matched = match_lists(read_campaign(config, run), config, run)
     fitted = fit_campaign(matched, config, run)
     known = load_fit(run / "fit.nc")
     np.testing.assert_array_equal(fitted.linear.mean, known.mean)

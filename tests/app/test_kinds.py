@@ -11,7 +11,13 @@ from bayesdist.app.config import load_config
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.reader import StarReader
-from bayesdist.app.kinds.stars import fit_stars, load_fitted_stars, match_stars, sample_stars
+from bayesdist.app.kinds.stars import (
+    fit_stars,
+    load_fitted_stars,
+    match_stars,
+    read_stars,
+    sample_stars,
+)
 from bayesdist.app.kinds.summary import fit_sections
 from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
@@ -30,14 +36,14 @@ def job(finished):
 @pytest.fixture(scope="module")
 def fitted(job):
     config, base = job
-    matched = match_stars(config, base)
+    matched = match_stars(read_stars(config, base), config, base)
     return matched, fit_stars(matched, config)
 
 
 def test_functions_find_what_a_run_finds(finished, job, fitted):
     before = snapshot(finished.path.parent)
     (config, _), (matched, found) = job, fitted
-    posterior = sample_stars(found, FitData(matched, found).stars, config)
+    posterior = sample_stars(FitData(matched, found), config)
     assert snapshot(finished.path.parent) == before
     known, draws = load_fit(finished.path / "fit.nc"), load_posterior(finished.path)
     np.testing.assert_array_equal(found.linear.mean, known.mean)
@@ -61,7 +67,7 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
         holdout={"fraction": 0.3},
     )
     config, _ = load_config(path)
-    matched = match_stars(config, path.parent)
+    matched = match_stars(read_stars(config, path.parent), config, path.parent)
     found = fit_stars(matched, config)
     found.save(tmp_path)
     read = load_fitted_stars(tmp_path, config, as_json(fit_sections(found, matched.stars)))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import ErrorLaw, read_magnitude_errors
+from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import FIT, Fitted, required
 from bayesdist.app.selfcal.gauge import fixed_by, gauge_summary
 from bayesdist.app.selfcal.matched import SelfcalMatched
@@ -95,7 +96,7 @@ def load_fitted_selfcal(
 
 
 def sample_detections(
-    fitted: Fitted,
+    data: FitData,
     config: Config,
     *,
     folder: Path | None = None,
@@ -105,7 +106,7 @@ def sample_detections(
 
     Parameters
     ----------
-    fitted : Fitted
+    data : FitData
         Of a self-calibration.
     config : Config
     folder : Path, optional
@@ -119,7 +120,7 @@ def sample_detections(
         With errors in the unit of u, v.
     """
     s, jitter = config.sampler, config.outliers.jitter
-    solution = required(fitted.solved, "solution of detections").solution
+    solution = required(data.fitted.solved, "solution of detections").solution
     posterior = sample_selfcal(
         solution,
         jitter=None if jitter == "fit" else float(jitter),
@@ -134,7 +135,7 @@ def sample_detections(
         folder=folder,
         progress=progress,
     )
-    return _in_unit(posterior, fitted.linear.model.pixel_size(solution.theta))
+    return _in_unit(posterior, data.model.pixel_size(solution.theta))
 
 
 def _solved(

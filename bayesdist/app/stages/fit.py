@@ -24,7 +24,7 @@ def run_fit(results: Results) -> Results:
     config, kind = results.config, results.kind
     fitted = results.made.get("fitted")
     if fitted is None:
-        fitted = kind.fit(results.matched, config, results.base, reader=results.reader)
+        fitted = kind.fit(results.matched, config, results.base, results.reader)
         results = results.having(fitted=fitted)
     data = results.data
     fitted.save(results.run.path)

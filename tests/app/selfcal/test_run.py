@@ -17,6 +17,7 @@ from bayesdist.app.results import results_of
 from bayesdist.app.run import STAGES
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.selfcal.fit import fit_selfcal
+from bayesdist.app.selfcal.given import read_given
 from bayesdist.app.selfcal.matching import match_dithers
 from bayesdist.app.store import as_json
 from bayesdist.infer import load_fit, load_posterior
@@ -80,7 +81,8 @@ def test_false_detections_are_told_as_in_the_posterior(name, request):
 def test_functions_find_what_the_run_has_found(one_roll):
     """Lists become stars and a solution without a run's folder, the very ones that a run reads."""
     config, _ = load_config(one_roll.config)
-    matched = match_dithers(config, one_roll.config.parent)
+    base = one_roll.config.parent
+    matched = match_dithers(read_given(config, base), config, base)
     fitted = fit_selfcal(matched)
     known = load_fit(one_roll.path / "fit.nc")
     np.testing.assert_array_equal(fitted.linear.mean, known.mean)
