@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 from astropy.table import QTable
 
+from bayesdist.app.results import results_of
 from bayesdist.app.run import run
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import number, table_text
-from bayesdist.app.session import Session
 from bayesdist.app.summary_text import results_text
 from bayesdist.data import MatchTable
 from bayesdist.errors import InputError
 from bayesdist.files import atomic_path, made_folder
+from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import simulate_wise
 from bayesdist.simulate import Truth
 
@@ -125,12 +126,13 @@ def demo(folder: str | Path, *, force: bool = False, command: str = "") -> str:
     matches, truth = simulate_wise(N_STARS, rng=np.random.default_rng(SEED))
     write_simulation(folder / "input", matches, truth, simulation_config("W2"))
     run(folder / "input" / "config.toml", folder / "run", force=force, command=command)
-    session = Session(RunDirectory.open(folder / "run"))
-    return f"{_against_truth(session, truth)}\n\n{results_text(session)}"
+    finished = RunDirectory.open(folder / "run")
+    results = results_of(finished)
+    against = _against_truth(results.posterior, results.fit, truth)
+    return f"{against}\n\n{results_text(finished)}"
 
 
-def _against_truth(session: Session, truth: Truth) -> str:
-    posterior, fit = session.posterior, session.fit
+def _against_truth(posterior: Posterior, fit: LinearFit, truth: Truth) -> str:
     rows = []
     for k, name in enumerate(posterior.model.names):
         rows.append(

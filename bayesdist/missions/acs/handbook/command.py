@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,10 +10,10 @@ from astropy.table import Table
 
 from bayesdist.app.calibrations import calibration_at
 from bayesdist.app.folder import atomic_directory
+from bayesdist.app.output import write_table
+from bayesdist.app.results import open_results
 from bayesdist.app.rundir import RunDirectory
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
-from bayesdist.app.sessions import session_of
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
@@ -97,9 +96,9 @@ def _residuals(path: Path) -> tuple[Mapping[int, BinnedResiduals], str]:
     if not (home / "run.json").exists():
         return {}, "; no residuals, which only runs have"
     try:
-        with closing(session_of(RunDirectory.open(home))) as session:
-            chips = session.fit.model.chips
-            sums = zip(chips, session.diagnostics.shown, strict=True)
+        with open_results(RunDirectory.open(home)) as results:
+            chips = results.fit.model.chips
+            sums = zip(chips, results.diagnostics.shown, strict=True)
             return {chip.number: one.residuals() for chip, one in sums}, ""
     except InputError as error:  # matches that were moved away: all else can be shown without them
         return {}, f"; no residuals: {error}"

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from bayesdist.app.folder import atomic_directory
-from bayesdist.app.rundir import versions, write_json
+from bayesdist.app.folder import atomic_directory, versions
 from bayesdist.app.screen import table_text
+from bayesdist.app.store import write_json
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.bands.context import BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table
@@ -57,9 +57,9 @@ def bands_of_runs(
     with ExitStack() as stack:
         bands = open_bands(runs)
         for band in bands.values():
-            stack.enter_context(closing(band.session))
+            stack.enter_context(closing(band.results))
         folder = stack.enter_context(atomic_directory(Path(output)))
-        order = {str(band.session.run.path): name for name, band in bands.items()}
+        order = {str(band.results.run.path): name for name, band in bands.items()}
         named = [order[str(Path(path))] for path in runs]
         inputs = measure_bands(
             bands,
@@ -80,13 +80,13 @@ def bands_of_runs(
 
 def _meta(bands: Mapping[str, BandRun], folder: Path) -> list[str]:
     """WISE meta-data, where all bands are WISE's and in pixels."""
-    models = [band.session.posterior.model for band in bands.values()]
+    models = [band.results.posterior.model for band in bands.values()]
     if not set(bands) <= set(WISE_BANDS) or any(model.unit != "pix" for model in models):
         return []
     headers = {
         int(name[1:]): sip_from_solution(
-            band.session.solution,
-            epoch=band.session.epoch,
+            band.results.solution,
+            epoch=band.results.epoch,
             linear="sip",
             inverse_order=META_ORDER,
             scale_arcsec=band.arcsec,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.session import write_table
+from bayesdist.app.output import write_table
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.histograms import ResidualHistogram
 from bayesdist.missions.wise.bands.context import BandResult, BandsInput

@@ -10,8 +10,8 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.app.folder import atomic_directory
+from bayesdist.app.output import write_table
 from bayesdist.app.screen import table_text
-from bayesdist.app.session import write_table
 from bayesdist.data.frame_stars import FrameStars
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.files import read_table
